@@ -1,0 +1,1 @@
+"""Cameras: V4L2 and IIDC (FireWire) frame sources whose stamps mean mid-exposure."""

@@ -1,0 +1,1 @@
+"""MicroStrain inertial sensors: single-byte and MIP protocols, port, device."""

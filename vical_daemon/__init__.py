@@ -1,0 +1,1 @@
+"""vical: online camera-IMU calibration daemon (bus, roles, recorder, estimator, command line)."""

@@ -1,0 +1,1 @@
+"""Estimation: arithmetic only (numpy, scipy); nothing here reads a clock, a file or a socket."""

@@ -1,0 +1,87 @@
+"""What goes into the estimator: settings, priors and observations. Plain data, no behaviour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """Continuous-time noise densities of an IMU (Kalibr's four numbers).
+
+    Defaults: 3DM-GX3-25 (0.03 deg/s/sqrt(Hz), 80 ug/sqrt(Hz) and the bias walks of its class).
+    """
+
+    gyro_density: float = 5.2e-4  # rad/s/sqrt(Hz)
+    gyro_walk: float = 2.0e-5  # rad/s^2/sqrt(Hz)
+    accel_density: float = 8.0e-4  # m/s^2/sqrt(Hz)
+    accel_walk: float = 2.0e-4  # m/s^3/sqrt(Hz)
+    rate_hz: float = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPrior:
+    """What is known about a camera before the first frame.
+
+    Attributes:
+        resolution: width, height, px.
+        intrinsics: fx fy cx cy, px; None: guessed from the resolution.
+        distortion_model: radtan or equidistant.
+        distortion: 4 coefficients; None: zeros.
+        T_imu_cam: (R_imu_cam (3,3), p_imu_cam (3,)) or None: nothing known, found from the data.
+        timeshift_cam_imu_s: t_imu = t_cam + shift, s; None: nothing known, found from the data.
+        readout_s: Rolling-shutter readout, first to last row, s; 0: global shutter.
+    """
+
+    resolution: tuple[int, int]
+    intrinsics: tuple[float, float, float, float] | None = None
+    distortion_model: str = "radtan"
+    distortion: tuple[float, float, float, float] | None = None
+    T_imu_cam: tuple[FloatArray, FloatArray] | None = None
+    timeshift_cam_imu_s: float | None = None
+    readout_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class PointsFrame:
+    """Points seen in one image: target corners (known places) or feature tracks (unknown places).
+
+    Attributes:
+        camera: Name of the camera.
+        t_cam_ns: Stamp of the image in the camera's clock (UNIX or monotonic, one base per recording), ns.
+        ids: Point or feature ids, shape (n,), int64.
+        uv_px: Raw distorted pixel coordinates (u right, v down, pixel centres at integers), shape (n, 2).
+        sigma_px: One-sigma per axis as the detector states it, shape (n,); None: measured by the filter.
+    """
+
+    camera: str
+    t_cam_ns: int
+    ids: IntArray
+    uv_px: FloatArray
+    sigma_px: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """Switches of the estimator; names as on the command line.
+
+    Attributes:
+        fix: Of {"intrinsics", "timeshift", "extrinsics"}: held at their priors.
+        estimate: Of {"imu_intrinsics", "readout", "target_scale"}: optional blocks switched on.
+        target_free: Landmarks are estimated, no target is known.
+        gravity_mps2: Magnitude of gravity, m/s^2.
+        corner_sigma_px: First guess of the corner noise; measured from the data afterwards.
+    """
+
+    fix: frozenset[str] = frozenset()
+    estimate: frozenset[str] = frozenset()
+    target_free: bool = False
+    gravity_mps2: float = 9.80665
+    corner_sigma_px: float = 0.5
+    imu_noise: ImuNoise = field(default_factory=ImuNoise)

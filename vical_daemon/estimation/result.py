@@ -1,0 +1,136 @@
+"""The answer: one calibration estimate, as the filter gives it and as `vical calibrate --json` prints it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any
+
+
+class Status(StrEnum):
+    """Where a calibration stands."""
+
+    WAITING = "waiting"
+    INITIALISING = "initialising"
+    CONVERGING = "converging"
+    CONVERGED = "converged"
+    DEGENERATE = "degenerate"
+    INCONSISTENT = "inconsistent"
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """`T_imu_cam`: pose of the camera in the imu frame.
+
+    Attributes:
+        p_m: Lever arm: camera origin in the imu frame, m, 3 numbers.
+        q_wxyz: Hamilton unit quaternion, w >= 0, maps cam vectors into imu.
+        covariance: 6x6, order [px py pz rx ry rz], m and rad, rotation error local (right).
+    """
+
+    p_m: list[float]
+    q_wxyz: list[float]
+    covariance: list[list[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraEstimate:
+    """What is known about one camera; lists that are empty were not estimated and not given.
+
+    Attributes:
+        T_imu_cam: Extrinsics.
+        timeshift_cam_imu_s: t_imu = t_cam + timeshift_cam_imu_s, s.
+        timeshift_sigma_s: Its standard deviation, s.
+        intrinsics: fx fy cx cy, px.
+        intrinsics_sigma: Standard deviations, px (0 where held fixed).
+        distortion_model: radtan or equidistant.
+        distortion: 4 coefficients.
+        distortion_sigma: Standard deviations.
+        reprojection_rms_px: RMS of the residuals of accepted corners, px.
+        corner_sigma_px: Measured corner noise per axis, px.
+        unobservable: Names of withheld directions, each with the motion that would reveal it.
+        readout_s: Rolling-shutter readout first to last row, s (0: global shutter).
+        readout_sigma_s: Its standard deviation, s.
+    """
+
+    T_imu_cam: PoseEstimate
+    timeshift_cam_imu_s: float
+    timeshift_sigma_s: float
+    intrinsics: list[float]
+    intrinsics_sigma: list[float]
+    distortion_model: str
+    distortion: list[float]
+    distortion_sigma: list[float]
+    reprojection_rms_px: float
+    corner_sigma_px: float = 0.0
+    unobservable: list[str] = field(default_factory=list)
+    readout_s: float = 0.0
+    readout_sigma_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ImuEstimate:
+    """Inertial biases and, where estimated, scale and misalignment, in the imu frame."""
+
+    gyro_bias_rps: list[float]
+    accel_bias_mps2: list[float]
+    gyro_bias_sigma_rps: list[float] = field(default_factory=list)
+    accel_bias_sigma_mps2: list[float] = field(default_factory=list)
+    gyro_matrix: list[list[float]] = field(default_factory=list)
+    accel_matrix: list[list[float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class TracePoint:
+    """One entry a second of how a camera's calibration developed (`t_s` since the first sample)."""
+
+    t_s: float
+    p_m: list[float]
+    p_sigma_m: list[float]
+    q_wxyz: list[float]
+    r_sigma_rad: list[float]
+    timeshift_s: float
+    timeshift_sigma_s: float
+    nis_per_dof: float = 0.0
+    status: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationEstimate:
+    """Everything the estimator says at one moment.
+
+    Attributes:
+        t_ns: Stamp of the newest data used (the imu's clock), ns.
+        status: Where the calibration stands.
+        reason: Why, in words for a person; empty when converged.
+        progress: 0 to 1.
+        guidance: What motion to make next, in words; empty when nothing is missing.
+        duration_s: Seconds of data used.
+        frames: Camera frames used.
+        imu_samples: Inertial samples used.
+        cameras: By camera name; empty before the first solution.
+        imu: Biases; None before the first solution.
+        gravity_world_mps2: Acceleration of free fall in the world (target) frame, m/s^2; [] before.
+        nis_per_dof: Mean normalised innovation squared per degree of freedom; 1 when consistent.
+        rejected_fraction: Share of measurements that the gates refused.
+        events: Announcements since the last estimate, e.g. "bumped: ...".
+    """
+
+    t_ns: int
+    status: Status
+    reason: str
+    progress: float
+    guidance: str
+    duration_s: float
+    frames: int
+    imu_samples: int
+    cameras: dict[str, CameraEstimate]
+    imu: ImuEstimate | None
+    gravity_world_mps2: list[float]
+    nis_per_dof: float
+    rejected_fraction: float
+    events: list[str] = field(default_factory=list)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the dictionary that COMMANDS promises (without trace, cpu_s and truth)."""
+        return asdict(self)

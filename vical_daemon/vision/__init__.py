@@ -1,0 +1,1 @@
+"""Targets, detectors and feature tracks: the only folder that imports cv2."""
