@@ -1,6 +1,147 @@
-"""The `vical` command: one module per subcommand; importing this package imports nothing heavy."""
+"""The `vical` command: one module per subcommand; importing this package imports nothing heavy.
+
+A subcommand is a module `vical_daemon.cli.<name>` with `HELP`, `add_arguments(parser)` and
+`run(args) -> int`, listed in `table`. Only the module of the command that was typed is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from vical_daemon.cli import errors, options, table
+
+# The filter's matrices are small: a BLAS thread pool costs more than it gives and makes runs
+# depend on the machine. It must be set before numpy is imported.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+_INTRO = (
+    "vical: where does the camera sit on the IMU, and how late is it? Calibrated online, with honest sigmas."
+)
+_TEACHING = """\
+Start here:
+  vical demo                                    no hardware needed; ends with truth beside the estimate
+  vical calibrate LOG --target target.yaml      the same filter over a recording of yours
+  vical devices && vical check -c vical.yaml    what is plugged in, and does the config fit
+  vical run -c vical.yaml                       acquire, stamp, record, calibrate, publish
+
+Every command takes --json (machine output alone on stdout) and --help.
+Exit code: 0 done, 1 a known failure (one line on stderr), 2 bad usage or config.
+"""
 
 
-def main() -> int:
-    """Run the command line (the console script `vical`)."""
-    raise SystemExit(2)
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line (the console script `vical`).
+
+    Args:
+        argv: Words after `vical`; None: those of this process.
+
+    Returns:
+        The exit code.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _dispatch(words)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _silence_stdout()
+        return errors.EXIT_BROKEN_PIPE
+    except KeyboardInterrupt:
+        print("vical: interrupted", file=sys.stderr)
+        return errors.EXIT_INTERRUPTED
+    except Exception as error:
+        return _report(error)
+    return code
+
+
+def build_parser(selected: str | None) -> tuple[argparse.ArgumentParser, dict[str, table.Command]]:
+    """Make the parser; only the module of the `selected` command is imported and adds its arguments."""
+    commands = table.available()
+    parser = options.VicalParser(prog="vical", description=_INTRO, add_help=False)
+    parser.add_argument("-h", "--help", action="store_true", help="show this help")
+    parser.add_argument("--version", action="store_true", help="show the version")
+    subparsers = parser.add_subparsers(dest="_command", metavar="COMMAND", parser_class=options.VicalParser)
+    for name, command in commands.items():
+        child = subparsers.add_parser(
+            name,
+            help=command.summary,
+            description=command.summary[0].upper() + command.summary[1:] + ".",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if name == selected:
+            import_module(command.module).add_arguments(child)
+            for leaf in options.leaves(child):
+                options.add_json(leaf)
+                options.add_verbosity(leaf)
+    return parser, commands
+
+
+def help_text(commands: dict[str, table.Command]) -> str:
+    """Return the grouped overview that `vical --help` prints."""
+    lines = ["usage: vical COMMAND [options]", "", _INTRO, ""]
+    for group in dict.fromkeys(command.group for command in commands.values()):
+        lines.append(f"{group}:")
+        lines += [f"  {c.name:<16} {c.summary}" for c in commands.values() if c.group == group]
+        lines.append("")
+    return "\n".join(lines) + "\n" + _TEACHING
+
+
+def _dispatch(words: list[str]) -> int:
+    completing = "_ARGCOMPLETE" in os.environ
+    selected = _selected(os.environ.get("COMP_LINE", "").split()[1:] if completing else words)
+    parser, commands = build_parser(selected)
+    if selected is not None and selected not in commands and not completing:
+        raise errors.CliError(
+            f"{selected!r} is not a command{options.suggest(selected, list(commands))} (see `vical --help`)",
+            errors.EXIT_USAGE,
+        )
+    if completing:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    args = parser.parse_args(words)
+    if args.version:
+        from importlib.metadata import version
+
+        print(f"vical {version('vical')}")
+        return 0
+    if args._command is None:
+        print(help_text(commands), end="", file=sys.stdout if args.help else sys.stderr)
+        return 0 if args.help else errors.EXIT_USAGE
+    _set_up_logging(args)
+    return int(import_module(commands[args._command].module).run(args))
+
+
+def _selected(words: list[str]) -> str | None:
+    return next((word for word in words if not word.startswith("-")), None)
+
+
+def _set_up_logging(args: argparse.Namespace) -> None:
+    level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname).1s %(name)s: %(message)s")
+    if not args.verbose:  # libraries talk about themselves at INFO
+        for library in ("matplotlib", "asyncio", "aiohttp", "rosbags"):
+            logging.getLogger(library).setLevel(logging.WARNING)
+
+
+def _report(error: Exception) -> int:
+    """Turn any failure into one line on stderr; a bug also leaves its traceback in a file."""
+    known = errors.describe_known(error)
+    if known is not None:
+        print(f"vical: error: {known[0]}", file=sys.stderr)
+        return known[1]
+    path = errors.write_crash_log(error)
+    where = f"the traceback is in {path}" if path else "no folder to write the traceback to"
+    line = " ".join(f"{type(error).__name__}: {error}".split())
+    print(f"vical: internal error: {line}; {where}, please report it", file=sys.stderr)
+    return errors.EXIT_FAILURE
+
+
+def _silence_stdout() -> None:
+    """Point stdout at nothing, so that the interpreter's last flush does not complain as well."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

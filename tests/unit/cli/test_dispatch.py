@@ -1,0 +1,175 @@
+"""The frame of the command line: help without imports, one-line errors, exit codes, pipes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+from vical_drivers.errors import DeviceNotFoundError
+
+import vical_daemon.cli as cli
+from vical_daemon.cli import options, table
+from vical_daemon.cli.errors import CliError, describe_known
+
+HEAVY = (
+    "numpy",
+    "scipy",
+    "cv2",
+    "zenoh",
+    "rosbags",
+    "mcap",
+    "foxglove",
+    "matplotlib",
+    "rich",
+    "aiohttp",
+    "yaml",
+)
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch):
+    """Install a subcommand `probe` whose run() does what the test says."""
+
+    def install(run, add_arguments=lambda parser: None) -> None:
+        entry = table.Command("probe", "Tests", "for this test only")
+        module = types.ModuleType(entry.module)
+        module.HELP, module.run, module.add_arguments = "for this test only", run, add_arguments
+        monkeypatch.setitem(sys.modules, entry.module, module)
+        monkeypatch.setattr(table, "available", lambda: {"probe": entry})
+
+    return install
+
+
+def _raiser(error: BaseException):
+    def run(args: argparse.Namespace) -> int:
+        raise error
+
+    return run
+
+
+def test_help_lists_only_present_commands_and_needs_no_heavy_import() -> None:
+    code = (
+        "import sys, json; from vical_daemon.cli import main; rc = main(['--help']);"
+        f"print(json.dumps([rc, [m for m in {HEAVY!r} if m in sys.modules]]), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stderr) == [0, []]
+    for name in table.available():
+        assert f"  {name} " in done.stdout
+    assert "vical demo" in done.stdout
+
+
+def test_no_command_is_bad_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "usage: vical COMMAND" in err
+
+
+def test_unknown_command_names_the_nearest(command, capsys: pytest.CaptureFixture[str]) -> None:
+    command(lambda args: 0)
+    assert cli.main(["prob"]) == 2
+    err = capsys.readouterr().err
+    assert "did you mean probe?" in err and err.count("\n") == 1
+
+
+def test_every_leaf_takes_json_even_if_the_module_forgot(command) -> None:
+    def nested(parser: argparse.ArgumentParser) -> None:
+        subparsers = parser.add_subparsers(dest="what", required=True)
+        for name in ("one", "two"):
+            options.add_json(subparsers.add_parser(name))
+
+    seen = []
+    command(lambda args: seen.append((args.what, args.json)) or 0, nested)
+    assert cli.main(["probe", "two", "--json"]) == 0
+    assert seen == [("two", True)]
+    command(lambda args: seen.append(args.json) or 3)
+    assert cli.main(["probe", "--json"]) == 3
+    assert seen[-1] is True
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (CliError("no such board", 2), 2, "no such board"),
+        (CliError("two\nlines"), 1, "two lines"),
+        (DeviceNotFoundError("/dev/ttyX: nothing there"), 1, "/dev/ttyX: nothing there"),
+        (
+            FileNotFoundError(2, "No such file or directory", "log.mcap"),
+            1,
+            "log.mcap: No such file or directory",
+        ),
+    ],
+)
+def test_known_errors_are_one_line(command, capsys, error, code, line) -> None:
+    command(_raiser(error))
+    assert cli.main(["probe"]) == code
+    assert capsys.readouterr().err == f"vical: error: {line}\n"
+
+
+def test_a_bug_leaves_its_traceback_in_a_file(command, capsys, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.delenv("LOGS_DIRECTORY", raising=False)
+    command(_raiser(KeyError("gyro")))
+    assert cli.main(["probe"]) == 1
+    err = capsys.readouterr().err
+    (log,) = (tmp_path / "vical").iterdir()
+    assert err.count("\n") == 1 and "Traceback" not in err and str(log) in err
+    assert "Traceback" in log.read_text() and "KeyError" in log.read_text()
+
+
+def test_bad_option_is_one_line_with_the_help_to_read(command, capsys) -> None:
+    command(lambda args: 0, lambda parser: parser.add_argument("--rate", type=int))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["probe", "--rate", "fast"])
+    assert stop.value.code == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "vical probe --help" in err
+
+
+def test_wrong_choice_suggests_the_nearest(command, capsys) -> None:
+    command(lambda args: 0, lambda parser: parser.add_argument("--format", choices=["kalibr", "ros"]))
+    with pytest.raises(SystemExit):
+        cli.main(["probe", "--format", "kalbir"])
+    assert "did you mean kalibr?" in capsys.readouterr().err
+
+
+def test_interrupt_exits_130(command, capsys) -> None:
+    command(_raiser(KeyboardInterrupt()))
+    assert cli.main(["probe"]) == 130
+
+
+def test_broken_pipe_is_quiet() -> None:
+    code = (
+        "import sys, types; import vical_daemon.cli as cli; from vical_daemon.cli import table;"
+        "m = types.ModuleType('vical_daemon.cli.probe'); m.add_arguments = lambda p: None;"
+        "m.run = lambda a: [print('x' * 1000) for _ in range(10000)] and 0;"
+        "sys.modules[m.__name__] = m;"
+        "table.available = lambda: {'probe': table.Command('probe', 'T', 's')}; sys.exit(cli.main(['probe']))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.read(10)
+    process.stdout.close()
+    err = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(20) == 141 and err == b""
+
+
+def test_a_bug_is_not_described_as_known() -> None:
+    assert describe_known(ValueError("x")) is None
+    assert describe_known(OSError("no file named")) is None
+
+
+def test_table_names_are_unique_and_each_module_keeps_the_convention() -> None:
+    names = [c.name for c in table.COMMANDS]
+    assert len(names) == len(set(names))
+    for name in table.available():
+        _, commands = cli.build_parser(name)
+        module = sys.modules[commands[name].module]
+        assert isinstance(module.HELP, str) and "\n" not in module.HELP
+        assert callable(module.run)

@@ -1,0 +1,84 @@
+"""Options that several commands share, and the parser class that explains a mistake in one line."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from typing import NoReturn
+
+from vical_daemon.cli.errors import EXIT_USAGE
+
+
+class VicalParser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line and name the help to read."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line and exit 2."""
+        hint = _nearest_choice(message)
+        print(f"{self.prog}: error: {message}{hint} (see `{self.prog} --help`)", file=sys.stderr)
+        raise SystemExit(EXIT_USAGE)
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add `--json` to a leaf command; harmless when it is there already."""
+    if "--json" not in parser._option_string_actions:
+        parser.add_argument(
+            "--json", action="store_true", help="machine-readable output alone on stdout, the rest on stderr"
+        )
+
+
+def add_verbosity(parser: argparse.ArgumentParser) -> None:
+    """Add `--verbose` and `--quiet`, which set the level of the log on stderr."""
+    if "--verbose" in parser._option_string_actions or "--quiet" in parser._option_string_actions:
+        return
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--verbose", action="store_true", help="log more to stderr")
+    group.add_argument("--quiet", action="store_true", help="log errors only, no progress")
+
+
+def add_config(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
+    """Add `-c/--config FILE`, the one YAML file of a rig."""
+    parser.add_argument(
+        "-c",
+        "--config",
+        metavar="FILE",
+        required=required,
+        help="the rig's YAML (see examples/vical.yaml)",
+    )
+
+
+def is_leaf(parser: argparse.ArgumentParser) -> bool:
+    """Tell whether a parser has no subcommands of its own."""
+    return not any(isinstance(a, argparse._SubParsersAction) for a in parser._actions)
+
+
+def leaves(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
+    """Return the parsers of all leaf commands below (and including) `parser`."""
+    if is_leaf(parser):
+        return [parser]
+    found: list[argparse.ArgumentParser] = []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for child in action.choices.values():
+                found += [leaf for leaf in leaves(child) if leaf not in found]
+    return found
+
+
+def suggest(word: str, known: list[str]) -> str:
+    """Return `; did you mean X?`, or nothing where no known word is near.
+
+    >>> suggest("calibarte", ["calibrate", "check"])
+    '; did you mean calibrate?'
+    """
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _nearest_choice(message: str) -> str:
+    """Read argparse's "invalid choice: 'x' (choose from 'a', 'b')" and suggest the nearest."""
+    if "invalid choice: " not in message or "choose from " not in message:
+        return ""
+    word = message.split("invalid choice: ")[1].split(" (choose")[0].strip("'\"")
+    choices = message.split("choose from ")[1].rstrip(")")
+    return suggest(word, [c.strip(" '\"") for c in choices.split(",")])
