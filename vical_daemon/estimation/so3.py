@@ -134,7 +134,8 @@ def quat_multiply(p: FloatArray, q: FloatArray) -> FloatArray:
 
 def quat_conjugate(q: FloatArray) -> FloatArray:
     """Return the inverse rotations of unit quaternions, shape (..., 4)."""
-    return np.asarray(q, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+    out: FloatArray = np.asarray(q, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+    return out
 
 
 def quat_rotate(q: FloatArray, v: FloatArray) -> FloatArray:

@@ -1,0 +1,321 @@
+"""Pinhole cameras with radial-tangential or equidistant distortion: project, unproject, Jacobians.
+
+Kalibr's names and OpenCV's numbers: `radtan` is k1 k2 p1 p2 (Brown-Conrady, OpenCV's first four),
+`equidistant` is k1 k2 k3 k4 (Kannala-Brandt, OpenCV's fisheye). Intrinsics are fx fy cx cy in pixels; pixel
+centres lie at integers. Everything is batched: points (..., 3) against intrinsics (..., 4) and distortion
+(..., 4), whose leading axes broadcast, so that a filter projects all sigma points in one call.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+RADTAN = "radtan"
+EQUIDISTANT = "equidistant"
+MODELS = (RADTAN, EQUIDISTANT)
+
+_TINY_RADIUS = 1e-9  # below it a ray is the optical axis, and theta / r is 1 to the last digit
+_NEWTON_STEPS = 25
+_NEWTON_DONE = 1e-14  # step in normalised units (focal lengths); a millionth of a pixel is 1e-9
+
+
+def _check_model(model: str) -> None:
+    if model not in MODELS:
+        raise ValueError(f"unknown distortion model {model!r}: use {' or '.join(MODELS)}")
+
+
+def _front(z: FloatArray) -> FloatArray:
+    """Depth, with not-a-number for points that a pinhole cannot see (on or behind the image plane)."""
+    out: FloatArray = np.where(z > 0.0, z, np.nan)
+    return out
+
+
+def distort(xy: FloatArray, distortion: FloatArray) -> FloatArray:
+    """Apply radtan distortion to normalised coordinates (Brown-Conrady, as OpenCV).
+
+    Args:
+        xy: Ideal coordinates X/Z, Y/Z, shape (..., 2).
+        distortion: k1 k2 p1 p2, shape (..., 4).
+
+    Returns:
+        Distorted normalised coordinates, shape (..., 2).
+    """
+    x, y = xy[..., 0], xy[..., 1]
+    k1, k2, p1, p2 = (distortion[..., i] for i in range(4))
+    x2, y2, xy2 = x * x, y * y, 2.0 * x * y
+    r2 = x2 + y2
+    radial = 1.0 + r2 * (k1 + k2 * r2)
+    out = np.empty((*radial.shape, 2))
+    out[..., 0] = x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x2)
+    out[..., 1] = y * radial + p1 * (r2 + 2.0 * y2) + p2 * xy2
+    return out
+
+
+def project(
+    points_cam: FloatArray, intrinsics: FloatArray, distortion: FloatArray, model: str = RADTAN
+) -> FloatArray:
+    """Project points in the camera frame to pixels.
+
+    Args:
+        points_cam: x right, y down, z forward, m, shape (..., 3).
+        intrinsics: fx fy cx cy, px, shape (..., 4).
+        distortion: Four coefficients, shape (..., 4).
+        model: radtan or equidistant.
+
+    Returns:
+        Pixels u v, shape (..., 2); not-a-number where radtan has z <= 0 (a fisheye may look behind).
+
+    Raises:
+        ValueError: unknown model.
+    """
+    _check_model(model)
+    points = np.asarray(points_cam, dtype=np.float64)
+    K = np.asarray(intrinsics, dtype=np.float64)
+    D = np.asarray(distortion, dtype=np.float64)
+    front = points[..., :2] / _front(points[..., 2:]) if model == RADTAN else points
+    uv = (distort(front, D) if model == RADTAN else _equidistant(front, D)) * K[..., :2]
+    uv += K[..., 2:]
+    return uv
+
+
+def _equidistant(points: FloatArray, distortion: FloatArray) -> FloatArray:
+    """Distorted normalised coordinates of the Kannala-Brandt model: theta_d along the image direction."""
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    r = np.hypot(x, y)
+    theta = np.arctan2(r, z)
+    t2 = theta * theta
+    k1, k2, k3, k4 = (distortion[..., i] for i in range(4))
+    theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    axis = r < _TINY_RADIUS * np.abs(z)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.where(axis & (z > 0.0), 1.0 / z, theta_d / r)
+    out = np.empty((*scale.shape, 2))
+    out[..., 0] = x * scale
+    out[..., 1] = y * scale
+    return out
+
+
+def project_jacobians(
+    points_cam: FloatArray, intrinsics: FloatArray, distortion: FloatArray, model: str = RADTAN
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Project and differentiate.
+
+    Args:
+        points_cam: Points in the camera frame, m, shape (..., 3).
+        intrinsics: fx fy cx cy, px, shape (..., 4).
+        distortion: Four coefficients, shape (..., 4).
+        model: radtan or equidistant.
+
+    Returns:
+        Pixels (..., 2); their derivatives by the point (..., 2, 3), px/m; by fx fy cx cy and the four
+        distortion coefficients (..., 2, 8).
+
+    Raises:
+        ValueError: unknown model.
+    """
+    _check_model(model)
+    points = np.asarray(points_cam, dtype=np.float64)
+    K = np.asarray(intrinsics, dtype=np.float64)
+    D = np.asarray(distortion, dtype=np.float64)
+    if model == RADTAN:
+        d, d_point, d_distortion = _radtan_jacobians(points, D)
+    else:
+        d, d_point, d_distortion = _equidistant_jacobians(points, D)
+    focal = K[..., :2]
+    uv = d * focal + K[..., 2:]
+    J_point = d_point * focal[..., None]
+    J_camera = np.zeros((*d.shape, 8))
+    J_camera[..., 0, 0] = d[..., 0]
+    J_camera[..., 1, 1] = d[..., 1]
+    J_camera[..., 0, 2] = J_camera[..., 1, 3] = 1.0
+    J_camera[..., 4:] = d_distortion * focal[..., None]
+    return uv, J_point, J_camera
+
+
+def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    iz = 1.0 / _front(points[..., 2])
+    x, y = points[..., 0] * iz, points[..., 1] * iz
+    k1, k2, p1, p2 = (D[..., i] for i in range(4))
+    r2 = x * x + y * y
+    xy = np.stack((x, y), axis=-1)
+    d = distort(xy, D)
+    a, b, c = _radtan_derivative(x, y, r2, k1, k2, p1, p2)
+    J = np.empty((*d.shape, 3))
+    J[..., 0, 0] = a * iz
+    J[..., 0, 1] = J[..., 1, 0] = b * iz
+    J[..., 1, 1] = c * iz
+    J[..., 0, 2] = -(a * x + b * y) * iz
+    J[..., 1, 2] = -(b * x + c * y) * iz
+    J_d = np.empty((*d.shape, 4))
+    J_d[..., 0] = xy * r2[..., None]
+    J_d[..., 1] = xy * (r2 * r2)[..., None]
+    J_d[..., 0, 2] = J_d[..., 1, 3] = 2.0 * x * y
+    J_d[..., 1, 2] = r2 + 2.0 * y * y
+    J_d[..., 0, 3] = r2 + 2.0 * x * x
+    return d, J, J_d
+
+
+def _radtan_derivative(
+    x: FloatArray,
+    y: FloatArray,
+    r2: FloatArray,
+    k1: FloatArray,
+    k2: FloatArray,
+    p1: FloatArray,
+    p2: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the symmetric 2x2 derivative of `distort`: [[a, b], [b, c]]."""
+    radial = 1.0 + r2 * (k1 + k2 * r2)
+    slope = 2.0 * k1 + 4.0 * k2 * r2
+    a = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    b = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+    c = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    return a, b, c
+
+
+def _equidistant_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    r2 = x * x + y * y
+    r = np.sqrt(r2)
+    axis = r < _TINY_RADIUS * np.abs(z)
+    safe_r = np.where(axis, 1.0, r)
+    theta = np.arctan2(r, z)
+    t2 = theta * theta
+    powers = np.stack((t2, t2 * t2, t2**3, t2**4), axis=-1)
+    gain = 1.0 + np.sum(D * powers, axis=-1)
+    slope = 1.0 + np.sum(D * powers * np.array([3.0, 5.0, 7.0, 9.0]), axis=-1)
+    scale = np.where(axis, 1.0 / z, theta * gain / safe_r)
+    # d(scale)/dr and d(scale)/dz; theta_r = z / rho^2, theta_z = -r / rho^2
+    rho2 = r2 + z * z
+    scale_r = np.where(axis, 0.0, (slope * z / rho2 - scale) / safe_r)
+    scale_z = -slope / rho2
+    ux, uy = np.where(axis, 0.0, x / safe_r), np.where(axis, 0.0, y / safe_r)
+    J = np.empty((*scale.shape, 2, 3))
+    J[..., 0, 0] = scale + x * scale_r * ux
+    J[..., 0, 1] = x * scale_r * uy
+    J[..., 1, 0] = y * scale_r * ux
+    J[..., 1, 1] = scale + y * scale_r * uy
+    J[..., 0, 2] = x * scale_z
+    J[..., 1, 2] = y * scale_z
+    d = np.stack((x * scale, y * scale), axis=-1)
+    direction = np.stack((ux, uy), axis=-1)
+    J_d = direction[..., :, None] * (theta[..., None] * powers)[..., None, :]
+    return d, J, J_d
+
+
+def unproject(
+    uv_px: FloatArray, intrinsics: FloatArray, distortion: FloatArray, model: str = RADTAN
+) -> tuple[FloatArray, BoolArray]:
+    """Return the unit rays of pixels, found by Newton's method, with a mask of where that succeeded.
+
+    Args:
+        uv_px: Raw distorted pixels, shape (..., 2).
+        intrinsics: fx fy cx cy, px, shape (..., 4).
+        distortion: Four coefficients, shape (..., 4).
+        model: radtan or equidistant.
+
+    Returns:
+        Unit rays in the camera frame (..., 3), not-a-number where not ok; ok (...): converged, and on the
+        branch where the distortion is still monotonic (beyond it two rays share a pixel).
+
+    Raises:
+        ValueError: unknown model.
+    """
+    _check_model(model)
+    K = np.asarray(intrinsics, dtype=np.float64)
+    D = np.asarray(distortion, dtype=np.float64)
+    d = (np.asarray(uv_px, dtype=np.float64) - K[..., 2:]) / K[..., :2]
+    if model == RADTAN:
+        xy, ok = _undistort_radtan(d, D)
+        rays = np.concatenate((xy, np.ones_like(xy[..., :1])), axis=-1)
+        rays /= np.sqrt(np.einsum("...i,...i->...", rays, rays))[..., None]
+        return rays, ok
+    theta_d = np.hypot(d[..., 0], d[..., 1])
+    theta, ok = _undistort_theta(theta_d, D)
+    sine_ratio = np.where(theta_d > 0.0, np.sin(theta) / np.where(theta_d > 0.0, theta_d, 1.0), 1.0)
+    rays = np.concatenate((d * sine_ratio[..., None], np.cos(theta)[..., None]), axis=-1)
+    return rays, ok
+
+
+def undistort(
+    uv_px: FloatArray, intrinsics: FloatArray, distortion: FloatArray, model: str = RADTAN
+) -> tuple[FloatArray, BoolArray]:
+    """Return ideal normalised coordinates X/Z, Y/Z (..., 2) of pixels and where they are defined.
+
+    As `unproject`; rays at or behind the image plane (fisheye beyond 90 degrees) are not ok.
+    """
+    rays, ok = unproject(uv_px, intrinsics, distortion, model)
+    front = rays[..., 2] > 1e-6
+    ok = ok & front
+    xy: FloatArray = np.where(
+        ok[..., None], rays[..., :2] / np.where(front, rays[..., 2], 1.0)[..., None], np.nan
+    )
+    return xy, ok
+
+
+def valid_radius(distortion: FloatArray) -> FloatArray:
+    """Return the normalised radius up to which radtan's radial part grows (...,), inf where for ever.
+
+    First positive root of d/dr [r (1 + k1 r^2 + k2 r^4)] = 1 + 3 k1 s + 5 k2 s^2, s = r^2. Beyond it a
+    projected point folds back towards the image centre and means nothing.
+    """
+    D = np.asarray(distortion, dtype=np.float64)
+    a, b = 5.0 * D[..., 1], 3.0 * D[..., 0]
+    discriminant = b * b - 4.0 * a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the smallest positive root, written without cancellation and good for a = 0
+        s = 2.0 / (-b + np.sqrt(discriminant))
+    other: FloatArray = np.where((discriminant >= 0.0) & (s > 0.0), s, np.inf)
+    out: FloatArray = np.sqrt(other)
+    return out
+
+
+def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArray]:
+    shape = np.broadcast_shapes(d.shape[:-1], D.shape[:-1])
+    limit = valid_radius(D)
+    k1, k2, p1, p2 = (D[..., i] for i in range(4))
+    target = np.broadcast_to(d, (*shape, 2))
+    # a start inside the monotonic range: from the far side Newton would land on the wrong branch
+    r_d = np.hypot(target[..., 0], target[..., 1])
+    start = np.minimum(1.0, 0.9 * limit / np.maximum(r_d, 1e-300))
+    xy = target * start[..., None]
+    error = np.full(shape, np.inf)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            x, y = xy[..., 0], xy[..., 1]
+            e = distort(xy, D) - target
+            a, b, c = _radtan_derivative(x, y, x * x + y * y, k1, k2, p1, p2)
+            det = a * c - b * b
+            step = np.stack((c * e[..., 0] - b * e[..., 1], a * e[..., 1] - b * e[..., 0]), axis=-1)
+            step /= det[..., None]
+            xy = xy - step
+            error = np.abs(step).max(axis=-1)
+            if not np.any(error > _NEWTON_DONE):
+                break
+        ok = (error < 1e-9) & (np.hypot(xy[..., 0], xy[..., 1]) < limit) & (det > 0.0)
+    return np.where(ok[..., None], xy, np.nan), ok
+
+
+def _undistort_theta(theta_d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArray]:
+    shape = np.broadcast_shapes(theta_d.shape, D.shape[:-1])
+    target = np.broadcast_to(theta_d, shape)
+    theta = np.minimum(target, np.pi / 2)
+    k1, k2, k3, k4 = (D[..., i] for i in range(4))
+    error = np.full(shape, np.inf)
+    slope = np.ones(shape)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            t2 = theta * theta
+            value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+            slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+            step = np.clip((value - target) / slope, -0.5, 0.5)
+            theta = theta - step
+            error = np.abs(step)
+            if not np.any(error > _NEWTON_DONE):
+                break
+        ok = (error < 1e-9) & (slope > 0.0) & (theta >= 0.0) & (theta < np.pi)
+    return np.where(ok, theta, np.nan), ok
