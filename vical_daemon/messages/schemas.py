@@ -1,0 +1,100 @@
+"""The ros2msg definitions of everything that travels: what a log embeds so that others can read it.
+
+Our own types are defined here; those of ROS come from rosbags' typestore (a text, no ROS needed).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+_POINTS_FIELDS = """\
+std_msgs/Header header   # stamp: middle of the exposure; frame_id: camera
+uint32 width             # px of the image, 0 unknown
+uint32 height
+int64[] ids              # {ids}
+float64[] uv_px          # u0 v0 u1 v1 ...: raw distorted pixels, u right, v down, centres at integers
+float64[] sigma_px       # one sigma per axis for each point; empty: not stated
+"""
+
+DEFINITIONS: dict[str, str] = {
+    "vical_msgs/msg/TargetPoints": "# Points of a calibration target seen in one image\n"
+    + _POINTS_FIELDS.format(ids="row of the point in the target"),
+    "vical_msgs/msg/FeatureTracks": "# Unknown points followed from image to image\n"
+    + _POINTS_FIELDS.format(ids="id of the feature, never used again"),
+    "vical_msgs/msg/ImuCalibration": """\
+# Inertial biases and matrices; empty arrays were not estimated
+bool known
+float64[] gyro_bias_rps
+float64[] accel_bias_mps2
+float64[] gyro_bias_sigma_rps
+float64[] accel_bias_sigma_mps2
+float64[] gyro_matrix            # 3x3 row by row
+float64[] accel_matrix           # 3x3 row by row
+""",
+    "vical_msgs/msg/CameraCalibration": """\
+# Where a camera sits on the imu, how late it is, and its lens; empty arrays were not estimated
+bool known
+geometry_msgs/Pose pose_imu_cam  # pose of the camera in the imu frame
+float64[36] covariance           # [px py pz rx ry rz], m, rad; rotation local (right): about the cam axes
+float64 timeshift_cam_imu_s      # t_imu = t_cam + timeshift_cam_imu_s
+float64 timeshift_sigma_s
+float64[] intrinsics             # fx fy cx cy, px
+float64[] intrinsics_sigma
+string distortion_model          # radtan (k1 k2 p1 p2) or equidistant
+float64[] distortion
+float64[] distortion_sigma
+float64 readout_s                # first to last row, 0 global shutter
+float64 readout_sigma_s
+float64 reprojection_rms_px
+float64 corner_sigma_px
+string[] unobservable            # withheld directions, each with the motion that would reveal it
+""",
+    "vical_msgs/msg/CalibrationEstimate": """\
+# Everything the estimator says about one camera at one moment
+std_msgs/Header header           # stamp: newest data used; frame_id: camera
+string status                    # waiting initialising converging converged degenerate inconsistent
+string reason
+string guidance                  # what motion to make next
+string[] events
+float64 progress                 # 0 to 1
+float64 duration_s
+uint64 frames
+uint64 imu_samples
+float64 nis_per_dof              # 1 when consistent
+float64 rejected_fraction
+float64[] gravity_world_mps2     # acceleration of free fall in the world frame
+vical_msgs/ImuCalibration imu
+vical_msgs/CameraCalibration camera
+""",
+}
+
+
+@cache
+def typestore() -> Any:
+    """Return rosbags' typestore of ROS 2 with our own types registered (0.1 s the first time)."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for name, definition in DEFINITIONS.items():
+        types.update(get_types_from_msg(definition, name))
+    store.register(types)
+    return store
+
+
+@cache
+def ros2_schema(type_name: str) -> str:
+    """Return the full ros2msg text of a type with all that it contains, as MCAP wants it.
+
+    Args:
+        type_name: ROS 2 name, e.g. ``sensor_msgs/msg/Imu``.
+
+    Raises:
+        KeyError: No such type.
+    """
+    store = typestore()
+    if type_name not in store.fielddefs:
+        raise KeyError(type_name)
+    text, _ = store.generate_msgdef(type_name, ros_version=2)
+    return str(text)
