@@ -1,0 +1,343 @@
+"""The one settings file of a rig: typed, strict, every refusal with path, bound, file and line.
+
+Defaults stand here and beside the algorithms; `examples/vical.yaml` shows every key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+
+from vical_daemon import schema
+from vical_daemon.estimation.measurements import CalibrationOptions, ImuNoise
+from vical_daemon.schema import Bound
+from vical_daemon.strict_yaml import ConfigError, Document, parse, read
+
+__all__ = ["Config", "ConfigError", "load", "loads"]
+
+NAME = r"[a-z][a-z0-9_]{0,31}"
+Name = Annotated[
+    str, Bound(pattern=NAME, hint="a small letter, then small letters, digits or _ (at most 32)")
+]
+Positive = Annotated[float, Bound(above=0)]
+Focal = Annotated[float, Bound(above=0, high=1e5)]
+Pixels = Annotated[int, Bound(low=16, high=16384)]
+Matrix4 = tuple[
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+]
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseConfig:
+    """Continuous-time noise densities; an IMU's data sheet or `vical allan` has them."""
+
+    gyro_density: Annotated[float, Bound(above=0, high=1.0)] = ImuNoise().gyro_density
+    gyro_walk: Annotated[float, Bound(above=0, high=1.0)] = ImuNoise().gyro_walk
+    accel_density: Annotated[float, Bound(above=0, high=10.0)] = ImuNoise().accel_density
+    accel_walk: Annotated[float, Bound(above=0, high=10.0)] = ImuNoise().accel_walk
+
+
+@dataclass(frozen=True, slots=True)
+class ImuConfig:
+    """One IMU.
+
+    Attributes:
+        port: Serial port, best a stable name below /dev/serial/by-id or /dev/vical.
+        driver: gx3: MicroStrain 3DM-GX3-25 (and MIP devices).
+        protocol: auto asks the device which one it speaks.
+        rate_hz: Samples a second; the GX3 divides 1000 Hz.
+        filter_samples: Width M of the device's own moving average; None: as the device has it.
+        filter_delay_s: Delay of that filter, where a device of another make needs it stated.
+        noise: Densities for the estimator.
+    """
+
+    port: str
+    driver: Literal["gx3"] = "gx3"
+    protocol: Literal["auto", "single-byte", "mip"] = "auto"
+    rate_hz: Annotated[float, Bound(low=1, high=1000)] = 500.0
+    filter_samples: Annotated[int, Bound(low=1, high=32)] | None = None
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class LensConfig:
+    """What is known about a lens, in Kalibr's words (`kalibr_io` reads Kalibr's own files)."""
+
+    distortion_model: Literal["radtan", "equidistant"] = "radtan"
+    intrinsics: tuple[Focal, Focal, float, float] | None = None
+    distortion_coeffs: tuple[float, float, float, float] | None = None
+    T_cam_imu: Matrix4 | None = None
+    timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
+    readout_s: Annotated[float, Bound(low=0, high=0.2)] = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraConfig:
+    """One camera.
+
+    Attributes:
+        uri: v4l2:/dev/video0, iidc:GUID, or what `vical devices` prints.
+        size: width, height, px.
+        rate_hz: Frames a second.
+        exposure_s: Exposure time; None: as the camera has it.
+        gain: In the camera's own unit; None: as the camera has it.
+        lens: Prior of intrinsics and mounting.
+    """
+
+    uri: str
+    size: tuple[Pixels, Pixels] = (640, 480)
+    rate_hz: Annotated[float, Bound(above=0, high=1000)] = 30.0
+    exposure_s: Annotated[float, Bound(above=0, high=1.0, hint="seconds")] | None = None
+    gain: float | None = None
+    lens: LensConfig = field(default_factory=LensConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class ConvergenceConfig:
+    """When a calibration counts as converged: every sigma below these."""
+
+    position_sigma_m: Annotated[float, Bound(above=0, high=1.0)] = 0.005
+    rotation_sigma_deg: Annotated[float, Bound(above=0, high=10.0)] = 0.1
+    timeshift_sigma_s: Annotated[float, Bound(above=0, high=0.1)] = 0.0005
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationConfig:
+    """What the estimator does.
+
+    Attributes:
+        mode: target: corners of the board; target_free: tracked features.
+        imu: The IMU to calibrate against; None: the only one.
+        cameras: Those to calibrate; empty: all.
+        fix: Held at their priors.
+        estimate: Optional blocks switched on.
+        corner_sigma_px: First guess; measured afterwards.
+        gravity_mps2: Magnitude of gravity at the site.
+        lag_s: How long the estimator waits so that late samples are still sorted by stamp.
+        detect_rate_hz: At most so many images a second are searched for the board.
+        convergence: Targets.
+    """
+
+    mode: Literal["target", "target_free"] = "target"
+    imu: Name | None = None
+    cameras: tuple[Name, ...] = ()
+    fix: tuple[Literal["intrinsics", "timeshift", "extrinsics"], ...] = ()
+    estimate: tuple[Literal["imu_intrinsics", "readout", "target_scale"], ...] = ()
+    corner_sigma_px: Annotated[float, Bound(above=0, high=20)] = CalibrationOptions().corner_sigma_px
+    gravity_mps2: Annotated[float, Bound(low=9.7, high=9.9, hint="magnitude on Earth, m/s^2")] = 9.80665
+    lag_s: Annotated[float, Bound(low=0, high=5)] = 0.2
+    detect_rate_hz: Annotated[float, Bound(above=0, high=1000)] = 30.0
+    convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class BusConfig:
+    """How processes find each other; nothing listens beyond loopback unless told so here.
+
+    Attributes:
+        socket: Unix socket of the router; None: `zenoh.sock` in the runtime directory.
+        tcp_port: Loopback port of the router; 0: none.
+        listen: Further zenoh endpoints of the router (`tls/0.0.0.0:7447`).
+        connect: Endpoints of a site's router that this rig joins.
+        tls_ca: Certificate authority, PEM file.
+        tls_certificate: This rig's certificate, PEM file.
+        tls_key: Its private key, PEM file.
+        password_file: usrpwd dictionary (user:password lines) of those who may connect.
+        user: User name for `connect`.
+        password: Its password.
+        readers: Users who may only read.
+    """
+
+    socket: str | None = None
+    tcp_port: Annotated[int, Bound(low=0, high=65535)] = 7447
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    tls_ca: str | None = None
+    tls_certificate: str | None = None
+    tls_key: str | None = None
+    password_file: str | None = None
+    user: str | None = None
+    password: str | None = None
+    readers: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RecordConfig:
+    """The recorder.
+
+    Attributes:
+        enabled: Record from the start; over the bus it can be started and stopped at any time.
+        directory: Where files go; None: `log` in the state directory.
+        images: Record images (points and IMU are always recorded).
+        rotate_s: A new file after so many seconds.
+        rotate_bytes: A new file after so many bytes.
+        quota_bytes: The oldest finished files are deleted beyond this.
+        reserve_bytes: Recording stops before the disk has less than this left.
+    """
+
+    enabled: bool = True
+    directory: str | None = None
+    images: bool = True
+    rotate_s: Annotated[float, Bound(low=1)] = 300.0
+    rotate_bytes: Annotated[int, Bound(low=1_000_000)] = 1_000_000_000
+    quota_bytes: Annotated[int, Bound(low=0)] = 20_000_000_000
+    reserve_bytes: Annotated[int, Bound(low=0)] = 500_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class WebConfig:
+    """The page with the live calibration."""
+
+    enabled: bool = False
+    host: str = "127.0.0.1"
+    port: Annotated[int, Bound(low=0, high=65535)] = 8080
+
+
+@dataclass(frozen=True, slots=True)
+class StoreConfig:
+    """Where the last converged calibration is kept; None: the state directory."""
+
+    directory: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A whole rig.
+
+    Attributes:
+        rig: Its name in every bus key.
+        imus: By name.
+        cameras: By name.
+        target: Target file (Kalibr's format); relative to the settings file.
+        path: Where this was read from; empty when made in memory.
+    """
+
+    rig: Name = "rig0"
+    imus: dict[Name, ImuConfig] = field(default_factory=dict)
+    cameras: dict[Name, CameraConfig] = field(default_factory=dict)
+    target: str | None = None
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
+    web: WebConfig = field(default_factory=WebConfig)
+    store: StoreConfig = field(default_factory=StoreConfig)
+    path: Path | None = field(default=None, metadata={"hidden": True})
+
+    @property
+    def calibration_imu(self) -> str:
+        """Name of the IMU that cameras are calibrated against."""
+        return self.calibration.imu or next(iter(self.imus))
+
+    @property
+    def calibration_cameras(self) -> tuple[str, ...]:
+        """Names of the cameras to calibrate."""
+        return self.calibration.cameras or tuple(self.cameras)
+
+    @property
+    def target_path(self) -> Path | None:
+        """The target file, relative names taken from the folder of the settings file."""
+        if self.target is None:
+            return None
+        return (self.path.parent if self.path else Path()) / self.target
+
+
+def load(path: Path | str) -> Config:
+    """Read a settings file.
+
+    Raises:
+        ConfigError: It cannot be used; the message is one line, `problems` has them all.
+    """
+    path = Path(path)
+    return _check(read(path), path)
+
+
+def loads(text: str, name: str = "config") -> Config:
+    """Read settings from text; `name` stands in messages.
+
+    Raises:
+        ConfigError: See `load`.
+    """
+    return _check(parse(text, name), None)
+
+
+def _check(document: Document, path: Path | None) -> Config:
+    config = replace(schema.build(document, Config), path=path)
+    problems = [schema.mistake(document, where, text) for where, text in _contradictions(config)]
+    if problems:
+        raise ConfigError(problems[0], problems)
+    return config
+
+
+def _contradictions(config: Config) -> Iterator[tuple[str, str]]:
+    """Yield (path, text) of what no single value shows."""
+    for name, imu in config.imus.items():
+        yield from _check_gx3_rate(f"imus.{name}.rate_hz", imu.rate_hz)
+    for name, camera in config.cameras.items():
+        yield from _check_lens(f"cameras.{name}.lens", camera, config.calibration.fix)
+    calibration = config.calibration
+    if calibration.imu is not None and calibration.imu not in config.imus:
+        yield (
+            "calibration.imu",
+            f"there is no imu {calibration.imu} (known: {', '.join(config.imus) or 'none'})",
+        )
+    if calibration.imu is None and len(config.imus) > 1:
+        yield "calibration", f"several imus; say which with imu: {' or '.join(config.imus)}"
+    for i, name in enumerate(calibration.cameras):
+        if name not in config.cameras:
+            known = ", ".join(config.cameras) or "none"
+            yield f"calibration.cameras.{i}", f"there is no camera {name} (known: {known})"
+    if calibration.mode == "target" and config.target is None and config.cameras:
+        yield (
+            "calibration.mode",
+            "target needs `target: FILE` (`vical target` makes one), or mode: target_free",
+        )
+
+
+def _check_gx3_rate(path: str, rate_hz: float) -> Iterator[tuple[str, str]]:
+    """The GX3 divides 1000 Hz by a whole number."""
+    divisor = max(1, round(1000 / rate_hz))
+    if abs(1000 / divisor - rate_hz) > 0.01 * rate_hz:
+        near = sorted({round(1000 / d, 2) for d in (int(1000 / rate_hz), int(1000 / rate_hz) + 1) if d > 0})
+        yield path, f"{rate_hz:g} is not 1000/n; the device can do {' or '.join(f'{r:g}' for r in near)}"
+
+
+def _check_lens(path: str, camera: CameraConfig, fix: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    lens = camera.lens
+    if lens.intrinsics is not None:
+        for i, (centre, size) in enumerate(zip(lens.intrinsics[2:], camera.size, strict=True)):
+            if not 0 <= centre <= size:
+                yield (
+                    f"{path}.intrinsics",
+                    f"the principal point {'xy'[i]} = {centre:g} lies outside 0..{size}",
+                )
+    if lens.T_cam_imu is not None and (text := rigid_error(lens.T_cam_imu)):
+        yield f"{path}.T_cam_imu", text
+    needed = {
+        "intrinsics": ("intrinsics", lens.intrinsics),
+        "extrinsics": ("T_cam_imu", lens.T_cam_imu),
+        "timeshift": ("timeshift_cam_imu", lens.timeshift_cam_imu),
+    }
+    for what in fix:
+        key, value = needed[what]
+        if value is None:
+            yield path, f"calibration.fix holds {what}, so {key} must be given here"
+
+
+def rigid_error(matrix: Matrix4) -> str:
+    """Say what is wrong with a 4x4 rigid transform; empty if nothing."""
+    T = np.asarray(matrix)
+    R = T[:3, :3]
+    if not np.allclose(T[3], [0, 0, 0, 1], atol=1e-9):
+        return "the last row must be 0 0 0 1"
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        return "the upper left 3x3 block is no rotation"
+    if np.abs(T[:3, 3]).max() > 10:
+        return "the camera lies more than 10 m from the IMU; the unit is m"
+    return ""
