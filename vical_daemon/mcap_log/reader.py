@@ -1,0 +1,275 @@
+"""Reads MCAP files that may be cut, damaged or hostile: gives every message that is whole.
+
+Records are taken from front to back, never through the index, so that a file without its end reads
+like any other. Nothing is believed: lengths must lie in the file, chunks must match their checksum,
+and no chunk may unpack to more than `CHUNK_LIMIT`.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
+
+from vical_daemon.mcap_log.files import LogError, describe
+
+MAGIC = b"\x89MCAP0\r\n"
+CHUNK_LIMIT = 256 * 2**20
+# What the parsers of the mcap package and of lz4 raise on damaged input.
+_DAMAGE = (ValueError, RuntimeError, KeyError, OverflowError, EOFError, struct.error, McapError)
+_LENGTH = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
+
+
+@dataclass(frozen=True, slots=True)
+class LogChannel:
+    """One topic of a log: ROS topic, type, encoding of messages and schema text."""
+
+    topic: str
+    type_name: str
+    encoding: str
+    schema: str
+    schema_encoding: str
+
+
+@dataclass(frozen=True, slots=True)
+class LogMessage:
+    """One message of a log; `log_time_ns` is when it was received (UNIX), not its own stamp."""
+
+    channel: LogChannel
+    payload: bytes
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+
+
+@dataclass(slots=True)
+class LogReader:
+    """Front-to-back reader of one file.
+
+    Attributes:
+        path: The file.
+        metadata: Metadata records seen so far, (name, values) in order.
+        attachments: Attachments seen so far.
+        warnings: What is wrong with the file, one line each; complete after `messages` has ended.
+        complete: The file ended as it should; valid after `messages` has ended.
+        data_end: Offset behind the last whole record of data.
+    """
+
+    path: Path
+    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
+    attachments: list[Attachment] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    complete: bool = False
+    _schemas: dict[int, Schema] = field(default_factory=dict)
+    _channels: dict[int, LogChannel] = field(default_factory=dict)
+    _damaged: int = 0
+
+    def __post_init__(self) -> None:
+        """Check that this is an MCAP file.
+
+        Raises:
+            LogError: It cannot be read, or is something else.
+        """
+        try:
+            with self.path.open("rb") as file:
+                head = file.read(len(MAGIC))
+        except OSError as error:
+            raise LogError(f"cannot read {self.path}: {describe(error)}") from None
+        if not head:
+            raise LogError(f"{self.path} is empty")
+        if head != MAGIC:
+            raise LogError(f"{self.path} is no MCAP file (its first bytes are {head!r})")
+
+    @property
+    def channels(self) -> list[LogChannel]:
+        """Topics seen so far."""
+        return list(self._channels.values())
+
+    def messages(self) -> Iterator[LogMessage]:
+        """Yield every whole message in the order of the file; never raises on damage (see `warnings`).
+
+        Raises:
+            LogError: The disk refuses.
+        """
+        self._restart()
+        size = self.path.stat().st_size
+        try:
+            with self.path.open("rb") as file:
+                file.seek(len(MAGIC))
+                yield from self._read_data(file, size)
+        except OSError as error:
+            raise LogError(f"cannot read {self.path}: {describe(error)}") from None
+        if self._damaged:
+            self.warnings.append(f"{self.path.name}: {self._damaged} damaged pieces left out")
+        if not self.complete:
+            self.warnings.append(
+                f"{self.path.name}: the end is missing; using what is there (vical recover mends it)"
+            )
+
+    def _restart(self) -> None:
+        self.metadata.clear()
+        self.attachments.clear()
+        self.warnings.clear()
+        self._schemas.clear()
+        self._channels.clear()
+        self.complete = False
+        self._damaged = 0
+
+    def _read_data(self, file: BinaryIO, size: int) -> Iterator[LogMessage]:
+        while True:
+            head = file.read(_LENGTH.size)
+            if len(head) < _LENGTH.size:
+                return
+            opcode, length = _LENGTH.unpack(head)
+            if opcode == Opcode.DATA_END:
+                self.complete = self._ends_well(file, size)
+                return
+            if length > size - file.tell():
+                if opcode == Opcode.CHUNK:
+                    yield from self._read_open_chunk(file.read())
+                return
+            if opcode in (
+                Opcode.CHUNK,
+                Opcode.MESSAGE,
+                Opcode.METADATA,
+                Opcode.ATTACHMENT,
+                Opcode.SCHEMA,
+                Opcode.CHANNEL,
+            ):
+                yield from self._read_record(opcode, file.read(length))
+            else:
+                file.seek(length, 1)
+
+    def _ends_well(self, file: BinaryIO, size: int) -> bool:
+        file.seek(max(0, size - len(MAGIC)))
+        return file.read() == MAGIC
+
+    def _read_record(self, opcode: int, content: bytes) -> Iterator[LogMessage]:
+        try:
+            if opcode == Opcode.CHUNK:
+                yield from self._read_records(unpack_chunk(content))
+            elif opcode == Opcode.MESSAGE:
+                message = self._message(content, 0, len(content))
+                if message is not None:
+                    yield message
+            elif opcode == Opcode.METADATA:
+                record = Metadata.read(ReadDataStream(BytesIO(content)))
+                self.metadata.append((record.name, record.metadata))
+            elif opcode == Opcode.ATTACHMENT:
+                self.attachments.append(Attachment.read(ReadDataStream(BytesIO(content))))
+            else:
+                self._learn(opcode, content)
+        except _DAMAGE:
+            self._damaged += 1
+
+    def _read_open_chunk(self, content: bytes) -> Iterator[LogMessage]:
+        """Take what can be taken from the chunk that was being written when the process died."""
+        try:
+            yield from self._read_records(unpack_chunk(content, whole=False))
+        except _DAMAGE:
+            return
+
+    def _read_records(self, data: bytes) -> Iterator[LogMessage]:
+        position, end = 0, len(data)
+        while position + _LENGTH.size <= end:
+            opcode, length = _LENGTH.unpack_from(data, position)
+            position += _LENGTH.size
+            if length > end - position:
+                return
+            if opcode == Opcode.MESSAGE:
+                message = self._message(data, position, length)
+                if message is not None:
+                    yield message
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._learn(opcode, data[position : position + length])
+            position += length
+
+    def _message(self, data: bytes, begin: int, length: int) -> LogMessage | None:
+        if length < _MESSAGE.size:
+            return None
+        channel_id, sequence, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(data, begin)
+        channel = self._channels.get(channel_id)
+        if channel is None:
+            return None
+        payload = data[begin + _MESSAGE.size : begin + length]
+        return LogMessage(channel, payload, log_time_ns, publish_time_ns, sequence)
+
+    def _learn(self, opcode: int, content: bytes) -> None:
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+            return
+        channel = Channel.read(stream)
+        known = self._schemas.get(channel.schema_id)
+        name, encoding = (known.name, known.encoding) if known else ("", "")
+        text = known.data.decode("utf-8", "replace") if known else ""
+        self._channels[channel.id] = LogChannel(channel.topic, name, channel.message_encoding, text, encoding)
+
+
+def unpack_chunk(content: bytes, *, whole: bool = True) -> bytes:
+    """Return the records of a chunk.
+
+    Args:
+        content: The chunk record.
+        whole: Checksum and sizes must be right; False: the chunk was never finished, give what unpacks.
+
+    Raises:
+        ValueError: It is damaged or unpacks to more than it may.
+    """
+    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
+    begin = _CHUNK.size + name_length
+    compression = content[_CHUNK.size : begin]
+    length = struct.unpack_from("<Q", content, begin)[0]
+    packed = memoryview(content)[begin + 8 :]
+    if whole and (length > len(packed) or size > CHUNK_LIMIT):
+        raise ValueError("chunk with impossible sizes")
+    data = _decompress(compression, packed[:length], size if whole else CHUNK_LIMIT)
+    if whole and (len(data) != size or (crc and zlib.crc32(data) != crc)):
+        raise ValueError("chunk that does not match its checksum")
+    return data
+
+
+def _decompress(compression: bytes, packed: memoryview, limit: int) -> bytes:
+    if not compression:
+        return bytes(packed[:limit])
+    if compression == b"lz4":
+        import lz4.frame
+
+        data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=limit)
+        return data
+    if compression == b"zstd":
+        return _decompress_zstd(packed, limit)
+    raise ValueError(f"chunk compression {compression!r} is not known")
+
+
+def _decompress_zstd(packed: memoryview, limit: int) -> bytes:
+    """Unpack piece by piece: the size that a frame states is not believed."""
+    import zstandard
+
+    pieces: list[bytes] = []
+    total = 0
+    with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed) as reader:
+        while total < limit:
+            try:
+                piece = reader.read(min(2**20, limit - total))
+            except zstandard.ZstdError:
+                if pieces:
+                    break  # a chunk without its end: keep what came out; the caller compares sizes
+                raise ValueError("chunk that does not unpack") from None
+            if not piece:
+                break
+            pieces.append(piece)
+            total += len(piece)
+    return b"".join(pieces)
