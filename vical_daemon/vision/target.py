@@ -1,8 +1,9 @@
 """Calibration targets: where the points of a printed board lie, read from Kalibr's target YAML.
 
-Frame ``target``: origin at the point with id 0, x to the right and y up as one looks at the printed
-side, hence z out of the board towards the viewer; every point has z = 0. A camera that sees the board
-always has positive z in this frame.
+Frame ``target``: origin at the point with id 0, every point has z = 0, x to the right as one looks at the
+printed side. AprilGrid (Kalibr's order): y up, hence z towards the viewer, and a camera that sees the board
+has positive z. Checkerboard (OpenCV's order): y down, hence z away from the viewer, and a camera that sees
+the board has negative z.
 
 No image is touched here and cv2 is not needed: the estimator's side may import this module freely.
 """
@@ -85,8 +86,8 @@ class AprilGrid:
 class Checkerboard:
     """A checkerboard, described by its inner corners.
 
-    ``point_id = row * cols + col`` at (col * col_spacing_m, row * row_spacing_m): rows count upwards. Where
-    ``cols + rows`` is odd the two ends differ in colour and the square below and left of point 0 is black;
+    ``point_id = row * cols + col`` at (col * col_spacing_m, row * row_spacing_m): rows count downwards. Where
+    ``cols + rows`` is odd the two ends differ in colour and the square above and left of point 0 is black;
     otherwise a half turn maps the board onto itself (see `is_symmetric`).
 
     Attributes:
