@@ -1,0 +1,66 @@
+"""The table of formats, and the one function that turns a rig into files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from vical_daemon.export import kalibr, robots, slam
+from vical_daemon.export.rig import ExportError, Rig
+
+
+@dataclass(frozen=True, slots=True)
+class ExportFile:
+    """One file of an export: its usual name and its text."""
+
+    name: str
+    text: str
+
+
+def _kalibr(rig: Rig) -> list[ExportFile]:
+    imu = kalibr.write_imu(rig.noise, rig.imu_topic, rig.note)
+    return [ExportFile("camchain-imucam.yaml", kalibr.write_camchain(rig)), ExportFile("imu.yaml", imu)]
+
+
+def _openvins(rig: Rig) -> list[ExportFile]:
+    return [
+        ExportFile("kalibr_imucam_chain.yaml", slam.write_openvins_cameras(rig)),
+        ExportFile("kalibr_imu_chain.yaml", slam.write_openvins_imu(rig)),
+    ]
+
+
+def _vins(rig: Rig) -> list[ExportFile]:
+    cameras = [
+        ExportFile(f"cam{i}.yaml", slam.write_vins_camera(c)) for i, c in enumerate(rig.cameras.values())
+    ]
+    return [ExportFile("vins.yaml", slam.write_vins(rig)), *cameras]
+
+
+def _ros(rig: Rig) -> list[ExportFile]:
+    return [ExportFile(f"{c.name}.yaml", robots.write_camera_info(c, rig)) for c in rig.cameras.values()]
+
+
+FORMATS: dict[str, Callable[[Rig], list[ExportFile]]] = {
+    "kalibr": _kalibr,
+    "ros": _ros,
+    "opencv": lambda rig: [ExportFile("camera.yaml", slam.write_opencv(rig))],
+    "openvins": _openvins,
+    "vins": _vins,
+    "orbslam3": lambda rig: [ExportFile("settings.yaml", slam.write_orbslam3(rig))],
+    "basalt": lambda rig: [ExportFile("calibration.json", robots.write_basalt(rig))],
+    "urdf": lambda rig: [ExportFile("rig.urdf", robots.write_urdf(rig))],
+    "json": lambda rig: [ExportFile("calibration.json", robots.write_json(rig))],
+}
+
+
+def export(rig: Rig, format_name: str) -> list[ExportFile]:
+    """Turn a rig into the files of a format; the first one is the main file.
+
+    Raises:
+        ExportError: No camera, an unknown format, or something that the format needs is not known.
+    """
+    if format_name not in FORMATS:
+        raise ExportError(f"format {format_name!r} is none of {', '.join(FORMATS)}")
+    if not rig.cameras:
+        raise ExportError("there is no camera in the source: the calibration had no solution yet")
+    return FORMATS[format_name](rig)

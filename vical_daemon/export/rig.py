@@ -1,0 +1,121 @@
+"""What is exported: a rig's calibration as plain data, independent of any file format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise
+
+
+class ExportError(ValueError):
+    """The calibration cannot be written in that form; the message says what is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigCamera:
+    """One calibrated camera.
+
+    Attributes:
+        name: As in the config.
+        R_imu_cam: Maps cam vectors into imu, shape (3, 3).
+        p_imu_cam: Camera origin in the imu frame, m, shape (3,).
+        timeshift_cam_imu_s: t_imu = t_cam + timeshift_cam_imu_s, s.
+        intrinsics: fx fy cx cy, px.
+        distortion_model: radtan or equidistant.
+        distortion: k1 k2 p1 p2 or k1 k2 k3 k4.
+        resolution: width, height, px; None: not known.
+        covariance: Of [px py pz rx ry rz], m and rad, rotation error local, shape (6, 6); None: not known.
+        timeshift_sigma_s: Its standard deviation, s; None: not known.
+        readout_s: First to last row of a rolling shutter, s; 0: global shutter.
+        topic: ROS topic of the images.
+        rate_hz: Frames a second; None: not known.
+        unobservable: Directions that the motion did not reveal: their numbers are not to be trusted.
+    """
+
+    name: str
+    R_imu_cam: FloatArray
+    p_imu_cam: FloatArray
+    timeshift_cam_imu_s: float
+    intrinsics: tuple[float, float, float, float]
+    distortion_model: str
+    distortion: tuple[float, float, float, float]
+    resolution: tuple[int, int] | None = None
+    covariance: FloatArray | None = None
+    timeshift_sigma_s: float | None = None
+    readout_s: float = 0.0
+    topic: str = ""
+    rate_hz: float | None = None
+    unobservable: tuple[str, ...] = ()
+
+    @property
+    def T_imu_cam(self) -> FloatArray:
+        """Pose of the camera in the imu frame, shape (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = self.R_imu_cam
+        T[:3, 3] = self.p_imu_cam
+        return T
+
+    @property
+    def T_cam_imu(self) -> FloatArray:
+        """Pose of the imu in the camera frame (Kalibr's direction), shape (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = self.R_imu_cam.T
+        T[:3, 3] = -self.R_imu_cam.T @ self.p_imu_cam
+        return T
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, px.
+
+        Raises:
+            ExportError: Not known.
+        """
+        if self.resolution is None:
+            raise ExportError(
+                f"{self.name}: the image size is not in the source; give it with --resolution WIDTHxHEIGHT"
+            )
+        return self.resolution
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """A calibrated rig.
+
+    Attributes:
+        cameras: By name, in the order in which they are exported.
+        noise: Densities of the imu.
+        gyro_bias_rps: Last known bias, rad/s.
+        accel_bias_mps2: Last known bias, m/s^2.
+        gyro_matrix: M_g of omega = M_g (omega_m - b_g), shape (3, 3).
+        accel_matrix: M_a of f = M_a (f_m - b_a), lower triangular, shape (3, 3).
+        gravity_mps2: Magnitude of gravity.
+        imu_topic: ROS topic of the imu.
+        imu_frame: Name of the imu frame for ROS.
+        note: One line on where the numbers come from; written as a comment.
+    """
+
+    cameras: dict[str, RigCamera]
+    noise: ImuNoise = field(default_factory=ImuNoise)
+    gyro_bias_rps: FloatArray = field(default_factory=lambda: np.zeros(3))
+    accel_bias_mps2: FloatArray = field(default_factory=lambda: np.zeros(3))
+    gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    gravity_mps2: float = 9.80665
+    imu_topic: str = "/imu0"
+    imu_frame: str = "imu"
+    note: str = ""
+
+    def only_camera(self, format_name: str) -> RigCamera:
+        """Return the camera of a format that holds one.
+
+        Raises:
+            ExportError: There are several (choose with --camera).
+        """
+        if len(self.cameras) != 1:
+            names = ", ".join(self.cameras)
+            raise ExportError(
+                f"a file for {format_name} holds one camera; choose one of {names} with --camera"
+            )
+        return next(iter(self.cameras.values()))
