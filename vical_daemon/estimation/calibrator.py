@@ -1,0 +1,255 @@
+"""The estimator as the roles see it: measurements in, calibration out. No clock, no thread, no I/O.
+
+Flow: buffer until `start.attempt` succeeds -> filter everything buffered -> follow the stream behind a short
+lag (so that inertial data always bracket each image) -> `judge` says how far to trust it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from vical_daemon.estimation import start
+from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
+from vical_daemon.estimation.corner_noise import CornerNoise
+from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.judge import Judge
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    POSITION,
+    VELOCITY,
+    Layout,
+    State,
+    make_layout,
+)
+
+_ATTEMPT_EVERY_S = 0.5
+_MAX_GAP_S = 0.5
+_KEEP_S = 5.0
+_RESTART_AFTER = 12  # refused frames in a row before the pose is taken anew
+
+
+class Calibrator:
+    """Calibrates cameras against one IMU, online, from target points.
+
+    Args:
+        options: Switches and noise.
+        cameras: What is known about each camera.
+        target_points_m: Points of the target in its frame, m, shape (n, 3); row = point id.
+    """
+
+    def __init__(
+        self,
+        options: CalibrationOptions,
+        cameras: dict[str, CameraPrior],
+        target_points_m: FloatArray | None,
+    ) -> None:
+        if target_points_m is None:
+            raise ValueError("target-free calibration needs TargetFreeCalibrator")
+        self.options = options
+        self.priors = dict(cameras)
+        self.target = np.asarray(target_points_m, dtype=np.float64)
+        self.layout = make_layout(list(cameras), fix=options.fix, estimate=options.estimate)
+        self.judge = Judge(options, self.layout)
+        self.filter: CalibrationFilter | None = None
+        self._buffer: ImuBuffer | None = None
+        self._base_ns = 0
+        self._waiting: dict[str, list[tuple[float, PointsFrame]]] = {name: [] for name in cameras}
+        self._pending: deque[tuple[float, PointsFrame]] = deque()
+        self._next_attempt_s = -np.inf
+        self._refused_in_a_row = 0
+        self._early: deque[tuple[int, FloatArray, FloatArray]] = deque(maxlen=64)
+        self._start_reason = ""
+
+    # ------------------------------------------------------------------ input
+    def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
+        """Take one inertial reading (imu clock, ns; rad/s; m/s^2). Old or non-finite ones are counted only."""
+        if self._buffer is None:
+            self._base_ns = t_imu_ns
+            self._buffer = ImuBuffer(t_imu_ns)
+        gyro, accel = (
+            np.asarray(gyro_rps, dtype=np.float64),
+            np.asarray(specific_force_mps2, dtype=np.float64),
+        )
+        fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
+        if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
+            self.judge.saw_imu(t_imu_ns, gyro, accel)
+        else:
+            self.judge.imu_refused += 1
+
+    def add_points(self, frame: PointsFrame) -> None:
+        """Take the points of one image; unknown cameras, ids off the board and empty images are counted only."""
+        ok = np.isfinite(frame.uv_px).all(axis=1) & (frame.ids >= 0) & (frame.ids < len(self.target))
+        if frame.camera not in self.priors or self._buffer is None:
+            self.judge.frames_ignored += 1
+            return
+        if not ok.all():
+            sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
+            frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
+        self._pending.append(((frame.t_cam_ns - self._base_ns) * 1e-9, frame))
+
+    # ------------------------------------------------------------------ work
+    def process(self) -> list[FrameReport]:
+        """Do what can be done with what has arrived."""
+        if self._buffer is None:
+            return []
+        if self.filter is None:
+            self._collect()
+            if self._buffer.newest_s >= self._next_attempt_s:
+                self._next_attempt_s = self._buffer.newest_s + _ATTEMPT_EVERY_S
+                self._attempt()
+        return self._follow(flush=False)
+
+    def finish(self) -> list[FrameReport]:
+        """End of the data: a last attempt to start, and all frames that inertial data cover."""
+        if self._buffer is None:
+            return []
+        if self.filter is None:
+            self._collect()
+            self._attempt()
+        return self._follow(flush=True)
+
+    def _collect(self) -> None:
+        """Move arrived frames to the starting set, thinning the oldest half when it grows too long."""
+        while self._pending:
+            t, frame = self._pending.popleft()
+            waiting = self._waiting[frame.camera]
+            waiting.append((t, frame))
+            if len(waiting) > start.MAX_FRAMES:
+                del waiting[: len(waiting) // 2]
+        oldest = min((w[0][0] for w in self._waiting.values() if w), default=None)
+        if oldest is not None and self._buffer is not None:
+            self._buffer.trim(oldest - _KEEP_S)
+
+    def _attempt(self) -> None:
+        assert self._buffer is not None
+        spans = [w[-1][0] - w[0][0] for w in self._waiting.values() if len(w) > 1]
+        if len(spans) < len(self._waiting) or min(spans) < start.MIN_SPAN_S:
+            self.judge.waiting("collecting the first seconds: move the rig, keep the target in view")
+            return
+        result = start.attempt(
+            self._buffer, self._waiting, self.priors, self.options, self.layout, self.target
+        )
+        if result.state is None:
+            self.judge.waiting(result.reason)
+            return
+        begin = result.state.t_s
+        frames = sorted(
+            ((t, f) for w in self._waiting.values() for t, f in w if t >= begin - 0.5), key=lambda e: e[0]
+        )
+        self.filter = self._new_filter(result.state)
+        self.judge.started(begin)
+        self._pending.extendleft(reversed(frames))
+        for waiting in self._waiting.values():
+            waiting.clear()
+
+    def _new_filter(self, state: State) -> CalibrationFilter:
+        noise = {name: CornerNoise(self.options.corner_sigma_px) for name in self.priors}
+        walk = np.zeros(self.layout.size)
+        return CalibrationFilter(
+            state, self.layout, np.diag(self._start_sigmas(state)), self.options.imu_noise, noise, walk
+        )
+
+    def _start_sigmas(self, state: State) -> FloatArray:
+        """Standard deviations the filter starts with: many times what the start is really worth.
+
+        The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
+        """
+        s = np.zeros(self.layout.size)
+        s[ATTITUDE], s[POSITION], s[VELOCITY] = 0.1, 0.1, 0.5
+        s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
+        if self.layout.gyro_matrix is not None and self.layout.accel_matrix is not None:
+            s[self.layout.gyro_matrix], s[self.layout.accel_matrix] = 0.01, 0.01
+        if self.layout.target_scale is not None:
+            s[self.layout.target_scale] = 0.002
+        for name, where in self.layout.cameras.items():
+            focal = float(state.cameras[name].intrinsics[0])
+            if where.position is not None and where.rotation is not None:
+                s[where.position], s[where.rotation] = 0.15, 0.1
+            if where.timeshift is not None:
+                s[where.timeshift] = 5e-3
+            if where.intrinsics is not None and where.distortion is not None:
+                s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
+            if where.readout is not None:
+                s[where.readout] = 0.01
+        return s
+
+    def _follow(self, *, flush: bool) -> list[FrameReport]:
+        """Filter every pending frame that inertial data already bracket."""
+        reports: list[FrameReport] = []
+        while self._pending and self.filter is not None and self._buffer is not None:
+            t_cam_s, frame = self._pending[0]
+            t_s = t_cam_s + self.filter.state.cameras[frame.camera].timeshift_s
+            if t_s > self._buffer.newest_s:
+                if flush:
+                    self.judge.frames_ignored += 1
+                    self._pending.popleft()
+                    continue
+                break
+            self._pending.popleft()
+            report = self._one(frame, t_cam_s, t_s)
+            if report is not None:
+                reports.append(report)
+        return reports
+
+    def _one(self, frame: PointsFrame, t_cam_s: float, t_s: float) -> FrameReport | None:
+        """Propagate to one image and correct with it."""
+        f, buffer = self.filter, self._buffer
+        assert f is not None
+        assert buffer is not None
+        if t_s > f.state.t_s:
+            segment = buffer.segment(f.state.t_s, t_s)
+            if segment is None:
+                self.judge.frames_ignored += 1
+                return None
+            f.predict(segment)
+        buffer.trim(f.state.t_s - _KEEP_S)
+        if len(frame.ids) < 4:
+            return None
+        report = f.update(
+            frame.camera,
+            frame.t_cam_ns,
+            t_cam_s,
+            frame.ids,
+            self.target[frame.ids],
+            frame.uv_px,
+            frame.sigma_px,
+        )
+        self._refused_in_a_row = 0 if report.used else self._refused_in_a_row + 1
+        if self._refused_in_a_row >= _RESTART_AFTER:
+            self._pose_anew(frame, t_cam_s)
+        self.judge.saw_frame(report, f)
+        return report
+
+    def _pose_anew(self, frame: PointsFrame, t_cam_s: float) -> None:
+        """After a run of refused images: take attitude and position from the image, keep the calibration."""
+        f = self.filter
+        assert f is not None
+        camera = f.state.cameras[frame.camera]
+        lens = start.Lens(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)
+        seen = start.pose_of(frame, t_cam_s, lens, self.target)
+        if seen is None:
+            return
+        R = seen.R_target_cam @ camera.R_imu_cam.T
+        f.reset_motion(R, seen.p_target_cam - R @ camera.p_imu_cam)
+        self._refused_in_a_row = 0
+        self.judge.pose_lost()
+
+    # ------------------------------------------------------------------ output
+    def estimate(self) -> CalibrationEstimate:
+        """Return what is known now."""
+        return self.judge.estimate(self.filter)
+
+    def trace(self, camera: str) -> list[TracePoint]:
+        """Return one entry a second of how a camera's calibration developed."""
+        return self.judge.trace(camera)
+
+
+__all__ = ["Calibrator", "FrameReport"]

@@ -1,0 +1,54 @@
+"""Corner noise, measured from what no state error can explain (the part of the residuals left by QR)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray
+
+
+@dataclass(slots=True)
+class CornerNoise:
+    """Running estimate of the noise per axis of one camera's corners.
+
+    The first guess weighs as much as one well-filled frame; afterwards the estimate forgets slowly, so that
+    a change of light or focus is followed within some hundred frames.
+
+    Attributes:
+        sigma_px: Present estimate, px.
+        guess_px: First guess, px.
+        memory: Degrees of freedom remembered.
+    """
+
+    guess_px: float
+    memory: float = 60_000.0
+    sigma_px: float = 0.0
+    _sum: float = 0.0
+    _dof: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.sigma_px = self.guess_px
+        self._dof = 100.0
+        self._sum = self._dof * self.guess_px**2
+
+    def sigmas(self, stated_px: FloatArray | None, n: int) -> FloatArray:
+        """Noise of each corner: the measured level, shared out by the detector's own weights if it has any."""
+        if stated_px is None or not len(stated_px):
+            return np.full(n, self.sigma_px)
+        relative = stated_px / np.sqrt(np.mean(stated_px**2))
+        return np.asarray(self.sigma_px * np.clip(relative, 0.3, 10.0))
+
+    def learn(self, whitened_rest: float, dof: int) -> None:
+        """Take in the unexplained sum of squares of one frame (whitened by the present sigma)."""
+        if dof < 4:
+            return
+        ratio = min(whitened_rest / dof, 9.0)
+        self._sum += ratio * dof * self.sigma_px**2
+        self._dof += dof
+        if self._dof > self.memory:
+            keep = self.memory / self._dof
+            self._sum *= keep
+            self._dof *= keep
+        self.sigma_px = float(np.clip(np.sqrt(self._sum / self._dof), 0.01, 20.0))

@@ -1,0 +1,142 @@
+"""Rough intrinsics from the first views of a planar target: Zhang's closed form, then a small bundle.
+
+Only a start: the filter estimates the same eight numbers with everything else.
+[Zhang, "A flexible new technique for camera calibration", 2000, section 3]
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.camera_model import project_jacobians, unproject
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.planar_pose import planar_pose
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.start import Lens
+
+_VIEWS = 24
+_STEPS = 15
+_PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05])  # relative to fx for the first four
+
+
+def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArray) -> float:
+    """Improve a lens in place by a bundle adjustment over spread-out views (Gauss-Newton, Levenberg damping).
+
+    Args:
+        lens: Start values; overwritten.
+        frames: Views of the target.
+        target: Its points, m, shape (n, 3).
+
+    Returns:
+        RMS residual, px; not-a-number when there were too few views (the lens is then left alone).
+    """
+    views = _spread(frames, lens)
+    if len(views) < 6:
+        return float("nan")
+    poses = _poses(views, lens, target)
+    theta = np.concatenate([lens.intrinsics, lens.distortion])
+    scale = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(4)]) * _PRIOR
+    prior, cost, damping = theta.copy(), np.inf, 1e-3
+    best = (theta, poses)
+    for _ in range(_STEPS):
+        normal = _normal(views, poses, target, theta, lens.model)
+        if normal is None:
+            break
+        new_cost = normal.cost + float((((theta - prior) / scale) ** 2).sum())
+        if new_cost < cost:
+            done = cost - new_cost < 1e-6 * new_cost
+            best, cost, damping = (theta, poses), new_cost, damping * 0.3
+            if done:
+                break
+            last = normal
+        else:
+            damping *= 10.0
+        dtheta, dposes = last.solve((prior - best[0]) / scale**2, 1.0 / scale**2, damping)
+        theta = best[0] + dtheta
+        poses = [(R @ so3.exp(d[3:]), p + d[:3]) for (R, p), d in zip(best[1], dposes, strict=True)]
+    theta = best[0]
+    count = sum(2 * len(v.ids) for v in views)
+    rms = float(np.sqrt(cost / max(count, 1)))
+    if np.isfinite(rms) and 0.3 * prior[0] < theta[0] < 3.0 * prior[0]:
+        lens.intrinsics, lens.distortion = theta[:4], theta[4:]
+    return rms
+
+
+def _spread(frames: list[PointsFrame], lens: Lens) -> list[PointsFrame]:
+    """Choose views with many points that differ most in where the board lies in the image."""
+    good = [f for f in frames if len(f.ids) >= 12]
+    if len(good) <= _VIEWS:
+        return good
+    width, height = lens.resolution
+    features = np.array(
+        [np.concatenate([f.uv_px.mean(0), f.uv_px.std(0) * 2, f.uv_px[-1] - f.uv_px[0]]) for f in good]
+    ) / np.array([width, height, width, height, width, height])
+    chosen = [int(np.argmax([len(f.ids) for f in good]))]
+    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
+    while len(chosen) < _VIEWS:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return [good[i] for i in sorted(chosen)]
+
+
+def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    poses, kept = [], []
+    for v in views:
+        rays, ok = unproject(v.uv_px, lens.intrinsics, lens.distortion, lens.model)
+        found = planar_pose(target[v.ids[ok]], rays[ok, :2] / rays[ok, 2:])
+        if found.candidates:
+            poses.append((found.candidates[0].R_cam_target, found.candidates[0].p_cam_target))
+            kept.append(v)
+    views[:] = kept
+    return poses
+
+
+class _Normal:
+    """Normal equations with the poses eliminated (Schur complement)."""
+
+    def __init__(self) -> None:
+        self.A = np.zeros((8, 8))
+        self.b = np.zeros(8)
+        self.views: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self.cost = 0.0
+
+    def add(self, J_lens: FloatArray, J_pose: FloatArray, r: FloatArray) -> None:
+        self.A += J_lens.T @ J_lens
+        self.b += J_lens.T @ r
+        self.views.append((J_pose.T @ J_pose, J_pose.T @ J_lens, J_pose.T @ r))
+        self.cost += float(r @ r)
+
+    def solve(self, b0: FloatArray, a0: FloatArray, damping: float) -> tuple[FloatArray, list[FloatArray]]:
+        A, b = self.A + np.diag(a0), self.b + b0
+        A += damping * np.diag(np.diag(A))
+        inverses = []
+        for P, C, c in self.views:
+            inverse = np.linalg.inv(P + damping * np.diag(np.diag(P)))
+            A -= C.T @ inverse @ C
+            b -= C.T @ inverse @ c
+            inverses.append(inverse)
+        d = np.linalg.solve(A, b)
+        return d, [i @ (c - C @ d) for i, (_, C, c) in zip(inverses, self.views, strict=True)]
+
+
+def _normal(
+    views: list[PointsFrame],
+    poses: list[tuple[FloatArray, FloatArray]],
+    target: FloatArray,
+    theta: FloatArray,
+    model: str,
+) -> _Normal | None:
+    out = _Normal()
+    for view, (R, p) in zip(views, poses, strict=True):
+        X = target[view.ids]
+        x = X @ R.T + p
+        uv, J_point, J_lens = project_jacobians(x, theta[:4], theta[4:], model)
+        if not np.isfinite(uv).all():
+            return None
+        J_pose = np.concatenate([J_point, J_point @ (-R @ so3.hat(X))], axis=-1)
+        out.add(J_lens.reshape(-1, 8), J_pose.reshape(-1, 6), (view.uv_px - uv).ravel())
+    return out

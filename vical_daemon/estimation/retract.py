@@ -1,0 +1,125 @@
+"""Apply errors to the state: one at a time (`retract`) and a whole set of sigma points at once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    LOWER,
+    POSITION,
+    VELOCITY,
+    CameraState,
+    Layout,
+    State,
+    rotation_from_grp,
+    tilted_gravity,
+)
+
+
+class MotionPoints(NamedTuple):
+    """Sigma points of what moves the imu; batch of S (see `State` for meanings and units)."""
+
+    R: FloatArray
+    p: FloatArray
+    v: FloatArray
+    gyro_bias: FloatArray
+    accel_bias: FloatArray
+    gravity: FloatArray
+    gyro_matrix: FloatArray | None
+    accel_matrix: FloatArray | None
+
+
+class CameraPoints(NamedTuple):
+    """Sigma points of one camera; batch of S."""
+
+    R_imu_cam: FloatArray
+    p_imu_cam: FloatArray
+    timeshift_s: FloatArray
+    intrinsics: FloatArray
+    distortion: FloatArray
+    readout_s: FloatArray
+
+
+def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoints:
+    """Apply errors (S, >= dynamic) to the motion, biases, gravity and imu matrices."""
+    gyro_matrix = accel_matrix = None
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        gyro_matrix = state.gyro_matrix + errors[:, layout.gyro_matrix].reshape(-1, 3, 3)
+        accel_matrix = np.repeat(state.accel_matrix[None], len(errors), axis=0)
+        accel_matrix[:, LOWER[:, 0], LOWER[:, 1]] += errors[:, layout.accel_matrix]
+    return MotionPoints(
+        state.R_world_imu @ rotation_from_grp(errors[:, ATTITUDE]),
+        state.p_world_imu + errors[:, POSITION],
+        state.v_world_imu + errors[:, VELOCITY],
+        state.gyro_bias + errors[:, GYRO_BIAS],
+        state.accel_bias + errors[:, ACCEL_BIAS],
+        tilted_gravity(state.gravity, errors[:, GRAVITY]),
+        gyro_matrix,
+        accel_matrix,
+    )
+
+
+def camera_points(camera: CameraState, layout: Layout, name: str, errors: FloatArray) -> CameraPoints:
+    """Apply errors (S, n) to one camera; what is not estimated keeps a batch of 1 and broadcasts."""
+    where = layout.cameras[name]
+    R, p = camera.R_imu_cam[None], camera.p_imu_cam[None]
+    shift, readout = np.array([camera.timeshift_s]), np.array([camera.readout_s])
+    K, D = camera.intrinsics[None], camera.distortion[None]
+    if where.rotation is not None and where.position is not None:
+        R = R @ rotation_from_grp(errors[:, where.rotation])
+        p = p + errors[:, where.position]
+    if where.timeshift is not None:
+        shift = shift + errors[:, where.timeshift]
+    if where.intrinsics is not None and where.distortion is not None:
+        K = K + errors[:, where.intrinsics]
+        D = D + errors[:, where.distortion]
+    if where.readout is not None:
+        readout = readout + errors[:, where.readout]
+    return CameraPoints(R, p, shift, K, D, readout)
+
+
+def retract(state: State, layout: Layout, dx: FloatArray) -> State:
+    """Return the state moved by one error vector, shape (n,). The argument is not changed."""
+    motion = motion_points(state, layout, dx[None])
+    cameras = {}
+    for name, camera in state.cameras.items():
+        c = camera_points(camera, layout, name, dx[None])
+        cameras[name] = CameraState(
+            _orthonormal(c.R_imu_cam[0]),
+            c.p_imu_cam[0],
+            float(c.timeshift_s[0]),
+            c.intrinsics[0],
+            c.distortion[0],
+            camera.distortion_model,
+            camera.resolution,
+            float(c.readout_s[0]),
+        )
+    scale = state.target_scale
+    if layout.target_scale is not None:
+        scale += float(dx[layout.target_scale])
+    return State(
+        state.t_s,
+        _orthonormal(motion.R[0]),
+        motion.p[0],
+        motion.v[0],
+        motion.gyro_bias[0],
+        motion.accel_bias[0],
+        motion.gravity[0],
+        cameras,
+        state.gyro_matrix if motion.gyro_matrix is None else motion.gyro_matrix[0],
+        state.accel_matrix if motion.accel_matrix is None else motion.accel_matrix[0],
+        scale,
+    )
+
+
+def _orthonormal(R: FloatArray) -> FloatArray:
+    """One Newton step towards the nearest rotation: rounding never accumulates, however long it runs."""
+    out: FloatArray = 1.5 * R - 0.5 * R @ (R.T @ R)
+    return out

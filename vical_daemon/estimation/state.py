@@ -1,0 +1,198 @@
+"""The estimator's state: nominal values with names, and where each error lives in the covariance.
+
+Attitude errors are generalised Rodrigues parameters with a = 1, f = 4 (four times the modified Rodrigues
+parameters; equal to the rotation vector for small angles), local (right): R = R_nominal * delta.
+[Crassidis & Markley, "Unscented filtering for spacecraft attitude estimation", 2003, eq. (33)-(35)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray
+
+MOTION = slice(0, 9)  # attitude rad, position m, velocity m/s: what moves
+ATTITUDE = slice(0, 3)  # rad, local (right) error of R_world_imu
+POSITION = slice(3, 6)  # m, p_world_imu
+VELOCITY = slice(6, 9)  # m/s, in world
+GYRO_BIAS = slice(9, 12)  # rad/s
+ACCEL_BIAS = slice(12, 15)  # m/s^2
+GRAVITY = slice(15, 17)  # rad, tilt of the direction of gravity
+_CORE = 17
+
+LOWER = np.array([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)])  # entries of the accelerometer matrix
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSlices:
+    """Where one camera's errors live; None: not estimated."""
+
+    position: slice | None  # m, p_imu_cam
+    rotation: slice | None  # rad, local (right) error of R_imu_cam
+    timeshift: int | None  # s
+    intrinsics: slice | None  # px, fx fy cx cy
+    distortion: slice | None  # 4 coefficients
+    readout: int | None  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Order of the error state: [core 17 | imu matrices | cameras | target scale].
+
+    Attributes:
+        size: Length of the error state.
+        dynamic: Number of leading errors that enter the propagation (core and imu matrices).
+        gyro_matrix: 9 entries, row-major, of M_g - I; None: not estimated.
+        accel_matrix: 6 entries (lower triangle) of M_a - I; the lower triangle fixes the gauge, since a
+            full matrix could be traded against R_imu_cam.
+        cameras: By name.
+        target_scale: Relative size of the board, index or None.
+    """
+
+    size: int
+    dynamic: int
+    gyro_matrix: slice | None
+    accel_matrix: slice | None
+    cameras: dict[str, CameraSlices]
+    target_scale: int | None
+
+
+def make_layout(
+    cameras: list[str], *, fix: frozenset[str], estimate: frozenset[str], landmarks: int = 0
+) -> Layout:
+    """Lay the error state out for a set of switches (names as in `CalibrationOptions`)."""
+    if landmarks:
+        raise ValueError("landmarks live behind this layout")
+    at = _CORE
+    gyro_matrix = accel_matrix = None
+    if "imu_intrinsics" in estimate:
+        gyro_matrix, accel_matrix = slice(at, at + 9), slice(at + 9, at + 15)
+        at += 15
+    dynamic = at
+    blocks: dict[str, CameraSlices] = {}
+
+    def take(wanted: bool, n: int) -> slice | None:
+        nonlocal at
+        if not wanted:
+            return None
+        at += n
+        return slice(at - n, at)
+
+    for name in cameras:
+        position, rotation = take("extrinsics" not in fix, 3), take("extrinsics" not in fix, 3)
+        shift = take("timeshift" not in fix, 1)
+        intrinsics, distortion = take("intrinsics" not in fix, 4), take("intrinsics" not in fix, 4)
+        readout = take("readout" in estimate, 1)
+        blocks[name] = CameraSlices(
+            position,
+            rotation,
+            shift.start if shift else None,
+            intrinsics,
+            distortion,
+            readout.start if readout else None,
+        )
+    scale = take("target_scale" in estimate, 1)
+    return Layout(at, dynamic, gyro_matrix, accel_matrix, blocks, scale.start if scale else None)
+
+
+@dataclass(slots=True)
+class CameraState:
+    """Nominal values of one camera (see `CameraEstimate` for meanings)."""
+
+    R_imu_cam: FloatArray
+    p_imu_cam: FloatArray
+    timeshift_s: float
+    intrinsics: FloatArray
+    distortion: FloatArray
+    distortion_model: str
+    resolution: tuple[int, int]
+    readout_s: float = 0.0
+
+
+@dataclass(slots=True)
+class State:
+    """Nominal state at `t_s` (the imu's clock).
+
+    Attributes:
+        t_s: Instant of the motion state, s since the base.
+        R_world_imu: Attitude, shape (3, 3).
+        p_world_imu: Position, m.
+        v_world_imu: Velocity, m/s.
+        gyro_bias: rad/s.
+        accel_bias: m/s^2.
+        gravity: Acceleration of free fall in the world, m/s^2; its length never changes.
+        gyro_matrix: M_g in omega = M_g (omega_m - b_g).
+        accel_matrix: M_a in f = M_a (f_m - b_a), lower triangular.
+        cameras: By name.
+        target_scale: True size of the board over its stated size.
+    """
+
+    t_s: float
+    R_world_imu: FloatArray
+    p_world_imu: FloatArray
+    v_world_imu: FloatArray
+    gyro_bias: FloatArray
+    accel_bias: FloatArray
+    gravity: FloatArray
+    cameras: dict[str, CameraState]
+    gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    target_scale: float = 1.0
+
+
+def rotation_from_grp(p: FloatArray) -> FloatArray:
+    """Rotation matrices of attitude errors (a = 1, f = 4), rational: no trigonometry.
+
+    With s = |p|^2/16: R = I + 2/(1+s)^2 * (2 (1-s) hat(p)/4 + 4 hat(p)^2 / 16) [Schaub & Junkins (3.152)].
+
+    Args:
+        p: Errors, shape (..., 3).
+
+    Returns:
+        Rotations, shape (..., 3, 3).
+    """
+    m = 0.25 * p
+    s = np.einsum("...i,...i->...", m, m)
+    d = 1.0 / (1.0 + s) ** 2
+    a, b = 4.0 * (1.0 - s) * d, 8.0 * d
+    out: FloatArray = (b[..., None] * m)[..., :, None] * m[..., None, :]
+    diagonal = 1.0 - b * s
+    am = a[..., None] * m
+    out[..., 0, 0] += diagonal
+    out[..., 1, 1] += diagonal
+    out[..., 2, 2] += diagonal
+    out[..., 2, 1] += am[..., 0]
+    out[..., 1, 2] -= am[..., 0]
+    out[..., 0, 2] += am[..., 1]
+    out[..., 2, 0] -= am[..., 1]
+    out[..., 1, 0] += am[..., 2]
+    out[..., 0, 1] -= am[..., 2]
+    return out
+
+
+def grp_from_rotation(R: FloatArray) -> FloatArray:
+    """Attitude errors (a = 1, f = 4) of rotations below 180 degrees, shape (..., 3)."""
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    w = 0.5 * np.sqrt(np.maximum(1.0 + trace, 1e-12))
+    v = np.stack(
+        (R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), axis=-1
+    )
+    out: FloatArray = v / (w * (1.0 + w))[..., None]
+    return out
+
+
+def tilt_basis(gravity: FloatArray) -> FloatArray:
+    """Two unit vectors across gravity, shape (3, 2): the directions in which it can tilt."""
+    axis = gravity / np.linalg.norm(gravity)
+    other = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    first = np.cross(axis, other)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first)], axis=1)
+
+
+def tilted_gravity(gravity: FloatArray, tilt: FloatArray) -> FloatArray:
+    """Turn gravity by small angles about `tilt_basis` keeping its length; tilt shape (..., 2), rad."""
+    basis = tilt_basis(gravity)
+    return (rotation_from_grp(tilt @ basis.T) @ gravity[:, None])[..., 0]

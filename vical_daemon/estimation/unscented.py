@@ -1,0 +1,136 @@
+"""Sigma-point linear algebra on a square-root covariance: P = S S^T with S lower triangular, always.
+
+The transform is the symmetric sigma-point set with spread sqrt(3) in its divided-difference form
+[Norgaard, Poulsen & Ravn, "New developments in state estimation for nonlinear systems", 2000, DD2]: mean and
+covariance agree with the unscented transform to second order, and the covariance is a sum of squares, so it
+cannot lose symmetry or positivity. No matrix is ever inverted.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dgeqrf
+
+from vical_daemon.estimation.measurements import FloatArray
+
+SPREAD = np.sqrt(3.0)  # matches the kurtosis of a Gaussian
+
+
+def offsets(S: FloatArray, columns: int | None = None) -> FloatArray:
+    """Return the sigma points as offsets: first 0, then +, then - each column of S; shape (2c + 1, n)."""
+    scaled = SPREAD * S[:, :columns].T
+    return np.concatenate([np.zeros((1, S.shape[0])), scaled, -scaled])
+
+
+class Moments(NamedTuple):
+    """A function seen through sigma points.
+
+    Attributes:
+        shift: Mean minus the central value, shape (m,).
+        linear: Square root of the part explained by the state: d[m, c]; linear = H S. Shape (m, c).
+        curved: Square root of the second-order covariance, independent of the state; shape (m, c).
+    """
+
+    shift: FloatArray
+    linear: FloatArray
+    curved: FloatArray
+
+
+def moments(values: FloatArray) -> Moments:
+    """Turn values at sigma points (relative to the central one) into mean and covariance factors.
+
+    Args:
+        values: f(x_i) - f(x_0) for i = 1 .. 2c (plus half first), shape (2c, m).
+
+    Returns:
+        The moments.
+    """
+    c = len(values) // 2
+    plus, minus = values[:c], values[c:]
+    second = plus + minus
+    shift = second.sum(axis=0) / (2.0 * SPREAD**2)
+    linear = (plus - minus).T / (2.0 * SPREAD)
+    curved = second.T * (np.sqrt(SPREAD**2 - 1.0) / (2.0 * SPREAD**2))
+    return Moments(shift, linear, curved)
+
+
+def lower_root(columns: FloatArray) -> FloatArray:
+    """Return lower-triangular L with L L^T = A A^T for A (n, k), k >= n, by QR; its diagonal is >= 0."""
+    n = columns.shape[0]
+    qr, _, _, _ = dgeqrf(columns.T)
+    L: FloatArray = np.tril(qr[:n].T)
+    signs = np.where(np.diag(L) < 0.0, -1.0, 1.0)
+    return L * signs
+
+
+def compress(M: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, float, int]:
+    """Compress whitened measurements r = M e + unit noise to at most as many rows as columns, by QR.
+
+    Args:
+        M: shape (m, n).
+        r: shape (m,).
+
+    Returns:
+        (M_small, r_small, rest, dof): `rest` is the sum of squares that no state error can explain and
+        `dof` its degrees of freedom; both 0 where there was nothing to compress.
+    """
+    m, n = M.shape
+    if m <= n + 1:
+        return M, r, 0.0, 0
+    stacked = np.empty((m, n + 1), order="F")
+    stacked[:, :n] = M
+    stacked[:, n] = r
+    qr, _, _, _ = dgeqrf(stacked, overwrite_a=True)
+    top = np.triu(qr[: n + 1])
+    return top[:n, :n], top[:n, n], float(top[n, n] ** 2), m - n
+
+
+class Correction(NamedTuple):
+    """Result of one linear correction.
+
+    Attributes:
+        S: New square root, lower triangular, shape (n, n).
+        dx: State correction, shape (n,).
+        nis: Normalised innovation squared of the rows given.
+        solution: Most likely e and common c, shape (n + k,): dx = S_old e.
+    """
+
+    S: FloatArray
+    dx: FloatArray
+    nis: float
+    solution: FloatArray
+
+
+def correct(S: FloatArray, M: FloatArray, r: FloatArray, common: FloatArray | None = None) -> Correction:
+    """Kalman update in square-root form for whitened rows r = M e + common c + unit noise, e ~ N(0, I).
+
+    With Lambda lower triangular, Lambda^T Lambda = I + [M common]^T [M common]:
+    S+ = S Lambda^-1 (top left), dx = S+ y, y = Lambda^-T M^T r, NIS = r^T r - y^T y.
+
+    Args:
+        S: Square root of the covariance, lower triangular, (n, n).
+        M: H S of the whitened rows, shape (m, n).
+        r: Whitened innovation, shape (m,).
+        common: Columns of noise shared by rows (stamp jitter, curvature), shape (m, k), or None.
+
+    Returns:
+        The correction.
+    """
+    n = S.shape[0]
+    full = M if common is None else np.concatenate([M, common], axis=1)
+    k = full.shape[1]
+    stacked = np.empty((len(full) + k, k), order="F")
+    stacked[:k] = np.eye(k)[:, ::-1]
+    stacked[k:] = full[:, ::-1]
+    qr, _, _, _ = dgeqrf(stacked, overwrite_a=True)
+    Lambda = np.triu(qr[:k])[::-1, ::-1]
+    y = solve_triangular(Lambda, full.T @ r, lower=True, trans="T", check_finite=False)
+    inner = Lambda[:n, :n]
+    new = solve_triangular(inner, S.T, lower=True, trans="T", check_finite=False).T
+    signs = np.where(np.diag(new) < 0.0, -1.0, 1.0)
+    dx = new @ y[:n]
+    solution = solve_triangular(Lambda, y, lower=True, check_finite=False)
+    return Correction(np.tril(new * signs), dx, float(r @ r - y @ y), solution)
