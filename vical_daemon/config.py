@@ -19,10 +19,9 @@ from vical_daemon.strict_yaml import ConfigError, Document, parse, read
 
 __all__ = ["Config", "ConfigError", "load", "loads"]
 
-NAME = r"[a-z][a-z0-9_]{0,31}"
-Name = Annotated[
-    str, Bound(pattern=NAME, hint="a small letter, then small letters, digits or _ (at most 32)")
-]
+NAME = r"[A-Za-z][A-Za-z0-9_]{0,62}"  # as `topics.check_name`
+URI = r"(v4l2|iidc):\S+"
+Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
 Positive = Annotated[float, Bound(above=0)]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
 Pixels = Annotated[int, Bound(low=16, high=16384)]
@@ -53,8 +52,7 @@ class ImuConfig:
         driver: gx3: MicroStrain 3DM-GX3-25 (and MIP devices).
         protocol: auto asks the device which one it speaks.
         rate_hz: Samples a second; the GX3 divides 1000 Hz.
-        filter_samples: Width M of the device's own moving average; None: as the device has it.
-        filter_delay_s: Delay of that filter, where a device of another make needs it stated.
+        filter_samples: Width M of the moving average in the device, ms; its delay is taken off the stamps.
         noise: Densities for the estimator.
     """
 
@@ -62,7 +60,7 @@ class ImuConfig:
     driver: Literal["gx3"] = "gx3"
     protocol: Literal["auto", "single-byte", "mip"] = "auto"
     rate_hz: Annotated[float, Bound(low=1, high=1000)] = 500.0
-    filter_samples: Annotated[int, Bound(low=1, high=32)] | None = None
+    filter_samples: Annotated[int, Bound(low=1, high=32)] = 15
     noise: NoiseConfig = field(default_factory=NoiseConfig)
 
 
@@ -91,7 +89,7 @@ class CameraConfig:
         lens: Prior of intrinsics and mounting.
     """
 
-    uri: str
+    uri: Annotated[str, Bound(pattern=URI, hint="v4l2:/dev/video0 or iidc:GUID, see `vical devices`")]
     size: tuple[Pixels, Pixels] = (640, 480)
     rate_hz: Annotated[float, Bound(above=0, high=1000)] = 30.0
     exposure_s: Annotated[float, Bound(above=0, high=1.0, hint="seconds")] | None = None

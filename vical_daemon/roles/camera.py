@@ -1,0 +1,138 @@
+"""Role camera: one thread per camera, blocking read -> stamp (in the driver) -> bounded queue -> bus."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+
+from vical_drivers.samples import Frame, FrameSource
+
+from vical_daemon import topics
+from vical_daemon.bus import Bus
+from vical_daemon.config import CameraConfig, Config
+from vical_daemon.device_loop import DeviceLoop, SingleReads
+from vical_daemon.health import StatusSender, device_status
+from vical_daemon.messages import DiagnosticStatus, encode_image
+from vical_daemon.outbox import Outbox
+from vical_daemon.places import make_private, runtime_directory
+from vical_daemon.wall_clock import WallClock, shared_clock
+
+QUEUE_DEPTH = 8  # images are large: 8 of 1.3 MB
+JOIN_S = 3.0
+
+OpenCamera = Callable[[CameraConfig], FrameSource]
+
+
+class CameraRole:
+    """Turns the frames of one camera into messages. No I/O.
+
+    Args:
+        rig: Name of the rig.
+        name: Name of the camera.
+        clock: Monotonic to UNIX time.
+    """
+
+    def __init__(self, rig: str, name: str, clock: WallClock) -> None:
+        self.key = topics.image_key(rig, name)
+        self._name, self._clock = name, clock
+        self._t_last_ns = 0
+        self._backwards = 0
+        self._dropped = 0
+        self._rules: Counter[str] = Counter()
+
+    def message(self, frame: Frame) -> bytes | None:
+        """Return the message of one frame, stamped mid-exposure; None if its stamp does not follow."""
+        self._dropped += frame.dropped_before
+        if frame.t_exposure_mid_ns <= self._t_last_ns:
+            self._backwards += 1
+            return None
+        self._t_last_ns = frame.t_exposure_mid_ns
+        self._rules[frame.stamp_rule] += 1
+        stamp_ns = self._clock.unix_ns(frame.t_exposure_mid_ns)
+        return encode_image(stamp_ns, self._name, frame.image, frame.encoding)
+
+    def counters(self) -> dict[str, str]:
+        """Return what the driver's counters do not say: which stamp rule was used, and how often."""
+        rules = ", ".join(f"{rule} ({count})" for rule, count in self._rules.items())
+        return {
+            "stamp_rule": rules,
+            "frames_dropped": str(self._dropped),
+            "stamps_backwards": str(self._backwards),
+        }
+
+
+def open_camera(config: CameraConfig) -> FrameSource:
+    """Open the device that the config names.
+
+    Raises:
+        DriverError: It cannot be opened; one line.
+    """
+    from vical_drivers.camera.settings import CameraSettings
+
+    width, height = config.size
+    settings = CameraSettings(
+        width=width,
+        height=height,
+        rate_hz=config.rate_hz,
+        exposure_s=config.exposure_s,
+        gain=config.gain,
+        rolling_shutter=config.lens.readout_s > 0,
+        readout_s=config.lens.readout_s,
+    )
+    kind, _, device = config.uri.partition(":")
+    if kind == "v4l2":
+        from vical_drivers.camera.v4l2 import V4l2Camera
+
+        return V4l2Camera(device, settings)
+    from vical_drivers.camera.iidc import IidcCamera
+
+    return IidcCamera(device, settings)
+
+
+def run(
+    config: Config,
+    bus: Bus,
+    stop: threading.Event,
+    *,
+    clock: WallClock | None = None,
+    open_source: OpenCamera = open_camera,
+) -> None:
+    """Acquire from every camera of the config until `stop`.
+
+    Args:
+        config: The rig.
+        bus: Where images and status go.
+        stop: Ends the role.
+        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        open_source: Opens a device (the demo gives a rendered one).
+    """
+    clock = clock or shared_clock(make_private(runtime_directory()))
+    devices = [_start(config, name, bus, stop, clock, open_source) for name in config.cameras]
+
+    def statuses() -> list[DiagnosticStatus]:
+        return [
+            device_status(loop.name, loop.health(), outbox, config.cameras[name].rate_hz, role.counters())
+            for name, role, loop, outbox in devices
+        ]
+
+    StatusSender(config.rig, "camera", bus, clock).run_until(stop, statuses)
+    for _, _, loop, outbox in devices:
+        loop.join(JOIN_S)
+        outbox.close()
+
+
+def _start(
+    config: Config, name: str, bus: Bus, stop: threading.Event, clock: WallClock, open_source: OpenCamera
+) -> tuple[str, CameraRole, DeviceLoop[Frame], Outbox]:
+    role = CameraRole(config.rig, name, clock)
+    outbox = Outbox(bus, QUEUE_DEPTH, f"camera/{name} out")
+
+    def deliver(frame: Frame) -> None:
+        payload = role.message(frame)
+        if payload is not None:
+            outbox.put(role.key, payload)
+
+    loop = DeviceLoop(f"camera/{name}", lambda: SingleReads(open_source(config.cameras[name])), deliver, stop)
+    loop.start()
+    return name, role, loop, outbox
