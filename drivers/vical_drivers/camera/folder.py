@@ -1,0 +1,115 @@
+"""Image folders as a camera: the ASL layout (``data.csv`` beside ``data/``), as EuRoC's ``mav0/cam0``."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.statistics import FrameStatistics
+from vical_drivers.errors import DeviceNotFoundError, DeviceRefusedError
+from vical_drivers.samples import DeviceInfo, Frame, SourceStats
+
+
+class ImageFolder:
+    """A `FrameSource` that replays a folder as fast as it is read.
+
+    Args:
+        path: Folder with ``data.csv`` (``timestamp [ns], file name``); images in ``data/`` or beside it.
+        settings: `decoder` decompresses the files; `encoding` is mono8 or bgr8.
+
+    Raises:
+        DeviceNotFoundError: No such folder or no ``data.csv``.
+        DeviceRefusedError: No decoder was given, or the list is damaged.
+    """
+
+    def __init__(self, path: str, settings: CameraSettings) -> None:
+        self._folder = Path(path)
+        self._settings = settings
+        if settings.decoder is None:
+            raise DeviceRefusedError(f"folder:{path}: needs an image decoder")
+        self._decoder = settings.decoder
+        listing = self._folder / "data.csv"
+        if not listing.is_file():
+            raise DeviceNotFoundError(f"folder:{path}: no data.csv there; give a folder like mav0/cam0")
+        self._frames = deque(self._parse(listing))
+        self._total = len(self._frames)
+        self._statistics = FrameStatistics()
+        self._missing = 0
+        self._sequence = 0
+
+    def _parse(self, listing: Path) -> list[tuple[int, Path]]:
+        frames = []
+        with listing.open(encoding="utf-8", newline="") as file:
+            for number, row in enumerate(csv.reader(file), start=1):
+                if not row or row[0].lstrip().startswith("#"):
+                    continue
+                try:
+                    frames.append((int(row[0]), self._image_path(row[1].strip())))
+                except (ValueError, IndexError) as error:
+                    raise DeviceRefusedError(f"{listing}: line {number} is not 'stamp, file name'") from error
+        return frames
+
+    def _image_path(self, name: str) -> Path:
+        inside = self._folder / "data" / name
+        return inside if inside.exists() else self._folder / name
+
+    @property
+    def info(self) -> DeviceInfo:
+        """The folder."""
+        return DeviceInfo(
+            kind="camera",
+            model="image folder",
+            serial_number=f"folder-{self._folder.name}",
+            path=str(self._folder),
+            protocol="folder",
+            details={"frames": str(self._total), "encoding": self._settings.encoding},
+        )
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next frame; None at the end of the folder (after `timeout_s`)."""
+        while self._frames:
+            t_ns, path = self._frames.popleft()
+            self._sequence += 1
+            try:
+                data = np.fromfile(path, dtype=np.uint8)
+                image = self._decoder(data, colour=self._settings.encoding == "bgr8")
+            except (OSError, ValueError):
+                self._statistics.count("unreadable_files")
+                self._missing += 1
+                continue
+            dropped, self._missing = self._missing, 0
+            self._statistics.add(t_ns, dropped)
+            return Frame(
+                t_exposure_mid_ns=t_ns,
+                t_arrival_ns=time.monotonic_ns(),
+                sequence=self._sequence - 1,
+                image=image,
+                encoding=self._settings.encoding,
+                stamp_rule="recorded",
+                dropped_before=dropped,
+            )
+        time.sleep(max(0.0, timeout_s))
+        return None
+
+    def stats(self) -> SourceStats:
+        """Counters since the folder was opened."""
+        return self._statistics.snapshot()
+
+    def close(self) -> None:
+        """Forget the rest; may be called twice."""
+        self._frames.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,364 @@
+"""V4L2 cameras: memory-mapped streaming, kernel stamps moved to the middle of the exposure.
+
+What happens when something goes wrong:
+
+| event | outcome |
+|---|---|
+| unplugged, also during a dequeue | `DeviceLostError`; the next `read` waits for it and opens it anew |
+| empty buffer, buffer flagged as damaged, JPEG or image cut off | counted, skipped, the frame is lost |
+| jump in the sequence numbers | `Frame.dropped_before`, counted |
+| format or size refused | `DeviceRefusedError` with what is on offer |
+| a second process on the camera | `DeviceBusyError` naming the first one |
+| no permission | `DevicePermissionError` naming the group |
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from vical_drivers.camera import v4l2_abi as abi
+from vical_drivers.camera.discovery import NodeEntry, find_again, find_node
+from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Image
+from vical_drivers.camera.hotplug import wait_for_camera
+from vical_drivers.camera.kernel import Kernel, LinuxKernel
+from vical_drivers.camera.negotiate import negotiate
+from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.stamps import SequenceCounter
+from vical_drivers.camera.statistics import FrameStatistics
+from vical_drivers.camera.uvc_stream import UvcMetadata
+from vical_drivers.camera.v4l2_controls import Controls
+from vical_drivers.camera.v4l2_exposure import apply_settings, read_exposure_ns, set_exposure
+from vical_drivers.camera.v4l2_node import DequeuedBuffer, NodeIdentity, ObtainedFormat, VideoNode
+from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp, kernel_stamp
+from vical_drivers.errors import DeviceLostError, DeviceRefusedError, DriverError
+from vical_drivers.samples import DeviceInfo, Frame, SourceStats
+
+_log = logging.getLogger(__name__)
+
+_GONE = select.POLLERR | select.POLLHUP | select.POLLNVAL
+_UVC_DRIVER = "uvcvideo"
+
+
+class _Session:
+    """One opening of the device: everything that is made anew after a replug."""
+
+    def __init__(self, kernel: Kernel, entry: NodeEntry, settings: CameraSettings) -> None:
+        self.metadata: UvcMetadata | None = None
+        self.node = VideoNode(kernel, entry.path)
+        try:
+            self.identity: NodeIdentity = self.node.identity()
+            if not self.identity.captures_video:
+                raise DeviceRefusedError(_no_capture(entry.path, self.identity))
+            self.format: ObtainedFormat
+            self.format, self.rate_hz = negotiate(self.node, settings)
+            self.decode = _decoder(entry.path, self.format, settings)
+            self.controls = Controls(kernel, self.node)
+            apply_settings(self.controls, settings)
+            self.exposure_ns = read_exposure_ns(self.controls)
+            self._watch_exposure()
+            if self.identity.driver == _UVC_DRIVER and settings.stamp == "auto":
+                self.metadata = UvcMetadata.open(kernel, entry)
+            self.buffers = self.node.start(settings.buffers)
+        except BaseException:
+            self.close()
+            raise
+
+    def _watch_exposure(self) -> None:
+        """Ask to be told when somebody else changes the exposure; not every driver can."""
+        for control_id in (abi.CID_EXPOSURE_ABSOLUTE, abi.CID_EXPOSURE_AUTO):
+            if self.controls.find(control_id) is not None:
+                try:
+                    subscription = abi.EventSubscription(type=abi.EVENT_CTRL, id=control_id)
+                    self.node.request(abi.VIDIOC_SUBSCRIBE_EVENT, subscription, "report changes")
+                except DriverError as error:
+                    _log.debug("no control events: %s", error)
+
+    def close(self) -> None:
+        if self.metadata is not None:
+            self.metadata.close()
+        self.node.close()
+
+
+class V4l2Camera:
+    """A `FrameSource` over one V4L2 node.
+
+    Args:
+        name: Device node, a link to it, its number, or the camera's serial number.
+        settings: What is asked of the camera; applied again after each replug.
+        kernel: The system-call boundary.
+        wait: Waits up to a number of seconds for a camera to appear; None: on the udev events.
+
+    Raises:
+        DriverError: See the table above.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        settings: CameraSettings | None = None,
+        *,
+        kernel: Kernel | None = None,
+        wait: Callable[[float], None] | None = None,
+    ) -> None:
+        self._settings = settings or CameraSettings()
+        self._kernel = kernel or LinuxKernel()
+        self._wait = wait or wait_for_camera
+        self._entry = find_node(self._kernel, name)
+        self._sequence = SequenceCounter()
+        self._statistics = FrameStatistics()
+        self._stamper = ExposureStamper(self._settings)
+        self._borrowed: int | None = None
+        self._rule = ""
+        self._pending_loss = 0
+        self._closed = False
+        self._session: _Session | None = None
+        self._open()
+        self._info = self._describe()
+
+    # -- life ---------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self._session = _Session(self._kernel, self._entry, self._settings)
+        self._stamper.set_exposure(self._session.exposure_ns, 0)
+        self._sequence.restart()
+        self._borrowed = None
+
+    def _drop_session(self) -> None:
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
+
+    def _come_back(self, timeout_s: float) -> None:
+        entry = find_again(self._kernel, self._entry)
+        if entry is None:
+            self._wait(timeout_s)
+            entry = find_again(self._kernel, self._entry)
+        if entry is None:
+            raise DeviceLostError(f"{self._entry.path}: the camera is still away; plug it in again")
+        self._entry = entry
+        try:
+            self._open()
+        except DriverError as error:
+            self._wait(timeout_s)  # udev may not have set the permissions yet
+            raise DeviceLostError(f"{entry.path}: the camera is not back yet ({error})") from error
+        self._statistics.restart()
+        _log.info("camera back path=%s", entry.path)
+
+    def close(self) -> None:
+        """Stop streaming and free the device; may be called twice."""
+        self._closed = True
+        self._drop_session()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # -- who and how ---------------------------------------------------------------------------------
+
+    @property
+    def info(self) -> DeviceInfo:
+        """Who the camera is and, in `details`, what was obtained of what was asked."""
+        return self._info
+
+    def _describe(self) -> DeviceInfo:
+        session = self._need_session()
+        fmt, exposure_ns = session.format, self._stamper.exposure_ns
+        return DeviceInfo(
+            kind="camera",
+            model=session.identity.card,
+            serial_number=self._entry.identity,
+            path=self._entry.stable_path or self._entry.path,
+            protocol="v4l2",
+            details={
+                "driver": session.identity.driver,
+                "bus": session.identity.bus_info,
+                "pixel_format": fmt.pixel_format,
+                "size": f"{fmt.width}x{fmt.height}",
+                "rate_hz": f"{session.rate_hz:g}",
+                "encoding": self._settings.encoding,
+                "exposure_s": "unknown" if exposure_ns is None else f"{exposure_ns * 1e-9:g}",
+                "buffers": str(session.buffers),
+                "uvc_metadata": "yes" if session.metadata is not None else "no",
+            },
+        )
+
+    def _need_session(self) -> _Session:
+        if self._closed:
+            raise DeviceLostError(f"{self._entry.path}: the camera is closed")
+        if self._session is None:
+            raise DeviceLostError(f"{self._entry.path}: the camera is away")
+        return self._session
+
+    @property
+    def controls(self) -> Controls:
+        """The controls of the open camera."""
+        return self._need_session().controls
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Set the exposure time while streaming; returns the one obtained, s.
+
+        Frames that began to expose before now keep the old exposure in their stamps.
+        """
+        session = self._need_session()
+        obtained_ns = set_exposure(session.controls, exposure_s)
+        self._stamper.set_exposure(obtained_ns, self._kernel.monotonic_ns())
+        return obtained_ns * 1e-9
+
+    def stats(self) -> SourceStats:
+        """Counters since the source was opened; `extra` counts faults by kind and the UVC clock fit."""
+        metadata = self._session.metadata if self._session is not None else None
+        if metadata is None:
+            return self._statistics.snapshot()
+        health = metadata.health()
+        return self._statistics.snapshot(
+            clock_skew_ppm=health.skew_ppm,
+            uvc_fit_residual_us=health.residual_sigma_ns * 1e-3,
+            uvc_fit_used=float(health.usable),
+        )
+
+    # -- frames --------------------------------------------------------------------------------------
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, or None after `timeout_s` without one.
+
+        With `CameraSettings.borrow` the image shows kernel memory and is valid until the next call.
+
+        Raises:
+            DeviceLostError: The camera went away, or is still away; call again.
+        """
+        deadline_ns = self._kernel.monotonic_ns() + round(timeout_s * 1e9)
+        if self._session is None and not self._closed:
+            self._come_back(timeout_s)
+        session = self._need_session()
+        try:
+            self._return_borrowed(session)
+            while True:
+                left_s = (deadline_ns - self._kernel.monotonic_ns()) * 1e-9
+                buffer = self._next_buffer(session, left_s)
+                if buffer is not None:
+                    frame = self._frame(session, buffer)
+                    if frame is not None:
+                        return frame
+                elif self._kernel.monotonic_ns() >= deadline_ns:
+                    return None
+        except DeviceLostError:
+            self._drop_session()
+            raise
+
+    def _return_borrowed(self, session: _Session) -> None:
+        if self._borrowed is not None:
+            index, self._borrowed = self._borrowed, None
+            session.node.queue(index)
+
+    def _next_buffer(self, session: _Session, timeout_s: float) -> DequeuedBuffer | None:
+        """Wait for a buffer; None on timeout or when only an event came."""
+        fd = session.node.fd
+        events = self._kernel.poll([(fd, select.POLLIN | select.POLLPRI)], max(0.0, timeout_s)).get(fd, 0)
+        if events & select.POLLPRI:
+            self._take_event(session)
+        if events & (select.POLLIN | _GONE):
+            buffer = session.node.dequeue()  # names the reason if the device is gone
+            if buffer is None and events & _GONE:
+                raise DeviceLostError(f"{self._entry.path}: the camera stopped delivering")
+            return buffer
+        return None
+
+    def _take_event(self, session: _Session) -> None:
+        session.node.request(abi.VIDIOC_DQEVENT, abi.Event(), "tell what changed")
+        self._stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
+
+    def _frame(self, session: _Session, buffer: DequeuedBuffer) -> Frame | None:
+        t_arrival_ns = self._kernel.monotonic_ns()
+        self._pending_loss += self._sequence.missing_before(buffer.sequence)
+        image = self._image(session, buffer)
+        if image is None:
+            self._pending_loss += 1
+            session.node.queue(buffer.index)
+            return None
+        if self._settings.borrow:
+            self._borrowed = buffer.index
+        else:
+            if not image.flags.owndata:
+                image = image.copy()
+            session.node.queue(buffer.index)
+        raw = self._raw_stamp(session, buffer, t_arrival_ns)
+        stamp, exposure_ns = self._stamper.stamp(raw)
+        self._say_rule(stamp.rule)
+        dropped, self._pending_loss = self._pending_loss, 0
+        self._statistics.add(stamp.t_exposure_mid_ns, dropped)
+        return Frame(
+            t_exposure_mid_ns=stamp.t_exposure_mid_ns,
+            t_arrival_ns=t_arrival_ns,
+            sequence=buffer.sequence,
+            image=image,
+            encoding=self._settings.encoding,
+            stamp_rule=stamp.rule,
+            exposure_ns=exposure_ns,
+            readout_ns=self._settings.shutter.row_spread_ns,
+            t_sigma_ns=raw.t_sigma_ns,
+            dropped_before=dropped,
+        )
+
+    def _image(self, session: _Session, buffer: DequeuedBuffer) -> Image | None:
+        """Decode a buffer; None, with the reason counted, where it holds no good image."""
+        if buffer.bytes_used == 0:
+            self._statistics.count("empty_buffers")
+            return None
+        if buffer.flags & abi.BUF_FLAG_ERROR:
+            self._statistics.count("flagged_buffers")
+            self._statistics.corrupt += 1
+            return None
+        try:
+            return session.decode(session.node.mappings[buffer.index].array[: buffer.bytes_used])
+        except CorruptImageError as error:
+            self._statistics.count("corrupt_images")
+            self._statistics.corrupt += 1
+            _log.debug("corrupt image sequence=%d: %s", buffer.sequence, error)
+            return None
+
+    def _raw_stamp(self, session: _Session, buffer: DequeuedBuffer, t_arrival_ns: int) -> RawStamp:
+        if session.metadata is not None:
+            fitted = session.metadata.stamp(buffer)
+            if fitted is not None:
+                return fitted
+        return kernel_stamp(
+            buffer,
+            driver=session.identity.driver,
+            monotonic_ns=t_arrival_ns,
+            realtime_ns=self._kernel.realtime_ns(),
+            forced=self._settings.stamp,
+        )
+
+    def _say_rule(self, rule: str) -> None:
+        if rule != self._rule:
+            _log.info("stamp rule path=%s rule=%s", self._entry.path, rule)
+            self._rule = rule
+
+
+def _decoder(path: str, fmt: ObtainedFormat, settings: CameraSettings) -> FrameDecoder:
+    try:
+        return FrameDecoder(
+            FORMATS[fmt.pixel_format],
+            fmt.width,
+            fmt.height,
+            stride=fmt.stride,
+            encoding=settings.encoding,
+            decoder=settings.decoder,
+        )
+    except ValueError as error:
+        raise DeviceRefusedError(f"{path}: {error}") from error
+
+
+def _no_capture(path: str, identity: NodeIdentity) -> str:
+    if identity.capabilities & abi.CAP_VIDEO_CAPTURE_MPLANE:
+        return f"{path}: {identity.card} has multi-planar buffers only, which are not supported"
+    what = "metadata" if identity.captures_metadata else "no pictures"
+    return f"{path}: this node of {identity.card} delivers {what}; try the camera's other /dev/video node"

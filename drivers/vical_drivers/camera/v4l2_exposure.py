@@ -1,0 +1,73 @@
+"""Exposure, gain and the automatic controls of a V4L2 camera."""
+
+from __future__ import annotations
+
+from vical_drivers.camera import v4l2_abi as abi
+from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.v4l2_controls import Control, Controls
+from vical_drivers.errors import DeviceRefusedError
+
+_FIXED_EXPOSURE = (abi.EXPOSURE_MANUAL, abi.EXPOSURE_SHUTTER_PRIORITY)
+
+
+def apply_settings(controls: Controls, settings: CameraSettings) -> None:
+    """Write exposure, gain and the named controls; automatic ones are switched off first.
+
+    Raises:
+        DeviceRefusedError: The camera has no such control or does not take the value.
+    """
+    if settings.exposure_s is not None:
+        set_exposure(controls, settings.exposure_s)
+    if settings.gain is not None:
+        _set_gain(controls, settings.gain)
+    # a manual value is refused while its automatic control is on, so those go first
+    for name, value in sorted(settings.controls.items(), key=lambda item: "auto" not in item[0]):
+        controls.set(name, round(value))
+
+
+def set_exposure(controls: Controls, exposure_s: float) -> int:
+    """Set a fixed exposure time and return the one obtained, ns.
+
+    Raises:
+        DeviceRefusedError: The camera cannot, or the time is out of its range.
+    """
+    exposure = controls.find(abi.CID_EXPOSURE_ABSOLUTE)
+    if exposure is None:
+        raise DeviceRefusedError(
+            "camera: it has no exposure control; leave exposure_s out and state it as assume_exposure_s"
+        )
+    automatic = controls.find(abi.CID_EXPOSURE_AUTO)
+    if automatic is not None:
+        mode = next((m for m in _FIXED_EXPOSURE if _offers(automatic, m)), None)
+        if mode is not None:
+            controls.set(abi.CID_EXPOSURE_AUTO, mode)
+    if controls.find(abi.CID_EXPOSURE_AUTO_PRIORITY) is not None:
+        # else the camera halves its frame rate in the dark
+        controls.set(abi.CID_EXPOSURE_AUTO_PRIORITY, 0)
+    value = max(1, round(exposure_s * 1e9 / abi.EXPOSURE_UNIT_NS))
+    obtained = controls.set(abi.CID_EXPOSURE_ABSOLUTE, value)
+    return obtained * abi.EXPOSURE_UNIT_NS
+
+
+def _offers(menu: Control, value: int) -> bool:
+    return value in menu.menu if menu.menu else menu.minimum <= value <= menu.maximum
+
+
+def _set_gain(controls: Controls, gain: float) -> None:
+    if controls.find(abi.CID_AUTOGAIN) is not None:
+        controls.set(abi.CID_AUTOGAIN, 0)
+    which = abi.CID_GAIN if controls.find(abi.CID_GAIN) is not None else abi.CID_ANALOGUE_GAIN
+    if controls.find(which) is None:
+        raise DeviceRefusedError("camera: it has no gain control; leave gain out")
+    controls.set(which, round(gain))
+
+
+def read_exposure_ns(controls: Controls) -> int | None:
+    """Return the exposure time in force, ns; None where unknown or chosen by the camera itself."""
+    if controls.find(abi.CID_EXPOSURE_ABSOLUTE) is None:
+        return None
+    if controls.find(abi.CID_EXPOSURE_AUTO) is not None:
+        mode = controls.get(abi.CID_EXPOSURE_AUTO)
+        if mode not in _FIXED_EXPOSURE:
+            return None
+    return controls.get(abi.CID_EXPOSURE_ABSOLUTE) * abi.EXPOSURE_UNIT_NS
