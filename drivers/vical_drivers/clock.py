@@ -1,0 +1,318 @@
+"""Device clock to host clock, from one-way arrival times alone. Pure arithmetic: no clock is read here.
+
+Three clocks meet, each with its own names: the device's ticks (``device_ticks``, wrapping on the wire,
+unwrapped inside), device seconds since the mapping began (``x_s``), and CLOCK_MONOTONIC of the host
+(``t_..._ns``).
+
+An arrival is late by a delay that is never negative, so the truth lies along the *lower* envelope of
+(device time, arrival - device time): a straight line with the offset and the skew of the two clocks,
+touched from above by the luckiest samples (Zhang, Liu, Xia, INFOCOM 2002). Averages (exponential,
+alpha-beta) carry the mean delay as a bias; the envelope does not. What no one-way method can see is the
+*smallest* delay itself: the caller takes off what it knows of it (wire time, the sensor's filters).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+_NS = 1e9
+
+
+class TickUnwrapper:
+    """Turns a counter of `bits` bits into one that never wraps (None: it does not wrap)."""
+
+    def __init__(self, bits: int | None = 32) -> None:
+        self._modulus = None if bits is None else 1 << bits
+        self._last: int | None = None
+
+    def step(self, ticks: int) -> int:
+        """Ticks from the last accepted value to this one, taken forward: 0 <= step < 2^bits."""
+        if self._last is None:
+            return 0
+        step = ticks - self._last
+        return step if self._modulus is None else step % self._modulus
+
+    def accept(self, ticks: int) -> int:
+        """Make this the newest value and return it unwrapped (starts at the first raw value)."""
+        self._last = ticks if self._last is None else self._last + self.step(ticks)
+        return self._last
+
+    def restart(self) -> None:
+        """Forget the past; the next value is taken as it is."""
+        self._last = None
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopeOptions:
+    """Tuning of `LowerEnvelope`; the defaults suit crystals of +-100 ppm on either side.
+
+    Attributes:
+        max_skew: Bound of the relative rate error of the two clocks (1e-6 is 1 ppm).
+        skew_prior: One-sigma of that error before anything is known.
+        skew_wander_per_s: How fast the skew itself drifts, 1/s (2e-8: 1.2 ppm a minute); with the jitter it
+            sets the window: long enough for lucky samples, short enough for a straight line.
+        min_window_s: Shortest memory.
+        max_window_s: Longest memory.
+        block_s: Only the luckiest sample of each block of this length is kept.
+    """
+
+    max_skew: float = 500e-6
+    skew_prior: float = 100e-6
+    skew_wander_per_s: float = 2e-8
+    min_window_s: float = 20.0
+    max_window_s: float = 120.0
+    block_s: float = 0.2
+
+
+class LowerEnvelope:
+    """Lower envelope of (x, d): device seconds x, and d = arrival - x in seconds.
+
+    Keeps the luckiest point per block, forgets blocks older than a window chosen from the jitter, and
+    supports the convex hull of the rest by a line. Cost: O(window / block) when a block ends or a point
+    falls below the line, O(1) otherwise.
+    """
+
+    def __init__(self, options: EnvelopeOptions | None = None) -> None:
+        self.options = options or EnvelopeOptions()
+        self._blocks: deque[tuple[float, float]] = deque()
+        self._best: tuple[float, float] | None = None
+        self._block_start_s = 0.0
+        self._newest_s = 0.0
+        self._offset_s = 0.0
+        self._skew = 0.0
+        self._delay_mean_s = 0.0
+        self._delay_square_s2 = 0.0
+        self._points = 0
+        self._sigma_s = math.inf
+        self._skew_sigma = self.options.skew_prior
+
+    @property
+    def skew(self) -> float:
+        """Relative rate error: host seconds per device second, minus one."""
+        return self._skew
+
+    @property
+    def jitter_s(self) -> float:
+        """Standard deviation of the arrival delay, s (recent samples weigh most)."""
+        return math.sqrt(max(0.0, self._delay_square_s2 - self._delay_mean_s**2))
+
+    @property
+    def sigma_s(self) -> float:
+        """One-sigma uncertainty of the line at the newest point, s."""
+        return self._sigma_s
+
+    @property
+    def window_s(self) -> float:
+        """Present length of the memory, s: the cube root balances jitter/W against wander * W^2."""
+        o = self.options
+        window = (self._delay_mean_s / o.skew_wander_per_s) ** (1 / 3) if self._delay_mean_s > 0 else 0.0
+        return min(max(window, o.min_window_s), o.max_window_s)
+
+    def line(self, x_s: float) -> float:
+        """Offset (host - device) at device time `x_s`, s."""
+        return self._offset_s + self._skew * x_s
+
+    def add(self, x_s: float, d_s: float) -> None:
+        """Take one arrival; `x_s` must not decrease."""
+        self._newest_s = x_s
+        self._points += 1
+        if self._best is None:
+            self._best, self._block_start_s = (x_s, d_s), x_s
+        elif d_s - self._skew * x_s < self._best[1] - self._skew * self._best[0]:
+            self._best = (x_s, d_s)
+        below = self._points < 2 or d_s < self.line(x_s)
+        if x_s - self._block_start_s >= self.options.block_s:
+            self._close_block()
+            below = True
+        if below:
+            self._fit()
+        self._note_delay(d_s - self.line(x_s))
+
+    def _close_block(self) -> None:
+        assert self._best is not None
+        self._blocks.append(self._best)
+        self._best = None
+        oldest = self._newest_s - self.window_s
+        while len(self._blocks) > 2 and self._blocks[0][0] < oldest:
+            self._blocks.popleft()
+
+    def _note_delay(self, delay_s: float) -> None:
+        gain = max(1.0 / self._points, 1e-3)
+        self._delay_mean_s += gain * (delay_s - self._delay_mean_s)
+        self._delay_square_s2 += gain * (delay_s * delay_s - self._delay_square_s2)
+
+    def _fit(self) -> None:
+        points = list(self._blocks)
+        if self._best is not None:
+            points.append(self._best)
+        hull = _lower_hull(points)
+        edge_skew, span_s = _edge_at(hull, self._newest_s - self.window_s / 3.0)
+        spread_s = self._spread_s(points)
+        # A short edge under jittery points says little about the skew: weigh it against the prior.
+        skew_sigma = spread_s / span_s if span_s > 0 else math.inf
+        prior = self.options.skew_prior
+        weight = prior**2 / (prior**2 + skew_sigma**2) if math.isfinite(skew_sigma) else 0.0
+        bound = self.options.max_skew
+        self._skew = min(max(edge_skew * weight, -bound), bound)
+        self._offset_s = min(d - self._skew * x for x, d in hull)
+        self._skew_sigma = prior * math.sqrt(1.0 - weight)
+        self._sigma_s = self._uncertainty_s(points, spread_s)
+
+    def _spread_s(self, points: list[tuple[float, float]]) -> float:
+        """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
+        residuals = sorted(d - self.line(x) for x, d in points)
+        return max(residuals[len(residuals) // 10] - residuals[0], 1e-6)
+
+    def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float) -> float:
+        memory_s = max(points[-1][0] - points[0][0], self.options.block_s)
+        lead_s = memory_s / 3.0
+        if len(points) < 5:
+            spread_s = max(spread_s, self._delay_mean_s)
+        wander_s = 0.5 * self.options.skew_wander_per_s * lead_s**2
+        return math.hypot(spread_s, self._skew_sigma * lead_s, wander_s)
+
+
+def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Lower convex hull of points ordered by x (monotone chain)."""
+    hull: list[tuple[float, float]] = []
+    for x, d in points:
+        while len(hull) > 1:
+            (x1, d1), (x2, d2) = hull[-2], hull[-1]
+            if (d2 - d1) * (x - x1) < (d - d1) * (x2 - x1):
+                break
+            hull.pop()
+        if hull and x <= hull[-1][0]:
+            if d < hull[-1][1]:
+                hull[-1] = (x, d)
+            continue
+        hull.append((x, d))
+    return hull
+
+
+def _edge_at(hull: list[tuple[float, float]], x_s: float) -> tuple[float, float]:
+    """Slope and length of the hull edge over `x_s` (the nearest one where none is)."""
+    if len(hull) < 2:
+        return 0.0, 0.0
+    at = 1
+    while at < len(hull) - 1 and hull[at][0] < x_s:
+        at += 1
+    (x1, d1), (x2, d2) = hull[at - 1], hull[at]
+    return (d2 - d1) / (x2 - x1), x2 - x1
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """What the clock says of one sample.
+
+    Attributes:
+        t_device_event_ns: When the device's timer was read, on CLOCK_MONOTONIC, ns.
+        t_sigma_ns: One-sigma of it, ns.
+        device_ticks: Unwrapped ticks.
+        lost_before: Samples missing just before.
+    """
+
+    t_device_event_ns: int
+    t_sigma_ns: int
+    device_ticks: int
+    lost_before: int
+
+
+class DeviceClock:
+    """Maps ticks to the host: unwraps, notices restarts, counts lost samples, fits the envelope.
+
+    Args:
+        tick_hz: Ticks per device second.
+        tick_bits: Width of the counter on the wire; None where it does not wrap.
+        rate_hz: Nominal sample rate, for counting losses; 0 to not count.
+        options: Tuning of the envelope.
+    """
+
+    def __init__(
+        self, tick_hz: float, *, tick_bits: int | None = 32, rate_hz: float = 0.0,
+        options: EnvelopeOptions | None = None,
+    ) -> None:  # fmt: skip
+        self.tick_hz = tick_hz
+        self.rate_hz = rate_hz
+        self.restarts = 0
+        self.outliers = 0
+        self.lost = 0
+        self._options = options
+        self._unwrap = TickUnwrapper(tick_bits)
+        self._suspect: tuple[int, int] | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._unwrap.restart()
+        self.envelope = LowerEnvelope(self._options)
+        self._first_ticks: int | None = None
+        self._last_ticks = 0
+        self._t0_ns = 0
+        self._last_t_ns: int | None = None
+        self._stamped_ticks = 0
+
+    @property
+    def age_s(self) -> float:
+        """Device seconds since the mapping began; below about 1 s it is not worth much."""
+        return 0.0 if self._first_ticks is None else (self._last_ticks - self._first_ticks) / self.tick_hz
+
+    def add(self, ticks: int, t_arrival_ns: int) -> int | None:
+        """Take one sample; return its unwrapped ticks, None where the value cannot be true.
+
+        A value from the future is either damage or a restarted (or newly set) device timer. One such
+        value is dropped; a second one that fits the first is a restart, and the mapping begins anew.
+        """
+        if self._first_ticks is not None and not self._possible(ticks, t_arrival_ns):
+            if not self._continues_suspect(ticks, t_arrival_ns):
+                self._suspect = (ticks, t_arrival_ns)
+                self.outliers += 1
+                return None
+            self.restarts += 1
+            self.outliers -= 1
+            self._begin()
+        self._suspect = None
+        unwrapped = self._unwrap.accept(ticks)
+        if self._first_ticks is None:
+            self._first_ticks, self._t0_ns = unwrapped, t_arrival_ns
+        x_s = (unwrapped - self._first_ticks) / self.tick_hz
+        self.envelope.add(x_s, (t_arrival_ns - self._t0_ns) / _NS - x_s)
+        self._last_ticks = unwrapped
+        return unwrapped
+
+    def _possible(self, ticks: int, t_arrival_ns: int) -> bool:
+        assert self._first_ticks is not None
+        step = self._unwrap.step(ticks)
+        if step < 0:
+            return False
+        x_s = (self._last_ticks + step - self._first_ticks) / self.tick_hz
+        earliness_s = x_s + self.envelope.line(x_s) - (t_arrival_ns - self._t0_ns) / _NS
+        # Before the envelope has settled an arrival may lie well below the first guess.
+        allowed_s = 0.02 + 1e-3 * step / self.tick_hz + (1.0 if self.age_s < 5.0 else 0.0)
+        return earliness_s < allowed_s
+
+    def _continues_suspect(self, ticks: int, t_arrival_ns: int) -> bool:
+        if self._suspect is None:
+            return False
+        step_s = (ticks - self._suspect[0]) / self.tick_hz
+        host_s = (t_arrival_ns - self._suspect[1]) / _NS
+        return 0.0 < step_s < host_s + 1.0
+
+    def stamp(self, unwrapped_ticks: int) -> Stamp:
+        """Map unwrapped ticks that were added before; call it once per sample and in order.
+
+        Stamps never go back: where the envelope just moved, the step is spread over some samples.
+        """
+        assert self._first_ticks is not None
+        x_s = (unwrapped_ticks - self._first_ticks) / self.tick_hz
+        t_ns = self._t0_ns + round((x_s + self.envelope.line(x_s)) * _NS)
+        lost = 0
+        if self._last_t_ns is not None:
+            step_s = (unwrapped_ticks - self._stamped_ticks) / self.tick_hz
+            t_ns = max(t_ns, self._last_t_ns + max(1, round(0.5 * step_s * _NS)))
+            # Half a period of tolerance swallows the 62/63 tick alternation at 1000 Hz.
+            lost = max(0, round(step_s * self.rate_hz) - 1)
+        self.lost += lost
+        self._last_t_ns, self._stamped_ticks = t_ns, unwrapped_ticks
+        sigma_s = math.hypot(self.envelope.sigma_s, 1.0 / self.tick_hz / math.sqrt(12.0))
+        return Stamp(t_ns, round(min(sigma_s, 1.0) * _NS), unwrapped_ticks, lost)

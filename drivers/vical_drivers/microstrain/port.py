@@ -1,0 +1,248 @@
+"""Where bytes come from: the `BytePort` protocol and the serial port behind pyserial.
+
+A read returns the bytes *and* CLOCK_MONOTONIC taken right after the system call, before anything looks
+at them: every later microsecond would end up in the time stamps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import select
+import time
+from collections import deque
+from pathlib import Path
+from typing import Protocol
+
+import serial
+
+from vical_drivers.errors import (
+    DeviceBusyError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DevicePermissionError,
+    DeviceTimeoutError,
+    DriverError,
+)
+
+_log = logging.getLogger(__name__)
+BITS_PER_BYTE = 10
+"""Start, eight data, stop."""
+_CHUNK = 65_536
+_WRITE_TIMEOUT_S = 1.0
+
+
+class BytePort(Protocol):
+    """An open byte stream to a device."""
+
+    @property
+    def name(self) -> str:
+        """Path, for messages."""
+        ...
+
+    @property
+    def baud(self) -> int:
+        """Bits a second on the line as set on this side."""
+        ...
+
+    @property
+    def wire_byte_ns(self) -> float:
+        """Time one byte occupies the wire, ns; 0 where no UART is in between (USB)."""
+        ...
+
+    def read(self, timeout_s: float) -> tuple[bytes, int]:
+        """Return what has arrived and CLOCK_MONOTONIC ns of the read; (b"", now) after the timeout.
+
+        Raises:
+            DeviceLostError: The other side is gone.
+        """
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes.
+
+        Raises:
+            DeviceLostError: The other side is gone, or takes nothing.
+        """
+        ...
+
+    def set_baud(self, baud: int) -> None:
+        """Change this side's baud; what was in flight is dropped."""
+        ...
+
+    def close(self) -> None:
+        """Free the port; may be called twice."""
+        ...
+
+
+def link_of(path: str) -> str:
+    """Guess what lies between device and host: "usb", "ftdi", "uart" or "unknown" (pseudo terminal)."""
+    name = Path(os.path.realpath(path)).name
+    with contextlib.suppress(OSError):
+        driver = os.path.realpath(f"/sys/class/tty/{name}/device/driver")
+        known = {"cdc_acm": "usb", "ftdi_sio": "ftdi"}
+        if Path(driver).name in known:
+            return known[Path(driver).name]
+    if name.startswith("ttyACM"):
+        return "usb"
+    return "uart" if name.startswith("tty") else "unknown"
+
+
+class SerialPort:
+    """A serial port, opened raw, exclusively and in low-latency mode.
+
+    Args:
+        path: Device path; a link such as ``/dev/serial/by-id/...`` is best, it survives a replug.
+        baud: Bits a second.
+        link: "auto", or "usb", "ftdi", "uart" where the guess of `link_of` is wrong. Only on a real UART
+            (everything but "usb" and "unknown") do the bytes take time, which the stamps take off.
+
+    Raises:
+        DeviceNotFoundError: No such path, or it is no serial port.
+        DevicePermissionError: This user may not open it.
+        DeviceBusyError: Another process has it open.
+    """
+
+    def __init__(self, path: str, baud: int = 115_200, *, link: str = "auto") -> None:
+        self._name = path
+        self.link = link_of(path) if link == "auto" else link
+        try:
+            self._serial = serial.Serial(
+                path, baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
+            )
+        except (OSError, ValueError) as error:
+            raise _explain(path, error) from None
+        self._fd: int = self._serial.fileno()
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+        self._lower_latency()
+
+    def _lower_latency(self) -> None:
+        """Ask for ASYNC_LOW_LATENCY: ftdi_sio then sets the chip's latency timer from 16 to 1 ms."""
+        try:
+            self._serial.set_low_latency_mode(True)
+        except (OSError, ValueError, NotImplementedError) as error:
+            # Pseudo terminals, CDC-ACM and some adapters refuse; they need it least.
+            _log.debug("port=%s low_latency=refused reason=%s", self._name, error)
+
+    @property
+    def name(self) -> str:
+        """Path, for messages."""
+        return self._name
+
+    @property
+    def baud(self) -> int:
+        """Bits a second on the line as set on this side."""
+        return int(self._serial.baudrate)
+
+    @property
+    def wire_byte_ns(self) -> float:
+        """Time one byte occupies the wire, ns; 0 where no UART is in between."""
+        return 0.0 if self.link in ("usb", "unknown") else BITS_PER_BYTE * 1e9 / self.baud
+
+    def read(self, timeout_s: float) -> tuple[bytes, int]:
+        """See `BytePort.read`."""
+        try:
+            events = self._poll.poll(max(0.0, timeout_s) * 1e3)
+            data = os.read(self._fd, _CHUNK) if events else b""
+            now_ns = time.monotonic_ns()
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EINTR):
+                return b"", time.monotonic_ns()
+            raise self._lost(error.strerror or str(error)) from None
+        if events and not data:
+            raise self._lost("it reports data and has none")
+        return data, now_ns
+
+    def write(self, data: bytes) -> None:
+        """See `BytePort.write`."""
+        try:
+            self._serial.write(data)
+        except serial.SerialTimeoutException:
+            raise self._lost("it takes no more bytes") from None
+        except (OSError, serial.SerialException) as error:
+            raise self._lost(str(error)) from None
+
+    def set_baud(self, baud: int) -> None:
+        """See `BytePort.set_baud`."""
+        try:
+            self._serial.flush()
+            self._serial.baudrate = baud
+            self._serial.reset_input_buffer()
+        except (OSError, serial.SerialException) as error:
+            raise self._lost(str(error)) from None
+
+    def _lost(self, why: str) -> DeviceLostError:
+        return DeviceLostError(f"{self._name}: the port is gone ({why}); check the cable and power")
+
+    def close(self) -> None:
+        """Free the port; may be called twice."""
+        with contextlib.suppress(OSError):
+            self._serial.close()
+
+
+def _explain(path: str, error: Exception) -> DriverError:
+    """Turn what the system says into what a person can do."""
+    code = getattr(error, "errno", None)
+    text = str(error)
+    if code in (errno.EACCES, errno.EPERM):
+        group = _group_of(path)
+        return DevicePermissionError(
+            f"{path}: permission denied; add yourself to group {group}: sudo usermod -aG {group} $USER, "
+            "then log in again"
+        )
+    if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
+        return DeviceBusyError(f"{path}: another process has it open; find it with: fuser -v {path}")
+    if code == errno.ENOENT or not Path(path).exists():
+        return DeviceNotFoundError(f"{path}: no such port; `vical devices` lists those that exist")
+    if code in (errno.ENXIO, errno.ENODEV, errno.EIO):
+        return DeviceNotFoundError(f"{path}: nothing is connected to this port")
+    return DeviceNotFoundError(f"{path}: this is no serial port ({error})")
+
+
+def _group_of(path: str) -> str:
+    try:
+        return Path(path).group()
+    except (OSError, KeyError):
+        return "dialout"
+
+
+class ArrivalLog:
+    """Dates each byte of a stream by the read that brought it.
+
+    A record is dated by its last byte: the bytes read after it in the same call were on the wire later,
+    so on a real UART their wire time is taken off.
+    """
+
+    def __init__(self) -> None:
+        self._chunks: deque[tuple[int, int]] = deque()
+        self._end = 0
+
+    def add(self, size: int, t_read_ns: int) -> None:
+        """Note that `size` bytes arrived by a read at `t_read_ns`."""
+        self._end += size
+        self._chunks.append((self._end, t_read_ns))
+
+    def arrival_ns(self, offset: int, wire_byte_ns: float) -> int:
+        """When the byte that ends at stream offset `offset` was there, ns; offsets must not decrease."""
+        while len(self._chunks) > 1 and self._chunks[0][0] < offset:
+            self._chunks.popleft()
+        end, t_read_ns = self._chunks[0]
+        return t_read_ns - round((end - offset) * wire_byte_ns)
+
+
+def wait_for_silence(port: BytePort, quiet_s: float, limit_s: float) -> bool:
+    """Read and drop until nothing came for `quiet_s`; False where it still talks after `limit_s`."""
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline:
+        data, _ = port.read(quiet_s)
+        if not data:
+            return True
+    return False
+
+
+def timeout(port: BytePort, what: str) -> DeviceTimeoutError:
+    """Make the error for a device that does not answer."""
+    return DeviceTimeoutError(f"{port.name}: no answer to {what}; check power, cable and baud")

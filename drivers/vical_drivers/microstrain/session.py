@@ -1,0 +1,129 @@
+"""What both protocols offer to the driver above them: settings, raw samples, the session protocol."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from vical_drivers.samples import DeviceInfo
+
+GYRO_ANALOG_DELAY_S = 0.57e-3
+ACCEL_ANALOG_DELAY_S = 0.70e-3
+"""Analog filters of the GX3 (2-pole RC 358 Hz, 1-pole RC 226 Hz)."""
+_ADC_AVERAGE_DELAY_S = 29.0 / 60.0 * 1e-3
+
+
+def group_delay_s(filter_width: int) -> float:
+    """Delay of a GX3's sampling chain, s: 30 taps at 30 kHz, M taps at 1 kHz, and the analog filters.
+
+    Gyro and accelerometer differ by 0.13 ms in their analog part; one sample has one stamp, so the mean is
+    taken: the gyro, which carries the time shift of a camera, is then off by 0.065 ms of constant lag.
+
+    >>> round(group_delay_s(15) * 1e3, 2)
+    8.12
+    """
+    analog_s = 0.5 * (GYRO_ANALOG_DELAY_S + ACCEL_ANALOG_DELAY_S)
+    return _ADC_AVERAGE_DELAY_S + (filter_width - 1) / 2.0 * 1e-3 + analog_s
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSettings:
+    """What is asked of the device.
+
+    Attributes:
+        rate_hz: Samples per second; the device divides its own base rate by whole numbers.
+        filter_width: M of the moving average on gyro and accelerometer (GX3), 1 .. 32 ms.
+        baud: Bits a second wanted on the line; None: as found, or more where the rate needs it.
+    """
+
+    rate_hz: float = 100.0
+    filter_width: int = 15
+    baud: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What the device really does, read back from it.
+
+    Attributes:
+        rate_hz: Samples per second.
+        group_delay_s: Lag of the data behind the device's timer, s; 0 where unknown.
+        record_bytes: Length of one sample on the wire.
+        tick_hz: Ticks per second of the timer in each sample.
+        tick_bits: Width of that timer; None where it does not wrap.
+        filter_width: M in force, where known.
+    """
+
+    rate_hz: float
+    group_delay_s: float
+    record_bytes: int
+    tick_hz: float
+    tick_bits: int | None
+    filter_width: int | None = None
+
+
+class RawSample(NamedTuple):
+    """One sample as decoded, in SI units, with the device's own time.
+
+    Attributes:
+        ticks: Device timer as on the wire.
+        gyro_rps: Angular rate, rad/s.
+        specific_force_mps2: Specific force, m/s^2.
+        t_arrival_ns: CLOCK_MONOTONIC of its last byte, ns.
+    """
+
+    ticks: int
+    gyro_rps: tuple[float, float, float]
+    specific_force_mps2: tuple[float, float, float]
+    t_arrival_ns: int
+
+
+class Session(Protocol):
+    """One open device, spoken to in its protocol."""
+
+    @property
+    def protocol(self) -> str:
+        """Name of the protocol."""
+        ...
+
+    @property
+    def checksum_errors(self) -> int:
+        """Damaged records so far."""
+        ...
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes so far that belong to no record."""
+        ...
+
+    def identify(self) -> DeviceInfo:
+        """Ask who it is."""
+        ...
+
+    def configure(self, settings: ImuSettings) -> Applied:
+        """Set rate and filters (volatile), read them back and compare.
+
+        Raises:
+            DeviceRefusedError: The device does not take a setting.
+        """
+        ...
+
+    def start(self) -> None:
+        """Begin to stream."""
+        ...
+
+    def read(self, timeout_s: float) -> list[RawSample]:
+        """Return what arrived; [] after the timeout."""
+        ...
+
+    def stop(self) -> None:
+        """End the stream and leave the device as it was found; never raises."""
+        ...
+
+    def capture_gyro_bias(self, duration_s: float) -> tuple[float, float, float]:
+        """Let the device average its gyro at rest; sets its volatile bias. Returns it, rad/s."""
+        ...
+
+    def self_test(self) -> dict[str, bool]:
+        """Run the built-in test; part -> passed."""
+        ...

@@ -1,0 +1,205 @@
+"""A 3DM-GX3 spoken to in the single-byte protocol: identify, configure, stream, stop."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+
+from vical_drivers.errors import DeviceRefusedError, DriverError
+from vical_drivers.microstrain import single_byte as sb
+from vical_drivers.microstrain import single_byte_commands as cmd
+from vical_drivers.microstrain.port import ArrivalLog, BytePort, timeout, wait_for_silence
+from vical_drivers.microstrain.session import Applied, ImuSettings, RawSample, group_delay_s
+from vical_drivers.samples import DeviceInfo
+
+_REPLY_TIMEOUT_S = 0.5
+_TRIES = 3
+_STREAMED = 0xC2
+_SELF_TEST_PARTS = {
+    0: "3 V supply",
+    1: "5 V supply",
+    2: "external oscillator",
+    3: "internal oscillator",
+    4: "PLL",
+    6: "gyro x",
+    7: "gyro y",
+    8: "gyro z",
+    9: "accelerometer x",
+    10: "accelerometer y",
+    11: "accelerometer z",
+    20: "system tick",
+}
+_IDENTITY = ("model number", "serial number", "model name", "options", "lot")
+
+
+class SingleByteSession:
+    """See `session.Session`. The port stays the caller's."""
+
+    protocol = "single-byte"
+
+    def __init__(self, port: BytePort) -> None:
+        self._port = port
+        self._decoder = sb.Decoder()
+        self._arrivals = ArrivalLog()
+        self._baud_found = port.baud
+        self._backlog: list[RawSample] = []
+
+    @property
+    def checksum_errors(self) -> int:
+        """Damaged records."""
+        return self._decoder.checksum_errors
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes that belong to no record."""
+        return self._decoder.skipped_bytes
+
+    def probe(self, timeout_s: float) -> bool:
+        """Tell whether a GX3 answers here in this protocol."""
+        with contextlib.suppress(DriverError):
+            self._transact(cmd.GET_FIRMWARE, 0xE9, timeout_s, tries=1)
+            return True
+        return False
+
+    def quiet(self) -> None:
+        """Stop whatever streams and wait until it is silent."""
+        self._port.write(cmd.STOP_STREAM * 2)
+        wait_for_silence(self._port, quiet_s=0.1, limit_s=1.0)
+        self._reset_decoder()
+
+    def identify(self) -> DeviceInfo:
+        """See `Session.identify`."""
+        number = int(self._transact(cmd.GET_FIRMWARE, 0xE9).values[0])
+        text = {}
+        for index, name in enumerate(_IDENTITY):
+            with contextlib.suppress(DriverError):
+                text[name] = str(self._transact(cmd.get_identity(index), 0xEA).fields()["text"])
+        serial = text.get("serial number", "")
+        return DeviceInfo(
+            kind="imu",
+            model=text.get("model name", "") or text.get("model number", "") or "3DM-GX3",
+            serial_number=serial,
+            firmware=cmd.firmware_text(number),
+            path=self._port.name,
+            protocol=self.protocol,
+            details={k: v for k, v in text.items() if k not in ("serial number", "model name")},
+        )
+
+    def configure(self, settings: ImuSettings) -> Applied:
+        """See `Session.configure`. Volatile only (but see the comment on old firmware)."""
+        decimation = max(1, round(cmd.BASE_RATE_HZ / settings.rate_hz))
+        self._choose_baud(settings, cmd.BASE_RATE_HZ / decimation)
+        wanted = cmd.Sampling(decimation, cmd.FLAGS_INERTIAL_ONLY, settings.filter_width)
+        in_force = cmd.Sampling.from_record(self._transact(cmd.sampling(), 0xDB))
+        if in_force.difference(wanted):
+            # Firmware before 1.1.27 writes its EEPROM on "apply": never do it when nothing changes.
+            self._transact(cmd.sampling(cmd.APPLY, wanted), 0xDB)
+            in_force = cmd.Sampling.from_record(self._transact(cmd.sampling(), 0xDB))
+        if difference := in_force.difference(wanted):
+            raise DeviceRefusedError(f"{self._port.name}: the device did not take its settings: {difference}")
+        return Applied(
+            rate_hz=cmd.BASE_RATE_HZ / in_force.decimation,
+            group_delay_s=group_delay_s(in_force.filter_width),
+            record_bytes=sb.LAYOUTS[_STREAMED].length,
+            tick_hz=sb.TICK_HZ,
+            tick_bits=32,
+            filter_width=in_force.filter_width,
+        )
+
+    def _choose_baud(self, settings: ImuSettings, rate_hz: float) -> None:
+        wanted = settings.baud
+        if wanted is None and cmd.max_rate_hz(_STREAMED, self._port.baud) < rate_hz:
+            wanted = next((b for b in cmd.BAUD_RATES if cmd.max_rate_hz(_STREAMED, b) >= rate_hz), None)
+        if wanted is not None and wanted != self._port.baud:
+            self.change_baud(wanted)
+
+    def change_baud(self, baud: int) -> None:
+        """Change both sides' baud until the device's next power-up."""
+        reply = self._transact(cmd.communication(cmd.APPLY, baud), 0xD9)
+        if int(reply.values[1]) != baud:
+            raise DeviceRefusedError(
+                f"{self._port.name}: the device stays at {reply.values[1]} baud, not {baud}"
+            )
+        self._port.set_baud(baud)
+        time.sleep(0.05)
+        self._reset_decoder()
+        if not self.probe(_REPLY_TIMEOUT_S) and not self.probe(_REPLY_TIMEOUT_S):
+            raise timeout(self._port, f"the change to {baud} baud")
+
+    def start(self) -> None:
+        """See `Session.start`. Uses 0xC4: it is volatile, where presets would wear the EEPROM."""
+        reply = self._transact(cmd.set_continuous(_STREAMED), 0xC4)
+        if reply.values[0] != _STREAMED:
+            raise DeviceRefusedError(f"{self._port.name}: the device does not stream record 0xC2")
+
+    def read(self, timeout_s: float) -> list[RawSample]:
+        """See `Session.read`."""
+        if self._backlog:
+            out, self._backlog = self._backlog, []
+            return out
+        return [s for r in self._receive(timeout_s) if (s := self._sample(r)) is not None]
+
+    def _sample(self, record: sb.Record) -> RawSample | None:
+        if record.kind != _STREAMED:
+            return None
+        ax, ay, az, wx, wy, wz, ticks = record.values
+        force = (ax * sb.STANDARD_GRAVITY_MPS2, ay * sb.STANDARD_GRAVITY_MPS2, az * sb.STANDARD_GRAVITY_MPS2)
+        if not math.isfinite(sum(force) + wx + wy + wz):
+            return None
+        arrival_ns = self._arrivals.arrival_ns(record.end, self._port.wire_byte_ns)
+        return RawSample(ticks, (wx, wy, wz), force, arrival_ns)
+
+    def _receive(self, timeout_s: float) -> list[sb.Record]:
+        data, t_read_ns = self._port.read(timeout_s)
+        if not data:
+            return []
+        self._arrivals.add(len(data), t_read_ns)
+        return self._decoder.feed(data)
+
+    def _transact(
+        self, command: bytes, kind: int, timeout_s: float = _REPLY_TIMEOUT_S, tries: int = _TRIES
+    ) -> sb.Record:
+        """Send a command and return its reply; samples that stream in between are kept."""
+        for _ in range(tries):
+            self._port.write(command)
+            deadline = time.monotonic() + timeout_s
+            found: sb.Record | None = None
+            while found is None and (left := deadline - time.monotonic()) > 0:
+                for record in self._receive(left):
+                    if record.kind == kind:
+                        found = record
+                    elif record.kind == sb.ERROR_REPLY:
+                        raise DeviceRefusedError(
+                            f"{self._port.name}: the device refused command 0x{kind:02X}"
+                        )
+                    elif (sample := self._sample(record)) is not None:
+                        self._backlog.append(sample)
+            if found is not None:
+                return found
+        raise timeout(self._port, f"command 0x{kind:02X}")
+
+    def _reset_decoder(self) -> None:
+        old, self._decoder = self._decoder, sb.Decoder()
+        self._decoder.checksum_errors = old.checksum_errors
+        self._arrivals = ArrivalLog()
+        self._backlog = []
+
+    def stop(self) -> None:
+        """See `Session.stop`; a temporary baud is put back so that other software finds the device."""
+        with contextlib.suppress(DriverError):
+            self.quiet()
+            if self._port.baud != self._baud_found:
+                self.change_baud(self._baud_found)
+
+    def capture_gyro_bias(self, duration_s: float) -> tuple[float, float, float]:
+        """See `Session.capture_gyro_bias`."""
+        command = cmd.capture_gyro_bias(round(duration_s * 1e3))
+        reply = self._transact(command, 0xCD, duration_s + 2.0, tries=1)
+        x, y, z = (float(v) for v in reply.values[:3])
+        return x, y, z
+
+    def self_test(self) -> dict[str, bool]:
+        """See `Session.self_test`."""
+        flags = int(self._transact(cmd.SELF_TEST, 0xDA, 2.0, tries=1).values[0])
+        return {name: bool(flags >> bit & 1) for bit, name in _SELF_TEST_PARTS.items()}

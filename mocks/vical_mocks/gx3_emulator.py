@@ -1,0 +1,243 @@
+"""A 3DM-GX3-25 behind a pseudo terminal: byte-exact, in real time, in a thread of its own.
+
+By hand: ``python -m vical_mocks.gx3_emulator`` prints the terminal's name and runs until Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import os
+import select
+import signal
+import sys
+import tempfile
+import termios
+import threading
+import time
+import tty
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Self
+
+import numpy as np
+
+from vical_mocks.clock import LINKS, SkewedClock, make_link
+from vical_mocks.gx3_device import Gx3Device
+from vical_mocks.gx3_state import Identity, Settings
+from vical_mocks.imu import GX3_25_ERRORS, ImuErrors, Motion
+
+_IDLE_S = 0.05
+_BAUD_OF = {getattr(termios, f"B{b}"): b for b in (9600, 19200, 115200, 230400, 460800, 921600)}
+
+
+class Gx3Emulator:
+    """The device, the link and the terminal; a context manager.
+
+    Args:
+        motion: True motion: host seconds (CLOCK_MONOTONIC), shape (n,) -> angular rate rad/s (n, 3) and
+            specific force m/s^2 (n, 3). None: level and at rest.
+        protocol: "single-byte" or "mip".
+        link: One of "direct", "usb", "uart", "ftdi": how bytes are delayed and bunched.
+        clock_skew_ppm: Rate error of the device's crystal.
+        clock_wander_ppm: Amplitude of its slow change.
+        errors: Sensor errors; None for none.
+        seed: Seed of noise and jitter.
+        serial_number: As answered to the host.
+        eeprom: Settings at power-up; default as from the factory.
+        baud_matters: Compare the terminal's baud with the device's and garble what does not match, as a real
+            UART does; None: for every link but "usb" and "direct".
+    """
+
+    def __init__(
+        self,
+        motion: Motion | None = None,
+        *,
+        protocol: str = "single-byte",
+        link: str = "usb",
+        clock_skew_ppm: float = 0.0,
+        clock_wander_ppm: float = 0.0,
+        errors: ImuErrors | None = None,
+        seed: int = 0,
+        serial_number: str = "6223-12345",
+        eeprom: Settings | None = None,
+        first_ticks: int = 0,
+        baud_matters: bool | None = None,
+    ) -> None:
+        self._motion = motion
+        self._clock = SkewedClock(time.monotonic(), clock_skew_ppm, clock_wander_ppm)
+        self._rng = np.random.default_rng([seed, 7])
+        self._link_kind = link
+        self._baud_matters = link in ("uart", "ftdi") if baud_matters is None else baud_matters
+        identity = Identity(serial_number=serial_number)
+        self.device = Gx3Device(
+            motion, clock=self._clock, protocol=protocol, errors=errors, seed=seed,
+            identity=identity, eeprom=eeprom, first_ticks=first_ticks,
+        )  # fmt: skip
+        self._folder = tempfile.TemporaryDirectory(prefix="vical-gx3-")
+        self.port_name = str(Path(self._folder.name) / "ttyGX3")
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._master = self._slave = -1
+        self._wake_r, self._wake_w = os.pipe()
+        self.plug()
+
+    def plug(self) -> None:
+        """Connect to the host: a new terminal under the same name. The device powers up."""
+        with self._lock:
+            if self._master >= 0:
+                return
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            name = Path(self.port_name)
+            name.unlink(missing_ok=True)
+            name.symlink_to(os.ttyname(self._slave))
+            self._link = make_link(self._link_kind, self._rng, self.device.baud)
+            self.device.power_up()
+        self._wake()
+
+    def unplug(self) -> None:
+        """Pull the cable: the terminal disappears under whoever has it open."""
+        with self._lock:
+            if self._master < 0:
+                return
+            Path(self.port_name).unlink(missing_ok=True)
+            os.close(self._slave)
+            os.close(self._master)
+            self._master = self._slave = -1
+
+    def start(self) -> Self:
+        """Begin to run."""
+        self._thread = threading.Thread(target=self._run, name="gx3-emulator", daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """End; may be called twice."""
+        self._stop.set()
+        self._wake()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self.unplug()
+        if self._wake_w >= 0:
+            os.close(self._wake_r)
+            os.close(self._wake_w)
+            self._wake_r = self._wake_w = -1
+        self._folder.cleanup()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):
+            os.write(self._wake_w, b"x")
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            with self._lock:
+                wait_s, master = self._step(), self._master
+            watched = [self._wake_r] if master < 0 else [self._wake_r, master]
+            with contextlib.suppress(OSError, ValueError):
+                ready, _, _ = select.select(watched, [], [], wait_s)
+                if self._wake_r in ready:
+                    os.read(self._wake_r, 64)
+
+    def _step(self) -> float:
+        """Do what is due; return how long there is nothing more to do, s."""
+        if self._master < 0:
+            return _IDLE_S
+        now_s = time.monotonic()
+        self._take_input(now_s)
+        for t_s, data in self.device.advance(now_s):
+            self._link.push(data, t_s)
+        self._link.set_baud(self.device.baud)
+        for _, data in self._link.poll(now_s):
+            self._give(data)
+        due = [t for t in (self.device.next_s(), self._link.next_s()) if t is not None]
+        return max(0.0, min([*due, now_s + _IDLE_S]) - time.monotonic())
+
+    def _take_input(self, now_s: float) -> None:
+        try:
+            data = os.read(self._master, 4096)
+        except OSError as error:
+            if error.errno not in (errno.EAGAIN, errno.EIO):
+                raise
+            return
+        self.device.receive(self._garbled(data), now_s)
+
+    def _give(self, data: bytes) -> None:
+        try:
+            os.write(self._master, self._garbled(data))
+        except OSError as error:
+            # Nobody reads and the terminal is full: the bytes are lost, as on USB.
+            if error.errno not in (errno.EAGAIN, errno.EIO):
+                raise
+
+    def _garbled(self, data: bytes) -> bytes:
+        """What the other side sees when the two bauds differ."""
+        if not self._baud_matters or not data:
+            return data
+        host_baud = _BAUD_OF.get(termios.tcgetattr(self._slave)[4], 0)
+        if host_baud == self.device.baud:
+            return data
+        count = max(1, round(len(data) * host_baud / self.device.baud))
+        return bytes(int(b) & 0x7F for b in self._rng.integers(0, 256, count))
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m vical_mocks.gx3_emulator",
+        description="Emulate a MicroStrain 3DM-GX3-25 on a pseudo terminal; prints the terminal's name.",
+    )
+    parser.add_argument("--protocol", choices=("single-byte", "mip"), default="single-byte")
+    parser.add_argument("--link", choices=LINKS, default="usb", help="how bytes are delayed and bunched")
+    parser.add_argument("--skew-ppm", type=float, default=35.0, help="rate error of the device clock")
+    parser.add_argument("--wander-ppm", type=float, default=0.0, help="slow change of the rate error")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=None, help="end by itself after this time")
+    parser.add_argument("--serial-number", default="6223-12345")
+    parser.add_argument("--streaming", action="store_true", help="already streams 0xC2 at power-up")
+    parser.add_argument("--baud", type=int, default=115_200, help="left at this baud by someone")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the emulator until Ctrl-C, SIGTERM or --seconds."""
+    args = _parser().parse_args(argv)
+    done = threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        done.set()
+
+    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGINT, end)
+    eeprom = Settings(baud=args.baud)
+    if args.streaming:
+        eeprom.power_up_mode, eeprom.preset_command = 2, 0xC2
+    with Gx3Emulator(
+        protocol=args.protocol,
+        link=args.link,
+        clock_skew_ppm=args.skew_ppm,
+        clock_wander_ppm=args.wander_ppm,
+        errors=GX3_25_ERRORS,
+        seed=args.seed,
+        serial_number=args.serial_number,
+        eeprom=eeprom,
+    ) as emulator:
+        sys.stdout.write(emulator.port_name + "\n")
+        sys.stdout.flush()
+        done.wait(args.seconds)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
