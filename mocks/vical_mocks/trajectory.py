@@ -129,7 +129,7 @@ def hand_motion(
 ) -> Trajectory:
     """A rig waved by hand in front of a board that stays in view nearly all the time.
 
-    Slow tilts up to ~25 deg that the position follows (the camera orbits the board), quick shaking about
+    Slow tilts up to ~20 deg that the position follows (the camera orbits the board), quick shaking about
     all three axes and along them. All frequencies are scaled together so that the mean angular rate over
     the first minute is `mean_rate_dps`; at 55 deg/s the accelerations are about 1.5 m/s^2.
 
@@ -179,13 +179,13 @@ def _hand_curves(
     """Rotation and position of the camera; `speed` scales all frequencies."""
     slow_hz = speed * rng.uniform(0.06, 0.25, (3, 3))
     slow_phase = rng.uniform(0, 2 * np.pi, (3, 3))
-    slow_rad = np.deg2rad([13.0, 13.0, 14.0]) * rng.uniform(0.7, 1.1, (3, 3)) / np.sqrt(3)
+    slow_rad = np.deg2rad([10.0, 10.0, 14.0]) * rng.uniform(0.7, 1.1, (3, 3)) / np.sqrt(3)
     tilt = Sinusoids(np.zeros(3), slow_rad, slow_hz, slow_phase)
     # Tilting about y swings the view along x: the position takes it back, so that the camera orbits.
     orbit_hz, orbit_phase = slow_hz[:, [1, 0, 2]], slow_phase[:, [1, 0, 2]]
     orbit_m = slow_rad[:, [1, 0, 2]] * distance_m * np.array([-1.0, -side, 0.0])
     orbit = Sinusoids(_viewpoint(board_size_m, distance_m, side), orbit_m, orbit_hz, orbit_phase)
-    quick_rad, quick_m = np.deg2rad([5.2, 5.2, 9.0]), distance_m * np.array([0.05, 0.04, 0.11])
+    quick_rad, quick_m = np.deg2rad([5.4, 5.4, 11.5]), distance_m * np.array([0.05, 0.04, 0.09])
     if style == "spline":
         knots, step_s = 256, 0.35 / speed
         return (

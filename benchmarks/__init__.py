@@ -1,0 +1,1 @@
+"""Studies of accuracy, honesty and speed; `python -m benchmarks` lists them."""

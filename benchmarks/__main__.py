@@ -1,0 +1,44 @@
+"""`python -m benchmarks [NAME [options]]`: run one study, several (`a,b`), or list what there is."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+
+import benchmarks
+
+
+def studies() -> dict[str, str]:
+    """Names of the modules that have a `main(argv)`, with the first line of their docstrings."""
+    found: dict[str, str] = {}
+    for module in pkgutil.iter_modules(benchmarks.__path__):
+        if module.name.startswith("_"):
+            continue
+        loaded = importlib.import_module(f"benchmarks.{module.name}")
+        if hasattr(loaded, "main"):
+            found[module.name] = (loaded.__doc__ or "").strip().splitlines()[0]
+    return found
+
+
+def main(argv: list[str]) -> int:
+    """Run the named studies; names first, options after the last name go to each of them."""
+    known = studies()
+    names = [name for name in (argv[0].split(",") if argv else []) if name]
+    if not names or names == ["--help"]:
+        print("usage: python -m benchmarks NAME[,NAME ...] [options]   (NAME --help: its options)\n")
+        for name, line in known.items():
+            print(f"  {name:18s} {line}")
+        return 0
+    for name in names:
+        if name not in known:
+            print(f"no study {name!r}; there are: {', '.join(known)}", file=sys.stderr)
+            return 2
+    worst = 0
+    for name in names:
+        worst = max(worst, int(importlib.import_module(f"benchmarks.{name}").main(argv[1:]) or 0))
+    return worst
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

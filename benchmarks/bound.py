@@ -1,0 +1,472 @@
+"""Posterior Cramer-Rao bound along the true trajectory: what the data can tell at best, and no filter code.
+
+Model: one state (attitude, velocity, position, gyro and accelerometer bias) per frame, tied to the next
+one by the inertial readings in between (white noise and bias walks as continuous-time densities, error
+equations integrated in 5 ms steps at the truth), to the pixels by the projection, and to constants: lever
+arm, mounting, time shift, gravity, and as asked lens, target scale, IMU scale, landmarks. The information
+matrix over [newest state, constants, landmarks in view] goes forward from frame to frame; the state left
+behind and landmarks seen for the last time are eliminated by Schur complements. That is exact, so its
+inverse at time t is the bound for any estimator that uses the data up to t.
+
+Uses the simulation's truth (`vical_mocks`), and nothing of `vical_daemon`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from vical_mocks.points import SimulatedFrame, SimulatedRun, simulate
+from vical_mocks.rig import Rig
+from vical_mocks.rotations import skew
+from vical_mocks.tracks import simulate_tracks
+
+FloatArray = npt.NDArray[np.float64]
+
+STATE = 15  # attitude (local), velocity, position, gyro bias, accelerometer bias
+_MAX_STEP_S = 5.1e-3
+# One-sigma priors so wide that they tell nothing next to seconds of data (rad, m/s, m, rad/s, m/s^2).
+_STATE_PRIOR = np.repeat([3.0, 10.0, 10.0, 0.3, 2.0], 3)
+
+
+@dataclass(frozen=True)
+class BoundOptions:
+    """Which parameters are unknown.
+
+    Attributes:
+        corner_sigma_px: White noise per axis and corner.
+        frame_sigma_px: Noise common to the corners of a frame, per axis.
+        stamp_jitter_s: Independent error of each frame's stamp.
+        intrinsics: fx fy cx cy unknown.
+        distortion: The four coefficients unknown.
+        timeshift: Time shift unknown.
+        extrinsics: Lever arm and mounting unknown.
+        readout: Rolling-shutter readout unknown.
+        target_scale_prior: One-sigma relative prior of the target's size; 0: known.
+        imu_matrix_prior: Prior of each entry of the gyro (9) and accelerometer (6, lower triangle)
+            matrices; 0: known.
+        gravity: "free" (three numbers), "magnitude" (its direction is unknown) or "known".
+        target_free: World points are unknown; the first pose fixes the world.
+    """
+
+    corner_sigma_px: float = 0.5
+    frame_sigma_px: float = 0.0
+    stamp_jitter_s: float = 0.0
+    intrinsics: bool = True
+    distortion: bool = True
+    timeshift: bool = True
+    extrinsics: bool = True
+    readout: bool = False
+    target_scale_prior: float = 0.0
+    imu_matrix_prior: float = 0.0
+    gravity: str = "magnitude"
+    target_free: bool = False
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The bound at one time.
+
+    Attributes:
+        t_s: Data up to here were used.
+        slices: Name of a block to its place: p_imu_cam (m), r_imu_cam (rad, local), timeshift (s),
+            gravity (m/s^2), intrinsics (px), distortion, readout (s), target_scale, gyro_matrix,
+            accel_matrix, gyro_bias (rad/s), accel_bias (m/s^2), and of the newest frame attitude,
+            velocity, position.
+        covariance: Of all of them.
+    """
+
+    t_s: float
+    slices: dict[str, slice]
+    covariance: FloatArray
+
+    def sigma(self, name: str) -> FloatArray:
+        """One-sigma bounds of one block."""
+        place = self.slices[name]
+        return np.asarray(np.sqrt(np.diag(self.covariance)[place]))
+
+    def block(self, *names: str) -> FloatArray:
+        """Joint covariance of several blocks, in the order given."""
+        index = np.concatenate([np.arange(self.slices[n].start, self.slices[n].stop) for n in names])
+        return self.covariance[np.ix_(index, index)]
+
+
+@dataclass
+class _Constants:
+    """Places and priors of the constant parameters after the state."""
+
+    slices: dict[str, slice] = field(default_factory=dict)
+    prior_sigma: list[float] = field(default_factory=list)
+
+    def add(self, name: str, size: int, sigma: float) -> None:
+        start = STATE + len(self.prior_sigma)
+        self.slices[name] = slice(start, start + size)
+        self.prior_sigma += [sigma] * size
+
+    @classmethod
+    def of(cls, options: BoundOptions) -> _Constants:
+        c = cls()
+        if options.extrinsics:
+            c.add("p_imu_cam", 3, 1.0)
+            c.add("r_imu_cam", 3, 3.0)
+        if options.timeshift:
+            c.add("timeshift", 1, 1.0)
+        c.add("gravity", 3, 1e-7 if options.gravity == "known" else 10.0)
+        if options.intrinsics:
+            c.add("intrinsics", 4, 100.0)
+        if options.distortion:
+            c.add("distortion", 4, 1.0)
+        if options.readout:
+            c.add("readout", 1, 0.1)
+        if options.target_scale_prior > 0 and not options.target_free:
+            c.add("target_scale", 1, options.target_scale_prior)
+        if options.imu_matrix_prior > 0:
+            c.add("gyro_matrix", 9, options.imu_matrix_prior)
+            c.add("accel_matrix", 6, options.imu_matrix_prior)
+        return c
+
+
+class _Information:
+    """The information matrix over [state, constants, landmarks], with elimination."""
+
+    def __init__(self, constants: _Constants, rig: Rig, options: BoundOptions) -> None:
+        self.constants = constants
+        state_sigma = _STATE_PRIOR.copy()
+        if options.target_free:
+            state_sigma[[0, 1, 2, 6, 7, 8]] = 1e-7  # the first pose *is* the world
+        self.matrix = np.diag(np.concatenate([state_sigma, constants.prior_sigma]) ** -2.0)
+        self.fixed = len(self.matrix)
+        self.landmarks: list[int] = []
+        if options.gravity == "magnitude":
+            place = constants.slices["gravity"]
+            direction = rig.gravity_world_mps2 / np.linalg.norm(rig.gravity_world_mps2)
+            self.matrix[place, place] += np.outer(direction, direction) / 1e-6**2
+
+    def propagate(self, transition: FloatArray, inputs: FloatArray, noise: FloatArray) -> None:
+        """Move from one frame's state to the next.
+
+        Args:
+            transition: d new / d old state, (15, 15).
+            inputs: d new / d constants, (15, constants).
+            noise: Covariance of the new state given the old one and the constants, (15, 15).
+        """
+        size = len(self.matrix)
+        scale = 1 / np.sqrt(np.diag(noise))
+        weight = np.linalg.inv(noise * np.outer(scale, scale)) * np.outer(scale, scale)
+        jacobian = np.zeros((STATE, STATE + size))  # columns: old state, new state, constants, landmarks
+        jacobian[:, :STATE], jacobian[:, STATE : 2 * STATE] = -transition, np.eye(STATE)
+        jacobian[:, 2 * STATE : STATE + self.fixed] = -inputs
+        joint = jacobian.T @ weight @ jacobian
+        old = np.r_[np.arange(STATE), np.arange(2 * STATE, STATE + size)]
+        joint[np.ix_(old, old)] += self.matrix
+        self.matrix = _eliminate(joint, np.arange(STATE))
+
+    def add_landmark(self, identity: int) -> None:
+        """Take an unknown world point up (weak prior of 100 m)."""
+        size = len(self.matrix)
+        grown = np.zeros((size + 3, size + 3))
+        grown[:size, :size] = self.matrix
+        grown[size:, size:] = np.eye(3) / 100.0**2
+        self.matrix = grown
+        self.landmarks.append(identity)
+
+    def remove_landmarks(self, identities: set[int]) -> None:
+        """Eliminate points that will not be seen again."""
+        if not identities:
+            return
+        rows = [self.fixed + 3 * i for i, name in enumerate(self.landmarks) if name in identities]
+        self.matrix = _eliminate(self.matrix, np.concatenate([np.arange(r, r + 3) for r in rows]))
+        self.landmarks = [name for name in self.landmarks if name not in identities]
+
+    def landmark_place(self, identity: int) -> slice:
+        start = self.fixed + 3 * self.landmarks.index(identity)
+        return slice(start, start + 3)
+
+    def covariance(self) -> FloatArray:
+        """Of state and constants, landmarks marginalised."""
+        information = _eliminate(self.matrix, np.arange(self.fixed, len(self.matrix)))
+        scale = 1 / np.sqrt(np.diag(information))
+        return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
+
+
+def _eliminate(information: FloatArray, gone: npt.NDArray[np.int64]) -> FloatArray:
+    """Schur complement: the information left about the other variables."""
+    if len(gone) == 0:
+        return information
+    kept = np.setdiff1d(np.arange(len(information)), gone)
+    scale = 1 / np.sqrt(np.diag(information)[gone])
+    inner = information[np.ix_(gone, gone)] * np.outer(scale, scale)
+    cross = information[np.ix_(kept, gone)] * scale
+    left = information[np.ix_(kept, kept)] - cross @ np.linalg.solve(inner, cross.T)
+    return np.asarray((left + left.T) / 2)
+
+
+def inertial_factors(rig: Rig, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Error transitions from each frame to the next at the truth, for n + 1 times.
+
+    Returns:
+        Transitions (n, 15, 15); influence of [gravity 3, gyro matrix 9, accelerometer matrix 6]
+        (n, 15, 18); noise covariances (n, 15, 15).
+    """
+    gaps_s = np.diff(times_s)
+    count = max(1, int(np.ceil(np.max(gaps_s) / _MAX_STEP_S)))
+    step_s = gaps_s / count
+    densities = rig.densities
+    diffusion = (
+        np.repeat([densities.gyro, densities.accel, 0.0, densities.gyro_walk, densities.accel_walk], 3) ** 2
+    )
+    eye, small = np.eye(STATE + 18), np.eye(STATE)
+    total = np.tile(eye, (len(gaps_s), 1, 1))
+    noise = np.zeros((len(gaps_s), STATE, STATE))
+    for k in range(count):
+        a = _error_slopes(rig, times_s[:-1] + (k + 0.5) * step_s) * step_s[:, None, None]
+        step = eye + a @ (eye + a @ (eye + a / 3) / 2)
+        phi, inner = step[:, :STATE, :STATE], a[:, :STATE, :STATE]
+        half = small + inner / 2 + inner @ inner / 8
+        # Simpson's rule for the integral of phi(s) D phi(s)^T: exact to the order that matters at 5 ms.
+        added = np.diag(diffusion) + 4 * _spread(half, diffusion) + _spread(phi, diffusion)
+        noise = phi @ noise @ np.swapaxes(phi, 1, 2) + added * (step_s / 6)[:, None, None]
+        total = step @ total
+    return total[:, :STATE, :STATE], total[:, :STATE, STATE:], noise
+
+
+def _spread(phi: FloatArray, diffusion: FloatArray) -> FloatArray:
+    """Phi diag(diffusion) phi^T, batched."""
+    return np.asarray((phi * diffusion) @ np.swapaxes(phi, 1, 2))
+
+
+def _error_slopes(rig: Rig, t_s: FloatArray) -> FloatArray:
+    """Time derivative of [state errors, gravity, gyro matrix, accelerometer matrix] as matrices (n, 33, 33).
+
+    True attitude = estimate times exp(error); reading = matrix times truth + bias + noise.
+    """
+    R = rig.trajectory.R_world_imu(t_s)
+    rate, force = rig.imu_motion(t_s)
+    F = np.zeros((len(t_s), STATE + 18, STATE + 18))
+    F[:, 0:3, 0:3] = -skew(rate)
+    F[:, 0:3, 9:12] = -np.eye(3)
+    F[:, 3:6, 0:3] = -R @ skew(force)
+    F[:, 3:6, 12:15] = -R
+    F[:, 6:9, 3:6] = np.eye(3)
+    F[:, 3:6, 15:18] = np.eye(3)
+    for row in range(3):
+        F[:, row, 18 + 3 * row : 21 + 3 * row] = -rate
+        start = 27 + row * (row + 1) // 2
+        for column in range(row + 1):
+            F[:, 3:6, start + column] = -R[:, :, row] * force[:, column, None]
+    return F
+
+
+def pixel_jacobians(rig: Rig, frame: SimulatedFrame, points_m: FloatArray) -> dict[str, FloatArray]:
+    """Derivatives of a frame's pixels (2n rows) by every parameter, at the truth.
+
+    Keys as in `Bound.slices`, and "attitude", "position" of the imu, "points" (2n, 3: each by its own point).
+    """
+    t_s = np.asarray(frame.t_s)
+    R, p = rig.trajectory.R_world_imu(t_s), rig.trajectory.p_world_imu(t_s)
+    R_imu_cam, p_imu_cam = rig.extrinsics_at(t_s)
+    in_imu = (points_m - p) @ R
+    in_cam = (in_imu - p_imu_cam) @ R_imu_cam
+    by_cam, by_lens = _lens_derivatives(rig, in_cam)
+    by_imu = by_cam @ R_imu_cam.T
+    moving = np.cross(in_imu, rig.trajectory.omega_imu_rps(t_s)) - R.T @ rig.trajectory.v_world_imu(t_s)
+    by_time = np.einsum("nij,nj->ni", by_imu, moving)
+    uv, _ = rig.lens.project(in_cam)
+    row_share = uv[:, 1] / (rig.lens.resolution[1] - 1)
+    blocks = {
+        "attitude": by_imu @ skew(in_imu),
+        "position": -by_imu @ R.T,
+        "points": by_imu @ R.T,
+        "p_imu_cam": -by_imu,
+        "r_imu_cam": by_cam @ skew(in_cam),
+        "timeshift": by_time[..., None],
+        "readout": (by_time * row_share[:, None])[..., None],
+        "intrinsics": by_lens[..., :4],
+        "distortion": by_lens[..., 4:],
+        "target_scale": np.einsum("nij,nj->ni", by_imu @ R.T, points_m)[..., None],
+    }
+    return {name: block.reshape(-1, block.shape[-1]) for name, block in blocks.items()}
+
+
+def _lens_derivatives(rig: Rig, in_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels by the point (n, 2, 3) and by intrinsics and distortion (n, 2, 8): central differences."""
+    by_point = np.empty((len(in_cam), 2, 3))
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        by_point[:, :, axis] = (
+            rig.lens.project(in_cam + step)[0] - rig.lens.project(in_cam - step)[0]
+        ) / 2e-6
+    fx, fy, *_ = rig.lens.intrinsics
+    uv, _ = rig.lens.project(in_cam)
+    normal = (uv - np.array(rig.lens.intrinsics[2:])) / np.array([fx, fy])
+    by_lens = np.zeros((len(in_cam), 2, 8))
+    by_lens[:, 0, 0], by_lens[:, 1, 1] = normal[:, 0], normal[:, 1]
+    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+    for k in range(4):
+        lenses = []
+        for sign in (1, -1):
+            changed = list(rig.lens.distortion)
+            changed[k] += sign * 1e-5
+            lens = type(rig.lens)(rig.lens.intrinsics, tuple(changed), rig.lens.resolution, rig.lens.model)
+            lenses.append(lens.project(in_cam)[0])
+        by_lens[:, :, 4 + k] = (lenses[0] - lenses[1]) / 2e-5
+    return by_point, by_lens
+
+
+def _pixel_information(jacobian: FloatArray, by_time: FloatArray, options: BoundOptions) -> FloatArray:
+    """J^T C^-1 J with C = corner noise + what is common to the frame (stamp error, offset)."""
+    weight = options.corner_sigma_px**-2
+    common = []
+    if options.stamp_jitter_s > 0:
+        common.append(by_time[:, :1] * options.stamp_jitter_s)
+    if options.frame_sigma_px > 0:
+        common.append(np.tile(np.eye(2) * options.frame_sigma_px, (len(jacobian) // 2, 1)))
+    information = weight * jacobian.T @ jacobian
+    if common:  # Woodbury: the common parts are few
+        u = np.hstack(common)
+        inner = np.eye(u.shape[1]) + weight * u.T @ u
+        cross = weight * jacobian.T @ u
+        information -= cross @ np.linalg.solve(inner, cross.T)
+    return information
+
+
+def bounds(
+    run: SimulatedRun, options: BoundOptions | None = None, times_s: Sequence[float] | None = None
+) -> list[Bound]:
+    """The bound after each of `times_s` (s since the start; None: at the end only).
+
+    Frames outside the imu's stretch, and corners that were made outliers, tell nothing.
+    """
+    chosen = options or BoundOptions(corner_sigma_px=run.options.corner_sigma_px)
+    wanted = list(times_s) if times_s is not None else [run.duration_s]
+    information = _Information(_Constants.of(chosen), run.rig, chosen)
+    frames = [f for f in run.frames if 0.0 <= f.t_s <= run.duration_s]
+    last_seen = {int(i): n for n, f in enumerate(frames) for i in f.ids} if chosen.target_free else {}
+    factors = inertial_factors(run.rig, np.array([f.t_s for f in frames]))
+    found: list[Bound] = []
+    for n, frame in enumerate(frames):
+        while len(found) < len(wanted) and frame.t_s > wanted[len(found)]:
+            found.append(_snapshot(information, wanted[len(found)]))
+        if len(found) == len(wanted):
+            return found
+        if n > 0:
+            _propagate(information, *(factor[n - 1] for factor in factors))
+        _update(information, run, frame, chosen)
+        if chosen.target_free:
+            information.remove_landmarks({i for i in information.landmarks if last_seen[i] <= n})
+    return found + [_snapshot(information, t_s) for t_s in wanted[len(found) :]]
+
+
+def _snapshot(information: _Information, t_s: float) -> Bound:
+    state = {
+        "attitude": slice(0, 3),
+        "velocity": slice(3, 6),
+        "position": slice(6, 9),
+        "gyro_bias": slice(9, 12),
+        "accel_bias": slice(12, 15),
+    }
+    return Bound(t_s, state | information.constants.slices, information.covariance())
+
+
+def _propagate(
+    information: _Information, transition: FloatArray, influence: FloatArray, noise: FloatArray
+) -> None:
+    inputs = np.zeros((STATE, information.fixed - STATE))
+    columns = {"gravity": slice(0, 3), "gyro_matrix": slice(3, 12), "accel_matrix": slice(12, 18)}
+    for name, source in columns.items():
+        if name in information.constants.slices:
+            place = information.constants.slices[name]
+            inputs[:, place.start - STATE : place.stop - STATE] = influence[:, source]
+    information.propagate(transition, inputs, noise)
+
+
+def _update(
+    information: _Information, run: SimulatedRun, frame: SimulatedFrame, options: BoundOptions
+) -> None:
+    ids = frame.ids[~frame.outlier]
+    if len(ids) == 0:
+        return
+    rows = np.array([run.landmark_of.get(int(i), int(i)) for i in ids])
+    jacobians = pixel_jacobians(run.rig, frame, run.points_m[rows])
+    if options.target_free:
+        for identity in ids:
+            if int(identity) not in information.landmarks:
+                information.add_landmark(int(identity))
+    full = np.zeros((2 * len(ids), len(information.matrix)))
+    full[:, 0:3], full[:, 6:9] = jacobians["attitude"], jacobians["position"]
+    for name, place in information.constants.slices.items():
+        if name in jacobians:
+            full[:, place] = jacobians[name]
+    if options.target_free:
+        for n, identity in enumerate(ids):
+            full[2 * n : 2 * n + 2, information.landmark_place(int(identity))] = jacobians["points"][
+                2 * n : 2 * n + 2
+            ]
+    information.matrix += _pixel_information(full, jacobians["timeshift"], options)
+
+
+def describe(bound: Bound) -> str:
+    """One Markdown table row: time, time shift, lever arm, mounting, focal length and centre."""
+    p = bound.sigma("p_imu_cam") * 1e3
+    r = np.rad2deg(bound.sigma("r_imu_cam"))
+    shift = f"{bound.sigma('timeshift')[0] * 1e6:.1f}" if "timeshift" in bound.slices else "-"
+    lens = "- | -"
+    if "intrinsics" in bound.slices:
+        f = bound.sigma("intrinsics")
+        lens = f"{f[0]:.3f}/{f[1]:.3f} | {f[2]:.3f}/{f[3]:.3f}"
+    places = f"{p[0]:.3f}/{p[1]:.3f}/{p[2]:.3f} | {r[0]:.4f}/{r[1]:.4f}/{r[2]:.4f}"
+    return f"{bound.t_s:.0f} | {shift} | {places} | {lens}"
+
+
+def main(argv: list[str]) -> int:
+    """Print the bound of the reference cases."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks bound", description=__doc__)
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="motions per case; their mean variance is printed"
+    )
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--case", action="append", help="only these cases")
+    args = parser.parse_args(argv)
+    times = [t for t in (5.0, 10.0, 20.0, 30.0, 60.0, 120.0) if t <= args.seconds]
+    print("| case | t s | time shift us | lever arm mm | mounting deg | f px | c px |")
+    print("|---|---|---|---|---|---|---|")
+    for name, (make, options) in CASES.items():
+        if args.case and name not in args.case:
+            continue
+        runs = [bounds(make(seed, args.seconds), options, times) for seed in range(args.seeds)]
+        for at_time in zip(*runs, strict=True):
+            mean = Bound(at_time[0].t_s, at_time[0].slices, np.mean([b.covariance for b in at_time], axis=0))
+            print(f"| {name} | {describe(mean)} |", flush=True)
+    return 0
+
+
+def _board(seed: int, seconds: float) -> SimulatedRun:
+    return simulate(seed, seconds, whole_board_only=True)
+
+
+def _tracks(seed: int, seconds: float) -> SimulatedRun:
+    return simulate_tracks(seed, seconds)
+
+
+CASES: dict[str, tuple[Callable[[int, float], SimulatedRun], BoundOptions]] = {
+    "reference": (_board, BoundOptions(gravity="free")),
+    "lens known": (_board, BoundOptions(gravity="free", intrinsics=False, distortion=False)),
+    "gravity magnitude known": (_board, BoundOptions()),
+    "gravity known": (_board, BoundOptions(gravity="known")),
+    "0.1 px": (_board, BoundOptions(gravity="free", corner_sigma_px=0.1)),
+    "stamp jitter 1 ms": (_board, BoundOptions(gravity="free", stamp_jitter_s=1e-3)),
+    "target scale 0.1 %": (_board, BoundOptions(gravity="free", target_scale_prior=1e-3)),
+    "IMU matrices 1 %, scale 0.2 %": (
+        _board,
+        BoundOptions(gravity="free", imu_matrix_prior=0.01, target_scale_prior=2e-3),
+    ),
+    "target-free": (_tracks, BoundOptions(target_free=True, gravity="free")),
+    "target-free, lens known": (
+        _tracks,
+        BoundOptions(target_free=True, gravity="free", intrinsics=False, distortion=False),
+    ),
+}
