@@ -1,0 +1,160 @@
+"""`vical calibrate INPUT`: the online filter over a recording."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.options import add_json, suggest
+
+if TYPE_CHECKING:
+    from vical_daemon.cli.calibration_run import Job, Outcome
+    from vical_daemon.estimation.result import CalibrationEstimate
+
+HELP = "the online filter over a recording: extrinsics and time shift"
+FIX = ("intrinsics", "timeshift", "extrinsics")
+ESTIMATE = ("imu_intrinsics", "readout", "target_scale")
+_UNUSABLE = ("waiting", "initialising", "inconsistent")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of COMMANDS."""
+    parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
+    parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format; without: target-free")
+    parser.add_argument("--camera", metavar="NAME", help="only this camera")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
+    parser.add_argument(
+        "--initial",
+        metavar="FILE",
+        help="what is known before: Kalibr's camchain and imu.yaml, every key optional",
+    )
+    parser.add_argument(
+        "--fix", metavar="WHAT", default="", help=f"comma-separated, held at --initial: {', '.join(FIX)}"
+    )
+    parser.add_argument(
+        "--estimate", metavar="WHAT", default="", help=f"comma-separated, switched on: {', '.join(ESTIMATE)}"
+    )
+    parser.add_argument("--report", metavar="F.html", help="write a report with figures")
+    parser.add_argument(
+        "-o", "--output", metavar="F.json", help="also write the result there, for `vical export`"
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate and print; 1 if there is no usable result."""
+    fix, estimate = _words("--fix", args.fix, FIX), _words("--estimate", args.estimate, ESTIMATE)
+    for path in (args.report, args.output):
+        if path and not Path(path).absolute().parent.is_dir():
+            raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
+    from vical_daemon.cli import calibration_run
+    from vical_daemon.priors import Initial, read_initial
+    from vical_daemon.recording import open_recording
+
+    initial = read_initial(args.initial) if args.initial else Initial()
+    if args.target:
+        from vical_daemon.vision.target import load_target
+
+        load_target(Path(args.target))  # a wrong file is refused before the recording is read
+    recording = open_recording(args.input)
+    for warning in recording.warnings:
+        print(f"vical: warning: {warning}", file=sys.stderr)
+    job = calibration_run.make_job(
+        recording,
+        initial,
+        target=args.target,
+        camera=args.camera,
+        imu=args.imu,
+        fix=fix,
+        estimate=estimate,
+    )
+    bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
+    outcome = calibration_run.run_job(job, bar.show, keep_frames=bool(args.report))
+    bar.close()
+    return _deliver(args, job, outcome)
+
+
+def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome) -> int:
+    """Print, write what was asked for, and say in one line if the result cannot be used."""
+    from vical_daemon.cli.calibration_run import document
+
+    result = document(job, outcome)
+    text = json.dumps(_finite(result), allow_nan=False)
+    if args.output:
+        Path(args.output).write_text(text + "\n", encoding="utf-8")
+    if args.json:
+        print(text)
+    else:
+        from vical_daemon.cli.calibration_text import describe
+
+        print(describe(result))
+    if args.report and result["cameras"]:
+        _report(args, job, outcome, result)
+    status, why = result["status"], result["reason"] or result["guidance"]
+    if status in _UNUSABLE:
+        raise CliError(f"no calibration: {status}: {why or 'too little data'}")
+    if status != "converged":
+        print(f"vical: warning: {status}: {why}", file=sys.stderr)
+    return 0
+
+
+def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any]) -> None:
+    from vical_daemon import report
+
+    inputs = [Path(p) for p in (args.input, args.target, args.initial) if p]
+    settings = {"fix": args.fix, "estimate": args.estimate}
+    report.write_report(
+        Path(args.report),
+        result | {"trace": outcome.traces},
+        outcome.frames,
+        image_sizes={name: prior.resolution for name, prior in job.priors.items()},
+        provenance=report.collect(" ".join(sys.argv), inputs, settings),
+    )
+    print(f"report: {args.report}", file=sys.stderr)
+
+
+def _words(option: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    words = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+    for word in words:
+        if word not in known:
+            hint = suggest(word, list(known)) or f" (known: {', '.join(known)})"
+            raise CliError(f"{option}: {word!r} is not known{hint}", EXIT_USAGE)
+    return words
+
+
+def _finite(value: Any) -> Any:
+    """Replace NaN and infinity, which JSON has not, by null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    return [_finite(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+class _Bar:
+    """One line on stderr that shows how far it is; only on a terminal and after the first second."""
+
+    def __init__(self, *, hidden: bool) -> None:
+        self._hidden = hidden
+        self._begin_s = time.monotonic()
+        self._shown = False
+
+    def show(self, share: float, estimate: CalibrationEstimate | None) -> None:
+        """Draw the bar anew."""
+        if self._hidden or time.monotonic() - self._begin_s < 1.0:
+            return
+        filled = round(30 * share)
+        status = str(estimate.status) if estimate is not None else ""
+        print(f"\r[{'#' * filled}{'.' * (30 - filled)}] {share:4.0%} {status:<12}", end="", file=sys.stderr)
+        self._shown = True
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._shown:
+            print("\r" + " " * 60 + "\r", end="", file=sys.stderr)

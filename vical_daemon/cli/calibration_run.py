@@ -1,0 +1,230 @@
+"""The online filter over a recording: the roles detect and estimate over a LocalBus, one message at a time.
+
+Everything happens in one thread and in the order of the stamps, so two runs are identical bit for bit.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from vical_daemon import topics
+from vical_daemon.bus import LocalBus, Sample
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.config import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
+from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
+from vical_daemon.estimation.result import CalibrationEstimate
+from vical_daemon.estimators import make_estimator
+from vical_daemon.priors import Initial
+from vical_daemon.publications import publish
+from vical_daemon.recording import Recording, Stream
+from vical_daemon.roles.estimate import EstimateRole
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.calibration_filter import FrameReport
+
+Progress = Callable[[float, CalibrationEstimate | None], None]
+PUBLISH_EVERY_S = 1.0  # of the data: often enough for a progress bar
+
+
+@dataclass(slots=True)
+class Job:
+    """What to calibrate.
+
+    Attributes:
+        recording: The data.
+        imu: Stream of the IMU.
+        cameras: Stream of each camera.
+        config: The rig, as the roles want it.
+        priors: What is known about each camera.
+    """
+
+    recording: Recording
+    imu: Stream
+    cameras: dict[str, Stream]
+    config: Config
+    priors: dict[str, CameraPrior]
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What came out: the last estimate, the trace of each camera, and the verdict on every frame."""
+
+    estimate: CalibrationEstimate
+    traces: dict[str, list[dict[str, Any]]]
+    frames: list[FrameReport] = field(default_factory=list)
+
+
+def make_job(
+    recording: Recording,
+    initial: Initial,
+    *,
+    target: str | None,
+    camera: str | None = None,
+    imu: str | None = None,
+    fix: Sequence[str] = (),
+    estimate: Sequence[str] = (),
+) -> Job:
+    """Choose streams and put what is known into the form of a config.
+
+    Args:
+        recording: The data.
+        initial: What `--initial` says.
+        target: Target file; None: target-free.
+        camera: Only this one; None: all.
+        imu: Which; None: the only one.
+        fix: See `CalibrationOptions`.
+        estimate: See `CalibrationOptions`.
+
+    Raises:
+        CliError: No such stream, or something needed is not known.
+    """
+    imu_stream = _choose("imu", recording.imus, imu)
+    chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
+    if not chosen:
+        raise CliError(f"{recording.path} holds no camera: neither images nor points")
+    priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
+    noise = initial.imu_noise or ImuNoise()
+    rate_hz = min(max(imu_stream.rate_hz, 1.0), 1000.0)
+    config = Config(
+        rig=recording.rig,
+        imus={
+            imu_stream.name: ImuConfig(
+                port="recording",
+                rate_hz=rate_hz,
+                noise=NoiseConfig(noise.gyro_density, noise.gyro_walk, noise.accel_density, noise.accel_walk),
+            )
+        },
+        cameras={n: CameraConfig(uri="recording", size=p.resolution) for n, p in priors.items()},
+        target=target,
+        calibration=CalibrationConfig(
+            mode="target" if target else "target_free",
+            fix=tuple(fix),  # type: ignore[arg-type]
+            estimate=tuple(estimate),  # type: ignore[arg-type]
+        ),
+    )
+    return Job(recording, imu_stream, chosen, config, priors)
+
+
+def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outcome:
+    """Push the recording through the roles.
+
+    Args:
+        job: What to calibrate.
+        progress: Called now and then with the share done and the estimate.
+        keep_frames: Collect the verdict on every frame.
+    """
+    frames: list[FrameReport] = []
+    bus = LocalBus()
+    estimator = make_estimator(job.config, job.priors)
+    role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, frames.extend if keep_frames else None)
+    for key in (job.imu.key, *(_points_key(job, name) for name in job.cameras)):
+        bus.subscribe(key, role.take)
+    _attach_detectors(bus, job)
+    total = job.imu.count + sum(stream.count for stream in job.cameras.values())
+    t_shown_s = time.monotonic()
+    for done, (key, payload) in enumerate(job.recording.messages([job.imu, *job.cameras.values()])):
+        bus.publish(key, payload)
+        if key != job.imu.key:
+            publish(bus, role.step())
+            if time.monotonic() - t_shown_s > 0.1:
+                t_shown_s = time.monotonic()
+                progress(done / total, role.latest)
+    publish(bus, role.finish())
+    assert role.latest is not None
+    traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
+    return Outcome(role.latest, traces, frames)
+
+
+def document(job: Job, outcome: Outcome) -> dict[str, Any]:
+    """Return the result as `--json` prints it; `cpu_s` counts from the start of the process."""
+    result = outcome.estimate.to_json()
+    result["status"] = str(outcome.estimate.status)
+    result["duration_s"] = job.recording.duration_s
+    for name, camera in result["cameras"].items():
+        camera["resolution"] = list(job.priors[name].resolution)
+    if result["imu"] is not None:
+        result["imu"]["noise"] = asdict(_noise_of(job))
+    result["warnings"] = list(job.recording.warnings)
+    first = next(iter(job.cameras))
+    result["trace"] = outcome.traces[first]
+    if len(job.cameras) > 1:
+        result["traces"] = outcome.traces
+    result["cpu_s"] = time.process_time()
+    return result
+
+
+def _attach_detectors(bus: LocalBus, job: Job) -> None:
+    """Give a detector to each camera that comes as images; its points go back on the same bus."""
+    images = {name for name, stream in job.cameras.items() if stream.kind in ("image", "compressed")}
+    if not images:
+        return
+    from vical_daemon.roles.detect import DetectRole
+
+    for name in images:
+        detect = DetectRole(job.config, name)
+
+        def on_image(sample: Sample, detect: DetectRole = detect) -> None:
+            publish(bus, detect.points(sample))
+
+        bus.subscribe(job.cameras[name].key, on_image)
+
+
+def _points_key(job: Job, camera: str) -> str:
+    stream = job.cameras[camera]
+    if stream.kind in ("points", "tracks"):
+        return stream.key
+    free = job.config.calibration.mode == "target_free"
+    return (topics.tracks_key if free else topics.points_key)(job.config.rig, camera)
+
+
+def _choose(what: str, streams: dict[str, Stream], name: str | None) -> Stream:
+    if name is None:
+        if len(streams) == 1:
+            return next(iter(streams.values()))
+        known = ", ".join(streams) or "none"
+        raise CliError(
+            f"the recording has {len(streams)} {what}s ({known}); say which with --{what}", EXIT_USAGE
+        )
+    if name not in streams:
+        raise CliError(
+            f"there is no {what} {name!r} in the recording (known: {', '.join(streams) or 'none'})"
+        )
+    return streams[name]
+
+
+def _prior(name: str, stream: Stream, initial: Initial, fix: Sequence[str]) -> CameraPrior:
+    """Return the prior of one camera; a single camera of another name in the file is meant for it."""
+    cameras = initial.cameras
+    prior = cameras.get(name)
+    if prior is None and len(cameras) == 1:
+        prior = next(iter(cameras.values()))
+    prior = prior or CameraPrior(resolution=(0, 0))
+    if prior.resolution == (0, 0):
+        if stream.resolution is None:
+            raise CliError(
+                f"{name}: the image size is neither in the recording nor in --initial; "
+                f"give a file with `{name}: {{resolution: [width, height]}}`",
+                EXIT_USAGE,
+            )
+        prior = replace(prior, resolution=stream.resolution)
+    elif stream.resolution is not None and stream.resolution != prior.resolution:
+        given_size, size = ("{} x {}".format(*r) for r in (prior.resolution, stream.resolution))
+        raise CliError(f"{name}: --initial is for images of {given_size}, the recording's are {size}")
+    given = {
+        "intrinsics": prior.intrinsics,
+        "extrinsics": prior.T_imu_cam,
+        "timeshift": prior.timeshift_cam_imu_s,
+    }
+    for what in fix:
+        if given[what] is None:
+            raise CliError(f"--fix {what}: --initial does not give it for {name}", EXIT_USAGE)
+    return prior
+
+
+def _noise_of(job: Job) -> ImuNoise:
+    imu = job.config.imus[job.imu.name]
+    n = imu.noise
+    return ImuNoise(n.gyro_density, n.gyro_walk, n.accel_density, n.accel_walk, imu.rate_hz)

@@ -1,0 +1,75 @@
+"""A calibration result in words and columns, for `vical calibrate` and `vical demo`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def describe(result: dict[str, Any]) -> str:
+    """Return the text of a result document (see `vical calibrate --json`)."""
+    lines = [_headline(result)]
+    for name, camera in result["cameras"].items():
+        lines += ["", f"{name} in the imu frame", *_camera_lines(camera)]
+    imu = result.get("imu")
+    if imu is not None:
+        lines += ["", "imu"]
+        lines.append(_row("gyro bias", imu["gyro_bias_rps"], imu.get("gyro_bias_sigma_rps"), "rad/s", 6))
+        lines.append(
+            _row("accelerometer bias", imu["accel_bias_mps2"], imu.get("accel_bias_sigma_mps2"), "m/s^2", 4)
+        )
+        lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
+    lines += [
+        "",
+        f"  NIS per degree of freedom {result['nis_per_dof']:.2f} (1 when consistent), "
+        f"{100 * result['rejected_fraction']:.2f} % of the points refused",
+    ]
+    return "\n".join(lines)
+
+
+def euler_deg(q_wxyz: list[float]) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw in degrees (R = Rz(yaw) Ry(pitch) Rx(roll)); for reading only.
+
+    >>> [round(a) for a in euler_deg([math.cos(0.5), 0.0, 0.0, math.sin(0.5)])]
+    [0, 0, 57]
+    """
+    w, x, y, z = q_wxyz
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
+
+
+def _headline(result: dict[str, Any]) -> str:
+    reason = f": {result['reason']}" if result["reason"] else ""
+    return (
+        f"{result['status']}{reason}  ({result['duration_s']:.1f} s, {result['frames']} frames, "
+        f"{result['imu_samples']} imu samples, {result.get('cpu_s', 0.0):.1f} s of CPU)"
+    )
+
+
+def _camera_lines(camera: dict[str, Any]) -> list[str]:
+    pose = camera["T_imu_cam"]
+    sigma = [math.sqrt(max(row[i], 0.0)) for i, row in enumerate(pose["covariance"])]
+    shift_ms = 1e3 * camera["timeshift_cam_imu_s"]
+    lines = [
+        _row("position", [1e3 * p for p in pose["p_m"]], [1e3 * s for s in sigma[:3]], "mm", 2),
+        _row("quaternion w x y z", pose["q_wxyz"], None, "", 6),
+        _row("roll pitch yaw", list(euler_deg(pose["q_wxyz"])), None, "deg", 3),
+        _row("rotation sigma x y z", [math.degrees(s) for s in sigma[3:]], None, "deg", 4),
+        _row("time shift", [shift_ms], [1e3 * camera["timeshift_sigma_s"]], "ms", 3)
+        + "  (t_imu = t_cam + shift)",
+        _row("fx fy cx cy", camera["intrinsics"], camera["intrinsics_sigma"], "px", 2),
+        _row(camera["distortion_model"], camera["distortion"], camera["distortion_sigma"], "", 5),
+        f"  {'reprojection rms':<22}{camera['reprojection_rms_px']:.3f} px",
+    ]
+    lines += [f"  withheld: {what}" for what in camera["unobservable"]]
+    return lines
+
+
+def _row(name: str, values: list[float], sigmas: list[float] | None, unit: str, digits: int) -> str:
+    if sigmas and any(sigmas):
+        text = "  ".join(f"{v:.{digits}f} ± {s:.{digits}f}" for v, s in zip(values, sigmas, strict=True))
+    else:
+        text = "  ".join(f"{v:.{digits}f}" for v in values)
+    return f"  {name:<22}{text} {unit}".rstrip()

@@ -1,0 +1,54 @@
+"""Chooses what finds points in images: a detector for the board, or a tracker of natural features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+from vical_daemon.config import Config, ConfigError
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+
+
+class Found(Protocol):
+    """Points of one image; see `vision.detection.Detection`."""
+
+    @property
+    def ids(self) -> IntArray:
+        """Point or feature ids, shape (n,)."""
+        ...
+
+    @property
+    def uv_px(self) -> FloatArray:
+        """Pixel coordinates, shape (n, 2)."""
+        ...
+
+    @property
+    def sigma_px(self) -> FloatArray | None:
+        """One-sigma per axis, shape (n,), or None."""
+        ...
+
+
+def make_detector(config: Config) -> Callable[[Any], Found]:
+    """Make the detector of one camera (it may remember the image before).
+
+    Raises:
+        ConfigError: The target file is missing or wrong.
+    """
+    if config.calibration.mode == "target_free":
+        return _tracker()
+    from vical_daemon.vision.detector import make_detector as for_target
+    from vical_daemon.vision.target import load_target
+
+    assert config.target_path is not None  # `config.load` has seen to it
+    return for_target(load_target(config.target_path)).detect
+
+
+def _tracker() -> Callable[[Any], Found]:
+    """Look the module up: a build without it says so in one line."""
+    name = "vical_daemon.vision.tracker"
+    if find_spec(name) is None:
+        raise ConfigError("calibration without a target is not in this build; give a target file (--target)")
+    detect: Callable[[Any], Found] = import_module(name).FeatureTracker().detect
+    return detect

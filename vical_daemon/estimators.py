@@ -1,0 +1,72 @@
+"""Chooses the estimator that a config asks for; target-based and target-free look the same from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+from vical_daemon.config import Config, ConfigError
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.priors import calibration_options, camera_prior
+
+
+class Estimator(Protocol):
+    """What a role needs of an estimator; see `Calibrator`."""
+
+    def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
+        """Take one inertial sample."""
+        ...
+
+    def add_points(self, frame: PointsFrame) -> None:
+        """Take the points of one image."""
+        ...
+
+    def process(self) -> Sequence[Any]:
+        """Do what can be done with what has arrived."""
+        ...
+
+    def finish(self) -> Sequence[Any]:
+        """End of the data."""
+        ...
+
+    def estimate(self) -> CalibrationEstimate:
+        """Return what is known now; takes the events since the last call along."""
+        ...
+
+    def trace(self, camera: str) -> list[TracePoint]:
+        """Return how the calibration of one camera developed."""
+        ...
+
+
+def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None) -> Estimator:
+    """Make the estimator of a rig.
+
+    Args:
+        config: The rig.
+        priors: What is known about the cameras; None: what the config says.
+
+    Raises:
+        ConfigError: The target file is missing or wrong.
+    """
+    options = calibration_options(config)
+    if priors is None:
+        priors = {name: camera_prior(config, name) for name in config.calibration_cameras}
+    if options.target_free:
+        return _target_free(options, priors)
+    from vical_daemon.estimation.calibrator import Calibrator
+    from vical_daemon.vision.target import load_target
+
+    assert config.target_path is not None  # `config.load` has seen to it
+    return Calibrator(options, priors, load_target(config.target_path).points_m)
+
+
+def _target_free(options: CalibrationOptions, priors: dict[str, CameraPrior]) -> Estimator:
+    """Look the module up: a build without it says so in one line."""
+    name = "vical_daemon.estimation.target_free"
+    if find_spec(name) is None:
+        raise ConfigError("calibration without a target is not in this build; give a target file (--target)")
+    estimator: Estimator = import_module(name).TargetFreeCalibrator(options, priors)
+    return estimator

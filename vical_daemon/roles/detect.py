@@ -1,0 +1,135 @@
+"""Role detect: images in, target points (or feature tracks) out; the newest image wins when it is slow."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from vical_daemon import topics
+from vical_daemon.bus import Bus, Sample
+from vical_daemon.config import Config
+from vical_daemon.detectors import Found, make_detector
+from vical_daemon.health import StatusSender
+from vical_daemon.messages import (
+    DiagnosticStatus,
+    Level,
+    MessageError,
+    decode_compressed_image,
+    decode_image,
+    encode_points,
+)
+from vical_daemon.places import make_private, runtime_directory
+from vical_daemon.publications import Message, publish
+from vical_daemon.wall_clock import WallClock, shared_clock
+
+QUEUE_DEPTH = 2
+JOIN_S = 3.0
+
+
+class DetectRole:
+    """Finds the points in the images of one camera. No I/O.
+
+    Args:
+        config: The rig.
+        camera: Name of the camera.
+        detector: Finds points in one image; None: what the config asks for.
+    """
+
+    def __init__(self, config: Config, camera: str, detector: Callable[[Any], Found] | None = None) -> None:
+        self.camera = camera
+        free = config.calibration.mode == "target_free"
+        self.key = (topics.tracks_key if free else topics.points_key)(config.rig, camera)
+        self._detect = detector or make_detector(config)
+        self._period_ns = 1e9 / config.calibration.detect_rate_hz
+        self._next_ns = 0.0
+        self._images = self._found = self._malformed = self._skipped = 0
+        self._busy_s = 0.0
+
+    def points(self, sample: Sample) -> list[Message]:
+        """Return the points message of one image (also when nothing was found); [] if it was skipped."""
+        begin_s = time.perf_counter()
+        try:
+            stamp_ns, image = _decode(sample)
+            if stamp_ns < self._next_ns - 0.5 * self._period_ns:
+                self._skipped += 1
+                return []
+            self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
+            found = self._detect(image)
+        except (MessageError, ValueError):
+            self._malformed += 1
+            return []
+        self._images += 1
+        self._found += len(found.ids) > 0
+        height, width = image.shape[:2]
+        payload = encode_points(
+            stamp_ns, self.camera, found.ids, found.uv_px, found.sigma_px, (width, height)
+        )
+        self._busy_s += time.perf_counter() - begin_s
+        return [(self.key, payload)]
+
+    def status(self, dropped: int = 0) -> DiagnosticStatus:
+        """Return how it goes; `dropped`: images that came while it was busy."""
+        share = self._found / self._images if self._images else 0.0
+        values = {
+            "images": str(self._images),
+            "with_points": str(self._found),
+            "skipped": str(self._skipped),
+            "dropped": str(dropped),
+            "malformed": str(self._malformed),
+            "detection_ms": f"{1e3 * self._busy_s / self._images if self._images else 0.0:.2f}",
+        }
+        message = f"{share:.0%} of {self._images} images show points"
+        level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK
+        return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)
+
+
+def _decode(sample: Sample) -> tuple[int, Any]:
+    """Return the stamp and the pixels of a raw or compressed image."""
+    parsed = topics.parse_key(sample.key)
+    if parsed is not None and parsed.topic is topics.COMPRESSED:
+        from vical_daemon.vision.images import decode_image_file
+
+        message = decode_compressed_image(sample.payload)
+        return message.stamp_ns, decode_image_file(bytes(message.data))
+    image = decode_image(sample.payload)
+    return image.stamp_ns, image.pixels()
+
+
+def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | None = None) -> None:
+    """Detect in the images of every camera to be calibrated until `stop`.
+
+    Args:
+        config: The rig.
+        bus: Where images come from and points go.
+        stop: Ends the role.
+        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+    """
+    clock = clock or shared_clock(make_private(runtime_directory()))
+    workers = [_Worker(config, name, bus, stop) for name in config.calibration_cameras]
+    for worker in workers:
+        worker.thread.start()
+    StatusSender(config.rig, "detect", bus, clock).run_until(stop, lambda: [w.status() for w in workers])
+    for worker in workers:
+        worker.subscription.close()
+        worker.thread.join(JOIN_S)
+
+
+class _Worker:
+    """One camera's thread: takes the newest image, detects, publishes."""
+
+    def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
+        self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
+        key = topics.image_key(config.rig, camera)
+        self.subscription = bus.subscribe(key, depth=QUEUE_DEPTH, newest_wins=True)
+        self.thread = threading.Thread(target=self._run, name=f"detect/{camera}", daemon=True)
+
+    def status(self) -> DiagnosticStatus:
+        return self._role.status(self.subscription.dropped)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            sample = self.subscription.recv(0.2)
+            if sample is not None:
+                publish(self._bus, self._role.points(sample))
