@@ -1,0 +1,230 @@
+"""The report: self-contained, complete, honest about what is missing; its statistics against brute force."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vical_daemon.report import ClockSeries, ReportError, collect, write_report
+from vical_daemon.report.residuals import cells, gather, per_point_rms
+from vical_daemon.report.values import value, warnings_of
+
+SIZE = (640, 480)
+
+
+@dataclass(frozen=True)
+class Frame:
+    t_ns: int
+    camera: str
+    ids: np.ndarray
+    uv_px: np.ndarray
+    residual_px: np.ndarray
+    accepted: np.ndarray
+    nis: float
+    dof: int
+
+
+def make_frames(rng, count=120, sigma=0.25):
+    frames = []
+    for k in range(count):
+        centre = rng.uniform((160, 120), (480, 360))
+        grid = np.stack(np.meshgrid(np.arange(8), np.arange(6)), axis=-1).reshape(-1, 2) * 30.0
+        uv = grid + centre - grid.mean(axis=0)
+        residual = sigma * rng.standard_normal(uv.shape) + 0.0006 * (uv - 320.0)
+        accepted = rng.uniform(size=len(uv)) > 0.02
+        residual[~accepted] += 3.0
+        dof = 2 * int(accepted.sum())
+        frames.append(
+            Frame(
+                int(1e18) + k * 50_000_000,
+                "cam0",
+                np.arange(48),
+                uv,
+                residual,
+                accepted,
+                rng.chisquare(dof),
+                dof,
+            )
+        )
+    return frames
+
+
+def make_trace(seconds=60):
+    rng, trace = np.random.default_rng(0), []
+    final = Rotation.from_euler("zyx", [89, 1, 0.2], degrees=True)
+    for t in range(1, seconds):
+        p_sigma, r_sigma, s_sigma = 0.02 / t, 0.01 / t, 5e-4 / t
+        q = (final * Rotation.from_rotvec(r_sigma * rng.standard_normal(3))).as_quat(scalar_first=True)
+        trace.append(
+            {
+                "t_s": float(t),
+                "p_m": (np.array([0.08, 0.02, -0.03]) + p_sigma * rng.standard_normal(3)).tolist(),
+                "p_sigma_m": [p_sigma] * 3,
+                "q_wxyz": q.tolist(),
+                "r_sigma_rad": [r_sigma] * 3,
+                "timeshift_s": -0.0052 + s_sigma * rng.standard_normal(),
+                "timeshift_sigma_s": s_sigma,
+                "nis_per_dof": 1.0,
+                "status": "converging",
+            }
+        )
+    return trace
+
+
+@pytest.fixture
+def result():
+    q = Rotation.from_euler("zyx", [89, 1, 0.2], degrees=True).as_quat(scalar_first=True)
+    return {
+        "status": "converged",
+        "reason": "",
+        "duration_s": 60.0,
+        "cpu_s": 4.1,
+        "frames": 1200,
+        "imu_samples": 6000,
+        "cameras": {
+            "cam0": {
+                "T_imu_cam": {
+                    "p_m": [0.0801, 0.0199, -0.0302],
+                    "q_wxyz": q.tolist(),
+                    "covariance": np.diag([9e-8, 8e-8, 2e-7, 1e-8, 2e-8, 3e-9]).tolist(),
+                },
+                "timeshift_cam_imu_s": -0.00521,
+                "timeshift_sigma_s": 1.8e-5,
+                "intrinsics": [520.1, 519.8, 321.0, 239.4],
+                "intrinsics_sigma": [0.3, 0.3, 0.2, 0.2],
+                "distortion_model": "radtan",
+                "distortion": [-0.28, 0.07, 0.0002, 0.0],
+                "distortion_sigma": [1e-3, 2e-3, 1e-4, 1e-4],
+                "reprojection_rms_px": 0.26,
+                "corner_sigma_px": 0.25,
+                "unobservable": [],
+                "resolution": list(SIZE),
+            }
+        },
+        "imu": {
+            "gyro_bias_rps": [0.001, -0.002, 0.003],
+            "accel_bias_mps2": [0.02, 0.01, -0.05],
+            "gyro_bias_sigma_rps": [1e-5] * 3,
+            "accel_bias_sigma_mps2": [2e-3] * 3,
+        },
+        "gravity_world_mps2": [0.1, 9.79, 0.3],
+        "nis_per_dof": 1.02,
+        "rejected_fraction": 0.02,
+        "trace": make_trace(),
+    }
+
+
+def test_report_is_complete_and_self_contained(result, tmp_path):
+    rng = np.random.default_rng(1)
+    data = tmp_path / "input.bin"
+    data.write_bytes(b"abc")
+    path, pngs = tmp_path / "r.html", tmp_path / "png"
+    write_report(
+        path,
+        result,
+        make_frames(rng),
+        clocks=[ClockSeries("imu0", np.arange(500) / 100, rng.exponential(80, 500))],
+        provenance=collect("vical calibrate input.bin --target t.yaml", [data], {"seed": 1}),
+        png_folder=pngs,
+    )
+    text = path.read_text()
+    outside = re.findall(r"(?:src|href)=\"(?!data:)[^\"]*|url\([^)]*|https?://[^\"'< ]*", text)
+    assert outside == []
+    assert "<script" not in text
+    for needed in (
+        "converged",
+        "80.10",
+        "-5.210",
+        "0.018",
+        "gyro bias",
+        "SHA-256",
+        "--target t.yaml",
+        "Clocks",
+    ):
+        assert needed in text, needed
+    assert "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad" in text  # sha256("abc")
+    names = {p.stem for p in pngs.glob("*.png")}
+    kinds = ("convergence", "sigmas", "nis", "map", "scatter", "frames", "correlation")
+    assert names == {f"cam0-{kind}" for kind in kinds} | {"clock-imu0"}
+    assert len(text) < 4_000_000
+
+
+def test_report_without_frames_says_so(result, tmp_path):
+    result["trace"] = result["trace"][:1]
+    path = tmp_path / "r.html"
+    write_report(path, result)
+    assert "residuals of the frames were not kept" in path.read_text()
+
+
+def test_names_from_outside_are_escaped(result, tmp_path):
+    result |= {"reason": "<script>alert(1)</script>", "trace": []}
+    result["cameras"]["<b>"] = result["cameras"].pop("cam0")
+    path = tmp_path / "r.html"
+    write_report(path, result)
+    assert "<script" not in path.read_text()
+    assert "<b>" not in path.read_text()
+
+
+def test_no_solution_and_no_folder_are_said(result, tmp_path):
+    with pytest.raises(ReportError, match="no solution"):
+        write_report(tmp_path / "r.html", {"cameras": {}, "reason": "no board seen"})
+    result["trace"] = []
+    with pytest.raises(ReportError, match="cannot write"):
+        write_report(tmp_path / "none" / "r.html", result)
+
+
+def test_warnings_name_what_must_not_be_used(result):
+    assert warnings_of(result) == []
+    result["status"] = "degenerate"
+    result["cameras"]["cam0"]["unobservable"] = ["lever arm along cam z: rotate about x and y"]
+    result |= {"nis_per_dof": 2.2, "rejected_fraction": 0.2, "guidance": "rotate about the optical axis"}
+    text = " ".join(warnings_of(result))
+    for needed in ("degenerate", "lever arm along cam z", "2.20", "20.0 %", "rotate about the optical axis"):
+        assert needed in text
+
+
+def test_cells_equal_a_loop():
+    rng = np.random.default_rng(2)
+    points = gather(make_frames(rng, 20), "cam0")
+    found = cells(points, SIZE, across=8)
+    assert found.count.sum() == points.accepted.sum()
+    for line in range(found.count.shape[0]):
+        for column in range(8):
+            inside = (
+                points.accepted
+                & (points.uv_px[:, 0] >= found.x_edges[column])
+                & (points.uv_px[:, 0] < found.x_edges[column + 1])
+                & (points.uv_px[:, 1] >= found.y_edges[line])
+                & (points.uv_px[:, 1] < found.y_edges[line + 1])
+            )
+            assert found.count[line, column] == inside.sum()
+            if inside.sum() >= 5:
+                assert found.mean_px[line, column] == pytest.approx(points.residual_px[inside].mean(axis=0))
+                assert found.rms_px[line, column] == pytest.approx(
+                    np.sqrt((points.residual_px[inside] ** 2).mean())
+                )
+
+
+def test_point_rms_and_refused_share():
+    frames = make_frames(np.random.default_rng(3), 30)
+    points = gather(frames, "cam0")
+    ids, rms, refused = per_point_rms(points)
+    own = np.concatenate([f.residual_px[(f.ids == 7) & f.accepted] for f in frames])
+    assert rms[list(ids).index(7)] == pytest.approx(np.sqrt((own**2).mean()))
+    assert refused[7] == pytest.approx(np.mean([not f.accepted[7] for f in frames]))
+    assert gather(frames, "other") is None
+
+
+@pytest.mark.parametrize(
+    ("number", "sigma", "shown"),
+    [
+        (1.23456, 0.012, ("1.235", "0.012")),
+        (5, 120.0, ("5", "120")),
+        (2, 0.0, ("2", "fixed")),
+        (2, None, ("2", "")),
+    ],
+)
+def test_values_have_the_digits_of_their_sigma(number, sigma, shown):
+    assert value(number, sigma) == shown
