@@ -275,7 +275,7 @@ def pixel_jacobians(rig: Rig, frame: SimulatedFrame, points_m: FloatArray) -> di
     moving = np.cross(in_imu, rig.trajectory.omega_imu_rps(t_s)) - R.T @ rig.trajectory.v_world_imu(t_s)
     by_time = np.einsum("nij,nj->ni", by_imu, moving)
     uv, _ = rig.lens.project(in_cam)
-    row_share = uv[:, 1] / (rig.lens.resolution[1] - 1)
+    row_share = uv[:, 1] / rig.lens.resolution[1] - 0.5
     blocks = {
         "attitude": by_imu @ skew(in_imu),
         "position": -by_imu @ R.T,

@@ -31,7 +31,7 @@ class SimulatedFrame:
         t_cam_ns: Stamp in the camera's clock, ns.
         ids: Point ids, shape (n,).
         uv_px: Pixels with noise, shape (n, 2).
-        t_s: True imu-clock time of the (first row of the) exposure, s since the start; truth, not data.
+        t_s: True imu-clock time of the (middle row of the) exposure, s since the start; truth.
         outlier: Which corners were made wrong on purpose, shape (n,); truth, not data.
     """
 
@@ -190,9 +190,9 @@ def project_points(
     uv, visible = rig.lens.project(rig.points_in_camera(t_s, points_m))
     if rig.readout_s == 0.0:
         return uv, visible
-    rows = rig.lens.resolution[1] - 1
+    height = rig.lens.resolution[1]
     for _ in range(4):  # where a point appears says when its row is read, which moves the point
-        t_row = t_s[:, None] + rig.readout_s * np.clip(uv[..., 1] / rows, 0.0, 1.0)
+        t_row = t_s[:, None] + rig.readout_s * (np.clip(uv[..., 1] / height, 0.0, 1.0) - 0.5)
         R, p = rig.camera_pose_target(t_row)
         uv, visible = rig.lens.project(np.einsum("fnji,fnj->fni", R, points_m - p))
     return uv, visible

@@ -112,7 +112,8 @@ class Rig:
         clock_skew_ppm: Growth of the shift, microseconds per second.
         gravity_world_mps2: Acceleration of free fall in the target frame; not along an axis.
         lens: Intrinsics and distortion.
-        readout_s: First to last row; 0: global shutter. The frame's stamp is that of the *first* row.
+        readout_s: First to last row; 0: global shutter. The frame's stamp is that of the middle row:
+            row v is taken readout_s * (v / height - 0.5) later.
         densities: White noise and bias walks of the imu.
         gyro_bias, accel_bias: rad/s and m/s^2.
         gyro_matrix, accel_matrix: Scale and misalignment: reading = matrix @ truth + bias + noise.

@@ -99,7 +99,7 @@ def test_bump_changes_extrinsics_and_shift_from_its_time_on():
 def test_rolling_shutter_rows_are_later():
     run = noise_free_run(readout_s=0.02)
     frame = run.frames[30]
-    t_row = frame.t_s + 0.02 * frame.uv_px[:, 1] / 479
+    t_row = frame.t_s + 0.02 * (frame.uv_px[:, 1] / 480 - 0.5)
     R, p = run.rig.camera_pose_target(t_row)
     p_cam = np.einsum("nji,nj->ni", R, board_points()[frame.ids] - p)
     np.testing.assert_allclose(frame.uv_px, run.rig.lens.project(p_cam)[0], atol=1e-3)
