@@ -2,8 +2,8 @@
 
 Model for sensor s: `R_world_s(t) = R_world_ref R_ref_imu(t + shift_s) R_imu_s Exp(noise)`. Shifts,
 mountings, worlds, gyro bias and the drift of the integrated gyro are one least-squares problem (see
-`drift_smoother`); pairs of closest points are not used any more. How large the noises are is itself estimated by restricted
-maximum likelihood, so that the sigmas that come out are those the data support.
+`drift_smoother`); pairs of closest points are not used any more. How large the noises are is itself estimated
+by restricted maximum likelihood, so that the sigmas that come out are those the data support.
 """
 
 from __future__ import annotations
