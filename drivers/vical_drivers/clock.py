@@ -316,3 +316,41 @@ class DeviceClock:
         self._last_t_ns, self._stamped_ticks = t_ns, unwrapped_ticks
         sigma_s = math.hypot(self.envelope.sigma_s, 1.0 / self.tick_hz / math.sqrt(12.0))
         return Stamp(t_ns, round(min(sigma_s, 1.0) * _NS), unwrapped_ticks, lost)
+
+
+class SampleCounter:
+    """A clock for devices that send none: one tick per sample, with losses guessed from the arrivals.
+
+    A lost sample makes everything after it late by one period, for good; so ticks are left out when even the
+    luckiest of the last samples is most of a period behind the luckiest before them. The guess comes `memory`
+    samples after the loss.
+
+    Args:
+        rate_hz: Nominal sample rate.
+        memory: Number of samples that must agree.
+    """
+
+    def __init__(self, rate_hz: float, memory: int = 50) -> None:
+        self._period_ns = _NS / rate_hz
+        self._recent: deque[float] = deque(maxlen=memory)
+        self._before: deque[float] = deque(maxlen=memory * 20)
+        self._ticks = 0
+        self._first_ns: int | None = None
+
+    def count(self, t_arrival_ns: int) -> int:
+        """Return the tick of the sample that arrived now."""
+        if self._first_ns is None:
+            self._first_ns = t_arrival_ns
+        self._ticks += 1
+        lateness = (t_arrival_ns - self._first_ns) - self._ticks * self._period_ns
+        if len(self._recent) == self._recent.maxlen:
+            self._before.append(self._recent[0])
+        self._recent.append(lateness)
+        if len(self._before) >= self._recent.maxlen if self._recent.maxlen else False:
+            behind = (min(self._recent) - min(self._before)) / self._period_ns
+            if behind > 0.75:
+                missed = round(behind)
+                self._ticks += missed
+                self._before.clear()
+                self._recent.clear()
+        return self._ticks

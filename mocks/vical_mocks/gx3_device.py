@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 
 from vical_mocks.clock import SkewedClock
+from vical_mocks.gx3_mip import MipFace
 from vical_mocks.gx3_single_byte import SingleByteFace
 from vical_mocks.gx3_state import Gx3State, Identity, Settings
 from vical_mocks.imu import BASE_RATE_HZ, ImuErrors, ImuModel, Motion
@@ -21,10 +22,16 @@ class Gx3Device:
         motion: True motion over host seconds; None for at rest.
         clock: Its crystal.
         protocol: "single-byte" (firmware below 2) or "mip".
+        model: For MIP: "gx3", "gx5" or "cv7" (see `gx3_mip.MODELS`).
         errors: Sensor errors; None for none.
         seed: Seed of the sensor noise.
         identity: What it answers when asked who it is.
         eeprom: What it starts with.
+        first_ticks: Its timer at the first power-up.
+
+    Attributes:
+        baud: Bits a second of its UART.
+        sent: (timer, true host time) of the cycles that sent something: the truth for time stamps.
     """
 
     def __init__(
@@ -33,6 +40,7 @@ class Gx3Device:
         *,
         clock: SkewedClock | None = None,
         protocol: str = "single-byte",
+        model: str = "gx3",
         errors: ImuErrors | None = None,
         seed: int = 0,
         identity: Identity | None = None,
@@ -40,40 +48,53 @@ class Gx3Device:
         first_ticks: int = 0,
     ) -> None:
         self.clock = clock or SkewedClock()
-        model = ImuModel(motion, self.clock, errors, seed)
-        self.state = Gx3State(model, self.clock, identity or Identity(), eeprom=eeprom or Settings())
-        self.state.ticks_offset = first_ticks
-        self.face = SingleByteFace(self.state, self._reset, self._change_baud)
-        self.protocol = protocol
+        imu = ImuModel(motion, self.clock, errors, seed)
+        self.state = Gx3State(imu, self.clock, identity or Identity(), eeprom=eeprom or Settings())
+        self.face: SingleByteFace | MipFace
+        if protocol == "mip":
+            self.face = MipFace(self.state, self._reset, self._change_baud, model)
+        elif protocol == "single-byte":
+            self.face = SingleByteFace(self.state, self._reset, self._change_baud)
+        else:
+            raise ValueError(f"unknown protocol {protocol!r}; known are single-byte, mip")
         self.sent: deque[tuple[int, float]] = deque(maxlen=2_000_000)
         self._next_k = 0
-        self._baud_after: int | None = None
-        self.power_up()
+        self._coming_baud: int | None = None
+        self.power_up(self.clock.t_start_s)
+        self.state.set_ticks(0, first_ticks)
 
-    def power_up(self) -> None:
-        """As after the supply came on (the base sample counter keeps running for the model's sake)."""
+    def power_up(self, t_host_s: float) -> None:
+        """As after the supply came on: settings from the EEPROM, timer at zero."""
         self.state.power_up()
         self.face.power_up()
-
-    def _reset(self) -> None:
-        self.power_up()
+        self.baud = self.state.settings.baud
+        self._coming_baud = None
+        self._next_k = self._k_after(t_host_s)
         self.state.set_ticks(self._next_k, 0)
 
-    def _change_baud(self, baud: int) -> None:
-        self._baud_after = baud
+    def _k_after(self, t_host_s: float) -> int:
+        """First base sample after a host time that ends a cycle."""
+        k = int(self.clock.device_s(t_host_s) * BASE_RATE_HZ) + 1
+        period = self.face.period()
+        return -(-k // period) * period
 
-    @property
-    def baud(self) -> int:
-        """Baud of its UART now."""
-        return self.state.settings.baud
+    def _reset(self) -> None:
+        self.power_up(self.clock.host_s(self._next_k / BASE_RATE_HZ))
+
+    def _change_baud(self, baud: int) -> None:
+        self._coming_baud = baud
+
+    def wire_is_idle(self) -> None:
+        """Tell the device that all it said has left the wire: now a new baud takes effect."""
+        if self._coming_baud is not None:
+            self.baud, self._coming_baud = self._coming_baud, None
 
     def receive(self, data: bytes, t_host_s: float) -> None:
         """Take bytes from the host; they act at the end of the running cycle."""
-        if not self.face.busy:
-            k = int(self.clock.device_s(t_host_s) * BASE_RATE_HZ) + 1
-            period = self.face.period()
-            self._next_k = max(self._next_k, -(-k // period) * period)
+        before = self.face.busy
         self.face.receive(data)
+        next_k = self._k_after(t_host_s)
+        self._next_k = min(self._next_k, next_k) if before else max(self._next_k, next_k)
 
     def next_s(self) -> float | None:
         """Host time of the next cycle; None while there is nothing to do."""
@@ -88,5 +109,5 @@ class Gx3Device:
                 out.append((t_s, data))
                 self.sent.append((self.state.ticks(k), t_s))
             period = self.face.period()
-            self._next_k = (k // period + 1) * period
+            self._next_k = max(self._next_k, (k // period + 1) * period)
         return out

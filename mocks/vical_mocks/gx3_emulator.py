@@ -25,6 +25,7 @@ import numpy as np
 
 from vical_mocks.clock import LINKS, SkewedClock, make_link
 from vical_mocks.gx3_device import Gx3Device
+from vical_mocks.gx3_mip import MODELS
 from vical_mocks.gx3_state import Identity, Settings
 from vical_mocks.imu import GX3_25_ERRORS, ImuErrors, Motion
 
@@ -39,6 +40,7 @@ class Gx3Emulator:
         motion: True motion: host seconds (CLOCK_MONOTONIC), shape (n,) -> angular rate rad/s (n, 3) and
             specific force m/s^2 (n, 3). None: level and at rest.
         protocol: "single-byte" or "mip".
+        model: For MIP: "gx3", "gx5" or "cv7".
         link: One of "direct", "usb", "uart", "ftdi": how bytes are delayed and bunched.
         clock_skew_ppm: Rate error of the device's crystal.
         clock_wander_ppm: Amplitude of its slow change.
@@ -55,6 +57,7 @@ class Gx3Emulator:
         motion: Motion | None = None,
         *,
         protocol: str = "single-byte",
+        model: str = "gx3",
         link: str = "usb",
         clock_skew_ppm: float = 0.0,
         clock_wander_ppm: float = 0.0,
@@ -72,7 +75,7 @@ class Gx3Emulator:
         self._baud_matters = link in ("uart", "ftdi") if baud_matters is None else baud_matters
         identity = Identity(serial_number=serial_number)
         self.device = Gx3Device(
-            motion, clock=self._clock, protocol=protocol, errors=errors, seed=seed,
+            motion, clock=self._clock, protocol=protocol, model=model, errors=errors, seed=seed,
             identity=identity, eeprom=eeprom, first_ticks=first_ticks,
         )  # fmt: skip
         self._folder = tempfile.TemporaryDirectory(prefix="vical-gx3-")
@@ -81,6 +84,7 @@ class Gx3Emulator:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._master = self._slave = -1
+        self._plugged_before = False
         self._wake_r, self._wake_w = os.pipe()
         self.plug()
 
@@ -89,6 +93,7 @@ class Gx3Emulator:
         with self._lock:
             if self._master >= 0:
                 return
+            replugged, self._plugged_before = self._plugged_before, True
             self._master, self._slave = os.openpty()
             tty.setraw(self._slave)
             os.set_blocking(self._master, False)
@@ -96,7 +101,8 @@ class Gx3Emulator:
             name.unlink(missing_ok=True)
             name.symlink_to(os.ttyname(self._slave))
             self._link = make_link(self._link_kind, self._rng, self.device.baud)
-            self.device.power_up()
+            if replugged:
+                self.device.power_up(time.monotonic())
         self._wake()
 
     def unplug(self) -> None:
@@ -151,9 +157,11 @@ class Gx3Emulator:
         self._take_input(now_s)
         for t_s, data in self.device.advance(now_s):
             self._link.push(data, t_s)
-        self._link.set_baud(self.device.baud)
         for _, data in self._link.poll(now_s):
             self._give(data)
+        if self._link.next_s() is None:
+            self.device.wire_is_idle()
+            self._link.set_baud(self.device.baud)
         due = [t for t in (self.device.next_s(), self._link.next_s()) if t is not None]
         return max(0.0, min([*due, now_s + _IDLE_S]) - time.monotonic())
 
@@ -199,6 +207,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Emulate a MicroStrain 3DM-GX3-25 on a pseudo terminal; prints the terminal's name.",
     )
     parser.add_argument("--protocol", choices=("single-byte", "mip"), default="single-byte")
+    parser.add_argument("--model", choices=tuple(MODELS), default="gx3", help="what a MIP unit knows")
     parser.add_argument("--link", choices=LINKS, default="usb", help="how bytes are delayed and bunched")
     parser.add_argument("--skew-ppm", type=float, default=35.0, help="rate error of the device clock")
     parser.add_argument("--wander-ppm", type=float, default=0.0, help="slow change of the rate error")
@@ -225,6 +234,7 @@ def main(argv: list[str] | None = None) -> int:
         eeprom.power_up_mode, eeprom.preset_command = 2, 0xC2
     with Gx3Emulator(
         protocol=args.protocol,
+        model=args.model,
         link=args.link,
         clock_skew_ppm=args.skew_ppm,
         clock_wander_ppm=args.wander_ppm,

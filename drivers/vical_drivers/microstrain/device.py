@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
-from vical_drivers.clock import DeviceClock, EnvelopeOptions
+from vical_drivers.clock import DeviceClock, EnvelopeOptions, SampleCounter
 from vical_drivers.errors import DeviceLostError, DeviceTimeoutError, DriverError
 from vical_drivers.microstrain.probe import PROTOCOLS, connect
 from vical_drivers.microstrain.session import ImuSettings, RawSample, Session
@@ -100,7 +100,10 @@ class MicrostrainImu:
         return self._info
 
     def _open(self) -> None:
-        session, port = connect(self._path, self._options.protocol, self._options.link, self._settings.baud)
+        o = self._options
+        session, port = connect(
+            self._path, o.protocol, o.link, self._settings.baud, patient=not self._samples
+        )
         self._close_port.callback(port.close)
         try:
             self._info = session.identify()
@@ -112,8 +115,10 @@ class MicrostrainImu:
             raise
         self._session = session
         a = self.applied
+        # Without a time field the samples themselves are the clock: one tick each.
+        self._counter = None if a.tick_hz else SampleCounter(a.rate_hz)
         self.clock = DeviceClock(
-            a.tick_hz, tick_bits=a.tick_bits, rate_hz=a.rate_hz, options=self._options.clock
+            a.tick_hz or a.rate_hz, tick_bits=a.tick_bits, rate_hz=a.rate_hz, options=o.clock
         )
         # The device reads its timer, then sends; what the stamp means lies a filter delay earlier.
         self._delay_ns = round(a.group_delay_s * 1e9 + a.record_bytes * port.wire_byte_ns)
@@ -146,7 +151,13 @@ class MicrostrainImu:
 
     def _stamped(self, raw: list[RawSample]) -> list[ImuSample]:
         for sample in raw:
-            ticks = self.clock.add(sample.ticks, sample.t_arrival_ns)
+            if sample.ticks is None and self._counter is None:
+                self._switch_to_counting()
+            elif sample.ticks is not None and self._counter is not None and self.applied.tick_hz:
+                self._switch_to_ticks()
+            raw_ticks = sample.ticks if self._counter is None else self._counter.count(sample.t_arrival_ns)
+            assert raw_ticks is not None
+            ticks = self.clock.add(raw_ticks, sample.t_arrival_ns)
             if ticks is not None:
                 self._held.append((sample, ticks))
         if not self._held or self.clock.age_s < self._options.warm_up_s:
@@ -155,6 +166,23 @@ class MicrostrainImu:
         out = [self._to_sample(sample, ticks) for sample, ticks in held]
         self._samples += len(out)
         return out
+
+    def _switch_to_counting(self) -> None:
+        """The device stopped dating its samples (no GPS time yet): count them instead."""
+        self._counter = SampleCounter(self.applied.rate_hz)
+        self._renew_clock(self.applied.rate_hz, None)
+
+    def _switch_to_ticks(self) -> None:
+        self._counter = None
+        self._renew_clock(self.applied.tick_hz, self.applied.tick_bits)
+
+    def _renew_clock(self, tick_hz: float, tick_bits: int | None) -> None:
+        self._held = []
+        restarts = self.clock.restarts + 1
+        self.clock = DeviceClock(
+            tick_hz, tick_bits=tick_bits, rate_hz=self.applied.rate_hz, options=self._options.clock
+        )
+        self.clock.restarts = restarts
 
     def _to_sample(self, raw: RawSample, ticks: int) -> ImuSample:
         stamp = self.clock.stamp(ticks)

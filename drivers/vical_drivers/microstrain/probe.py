@@ -5,21 +5,29 @@ from __future__ import annotations
 import logging
 
 from vical_drivers.errors import DeviceNotFoundError
-from vical_drivers.microstrain.port import SerialPort
-from vical_drivers.microstrain.session import Session
+from vical_drivers.microstrain import mip
+from vical_drivers.microstrain import single_byte_commands as cmd
+from vical_drivers.microstrain.mip_session import MipSession
+from vical_drivers.microstrain.port import SerialPort, wait_for_silence
 from vical_drivers.microstrain.single_byte_session import SingleByteSession
 
 _log = logging.getLogger(__name__)
 PROTOCOLS = ("auto", "single-byte", "mip")
 PROBE_BAUDS = (115_200, 921_600, 460_800, 230_400)
 """Factory setting first, then the temporary ones a crashed program may have left."""
-_ANSWER_S = 0.3
+_ANSWER_S = 0.25
+_SLOW_ANSWER_S = 1.2
+"""A GX3 sampling at 1 Hz takes commands once a second: the second round waits for it."""
+STOP_LIMIT_S = 1.0
 
 
 def connect(
-    path: str, protocol: str = "auto", link: str = "auto", baud: int | None = None
-) -> tuple[Session, SerialPort]:
+    path: str, protocol: str = "auto", link: str = "auto", baud: int | None = None, *, patient: bool = True
+) -> tuple[MipSession | SingleByteSession, SerialPort]:
     """Open a port and find the device on it; its stream is stopped.
+
+    Takes 0.4 s where the device is as expected, and at most about 9 s where nothing answers (3 s with
+    `patient` off).
 
     Raises:
         DeviceNotFoundError: Nothing there answers in a known protocol at a known baud.
@@ -28,12 +36,8 @@ def connect(
     bauds = [*([baud] if baud else []), *(b for b in PROBE_BAUDS if b != baud)]
     port = SerialPort(path, PROBE_BAUDS[0], link=link)
     try:
-        for candidate in bauds:
-            if candidate != port.baud:
-                port.set_baud(candidate)
-            session = _answering(port, protocol)
-            if session is not None:
-                return session, port
+        if (session := probe_port(port, protocol, bauds, rounds=1 + patient)) is not None:
+            return session, port
     except BaseException:
         port.close()
         raise
@@ -44,10 +48,38 @@ def connect(
     )
 
 
-def _answering(port: SerialPort, protocol: str) -> Session | None:
-    if protocol in ("auto", "single-byte"):
-        session = SingleByteSession(port)
-        session.quiet()
-        if session.probe(_ANSWER_S):
-            return session
+def probe_port(
+    port: SerialPort,
+    protocol: str = "auto",
+    bauds: list[int] | tuple[int, ...] = PROBE_BAUDS,
+    rounds: int = 2,
+) -> MipSession | SingleByteSession | None:
+    """Try the protocols at each baud, then once more patiently; None where nothing answers."""
+    for answer_s in (_ANSWER_S, _SLOW_ANSWER_S)[:rounds]:
+        for baud in bauds:
+            if baud != port.baud:
+                port.set_baud(baud)
+            if (session := _answering(port, protocol, answer_s)) is not None:
+                _log.info("port=%s baud=%d protocol=%s", port.name, baud, session.protocol)
+                return session
+    return None
+
+
+def _answering(port: SerialPort, protocol: str, answer_s: float) -> MipSession | SingleByteSession | None:
+    """The session that answers at the port's present baud.
+
+    First both stop commands: each protocol takes the other's as noise, and a stream would drown replies. MIP
+    is asked before single-byte because a MIP unit may also know E9, whereas 0x75 is nothing to an old GX3.
+    """
+    port.write(cmd.STOP_STREAM + mip.idle())
+    wait_for_silence(port, quiet_s=0.06, limit_s=STOP_LIMIT_S)
+    port.write(cmd.STOP_STREAM + mip.idle())
+    wait_for_silence(port, quiet_s=0.1, limit_s=STOP_LIMIT_S)
+    kinds: list[type[MipSession] | type[SingleByteSession]] = [MipSession, SingleByteSession]
+    for kind in kinds:
+        if protocol in ("auto", kind.protocol):
+            session = kind(port)
+            # MIP commands do not wait for the sampling cycle, so they need no patience.
+            if session.probe(answer_s if kind is SingleByteSession else _ANSWER_S):
+                return session
     return None

@@ -49,7 +49,7 @@ class Applied:
         rate_hz: Samples per second.
         group_delay_s: Lag of the data behind the device's timer, s; 0 where unknown.
         record_bytes: Length of one sample on the wire.
-        tick_hz: Ticks per second of the timer in each sample.
+        tick_hz: Ticks per second of the timer in each sample; 0 where samples carry no time.
         tick_bits: Width of that timer; None where it does not wrap.
         filter_width: M in force, where known.
     """
@@ -66,13 +66,13 @@ class RawSample(NamedTuple):
     """One sample as decoded, in SI units, with the device's own time.
 
     Attributes:
-        ticks: Device timer as on the wire.
+        ticks: Device timer as on the wire; None where the device sends no usable time.
         gyro_rps: Angular rate, rad/s.
         specific_force_mps2: Specific force, m/s^2.
         t_arrival_ns: CLOCK_MONOTONIC of its last byte, ns.
     """
 
-    ticks: int
+    ticks: int | None
     gyro_rps: tuple[float, float, float]
     specific_force_mps2: tuple[float, float, float]
     t_arrival_ns: int

@@ -1,0 +1,198 @@
+"""The MIP protocol (GX3 from firmware 2.0, GX4, GX5, CV5, CV7): bytes to packets and back. No I/O.
+
+Theory of operation. ``75 65 | descriptor set | payload length | fields | Fletcher-16``; a field is
+``length | descriptor | data``, its length counting itself and the descriptor. The sync word also occurs in
+data, so a candidate must have consistent field lengths and the right checksum; after a failure the decoder
+resumes at the byte after the bad 0x75. A candidate whose first fields already contradict its length is given
+up at once, without waiting for up to 261 bytes that may take a while.
+
+What the fields mean is in `mip_fields`.
+"""
+
+from __future__ import annotations
+
+import struct
+from itertools import accumulate
+from typing import NamedTuple
+
+SYNC = b"\x75\x65"
+SET_BASE, SET_3DM, SET_SYSTEM = 0x01, 0x0C, 0x7F
+"""Command sets; replies come in the same set."""
+SET_SENSOR = 0x80
+"""Data set of the inertial sensor."""
+ACK = 0xF1
+"""Descriptor of the field that acknowledges a command: its descriptor, then 0 or a reason."""
+APPLY, READ = 1, 2
+"""Function selectors of settings. 3, save, would write the EEPROM: the driver never sends it."""
+MAX_LENGTH = 261
+NACK_REASONS = {
+    1: "unknown command",
+    2: "bad checksum",
+    3: "invalid parameter",
+    4: "command failed",
+    5: "device timeout",
+}
+
+
+class Field(NamedTuple):
+    """One field: descriptor and raw data."""
+
+    descriptor: int
+    data: bytes
+
+
+class Packet(NamedTuple):
+    """One packet whose checksum and field lengths were right.
+
+    Attributes:
+        descriptor_set: What kind of packet; 0x80 is inertial data.
+        fields: Its fields in order.
+        end: Number of stream bytes up to and including its last one; dates the packet.
+    """
+
+    descriptor_set: int
+    fields: tuple[Field, ...]
+    end: int = 0
+
+    def field(self, descriptor: int) -> bytes | None:
+        """Data of the first field with this descriptor, None where there is none."""
+        for field in self.fields:
+            if field.descriptor == descriptor:
+                return field.data
+        return None
+
+
+def fletcher(data: bytes) -> int:
+    """Fletcher-16 with 8-bit sums: the running sum, then the sum of the running sums.
+
+    >>> hex(fletcher(bytes.fromhex("756501020201")))
+    '0xe0c6'
+    """
+    return (sum(data) & 0xFF) << 8 | sum(accumulate(data)) & 0xFF
+
+
+def encode(descriptor_set: int, *fields: tuple[int, bytes]) -> bytes:
+    """Make a packet; several commands of one set may share it.
+
+    Raises:
+        ValueError: The fields do not fit into one packet.
+    """
+    payload = b"".join(bytes((len(data) + 2, descriptor)) + data for descriptor, data in fields)
+    if len(payload) > 255:
+        raise ValueError(f"{len(payload)} bytes of fields do not fit into one MIP packet (255)")
+    body = SYNC + bytes((descriptor_set, len(payload))) + payload
+    return body + struct.pack(">H", fletcher(body))
+
+
+def ping() -> bytes:
+    """Is someone there? Answered by an ACK."""
+    return encode(SET_BASE, (0x01, b""))
+
+
+def idle() -> bytes:
+    """Stop all streams."""
+    return encode(SET_BASE, (0x02, b""))
+
+
+class Decoder:
+    """Incremental decoder: feed any chunks, get the same packets.
+
+    Attributes:
+        checksum_errors: Packets lost to damage: one began where it was due and its checksum was wrong.
+        skipped_bytes: Bytes that belong to no packet.
+        records: Number of packets returned so far.
+    """
+
+    def __init__(self) -> None:
+        self.checksum_errors = 0
+        self.skipped_bytes = 0
+        self.records = 0
+        self._tail = b""
+        self._consumed = 0
+        self._packet_bytes = 0
+        self._in_step = True
+
+    @property
+    def pending(self) -> bytes:
+        """The bytes that wait for the rest of a packet, at most `MAX_LENGTH` - 1."""
+        return self._tail
+
+    @property
+    def offset(self) -> int:
+        """Number of stream bytes fed so far."""
+        return self._consumed + len(self._tail)
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """Take the next bytes of the stream and return the packets they complete, in order."""
+        return self._parse(self._tail + data if self._tail else data, waiting=True)
+
+    def finish(self) -> list[Packet]:
+        """Return the packets hidden behind an incomplete one; call it at the end or after a silence.
+
+        What stays in `pending` is a partial packet with nothing good behind its beginning.
+        """
+        return self._parse(self._tail, waiting=False)
+
+    def _parse(self, buffer: bytes, *, waiting: bool) -> list[Packet]:
+        out: list[Packet] = []
+        position, base = 0, self._consumed
+        kept: int | None = None
+        while True:
+            start = buffer.find(SYNC, position)
+            if start != position:
+                if position == len(buffer):
+                    break
+                if start < 0:
+                    position = len(buffer) - buffer.endswith(b"\x75")
+                    self._in_step = self._in_step and not position
+                    break
+                self._in_step = False
+            end = _end_of(buffer, start)
+            if end is None:
+                if waiting:
+                    position = start
+                    break
+                kept = start if kept is None else kept
+            elif (fields := self._fields(buffer, start, end)) is not None:
+                out.append(Packet(buffer[start + 2], fields, base + end))
+                self._packet_bytes += end - start
+                position, kept, self._in_step = end, None, True
+                continue
+            self._in_step = False
+            position = start + 1
+        return self._keep(buffer, position if kept is None else kept, out)
+
+    def _fields(self, buffer: bytes, start: int, end: int) -> tuple[Field, ...] | None:
+        """Fields of the candidate packet; None where it is none (end 0: lengths already contradict)."""
+        if not end or fletcher(buffer[start : end - 2]) != buffer[end - 2] << 8 | buffer[end - 1]:
+            self.checksum_errors += self._in_step
+            return None
+        fields = []
+        at = start + 4
+        while at < end - 2:
+            length = buffer[at]
+            fields.append(Field(buffer[at + 1], buffer[at + 2 : at + length]))
+            at += length
+        return tuple(fields)
+
+    def _keep(self, buffer: bytes, position: int, out: list[Packet]) -> list[Packet]:
+        self._tail = buffer[position:]
+        self._consumed += position
+        self.records += len(out)
+        self.skipped_bytes = self._consumed - self._packet_bytes
+        return out
+
+
+def _end_of(buffer: bytes, start: int) -> int | None:
+    """Where the candidate packet ends; None: more bytes are needed; 0: its field lengths contradict."""
+    size = len(buffer)
+    if size < start + 4:
+        return None
+    payload_end = start + 4 + buffer[start + 3]
+    at = start + 4
+    while at < payload_end and at < size:
+        length = buffer[at]
+        if length < 2 or at + length > payload_end:
+            return 0
+        at += length
+    return payload_end + 2 if size >= payload_end + 2 else None
