@@ -13,7 +13,12 @@ from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.v4l2 import V4l2Camera
 from vical_mocks.v4l2_camera import CID_EXPOSURE_AUTO, FakeCamera
 
-DQBUF, REQBUFS, STREAMON = 17, 8, 18
+REQBUFS, STREAMON = 8, 18
+
+
+def read_on(source: V4l2Camera) -> None:
+    while True:
+        source.read(1.0)
 
 
 def test_unplug_is_told_and_the_camera_comes_back_under_another_number(open_fake, kernel) -> None:
@@ -168,8 +173,7 @@ def test_hundred_fault_cycles_leak_nothing(open_fake, kernel) -> None:
     source = open_fake(camera, exposure_s=0.004)
     for cycle in range(100):
         with pytest.raises(errors.DeviceLostError):
-            while True:
-                source.read(1.0)
+            read_on(source)
         assert kernel.open_descriptors == 0 and not kernel.mappings
         kernel.plug(camera, number=cycle % 3)
     stats = source.stats()
