@@ -20,7 +20,7 @@ from vical_daemon.strict_yaml import ConfigError, Document, parse, read
 __all__ = ["Config", "ConfigError", "load", "loads"]
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,62}"  # as `topics.check_name`
-URI = r"(v4l2|iidc):\S+"
+URI = r"(v4l2|iidc|aravis|folder):.+|/.+|\d+"
 Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
 Positive = Annotated[float, Bound(above=0)]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
@@ -81,11 +81,15 @@ class CameraConfig:
     """One camera.
 
     Attributes:
-        uri: v4l2:/dev/video0, iidc:GUID, or what `vical devices` prints.
+        uri: v4l2:/dev/video0, iidc:GUID, aravis:NAME, folder:PATH; `vical devices` prints it.
         size: width, height, px.
         rate_hz: Frames a second.
         exposure_s: Exposure time; None: as the camera has it.
+        assume_exposure_s: Of a camera that cannot tell its exposure time; only dates frames.
         gain: In the camera's own unit; None: as the camera has it.
+        pixel_format: What travels from the camera, e.g. GREY or MJPG; None: the cheapest.
+        stamp: What the driver's stamp marks; auto: what the driver says.
+        controls: More controls by the camera's own names.
         lens: Prior of intrinsics and mounting.
     """
 
@@ -93,7 +97,11 @@ class CameraConfig:
     size: tuple[Pixels, Pixels] = (640, 480)
     rate_hz: Annotated[float, Bound(above=0, high=1000)] = 30.0
     exposure_s: Annotated[float, Bound(above=0, high=1.0, hint="seconds")] | None = None
+    assume_exposure_s: Annotated[float, Bound(above=0, high=1.0, hint="seconds")] | None = None
     gain: float | None = None
+    pixel_format: str | None = None
+    stamp: Literal["auto", "raw", "soe", "eof", "first-packet", "shutter-closed"] = "auto"
+    controls: dict[str, float] = field(default_factory=dict)
     lens: LensConfig = field(default_factory=LensConfig)
 
 

@@ -10,6 +10,9 @@ from typing import Any, Protocol
 from vical_daemon.config import Config, ConfigError
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 
+Detect = Callable[[Any, int], "Found | None"]
+"""Image and its stamp (ns) -> the points, or None where nothing was found."""
+
 
 class Found(Protocol):
     """Points of one image; see `vision.detection.Detection`."""
@@ -30,7 +33,7 @@ class Found(Protocol):
         ...
 
 
-def make_detector(config: Config) -> Callable[[Any], Found]:
+def make_detector(config: Config) -> Detect:
     """Make the detector of one camera (it may remember the image before).
 
     Raises:
@@ -38,17 +41,17 @@ def make_detector(config: Config) -> Callable[[Any], Found]:
     """
     if config.calibration.mode == "target_free":
         return _tracker()
-    from vical_daemon.vision.detector import make_detector as for_target
+    from vical_daemon.vision.detector import BoardDetector
     from vical_daemon.vision.target import load_target
 
     assert config.target_path is not None  # `config.load` has seen to it
-    return for_target(load_target(config.target_path)).detect
+    return BoardDetector(load_target(config.target_path)).detect
 
 
-def _tracker() -> Callable[[Any], Found]:
+def _tracker() -> Detect:
     """Look the module up: a build without it says so in one line."""
     name = "vical_daemon.vision.tracker"
     if find_spec(name) is None:
         raise ConfigError("calibration without a target is not in this build; give a target file (--target)")
-    detect: Callable[[Any], Found] = import_module(name).FeatureTracker().detect
+    detect: Detect = import_module(name).FeatureTracker().detect
     return detect

@@ -6,6 +6,8 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
+import numpy as np
+import numpy.typing as npt
 from vical_drivers.samples import Frame, FrameSource
 
 from vical_daemon import topics
@@ -68,26 +70,31 @@ def open_camera(config: CameraConfig) -> FrameSource:
     Raises:
         DriverError: It cannot be opened; one line.
     """
-    from vical_drivers.camera.settings import CameraSettings
+    from vical_drivers.camera import opening
 
     width, height = config.size
-    settings = CameraSettings(
+    return opening.open_camera(
+        config.uri,
         width=width,
         height=height,
         rate_hz=config.rate_hz,
+        pixel_format=config.pixel_format,
         exposure_s=config.exposure_s,
         gain=config.gain,
+        controls=config.controls,
+        decoder=_decompress,
+        assume_exposure_s=config.assume_exposure_s,
         rolling_shutter=config.lens.readout_s > 0,
         readout_s=config.lens.readout_s,
+        stamp=config.stamp,
     )
-    kind, _, device = config.uri.partition(":")
-    if kind == "v4l2":
-        from vical_drivers.camera.v4l2 import V4l2Camera
 
-        return V4l2Camera(device, settings)
-    from vical_drivers.camera.iidc import IidcCamera
 
-    return IidcCamera(device, settings)
+def _decompress(data: npt.NDArray[np.uint8], *, colour: bool) -> npt.NDArray[np.uint8]:
+    """Decompress a JPEG; OpenCV is loaded only if a camera sends some."""
+    from vical_daemon.vision import image_codec
+
+    return image_codec.decode_image(data, colour=colour)
 
 
 def run(

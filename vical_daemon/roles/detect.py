@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
+
+import numpy as np
 
 from vical_daemon import topics
 from vical_daemon.bus import Bus, Sample
 from vical_daemon.config import Config
-from vical_daemon.detectors import Found, make_detector
+from vical_daemon.detectors import Detect, make_detector
 from vical_daemon.health import StatusSender
 from vical_daemon.messages import (
     DiagnosticStatus,
@@ -25,6 +26,7 @@ from vical_daemon.publications import Message, publish
 from vical_daemon.wall_clock import WallClock, shared_clock
 
 QUEUE_DEPTH = 2
+_NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 JOIN_S = 3.0
 
 
@@ -37,7 +39,7 @@ class DetectRole:
         detector: Finds points in one image; None: what the config asks for.
     """
 
-    def __init__(self, config: Config, camera: str, detector: Callable[[Any], Found] | None = None) -> None:
+    def __init__(self, config: Config, camera: str, detector: Detect | None = None) -> None:
         self.camera = camera
         free = config.calibration.mode == "target_free"
         self.key = (topics.tracks_key if free else topics.points_key)(config.rig, camera)
@@ -56,16 +58,17 @@ class DetectRole:
                 self._skipped += 1
                 return []
             self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
-            found = self._detect(image)
+            found = self._detect(image, stamp_ns)
         except (MessageError, ValueError):
             self._malformed += 1
             return []
         self._images += 1
-        self._found += len(found.ids) > 0
         height, width = image.shape[:2]
-        payload = encode_points(
-            stamp_ns, self.camera, found.ids, found.uv_px, found.sigma_px, (width, height)
-        )
+        points: tuple[Any, Any, Any] = (_NO_IDS, _NO_POINTS, None)
+        if found is not None:
+            self._found += 1
+            points = (found.ids, found.uv_px, found.sigma_px)
+        payload = encode_points(stamp_ns, self.camera, *points, (width, height))
         self._busy_s += time.perf_counter() - begin_s
         return [(self.key, payload)]
 
@@ -89,10 +92,10 @@ def _decode(sample: Sample) -> tuple[int, Any]:
     """Return the stamp and the pixels of a raw or compressed image."""
     parsed = topics.parse_key(sample.key)
     if parsed is not None and parsed.topic is topics.COMPRESSED:
-        from vical_daemon.vision.images import decode_image_file
+        from vical_daemon.vision import image_codec
 
         message = decode_compressed_image(sample.payload)
-        return message.stamp_ns, decode_image_file(bytes(message.data))
+        return message.stamp_ns, image_codec.decode_image(np.frombuffer(message.data, np.uint8))
     image = decode_image(sample.payload)
     return image.stamp_ns, image.pixels()
 
