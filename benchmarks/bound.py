@@ -24,6 +24,8 @@ from vical_mocks.rig import Rig
 from vical_mocks.rotations import skew
 from vical_mocks.tracks import simulate_tracks
 
+from benchmarks.projection import View, jacobians
+
 FloatArray = npt.NDArray[np.float64]
 
 STATE = 15  # attitude (local), velocity, position, gyro bias, accelerometer bias
@@ -261,60 +263,19 @@ def _error_slopes(rig: Rig, t_s: FloatArray) -> FloatArray:
 
 
 def pixel_jacobians(rig: Rig, frame: SimulatedFrame, points_m: FloatArray) -> dict[str, FloatArray]:
-    """Derivatives of a frame's pixels (2n rows) by every parameter, at the truth.
-
-    Keys as in `Bound.slices`, and "attitude", "position" of the imu, "points" (2n, 3: each by its own point).
-    """
+    """Derivatives of a frame's pixels at the truth; see `benchmarks.projection.jacobians`."""
     t_s = np.asarray(frame.t_s)
-    R, p = rig.trajectory.R_world_imu(t_s), rig.trajectory.p_world_imu(t_s)
     R_imu_cam, p_imu_cam = rig.extrinsics_at(t_s)
-    in_imu = (points_m - p) @ R
-    in_cam = (in_imu - p_imu_cam) @ R_imu_cam
-    by_cam, by_lens = _lens_derivatives(rig, in_cam)
-    by_imu = by_cam @ R_imu_cam.T
-    moving = np.cross(in_imu, rig.trajectory.omega_imu_rps(t_s)) - R.T @ rig.trajectory.v_world_imu(t_s)
-    by_time = np.einsum("nij,nj->ni", by_imu, moving)
-    uv, _ = rig.lens.project(in_cam)
-    row_share = uv[:, 1] / rig.lens.resolution[1] - 0.5
-    blocks = {
-        "attitude": by_imu @ skew(in_imu),
-        "position": -by_imu @ R.T,
-        "points": by_imu @ R.T,
-        "p_imu_cam": -by_imu,
-        "r_imu_cam": by_cam @ skew(in_cam),
-        "timeshift": by_time[..., None],
-        "readout": (by_time * row_share[:, None])[..., None],
-        "intrinsics": by_lens[..., :4],
-        "distortion": by_lens[..., 4:],
-        "target_scale": np.einsum("nij,nj->ni", by_imu @ R.T, points_m)[..., None],
-    }
-    return {name: block.reshape(-1, block.shape[-1]) for name, block in blocks.items()}
-
-
-def _lens_derivatives(rig: Rig, in_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels by the point (n, 2, 3) and by intrinsics and distortion (n, 2, 8): central differences."""
-    by_point = np.empty((len(in_cam), 2, 3))
-    for axis in range(3):
-        step = np.zeros(3)
-        step[axis] = 1e-6
-        by_point[:, :, axis] = (
-            rig.lens.project(in_cam + step)[0] - rig.lens.project(in_cam - step)[0]
-        ) / 2e-6
-    fx, fy, *_ = rig.lens.intrinsics
-    uv, _ = rig.lens.project(in_cam)
-    normal = (uv - np.array(rig.lens.intrinsics[2:])) / np.array([fx, fy])
-    by_lens = np.zeros((len(in_cam), 2, 8))
-    by_lens[:, 0, 0], by_lens[:, 1, 1] = normal[:, 0], normal[:, 1]
-    by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
-    for k in range(4):
-        lenses = []
-        for sign in (1, -1):
-            changed = list(rig.lens.distortion)
-            changed[k] += sign * 1e-5
-            lens = type(rig.lens)(rig.lens.intrinsics, tuple(changed), rig.lens.resolution, rig.lens.model)
-            lenses.append(lens.project(in_cam)[0])
-        by_lens[:, :, 4 + k] = (lenses[0] - lenses[1]) / 2e-5
-    return by_point, by_lens
+    view = View(
+        rig.trajectory.R_world_imu(t_s),
+        rig.trajectory.p_world_imu(t_s),
+        rig.trajectory.v_world_imu(t_s),
+        rig.trajectory.omega_imu_rps(t_s),
+        R_imu_cam,
+        p_imu_cam,
+        rig.lens,
+    )
+    return jacobians(view, points_m)
 
 
 def _pixel_information(jacobian: FloatArray, by_time: FloatArray, options: BoundOptions) -> FloatArray:
@@ -391,22 +352,22 @@ def _update(
     if len(ids) == 0:
         return
     rows = np.array([run.landmark_of.get(int(i), int(i)) for i in ids])
-    jacobians = pixel_jacobians(run.rig, frame, run.points_m[rows])
+    by = pixel_jacobians(run.rig, frame, run.points_m[rows])
     if options.target_free:
         for identity in ids:
             if int(identity) not in information.landmarks:
                 information.add_landmark(int(identity))
     full = np.zeros((2 * len(ids), len(information.matrix)))
-    full[:, 0:3], full[:, 6:9] = jacobians["attitude"], jacobians["position"]
+    full[:, 0:3], full[:, 6:9] = by["attitude"], by["position"]
     for name, place in information.constants.slices.items():
-        if name in jacobians:
-            full[:, place] = jacobians[name]
+        if name in by:
+            full[:, place] = by[name]
     if options.target_free:
         for n, identity in enumerate(ids):
-            full[2 * n : 2 * n + 2, information.landmark_place(int(identity))] = jacobians["points"][
+            full[2 * n : 2 * n + 2, information.landmark_place(int(identity))] = by["points"][
                 2 * n : 2 * n + 2
             ]
-    information.matrix += _pixel_information(full, jacobians["timeshift"], options)
+    information.matrix += _pixel_information(full, by["timeshift"], options)
 
 
 def describe(bound: Bound) -> str:

@@ -1,0 +1,269 @@
+"""Monte Carlo: RMSE beside the Cramer-Rao bound, NEES, coverage, time; also of a plain EKF."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+from vical_mocks.points import SimulatedRun, simulate
+from vical_mocks.rig import reference_rig
+from vical_mocks.tracks import simulate_tracks
+
+from benchmarks import runner, scores
+from benchmarks.bound import Bound, BoundOptions, bounds
+from benchmarks.ekf import EkfSubject
+from benchmarks.feed import CalibratorSubject, Record, StartErrors, Subject, camera_prior, feed, imu_noise
+from vical_daemon.estimation.measurements import CalibrationOptions
+
+TIMES_S = (10.0, 30.0, 60.0)
+_PLACES = (
+    ("p_imu_cam", slice(0, 3)),
+    ("r_imu_cam", slice(3, 6)),
+    ("timeshift", slice(6, 7)),
+    ("intrinsics", slice(7, 11)),
+    ("distortion", slice(11, 15)),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of a study.
+
+    Attributes:
+        lens_known: The lens is given exactly and held fixed.
+        start: Errors of the starting values.
+        timeshift_s: True time shift; None: uniform in +-50 ms, by seed.
+        skew_ppm: Drift of the camera's clock.
+        gravity_error_mps2: Added to the magnitude that the estimator is told.
+        target_free: Landmarks instead of a board.
+        trials: How many when not told otherwise.
+        simulation: Options of the simulation.
+        rig: Changes of the rig.
+        bound: Changes of the bound's model.
+        estimate: Optional blocks of the estimator.
+    """
+
+    lens_known: bool = False
+    start: StartErrors = field(default_factory=StartErrors)
+    timeshift_s: float | None = None
+    skew_ppm: float = 0.0
+    gravity_error_mps2: float = 0.0
+    target_free: bool = False
+    trials: int = 100
+    simulation: dict[str, Any] = field(default_factory=dict)
+    rig: dict[str, Any] = field(default_factory=dict)
+    bound: dict[str, Any] = field(default_factory=dict)
+    estimate: frozenset[str] = frozenset()
+
+    @property
+    def dof(self) -> int:
+        """Size of the calibration block."""
+        return 7 if self.lens_known else 15
+
+
+_FAR = StartErrors(0.05, 10.0, (float(np.deg2rad(10.0)), 0.10), 0.05)
+CASES: dict[str, Case] = {
+    "reference, lens known": Case(lens_known=True),
+    "reference": Case(),
+    "full self-calibration (lens 10 %)": Case(start=StartErrors(0.10, 15.0)),
+    "given 10 deg 100 mm 50 ms off": Case(start=_FAR),
+    "shift +200 ms": Case(timeshift_s=0.2, trials=20),
+    "shift -200 ms": Case(timeshift_s=-0.2, trials=20),
+    "0.1 px": Case(simulation={"corner_sigma_px": 0.1}, trials=20),
+    "5 % outliers, 30 % half-hidden": Case(
+        simulation={"outlier_fraction": 0.05, "hidden_fraction": 0.3}, trials=20
+    ),
+    "gravity told 0.02 m/s^2 wrong": Case(gravity_error_mps2=0.02, trials=20),
+    "skew 100 ppm": Case(skew_ppm=100.0, trials=20),
+    "stamp jitter 1 ms": Case(simulation={"stamp_jitter_s": 1e-3}, trials=20),
+    "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
+    "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),
+}
+
+
+def make_run(case: Case, seed: int, seconds: float) -> SimulatedRun:
+    """The recording of one trial."""
+    shift = case.timeshift_s
+    if shift is None:
+        shift = float(np.random.default_rng([seed, 61]).uniform(-0.05, 0.05))
+    rig = reference_rig(seed, timeshift_cam_imu_s=shift, clock_skew_ppm=case.skew_ppm, **case.rig)
+    make = simulate_tracks if case.target_free else simulate
+    return make(seed, seconds, rig=rig, **case.simulation)
+
+
+def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject:
+    """The estimator of one trial: "vical" or "ekf"."""
+    prior = camera_prior(run, seed, case.start, exact_lens=case.lens_known)
+    options = CalibrationOptions(
+        fix=frozenset({"intrinsics"}) if case.lens_known else frozenset(),
+        estimate=case.estimate,
+        target_free=case.target_free,
+        gravity_mps2=9.80665 + case.gravity_error_mps2,
+        imu_noise=imu_noise(run),
+    )
+    if kind == "ekf":
+        return EkfSubject(options, prior, run.points_m)
+    return CalibratorSubject(options, prior, None if case.target_free else run.points_m)
+
+
+def bound_options(case: Case, run: SimulatedRun) -> BoundOptions:
+    """The bound's model of a case."""
+    return replace(
+        BoundOptions(
+            corner_sigma_px=run.options.corner_sigma_px,
+            stamp_jitter_s=run.options.stamp_jitter_s,
+            intrinsics=not case.lens_known,
+            distortion=not case.lens_known,
+            target_free=case.target_free,
+        ),
+        **case.bound,
+    )
+
+
+def bound_sigmas(bound: Bound) -> list[float]:
+    """Sigmas of a bound in the order of the error vectors; 0 where not estimated."""
+    sigmas = np.zeros(15)
+    for name, place in _PLACES:
+        if name in bound.slices:
+            sigmas[place] = bound.sigma(name)
+    return sigmas.tolist()
+
+
+def bound_trial(case: Case, seconds: float, seed: int) -> runner.Result:
+    """The bound at the times of interest (kept apart: it does not change when the estimator does)."""
+    times = [t for t in TIMES_S if t <= seconds]
+    run = make_run(case, seed, seconds)
+    found = bounds(run, bound_options(case, run), times)
+    return {f"{b.t_s:g}": bound_sigmas(b) for b in found}
+
+
+def trial(case: Case, seconds: float, kind: str, seed: int) -> runner.Result:
+    """One recording through one estimator."""
+    run = make_run(case, seed, seconds)
+    record = feed(run, make_subject(case, run, seed, kind))
+    return summary(record, case.dof, [t for t in TIMES_S if t <= seconds])
+
+
+def summary(record: Record, dof: int, times_s: list[float]) -> runner.Result:
+    """What is kept of a record."""
+    shots = record.snapshots
+    at: dict[str, Any] = {}
+    for t_s in times_s:
+        shot = record.at(t_s)
+        at[f"{t_s:g}"] = shot and {
+            "error": shot.error,
+            "sigma": np.sqrt(np.diag(shot.covariance)),
+            "nees": scores.nees(shot.error, shot.covariance, dof),
+            "status": shot.status,
+            "extra": shot.extra,
+        }
+    return {
+        "started_s": record.started_s(),
+        "cpu_ms_per_frame": 1e3 * record.cpu_s / max(record.frames, 1),
+        "at": at,
+        "trace": {
+            "t_s": [s.t_s for s in shots],
+            "error": [s.error for s in shots],
+            "sigma": [np.sqrt(np.diag(s.covariance)) for s in shots],
+            "nees": [scores.nees(s.error, s.covariance, dof) for s in shots],
+            "status": [s.status for s in shots],
+        },
+        "events": record.events,
+        "statuses": record.statuses,
+        "unobservable": record.unobservable,
+        "guidance": record.guidance,
+    }
+
+
+@cache
+def code_under_test(kind: str) -> str:
+    """Fingerprint of what decides a trial's result."""
+    subject = "vical_daemon/estimation" if kind == "vical" else "benchmarks/ekf.py"
+    return runner.fingerprint(subject, "benchmarks/feed.py", "benchmarks/montecarlo.py", "mocks/vical_mocks")
+
+
+def results_of(name: str, case: Case, kind: str, args: argparse.Namespace) -> list[runner.Result]:
+    """Trials of a case joined with their bounds."""
+    seeds = runner.seeds_of(args)
+    file = f"{''.join(c if c.isalnum() else '_' for c in name)}_{args.seconds:g}s"
+    limits = runner.run_trials(
+        f"bound_{file}",
+        partial(bound_trial, case, args.seconds),
+        seeds,
+        args,
+        runner.fingerprint("benchmarks/bound.py", "mocks/vical_mocks"),
+    )
+    results = runner.run_trials(
+        f"{kind}_{file}", partial(trial, case, args.seconds, kind), seeds, args, code_under_test(kind)
+    )
+    for result, limit in zip(results, limits, strict=True):
+        for key, at in result["at"].items():
+            if at is not None:
+                at["bound"] = limit[key]
+    return results
+
+
+def print_case(name: str, case: Case, results: list[runner.Result], args: argparse.Namespace) -> None:
+    """Table rows of one case, and its plot."""
+    covered = scores.coverage(results, case.dof)
+    for t_s in (t for t in TIMES_S if t <= args.seconds):
+        print(scores.row(name, scores.score(results, t_s, case.dof), covered), flush=True)
+    slug = "".join(c if c.isalnum() else "_" for c in name)
+    if not args.no_plots and any(r["trace"]["t_s"] for r in results):
+        scores.plot(results, case.dof, name, args.out / f"{slug}.png")
+
+
+def print_behaviour(name: str, results: list[runner.Result]) -> None:
+    """One row: start, verdicts, costs."""
+    started = runner.array(results, "started_s")
+    cpu = runner.array(results, "cpu_ms_per_frame")
+    last = [r["trace"]["status"][-1] if r["trace"]["status"] else "no answer" for r in results]
+    counts = ", ".join(f"{last.count(s)} {s}" for s in sorted(set(last)))
+    lies = sum(lying(r) for r in results)
+    first = f"{np.nanmedian(started):.0f} / {np.nanmax(started):.0f}" if len(started) else "-"
+    print(f"| {name} | {first} | {counts} | {lies} | {np.median(cpu):.1f} |", flush=True)
+
+
+def lying(result: runner.Result, k: float = 5.0) -> bool:
+    """Whether it ever said `converged` while a calibration parameter was off by more than k sigma."""
+    trace = result["trace"]
+    for status, error, sigma in zip(trace["status"], trace["error"], trace["sigma"], strict=True):
+        e, s = np.array(error[:7]), np.array(sigma[:7])
+        if status == "converged" and np.any(np.abs(e) > k * s):
+            return True
+    return False
+
+
+def main(argv: list[str]) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks montecarlo", description=__doc__)
+    runner.add_arguments(parser, trials=0, seconds=60.0)
+    parser.add_argument("--subject", choices=("vical", "ekf", "both"), default="vical")
+    parser.add_argument("--no-plots", action="store_true")
+    args = parser.parse_args(argv)
+    unknown = set(args.case or ()) - set(CASES)
+    if unknown:
+        parser.error(f"no case {sorted(unknown)}; there are: {', '.join(CASES)}")
+    kinds = ("vical", "ekf") if args.subject == "both" else (args.subject,)
+    all_results: dict[str, list[runner.Result]] = {}
+    print(scores.HEADER)
+    asked = args.trials
+    for name in args.case or CASES:
+        case = CASES[name]
+        args.trials = asked or case.trials
+        for kind in kinds:
+            if kind == "ekf" and case.target_free:
+                continue
+            label = name if kind == "vical" else f"{name} (plain EKF)"
+            all_results[label] = results_of(name, case, kind, args)
+            print_case(label, case, all_results[label], args)
+    print(
+        "\n| case | first answer s (median / last) | last status | converged beyond 5 sigma | CPU ms/frame |"
+    )
+    print("|---|---|---|---|---|")
+    for label, results in all_results.items():
+        print_behaviour(label, results)
+    return 0
