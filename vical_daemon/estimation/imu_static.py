@@ -4,8 +4,9 @@ At rest the corrected specific force has the length of gravity; that gives the a
 two rests the corrected gyro must turn gravity's direction from the one to the other; that gives the gyro
 (the multi-position method of Tedaldi, Pretto and Menegatti, ICRA 2014, in our own formulation).
 
-Model, as in `imu_model`: f = M_a (f_m - b_a) with lower-triangular M_a (the gauge that says what the imu
-axes are: z of the imu frame is z of the accelerometer triad), omega = M_g (omega_m - b_g) with full M_g.
+Model, as in `imu_model`: f = M_a (f_m - b_a) with lower-triangular M_a, omega = M_g (omega_m - b_g) with
+full M_g. The triangle says what the imu axes are: x is the axis of the x accelerometer, y lies in the plane
+of the x and y accelerometers.
 """
 
 from __future__ import annotations

@@ -50,3 +50,58 @@ def rig(pinhole_camera, fisheye_camera):
         accel_matrix=np.array([[1.004, 0, 0], [0.003, 0.997, 0], [-0.002, 0.001, 1.002]]),
         note="made by a test",
     )
+
+
+IMU_RATE_HZ = 100.0
+IMU_TRUTH = {
+    "M_A": np.array([[1.004, 0, 0], [0.003, 0.997, 0], [-0.002, 0.001, 1.002]]),
+    "M_G": np.array([[1.006, 0.004, -0.003], [-0.002, 0.995, 0.005], [0.001, -0.006, 1.003]]),
+    "B_A": np.array([0.05, -0.03, 0.08]),
+    "B_G": np.array([0.004, -0.002, 0.001]),
+}
+
+
+@pytest.fixture
+def imu_truth():
+    return IMU_TRUTH
+
+
+@pytest.fixture
+def simulate_turns():
+    return _simulate
+
+
+@pytest.fixture
+def simulated_turns():
+    return _simulate(np.random.default_rng(5), positions=20)
+
+
+def _simulate(rng, positions=24, axes=None):
+    """Rest 3 s, turn 1.5 s about a random axis by 60 to 150 degrees, and so on."""
+    R, gyro, force = Rotation.random(random_state=int(rng.integers(1 << 30))), [], []
+    up = np.array([0.0, 0.0, 9.80665])
+    for _ in range(positions):
+        rest = R.inv().apply(up)
+        gyro += [np.zeros(3)] * 300
+        force += [rest] * 300
+        axis = rng.standard_normal(3) if axes is None else np.asarray(axes, dtype=float)
+        axis /= np.linalg.norm(axis)
+        # Raised-cosine rate: starts and ends at rest.
+        angle, t = rng.uniform(1.0, 2.6), (np.arange(150) + 0.5) / 150
+        rate = angle / 1.5 * (1 - np.cos(2 * np.pi * t))
+        for w in rate:
+            gyro.append(axis * w)
+            R = R * Rotation.from_rotvec(axis * w / IMU_RATE_HZ)
+            force.append(R.inv().apply(up) + rng.standard_normal(3) * 0.3)
+    gyro, force = np.array(gyro), np.array(force)
+    gyro_m = (
+        gyro @ np.linalg.inv(IMU_TRUTH["M_G"]).T
+        + IMU_TRUTH["B_G"]
+        + 5e-4 * np.sqrt(IMU_RATE_HZ) * rng.standard_normal(gyro.shape)
+    )
+    force_m = (
+        force @ np.linalg.inv(IMU_TRUTH["M_A"]).T
+        + IMU_TRUTH["B_A"]
+        + 8e-4 * np.sqrt(IMU_RATE_HZ) * rng.standard_normal(force.shape)
+    )
+    return gyro_m, force_m

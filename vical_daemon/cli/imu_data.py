@@ -1,0 +1,141 @@
+"""Reads the inertial samples that `vical allan` and `vical imu-calibrate` work on: a recording or a CSV."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.imu_options import COLUMNS
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+
+LOST_LIMIT = 0.02  # a recording that misses more samples than this is refused
+
+
+@dataclass(frozen=True, slots=True)
+class EvenSamples:
+    """Inertial samples on an even grid.
+
+    Attributes:
+        name: Where they come from.
+        rate_hz: Rate of the grid: what the recording really had, from its stamps.
+        gyro_rps: shape (n, 3).
+        accel_mps2: shape (n, 3).
+        filled: Samples that were lost and are interpolated.
+    """
+
+    name: str
+    rate_hz: float
+    gyro_rps: FloatArray
+    accel_mps2: FloatArray
+    filled: int
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the recording, s."""
+        return len(self.gyro_rps) / self.rate_hz
+
+
+def load(args: argparse.Namespace) -> EvenSamples:
+    """Read what the options name and put it on an even grid.
+
+    Raises:
+        CliError: Nothing usable there; the message says what and what to try.
+    """
+    path = Path(args.input)
+    if args.skip < 0 or (args.seconds is not None and args.seconds <= 0):
+        raise CliError("--skip must be 0 or more and --seconds above 0", EXIT_USAGE)
+    t_ns, gyro, accel, name = _read_csv(path) if path.suffix == ".csv" else _read_recording(path, args.imu)
+    use = t_ns >= t_ns[0] + int(args.skip * 1e9)
+    if args.seconds is not None:
+        use &= t_ns < t_ns[0] + int((args.skip + args.seconds) * 1e9)
+    if np.count_nonzero(use) < 100:
+        raise CliError(
+            f"{path}: only {np.count_nonzero(use)} samples after --skip and --seconds, 100 are needed"
+        )
+    samples = even_grid(name, t_ns[use], gyro[use], accel[use])
+    if samples.filled:
+        print(
+            f"vical: warning: {samples.filled} lost samples are interpolated "
+            f"({100 * samples.filled / len(samples.gyro_rps):.2f} %)",
+            file=sys.stderr,
+        )
+    return samples
+
+
+def even_grid(name: str, t_ns: IntArray, gyro: FloatArray, accel: FloatArray) -> EvenSamples:
+    """Put samples on a grid by counting periods between neighbours; lost ones are interpolated.
+
+    Jitter of the stamps does not move a sample: only whole missing periods open a gap.
+
+    Raises:
+        CliError: Stamps do not increase, or too much is missing.
+    """
+    steps = np.diff(t_ns)
+    if np.any(steps <= 0):
+        first = int(np.flatnonzero(steps <= 0)[0])
+        raise CliError(f"{name}: stamps do not increase (sample {first + 1}); sort the recording first")
+    period = float(np.median(steps))
+    index = np.concatenate(([0], np.cumsum(np.maximum(np.round(steps / period), 1.0)))).astype(np.int64)
+    count = int(index[-1]) + 1
+    filled = count - len(t_ns)
+    if filled > LOST_LIMIT * count:
+        raise CliError(
+            f"{name}: {100 * filled / count:.1f} % of the samples are missing "
+            f"(limit {100 * LOST_LIMIT:g} %); see `vical info` for the gaps, "
+            "or cut the recording with --skip and --seconds"
+        )
+    rate_hz = (count - 1) / ((t_ns[-1] - t_ns[0]) * 1e-9)
+    if filled:
+        grid = np.arange(count)
+        gyro = np.stack([np.interp(grid, index, gyro[:, i]) for i in range(3)], axis=-1)
+        accel = np.stack([np.interp(grid, index, accel[:, i]) for i in range(3)], axis=-1)
+    return EvenSamples(name, rate_hz, gyro, accel, filled)
+
+
+def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, FloatArray, str]:
+    from vical_daemon.recording import open_recording
+
+    recording = open_recording(path, check=False)
+    names = list(recording.imus)
+    if not names:
+        raise CliError(f"{path} holds no imu data")
+    if imu is None and len(names) > 1:
+        raise CliError(f"{path} holds the imus {', '.join(names)}; choose one with --imu", EXIT_USAGE)
+    chosen = imu or names[0]
+    if chosen not in names:
+        raise CliError(f"{path} holds no imu {chosen!r}, only {', '.join(names)}", EXIT_USAGE)
+    arrays = recording.imu_arrays(chosen)
+    return arrays.t_ns, arrays.gyro_rps, arrays.specific_force_mps2, f"{path}: {chosen}"
+
+
+def _read_csv(path: Path) -> tuple[IntArray, FloatArray, FloatArray, str]:
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            first = next(csv.reader(stream), [])
+        if not first:
+            raise CliError(f"{path}: is empty")
+        skip = int(not _is_number(first[0]))
+        table = np.loadtxt(path, delimiter=",", skiprows=skip, usecols=range(1, 7), ndmin=2, comments="#")
+        stamps = np.loadtxt(
+            path, delimiter=",", skiprows=skip, usecols=0, ndmin=1, comments="#", dtype=np.int64
+        )
+    except (ValueError, IndexError, UnicodeDecodeError) as error:
+        text = " ".join(str(error).split())
+        raise CliError(f"{path}: cannot be read as {COLUMNS}: {text}") from error
+    if not np.all(np.isfinite(table)) or len(stamps) < 100:
+        raise CliError(f"{path}: needs at least 100 lines of finite numbers: {COLUMNS}")
+    return stamps, table[:, :3], table[:, 3:], str(path)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
