@@ -46,14 +46,13 @@ class _Gallery:
         self._folder = png_folder
 
     def add(self, name: str, drawn: Figure, alt: str, caption: str = "") -> str:
-        engine = drawn.get_layout_engine()
-        if engine is not None:  # laid out once, not at every saving: it is half of the cost of a figure
-            engine.execute(drawn)
-            drawn.set_layout_engine("none")
+        from matplotlib import rc_context
+
         if self._folder is not None:
             drawn.savefig(self._folder / f"{name}.png", dpi=130)
         stream = io.BytesIO()
-        drawn.savefig(stream, format="svg", dpi=150, metadata={"Date": None})
+        with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):  # text stays text; files repeat
+            drawn.savefig(stream, format="svg", dpi=150, metadata={"Date": None})
         encoded = base64.b64encode(stream.getvalue()).decode("ascii")
         return page.figure(f"data:image/svg+xml;base64,{encoded}", alt, caption)
 
