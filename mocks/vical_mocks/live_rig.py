@@ -51,8 +51,8 @@ class LiveRigSettings:
     seed: int = 1
     timeshift_cam_imu_s: float = -0.0125
     mean_rate_dps: float = 55.0
-    camera_rate_hz: float = 20.0
-    exposure_s: float = 0.003
+    camera_rate_hz: float = 12.5
+    exposure_s: float = 0.001
     stamp_jitter_s: float = 5e-5
     distortion: tuple[float, float, float, float] = (-0.28, 0.07, 2e-4, 2e-5)
     imu_link: str = "direct"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -72,22 +73,26 @@ def open_camera(config: CameraConfig) -> FrameSource:
     """
     from vical_drivers.camera import opening
 
+    return opening.open_camera(config.uri, **driver_options(config))
+
+
+def driver_options(config: CameraConfig) -> dict[str, Any]:
+    """Return what the driver is asked for."""
     width, height = config.size
-    return opening.open_camera(
-        config.uri,
-        width=width,
-        height=height,
-        rate_hz=config.rate_hz,
-        pixel_format=config.pixel_format,
-        exposure_s=config.exposure_s,
-        gain=config.gain,
-        controls=config.controls,
-        decoder=_decompress,
-        assume_exposure_s=config.assume_exposure_s,
-        rolling_shutter=config.lens.readout_s > 0,
-        readout_s=config.lens.readout_s,
-        stamp=config.stamp,
-    )
+    return {
+        "width": width,
+        "height": height,
+        "rate_hz": config.rate_hz,
+        "pixel_format": config.pixel_format,
+        "exposure_s": config.exposure_s,
+        "gain": config.gain,
+        "controls": config.controls,
+        "decoder": _decompress,
+        "assume_exposure_s": config.assume_exposure_s,
+        "rolling_shutter": config.lens.readout_s > 0,
+        "readout_s": config.lens.readout_s,
+        "stamp": config.stamp,
+    }
 
 
 def _decompress(data: npt.NDArray[np.uint8], *, colour: bool) -> npt.NDArray[np.uint8]:

@@ -1,0 +1,161 @@
+"""`vical check -c FILE`: reads config and devices and says what is wrong, with what to try."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.errors import EXIT_FAILURE, EXIT_USAGE
+from vical_daemon.cli.options import add_config, add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.config import CameraConfig, Config, ImuConfig
+
+HELP = "read config and devices, say what is wrong"
+_IMU_SECONDS = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the check: `problem` is empty where all is well."""
+
+    what: str
+    text: str
+    problem: str = ""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of COMMANDS."""
+    add_config(parser)
+    parser.add_argument("--no-devices", action="store_true", help="read the files only, open nothing")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check everything; 2 if the config is wrong, 1 if something else is."""
+    from vical_daemon.config import ConfigError, load
+
+    try:
+        config = load(args.config)
+    except ConfigError as error:
+        findings = [Finding("config", args.config, problem) for problem in error.problems]
+        _print(findings, as_json=args.json)
+        return EXIT_USAGE
+    findings = [Finding("config", f"{args.config}: {_summary(config)}")]
+    for finding in _findings(config, devices=not args.no_devices):
+        findings.append(finding)
+        if not args.json:
+            _print_line(finding)
+    if args.json:
+        _print(findings, as_json=True)
+    bad = [finding for finding in findings if finding.problem]
+    if not args.json:
+        print(f"{len(bad)} problem{'s' * (len(bad) != 1)}" if bad else "all is well")
+    return EXIT_FAILURE if bad else 0
+
+
+def _summary(config: Config) -> str:
+    imus, cameras = ", ".join(config.imus) or "no imu", ", ".join(config.cameras) or "no camera"
+    return f"rig {config.rig}, {imus}, {cameras}, {config.calibration.mode}"
+
+
+def _findings(config: Config, *, devices: bool) -> Iterator[Finding]:
+    yield from _check_target(config)
+    yield _check_disk(config)
+    if not devices:
+        return
+    for name, imu in config.imus.items():
+        yield _check_imu(f"imus.{name}", imu)
+    for name, camera in config.cameras.items():
+        yield from _check_camera(f"cameras.{name}", camera)
+
+
+def _check_target(config: Config) -> Iterator[Finding]:
+    if config.target_path is None:
+        return
+    from vical_daemon.vision.target import load_target
+    from vical_daemon.vision.target_yaml import TargetError
+
+    try:
+        target = load_target(config.target_path)
+    except TargetError as error:
+        yield Finding("target", str(config.target_path), str(error))
+        return
+    size_m = target.points_m.max(axis=0) - target.points_m.min(axis=0)
+    yield Finding(
+        "target", f"{target.kind}, {len(target.points_m)} points over {size_m[0]:.3f} x {size_m[1]:.3f} m"
+    )
+
+
+def _check_disk(config: Config) -> Finding:
+    from vical_daemon.places import state_directory
+
+    folder = Path(config.record.directory or state_directory() / "log")
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    try:
+        free = shutil.disk_usage(existing).free
+    except OSError as error:
+        return Finding("record", str(folder), f"{existing}: {error.strerror}")
+    text = f"{folder}: {free / 1e9:.1f} GB free"
+    if free < config.record.reserve_bytes:
+        reserve = config.record.reserve_bytes / 1e9
+        return Finding(
+            "record", text, f"{text}, below record.reserve_bytes ({reserve:.1f} GB): nothing is recorded"
+        )
+    return Finding("record", text)
+
+
+def _check_imu(what: str, imu: ImuConfig) -> Finding:
+    from vical_drivers.errors import DriverError
+
+    from vical_daemon.roles.imu import open_imu
+
+    try:
+        with open_imu(imu) as source:
+            info, count = source.info, 0
+            end_s = time.monotonic() + _IMU_SECONDS
+            while time.monotonic() < end_s:
+                count += len(source.read(0.2))
+            rate_hz = source.stats().rate_hz
+    except DriverError as error:
+        return Finding(what, imu.port, str(error))
+    text = f"{imu.port}: {info.model} serial {info.serial_number} firmware {info.firmware}, {info.protocol}"
+    if not count:
+        return Finding(what, text, f"{imu.port}: {info.model} answers but sends no samples; power-cycle it")
+    if abs(rate_hz / imu.rate_hz - 1) > 0.05:
+        return Finding(what, text, f"{imu.port}: {rate_hz:.1f} Hz instead of {imu.rate_hz:g} Hz")
+    return Finding(what, f"{text}, {rate_hz:.1f} Hz")
+
+
+def _check_camera(what: str, camera: CameraConfig) -> Iterator[Finding]:
+    from vical_drivers.camera.opening import check_camera
+
+    from vical_daemon.roles.camera import driver_options
+
+    problems = check_camera(camera.uri, **driver_options(camera))
+    if not problems:
+        width, height = camera.size
+        yield Finding(what, f"{camera.uri}: {width} x {height} at {camera.rate_hz:g} Hz")
+    for problem in problems:
+        yield Finding(what, camera.uri, problem)
+
+
+def _print(findings: list[Finding], *, as_json: bool) -> None:
+    if not as_json:
+        for finding in findings:
+            _print_line(finding)
+        return
+    problems = [finding.problem for finding in findings if finding.problem]
+    checked = [{"what": f.what, "found": f.text, "problem": f.problem} for f in findings]
+    print(json.dumps({"ok": not problems, "problems": problems, "checked": checked}))
+
+
+def _print_line(finding: Finding) -> None:
+    mark, text = ("FAIL", finding.problem) if finding.problem else ("ok", finding.text)
+    print(f"{mark:<5}{finding.what:<16}{text}", flush=True)

@@ -1,0 +1,77 @@
+"""The live picture of a calibration, for `vical demo` and `vical watch`: estimate ± sigma and status."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.calibration_text import euler_deg
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+Row = tuple[str, str, str, str]  # name, estimate, sigma, unit
+
+
+def rows(camera: CameraEstimate) -> list[Row]:
+    """Return name, estimate, sigma and unit of everything that is estimated about one camera."""
+    pose = camera.T_imu_cam
+    sigma = [math.sqrt(max(pose.covariance[i][i], 0.0)) for i in range(6)]
+    table = [
+        (f"position {axis}", f"{1e3 * p:.2f}", f"{1e3 * s:.2f}", "mm")
+        for axis, p, s in zip("xyz", pose.p_m, sigma[:3], strict=True)
+    ]
+    angles = euler_deg(pose.q_wxyz)
+    table += [
+        (name, f"{angle:.3f}", f"{math.degrees(s):.3f}", "deg")
+        for name, angle, s in zip(("roll", "pitch", "yaw"), angles, sigma[3:], strict=True)
+    ]
+    shift, shift_sigma = camera.timeshift_cam_imu_s, camera.timeshift_sigma_s
+    table.append(("time shift", f"{1e3 * shift:.3f}", f"{1e3 * shift_sigma:.3f}", "ms"))
+    if any(camera.intrinsics_sigma):
+        for name, value, s in zip(
+            ("fx", "fy", "cx", "cy"), camera.intrinsics, camera.intrinsics_sigma, strict=True
+        ):
+            table.append((name, f"{value:.2f}", f"{s:.2f}", "px"))
+    return table
+
+
+def one_line(camera: str, estimate: CalibrationEstimate) -> str:
+    """Return one line of progress, for logs and pipes."""
+    known = estimate.cameras.get(camera)
+    text = f"{estimate.duration_s:6.1f} s  {camera}  {estimate.status:<12} {estimate.progress:4.0%}"
+    if known is not None:
+        p = " ".join(f"{1e3 * v:.1f}" for v in known.T_imu_cam.p_m)
+        sigma = max(math.sqrt(max(known.T_imu_cam.covariance[i][i], 0.0)) for i in range(3))
+        shift, shift_sigma = 1e3 * known.timeshift_cam_imu_s, 1e3 * known.timeshift_sigma_s
+        text += f"  p {p} ± {1e3 * sigma:.1f} mm  shift {shift:.2f} ± {shift_sigma:.2f} ms"
+    return text + (
+        f"  {estimate.guidance or estimate.reason}" if estimate.guidance or estimate.reason else ""
+    )
+
+
+def picture(camera: str, estimate: CalibrationEstimate, health: list[str]) -> RenderableType:
+    """Return the table of one camera with a bar and what to do next."""
+    from rich.console import Group
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=f"{camera} in the imu frame", title_justify="left", box=None, pad_edge=False)
+    for name, side in (("", "left"), ("estimate", "right"), ("± sigma", "right"), ("", "left")):
+        table.add_column(name, justify=side)  # type: ignore[arg-type]
+    known = estimate.cameras.get(camera)
+    for row in rows(known) if known is not None else []:
+        table.add_row(*row)
+    colour = {"converged": "green", "degenerate": "yellow", "inconsistent": "red"}.get(
+        estimate.status, "cyan"
+    )
+    head = Text.assemble(
+        (f"{estimate.status}", f"bold {colour}"),
+        f"  {estimate.duration_s:.1f} s, {estimate.frames} frames, {estimate.imu_samples} imu samples, "
+        f"NIS/dof {estimate.nis_per_dof:.2f}",
+    )
+    bar = ProgressBar(total=1.0, completed=min(max(estimate.progress, 0.0), 1.0), width=40)
+    advice = Text(estimate.guidance or estimate.reason, style="yellow")
+    return Group(head, bar, advice, table, *(Text(line, style="dim") for line in health))

@@ -1,0 +1,113 @@
+"""The table of roles and of the processes they run in, and roles as threads of one process."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from vical_daemon.bus import Bus
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.options import suggest
+from vical_daemon.config import Config
+
+_log = logging.getLogger(__name__)
+
+PROCESSES: dict[str, tuple[str, ...]] = {
+    "acquire": ("imu", "camera"),
+    "record": ("record",),
+    "calibrate": ("detect", "estimate"),
+    "web": ("web",),
+}
+"""Process (`vical run NAME`, unit `vical-NAME.service`) -> its roles."""
+
+HOSTS_BUS = "imu"
+"""The process with this role hosts the bus; the others are its clients."""
+
+
+def role_names(words: Sequence[str]) -> list[str]:
+    """Turn process and role names, as typed, into roles in the order of the table.
+
+    Raises:
+        CliError: A name that is neither.
+    """
+    roles = [role for names in PROCESSES.values() for role in names]
+    wanted: set[str] = set()
+    for word in words:
+        if word in PROCESSES:
+            wanted.update(PROCESSES[word])
+        elif word in roles:
+            wanted.add(word)
+        else:
+            known = [*PROCESSES, *roles]
+            hint = suggest(word, known) or f" (known: {', '.join(dict.fromkeys(known))})"
+            raise CliError(f"{word!r} is neither a process nor a role{hint}", EXIT_USAGE)
+    return [role for role in roles if role in wanted]
+
+
+def needed_processes(config: Config) -> list[str]:
+    """Return the processes that a config asks for."""
+    needed = ["acquire", "record"]
+    if config.cameras and config.imus:
+        needed.append("calibrate")
+    if config.web.enabled:
+        needed.append("web")
+    return [name for name in needed if all(find_spec(f"vical_daemon.roles.{r}") for r in PROCESSES[name])]
+
+
+class RoleThreads:
+    """Roles running as threads of this process, on one bus.
+
+    A role that dies of a programming error is not started again here: `failed` is set, and whoever runs
+    the process ends it, so that systemd (or the parent) starts it afresh.
+
+    Args:
+        config: The rig.
+        bus: What they talk through.
+    """
+
+    def __init__(self, config: Config, bus: Bus) -> None:
+        self._config, self._bus = config, bus
+        self._threads: dict[str, threading.Thread] = {}
+        self._stops: dict[str, threading.Event] = {}
+        self.failed = threading.Event()
+        self.errors: dict[str, Exception] = {}
+
+    def start(self, role: str, options: Mapping[str, Any] | None = None) -> None:
+        """Start a role; `options` are further arguments of its `run`."""
+        run = import_module(f"vical_daemon.roles.{role}").run
+        stop = self._stops[role] = threading.Event()
+
+        def guarded() -> None:
+            try:
+                run(self._config, self._bus, stop, **(options or {}))
+            except Exception as error:
+                self.errors[role] = error
+                self.failed.set()
+                if not hasattr(type(error), "exit_code"):
+                    _log.exception("role %s failed", role)
+
+        thread = self._threads[role] = threading.Thread(target=guarded, name=f"role {role}", daemon=True)
+        thread.start()
+
+    def stop(self, role: str, timeout_s: float = 10.0) -> bool:
+        """End a role; False if it does not end in time."""
+        self._stops[role].set()
+        self._threads[role].join(timeout_s)
+        stuck = self._threads[role].is_alive()
+        if stuck:
+            _log.error("role %s does not stop", role)
+        return not stuck
+
+    def stop_all(self, timeout_s: float = 10.0) -> bool:
+        """End all roles, the last started first: consumers are started first and see the last data."""
+        ended = [self.stop(role, timeout_s) for role in reversed(list(self._threads))]
+        return all(ended)
+
+    def raise_failure(self) -> None:
+        """Raise what a role died of, if one did."""
+        for error in self.errors.values():
+            raise error
