@@ -47,7 +47,7 @@ class FrameStatistics:
             numbers, stamps = np.array(self._recent, dtype=np.int64).T
             x, y = (numbers - numbers[0]).astype(float), (stamps - stamps[0]).astype(float)
             slope, intercept = np.polyfit(x, y, 1)
-            rate_hz = 1e9 / slope if slope > 0 else 0.0
+            rate_hz = float(1e9 / slope) if slope > 0 else 0.0
             jitter_us = float(np.std(y - slope * x - intercept)) * 1e-3
         return SourceStats(
             samples=self.frames,

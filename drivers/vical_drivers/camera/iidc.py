@@ -1,0 +1,343 @@
+"""FireWire (IIDC) cameras over libdc1394: frames dated by the bus clock.
+
+A Point Grey camera writes the cycle time at which its shutter closed into each image; the bus clock is
+read together with CLOCK_MONOTONIC at each frame and fitted (`cycle_clock`), and half the exposure is
+taken off. Any other camera is dated by the first packet of its frame. libdc1394 itself reports no lost
+frames; they are found by the embedded frame counter, or by gaps in the stamps.
+"""
+
+from __future__ import annotations
+
+import logging
+import select
+import time
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from vical_drivers.camera import iidc_abi as abi
+from vical_drivers.camera.cycle_clock import CycleClock, image_cycle_time_ns
+from vical_drivers.camera.embedded import EmbeddedInfo, parse_embedded
+from vical_drivers.camera.firewire import BusClock, find_node
+from vical_drivers.camera.formats import Bytes, CorruptImageError, FrameDecoder, Image
+from vical_drivers.camera.hotplug import wait_for_camera
+from vical_drivers.camera.iidc_device import IidcDevice, IidcMode, frame_bytes, list_devices, pixel_format
+from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.stamps import Anchor, SequenceCounter
+from vical_drivers.camera.statistics import FrameStatistics
+from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp
+from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
+from vical_drivers.samples import DeviceInfo, Frame, SourceStats
+
+_log = logging.getLogger(__name__)
+
+list_iidc_cameras = list_devices
+
+MIN_SILENCE_S = 1.0
+SILENT_PERIODS = 5.0
+PACKET_STAMP_SIGMA_NS = 36_000
+"""The first packet is dated by its bus cycle of 125 us: a uniform error of 125 us / sqrt(12)."""
+
+
+class IidcCamera:
+    """A `FrameSource` over one FireWire camera.
+
+    Args:
+        name: GUID in hexadecimal; "": the only camera on the bus.
+        settings: What is asked of the camera; applied again when it comes back. `borrow` is not used:
+            the ring's memory goes away with the camera.
+
+    Raises:
+        DriverError: One line, with what to try.
+    """
+
+    def __init__(self, name: str, settings: CameraSettings | None = None) -> None:
+        self._settings = settings or CameraSettings()
+        self._guid = _parse_guid(name)
+        self._statistics = FrameStatistics()
+        self._stamper = ExposureStamper(self._settings)
+        self._clock = CycleClock()
+        self._device: IidcDevice | None = None
+        self._bus: BusClock | None = None
+        self._closed = False
+        self._pending_loss = 0
+        self._open()
+        self._info = self._describe()
+
+    # -- life ----------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        try:
+            self._device = device = IidcDevice(self._guid)
+            self._guid = device.guid
+            path = find_node(device.guid)
+            if path is None:
+                raise DeviceLostError(f"{device.name}: the camera went away")
+            self._bus = BusClock(path)
+            self._mode: IidcMode = device.set_mode(self._settings)
+            self._frame_info = device.embed()
+            self._apply(device)
+            self._fd = device.start(self._settings.buffers)
+        except BaseException:
+            self._drop()
+            raise
+        self._decode: FrameDecoder | None = None
+        self._counter = SequenceCounter(32)
+        self._shutter_raw: int | None = None
+        self._sequence = 0
+        self._t_last_ns: int | None = None
+        self._t_alive_ns = time.monotonic_ns()
+
+    def _apply(self, device: IidcDevice) -> None:
+        wanted = self._settings
+        if wanted.exposure_s is not None:
+            device.set_absolute(abi.FEATURE_SHUTTER, wanted.exposure_s, "shutter", "s")
+        if wanted.gain is not None:
+            device.set_absolute(abi.FEATURE_GAIN, wanted.gain, "gain", "dB")
+        for name, value in wanted.controls.items():
+            register = _parse_register(device, name)
+            device.set_register(register, int(value))
+        self._stamper.set_exposure(self._read_exposure(device), 0)
+
+    def _read_exposure(self, device: IidcDevice) -> int | None:
+        """Exposure in force, ns; None where the camera cannot tell it in seconds."""
+        if not device.has_absolute(abi.FEATURE_SHUTTER):
+            return None
+        embeds_shutter = bool(self._frame_info)
+        if device.is_automatic(abi.FEATURE_SHUTTER) and not embeds_shutter:
+            return None
+        return round(device.absolute(abi.FEATURE_SHUTTER) * 1e9)
+
+    def _drop(self) -> None:
+        device, self._device = self._device, None
+        bus, self._bus = self._bus, None
+        if device is not None:
+            device.close()
+        if bus is not None:
+            bus.close()
+
+    def _come_back(self, timeout_s: float) -> None:
+        try:
+            self._open()
+        except DriverError as error:
+            wait_for_camera(timeout_s, ("firewire",))
+            raise DeviceLostError(f"iidc:{self._guid:016x}: the camera is not back yet ({error})") from error
+        self._clock = CycleClock()
+        self._statistics.restart()
+        _log.info("camera back guid=%016x", self._guid)
+
+    def close(self) -> None:
+        """Stop the camera and free the bus; may be called twice."""
+        self._closed = True
+        self._drop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # -- who and how -----------------------------------------------------------------------------------
+
+    @property
+    def info(self) -> DeviceInfo:
+        """Who the camera is and, in `details`, what was obtained of what was asked."""
+        return self._info
+
+    def _describe(self) -> DeviceInfo:
+        device, bus = self._need()
+        exposure_ns = self._stamper.exposure_ns
+        return DeviceInfo(
+            kind="camera",
+            model=device.vendor_and_model,
+            serial_number=f"{device.guid:016x}",
+            path=bus.path,
+            protocol="iidc",
+            details={
+                "uri": device.name,
+                "pixel_format": self._mode.coding,
+                "size": f"{self._mode.width}x{self._mode.height}",
+                "rate_hz": f"{self._mode.rate_hz:g}",
+                "encoding": self._settings.encoding,
+                "exposure_s": "unknown" if exposure_ns is None else f"{exposure_ns * 1e-9:g}",
+                "embedded_stamp": "yes" if self._frame_info else "no",
+            },
+        )
+
+    def _need(self) -> tuple[IidcDevice, BusClock]:
+        if self._device is None or self._bus is None:
+            state = "closed" if self._closed else "away"
+            raise DeviceLostError(f"iidc:{self._guid or 0:016x}: the camera is {state}")
+        return self._device, self._bus
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Set the exposure time while streaming; returns the one obtained, s."""
+        device, _ = self._need()
+        obtained_s = device.set_absolute(abi.FEATURE_SHUTTER, exposure_s, "shutter", "s")
+        if not self._frame_info:  # else the image itself says when the new shutter is in force
+            self._stamper.set_exposure(round(obtained_s * 1e9), time.monotonic_ns())
+        return obtained_s
+
+    def stats(self) -> SourceStats:
+        """Counters since the source was opened; `clock_skew_ppm` is the bus clock's."""
+        return self._statistics.snapshot(
+            clock_skew_ppm=self._clock.skew_ppm,
+            bus_clock_restarts=float(self._clock.restarts),
+            bus_clock_sigma_us=self._clock.sigma_ns * 1e-3,
+        )
+
+    # -- frames ----------------------------------------------------------------------------------------
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, or None after `timeout_s` without one.
+
+        Raises:
+            DeviceLostError: The camera went away, fell silent, or is still away; call again.
+        """
+        deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        if self._device is None and not self._closed:
+            self._come_back(timeout_s)
+        try:
+            while True:
+                left_s = (deadline_ns - time.monotonic_ns()) * 1e-9
+                frame = self._next(max(0.0, left_s))
+                if frame is not None or time.monotonic_ns() >= deadline_ns:
+                    return frame
+        except (DeviceLostError, DeviceBusyError):
+            self._drop()
+            raise
+
+    def _next(self, timeout_s: float) -> Frame | None:
+        device, bus = self._need()
+        poller = select.poll()
+        poller.register(self._fd, select.POLLIN)
+        events = dict(poller.poll(min(timeout_s, MIN_SILENCE_S) * 1e3)).get(self._fd, 0)
+        if events & (select.POLLERR | select.POLLHUP | select.POLLNVAL):
+            raise DeviceLostError(f"{device.name}: the camera went away")
+        held = device.dequeue() if events else None
+        if held is None:
+            self._check_silence(device)
+            return None
+        t_arrival_ns = time.monotonic_ns()
+        t_real_ns = time.time_ns()
+        self._t_alive_ns = t_arrival_ns
+        frame: abi.VideoFrame = held.contents
+        data = frame_bytes(frame)
+        t_packet_ns = t_arrival_ns - (t_real_ns - frame.timestamp_us * 1000)
+        image_format = pixel_format(self._mode.coding, frame)
+        depth_bits = frame.data_depth
+        device.enqueue(held)
+        self._clock.add(*bus.read())
+        if self._decode is None or self._decode.pixel_format != image_format:
+            self._decode = self._make_decoder(device, image_format)
+        info = parse_embedded(data[:64].tobytes(), self._frame_info)
+        return self._finish(device, data, depth_bits, info, t_packet_ns, t_arrival_ns)
+
+    def _check_silence(self, device: IidcDevice) -> None:
+        """A camera that was unplugged for a moment keeps its node, but has forgotten to send."""
+        period_s = 1.0 / self._mode.rate_hz if self._mode.rate_hz > 0 else 0.1
+        silent_s = (time.monotonic_ns() - self._t_alive_ns) * 1e-9
+        if silent_s > max(MIN_SILENCE_S, SILENT_PERIODS * period_s):
+            raise DeviceLostError(f"{device.name}: no frame for {silent_s:.1f} s; it is opened anew")
+
+    def _make_decoder(self, device: IidcDevice, image_format: Any) -> FrameDecoder:
+        try:
+            mode, encoding = self._mode, self._settings.encoding
+            return FrameDecoder(image_format, mode.width, mode.height, encoding=encoding)
+        except ValueError as error:
+            raise DeviceRefusedError(f"{device.name}: {error}") from error
+
+    def _finish(
+        self,
+        device: IidcDevice,
+        data: Bytes,
+        depth_bits: int,
+        info: EmbeddedInfo,
+        t_packet_ns: int,
+        t_arrival_ns: int,
+    ) -> Frame | None:
+        raw = self._raw_stamp(info, t_packet_ns)
+        self._update_exposure(device, info)
+        self._pending_loss += self._missing(info, raw.t_raw_ns)
+        image = self._image(data, depth_bits)
+        if image is None:
+            self._pending_loss += 1
+            return None
+        stamp, exposure_ns = self._stamper.stamp(raw)
+        dropped, self._pending_loss = self._pending_loss, 0
+        self._statistics.add(stamp.t_exposure_mid_ns, dropped)
+        return Frame(
+            t_exposure_mid_ns=stamp.t_exposure_mid_ns,
+            t_arrival_ns=t_arrival_ns,
+            sequence=self._sequence,
+            image=image,
+            encoding=self._settings.encoding,
+            stamp_rule=stamp.rule,
+            exposure_ns=exposure_ns,
+            readout_ns=self._settings.shutter.row_spread_ns,
+            t_sigma_ns=raw.t_sigma_ns,
+            dropped_before=dropped,
+        )
+
+    def _raw_stamp(self, info: EmbeddedInfo, t_packet_ns: int) -> RawStamp:
+        forced = self._settings.stamp
+        anchor = None if forced in ("auto", "raw") else Anchor(forced)
+        if info.cycle_time is not None:
+            t_ns = self._clock.to_host_ns(image_cycle_time_ns(info.cycle_time))
+            sigma_ns = round(self._clock.sigma_ns) + 200  # and the masked bits
+            return RawStamp(t_ns, anchor or Anchor.SHUTTER_CLOSED, "embedded-cycle-timer", sigma_ns)
+        return RawStamp(t_packet_ns, anchor or Anchor.FIRST_PACKET, None, PACKET_STAMP_SIGMA_NS)
+
+    def _update_exposure(self, device: IidcDevice, info: EmbeddedInfo) -> None:
+        """Read the shutter in seconds again whenever the image says that its raw value changed."""
+        if info.shutter is None or info.shutter == self._shutter_raw:
+            return
+        self._shutter_raw = info.shutter
+        exposure_ns = self._read_exposure(device)
+        self._stamper.set_exposure(exposure_ns, 0)
+
+    def _missing(self, info: EmbeddedInfo, t_raw_ns: int) -> int:
+        if info.frame_counter is not None:
+            missing = self._counter.missing_before(info.frame_counter)
+        elif self._t_last_ns is None or self._mode.rate_hz <= 0:
+            missing = 0
+        else:
+            periods = (t_raw_ns - self._t_last_ns) * 1e-9 * self._mode.rate_hz
+            missing = max(0, round(periods) - 1)
+        self._t_last_ns = t_raw_ns
+        self._sequence += missing + 1
+        return missing
+
+    def _image(self, data: Bytes, depth_bits: int) -> Image | None:
+        assert self._decode is not None
+        if self._mode.coding == "mono16":  # big endian on the bus, and left of its depth
+            wide = data.view(">u2").astype(np.uint16)
+            data = (wide << max(0, 16 - depth_bits)).astype(np.uint16).view(np.uint8)
+        try:
+            return self._decode(data)
+        except CorruptImageError as error:
+            self._statistics.count("corrupt_images")
+            self._statistics.corrupt += 1
+            _log.debug("corrupt image: %s", error)
+            return None
+
+
+def _parse_guid(name: str) -> int | None:
+    if not name:
+        return None
+    try:
+        return int(name, 16)
+    except ValueError as error:
+        raise DeviceRefusedError(f"iidc:{name}: not a GUID; it has 16 hexadecimal digits") from error
+
+
+def _parse_register(device: IidcDevice, name: str) -> int:
+    try:
+        return int(name, 16)
+    except ValueError as error:
+        raise DeviceRefusedError(
+            f"{device.name}: control {name!r} is no register like 0x80c; exposure_s and gain have names"
+        ) from error
