@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vical_daemon.cli.errors import EXIT_FAILURE, EXIT_USAGE
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     except ConfigError as error:
         findings = [Finding("config", args.config, problem) for problem in error.problems]
         _print(findings, as_json=args.json)
-        return EXIT_USAGE
+        raise CliError(_count(findings), EXIT_USAGE) from None
     findings = [Finding("config", f"{args.config}: {_summary(config)}")]
     for finding in _findings(config, devices=not args.no_devices):
         findings.append(finding)
@@ -54,10 +54,18 @@ def run(args: argparse.Namespace) -> int:
             _print_line(finding)
     if args.json:
         _print(findings, as_json=True)
-    bad = [finding for finding in findings if finding.problem]
+    if any(finding.problem for finding in findings):
+        raise CliError(_count(findings))
     if not args.json:
-        print(f"{len(bad)} problem{'s' * (len(bad) != 1)}" if bad else "all is well")
-    return EXIT_FAILURE if bad else 0
+        print("all is well")
+    return 0
+
+
+def _count(findings: list[Finding]) -> str:
+    """Return the one line that stands on stderr when the check fails."""
+    bad = [finding.problem for finding in findings if finding.problem]
+    more = f" (and {len(bad) - 1} more, see above)" if len(bad) > 1 else ""
+    return f"{bad[0]}{more}"
 
 
 def _summary(config: Config) -> str:

@@ -1,0 +1,122 @@
+"""Units: installed twice the same, removed without a trace, accepted by systemd and locked down."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vical_daemon.cli import install_service, main
+from vical_daemon.cli.process_sets import PROCESSES
+
+SERVICES = tuple(f"vical-{name}.service" for name in PROCESSES)
+MOST_EXPOSED = 2.0
+needs_analyze = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed (Debian: systemd)"
+)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    assert main(["install-service", "--root", str(tmp_path), "--program", sys.executable]) == 0
+    return tmp_path
+
+
+def _files(root: Path) -> dict[str, str]:
+    return {str(p.relative_to(root)): p.read_text() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def test_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [
+        "install-service",
+        "--dry-run",
+        "--json",
+        "--root",
+        str(tmp_path),
+        "--program",
+        sys.executable,
+    ]
+    assert main(arguments) == 0
+    steps = json.loads(capsys.readouterr().out)["steps"]
+    assert len(steps) >= 9 and {s["action"] for s in steps} == {"write"}
+    assert not list(tmp_path.iterdir())
+
+
+def test_twice_is_once(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = _files(root)
+    capsys.readouterr()
+    assert main(["install-service", "--json", "--root", str(root), "--program", sys.executable]) == 0
+    assert {s["action"] for s in json.loads(capsys.readouterr().out)["steps"]} == {"keep"}
+    assert _files(root) == before
+    assert "@" not in "".join(re.findall(r"@[A-Z_]+@", "".join(before.values())))
+
+
+def test_an_edited_config_is_kept_and_removal_leaves_only_it(root: Path) -> None:
+    config = root / "etc/vical/vical.yaml"
+    config.write_text("rig: mine\n")
+    assert main(["install-service", "--root", str(root), "--program", sys.executable]) == 0
+    assert config.read_text() == "rig: mine\n"
+    assert main(["install-service", "--remove", "--root", str(root)]) == 0
+    assert list(_files(root)) == ["etc/vical/vical.yaml"]
+    assert main(["install-service", "--remove", "--root", str(root)]) == 0
+
+
+def test_every_process_has_a_unit_that_runs_it(root: Path) -> None:
+    for name in PROCESSES:
+        text = (root / f"etc/systemd/system/vical-{name}.service").read_text()
+        assert f"ExecStart={sys.executable} run {name} -c /etc/vical/vical.yaml" in text
+
+
+def test_a_program_in_a_home_folder_stays_readable(tmp_path: Path) -> None:
+    text = install_service.render("vical-.service.d/10-common.conf", Path("/home/robot/vical/bin/vical"))
+    assert "ProtectHome=read-only" in text
+    text = install_service.render("vical-.service.d/10-common.conf", Path("/opt/vical/bin/vical"))
+    assert "ProtectHome=yes" in text
+
+
+def test_only_acquire_is_real_time(root: Path) -> None:
+    units = root / "etc/systemd/system"
+    real_time = [s for s in SERVICES if "CPUSchedulingPolicy=fifo" in (units / s).read_text()]
+    assert real_time == ["vical-acquire.service"]
+
+
+def test_no_right_to_write_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if os.getuid() == 0:
+        pytest.skip("root may write everywhere")
+    (tmp_path / "etc").mkdir()
+    (tmp_path / "etc").chmod(0o500)
+    assert main(["install-service", "--root", str(tmp_path), "--program", sys.executable]) == 1
+    assert "sudo" in capsys.readouterr().err
+
+
+@needs_analyze
+def test_systemd_has_nothing_to_complain_about(root: Path) -> None:
+    units = root / "etc/systemd/system"
+    names = [str(units / name) for name in (*SERVICES, "vical.target")]
+    environment = os.environ | {"SYSTEMD_UNIT_PATH": f"{units}:"}
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", *names], capture_output=True, text=True, env=environment
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@needs_analyze
+def test_the_sandbox_is_tight(root: Path) -> None:
+    units = root / "etc/systemd/system"
+    environment = os.environ | {"SYSTEMD_UNIT_PATH": f"{units}:"}
+    for name in SERVICES:
+        done = subprocess.run(
+            ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(units / name)],
+            capture_output=True,
+            text=True,
+            env=environment,
+        )
+        level = re.search(rf"level for {name}: ([0-9.]+)", done.stdout)
+        assert level is not None, done.stdout + done.stderr
+        assert float(level.group(1)) <= MOST_EXPOSED, name

@@ -1,0 +1,172 @@
+"""`vical install-service`: systemd units, sandbox, user, udev rules and a first config; and their removal."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from vical_daemon.cli.errors import CliError
+from vical_daemon.cli.options import add_json
+
+HELP = "install systemd units, udev rules and the user, or remove them"
+_UNITS = Path("etc/systemd/system")
+_CONFIG = Path("etc/vical/vical.yaml")
+_PLACES = {
+    "vical.target": _UNITS / "vical.target",
+    "vical-acquire.service": _UNITS / "vical-acquire.service",
+    "vical-record.service": _UNITS / "vical-record.service",
+    "vical-calibrate.service": _UNITS / "vical-calibrate.service",
+    "vical-web.service": _UNITS / "vical-web.service",
+    "vical-.service.d/10-common.conf": _UNITS / "vical-.service.d/10-common.conf",
+    "vical.sysusers": Path("etc/sysusers.d/vical.conf"),
+    "70-vical.rules": Path("etc/udev/rules.d/70-vical.rules"),
+}
+"""Template -> where it goes, below the root folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One thing to do: write a file (`text`), remove one, or run a command."""
+
+    action: str  # write, keep, remove or run
+    what: str
+    text: str = ""
+    command: tuple[str, ...] = ()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of COMMANDS."""
+    parser.add_argument("--dry-run", action="store_true", help="say what would be done, do nothing")
+    parser.add_argument("--remove", action="store_true", help="take everything away but config and data")
+    parser.add_argument("--now", action="store_true", help="also enable and start vical.target")
+    parser.add_argument(
+        "--root", metavar="DIR", default="/", help="install below DIR, run no command (images)"
+    )
+    parser.add_argument("--program", metavar="PATH", help="the `vical` to run (default: this one)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Install or remove; doing it twice changes nothing."""
+    root = Path(args.root)
+    steps = removal(root) if args.remove else installation(root, _program(args.program), now=args.now)
+    if not args.dry_run:
+        _require_rights(root)
+    done = []
+    for step in steps:
+        if step.command and (args.root != "/" or not shutil.which(step.command[0])):
+            continue
+        if not args.dry_run:
+            _perform(step)
+        done.append({"action": step.action, "what": step.what})
+        if not args.json:
+            print(f"{'would ' if args.dry_run else ''}{step.action:<7}{step.what}")
+    if args.json:
+        print(json.dumps({"dry_run": args.dry_run, "steps": done}))
+    elif not args.remove and not args.dry_run and not args.now:
+        print("next: edit /etc/vical/vical.yaml, `vical check -c /etc/vical/vical.yaml`,")
+        print("      `systemctl enable --now vical.target`, `vical watch`")
+    return 0
+
+
+def templates() -> Path:
+    """Return the folder of the unit templates: in the package, or in the repository it runs from.
+
+    Raises:
+        CliError: Neither is there.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "service_files", package.parent / "systemd"):
+        if (folder / "vical.target").is_file():
+            return folder
+    raise CliError(f"the unit files are not in this installation (looked beside {package})")
+
+
+def render(name: str, program: Path) -> str:
+    """Return a template with the program's path; home folders stay readable only if it runs from one."""
+    text = (templates() / name).read_text(encoding="utf-8")
+    in_home = any(program.is_relative_to(home) for home in ("/home", "/root", "/run/user"))
+    return text.replace("@VICAL@", str(program)).replace("@PROTECT_HOME@", "read-only" if in_home else "yes")
+
+
+def installation(root: Path, program: Path, *, now: bool = False) -> list[Step]:
+    """Return what to do to install."""
+    steps = []
+    for name, place in _PLACES.items():
+        path, text = root / place, render(name, program)
+        same = path.is_file() and path.read_text(encoding="utf-8") == text
+        steps.append(Step("keep" if same else "write", str(path), text))
+    config = root / _CONFIG
+    example = _example()
+    if example and not config.exists():
+        steps.append(Step("write", str(config), example))
+    else:
+        steps.append(Step("keep", str(config)))
+    steps += [_command("systemd-sysusers"), _command("systemctl", "daemon-reload")]
+    steps += [
+        _command("udevadm", "control", "--reload"),
+        _command("udevadm", "trigger", "--subsystem-match=tty"),
+    ]
+    if now:
+        steps.append(_command("systemctl", "enable", "--now", "vical.target"))
+    return steps
+
+
+def removal(root: Path) -> list[Step]:
+    """Return what to do to remove; the config, the user and what was recorded stay."""
+    steps = [_command("systemctl", "disable", "--now", "vical.target", "vical-web.service")]
+    steps += [_command("systemctl", "stop", "vical-acquire", "vical-record", "vical-calibrate")]
+    steps += [Step("remove", str(root / place)) for place in _PLACES.values() if (root / place).exists()]
+    steps += [_command("systemctl", "daemon-reload"), _command("udevadm", "control", "--reload")]
+    return steps
+
+
+def _command(*words: str) -> Step:
+    return Step("run", " ".join(words), command=words)
+
+
+def _example() -> str:
+    package = Path(__file__).resolve().parents[1]
+    for path in (package / "service_files" / "vical.yaml", package.parent / "examples" / "vical.yaml"):
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    return ""
+
+
+def _program(given: str | None) -> Path:
+    """Return the absolute path of the command that the units start."""
+    candidates = [Path(given)] if given else [Path(sys.argv[0]), Path(sys.executable).with_name("vical")]
+    for path in candidates:
+        if path.is_file() and os.access(path, os.X_OK):
+            return path.absolute()
+    raise CliError(f"{candidates[0]}: not a program; give it with --program", 2)
+
+
+def _require_rights(root: Path) -> None:
+    existing = next(
+        p for p in ((root / _UNITS).absolute(), *(root / _UNITS).absolute().parents) if p.exists()
+    )
+    if not os.access(existing, os.W_OK):
+        raise CliError(f"{existing}: not writable; run it with sudo, or look first with --dry-run")
+
+
+def _perform(step: Step) -> None:
+    if step.action == "write":
+        path = Path(step.what)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(path.name + ".new")
+        temporary.write_text(step.text, encoding="utf-8")
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    elif step.action == "remove":
+        Path(step.what).unlink(missing_ok=True)
+    elif step.command:
+        done = subprocess.run(step.command, capture_output=True, text=True, check=False)
+        if done.returncode:  # a unit that is not loaded cannot be stopped: no reason to give up
+            print(f"vical: warning: {step.what}: {done.stderr.strip()}", file=sys.stderr)
