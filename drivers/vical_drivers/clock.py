@@ -51,7 +51,7 @@ class EnvelopeOptions:
     Attributes:
         max_skew: Bound of the relative rate error of the two clocks (1e-6 is 1 ppm).
         skew_prior: One-sigma of that error before anything is known.
-        skew_wander_per_s: How fast the skew itself drifts, 1/s (2e-8: 1.2 ppm a minute); with the jitter it
+        skew_wander_per_s: How fast the skew itself drifts, 1/s (4e-8: 2.4 ppm a minute); with the jitter it
             sets the window: long enough for lucky samples, short enough for a straight line.
         min_window_s: Shortest memory.
         max_window_s: Longest memory.
@@ -60,7 +60,7 @@ class EnvelopeOptions:
 
     max_skew: float = 500e-6
     skew_prior: float = 100e-6
-    skew_wander_per_s: float = 2e-8
+    skew_wander_per_s: float = 4e-8
     min_window_s: float = 20.0
     max_window_s: float = 120.0
     block_s: float = 0.2
@@ -107,7 +107,9 @@ class LowerEnvelope:
     def window_s(self) -> float:
         """Present length of the memory, s: the cube root balances jitter/W against wander * W^2."""
         o = self.options
-        window = (self._delay_mean_s / o.skew_wander_per_s) ** (1 / 3) if self._delay_mean_s > 0 else 0.0
+        window = (
+            1.5 * (self._delay_mean_s / o.skew_wander_per_s) ** (1 / 3) if self._delay_mean_s > 0 else 0.0
+        )
         return min(max(window, o.min_window_s), o.max_window_s)
 
     def line(self, x_s: float) -> float:
@@ -148,14 +150,15 @@ class LowerEnvelope:
         if self._best is not None:
             points.append(self._best)
         hull = _lower_hull(points)
-        edge_skew, span_s = _edge_at(hull, self._newest_s - self.window_s / 3.0)
+        memory_s = min(self.window_s, points[-1][0] - points[0][0])
+        slope = _slope_at(hull, self._newest_s - memory_s / 2.0, memory_s / 4.0)
         spread_s = self._spread_s(points)
-        # A short edge under jittery points says little about the skew: weigh it against the prior.
-        skew_sigma = spread_s / span_s if span_s > 0 else math.inf
+        # A short memory of jittery points says little about the skew: weigh it against the prior.
+        skew_sigma = 2.0 * spread_s / memory_s if memory_s > 0 else math.inf
         prior = self.options.skew_prior
-        weight = prior**2 / (prior**2 + skew_sigma**2) if math.isfinite(skew_sigma) else 0.0
+        weight = 1.0 / (1.0 + (skew_sigma / prior) ** 2)
         bound = self.options.max_skew
-        self._skew = min(max(edge_skew * weight, -bound), bound)
+        self._skew = min(max(slope * weight, -bound), bound)
         self._offset_s = min(d - self._skew * x for x, d in hull)
         self._skew_sigma = prior * math.sqrt(1.0 - weight)
         self._sigma_s = self._uncertainty_s(points, spread_s)
@@ -163,7 +166,9 @@ class LowerEnvelope:
     def _spread_s(self, points: list[tuple[float, float]]) -> float:
         """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
         residuals = sorted(d - self.line(x) for x, d in points)
-        return max(residuals[len(residuals) // 10] - residuals[0], 1e-6)
+        # A few points may agree by chance: their number bounds what can be believed.
+        believable_s = self._delay_mean_s / math.sqrt(self._points)
+        return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
 
     def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float) -> float:
         memory_s = max(points[-1][0] - points[0][0], self.options.block_s)
@@ -191,15 +196,28 @@ def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
     return hull
 
 
-def _edge_at(hull: list[tuple[float, float]], x_s: float) -> tuple[float, float]:
-    """Slope and length of the hull edge over `x_s` (the nearest one where none is)."""
+def _slope_at(hull: list[tuple[float, float]], x_s: float, span_s: float) -> float:
+    """Slope of the hull over `x_s`, from a chord of at least `span_s` where there is one.
+
+    The hull's edge there may join two lucky neighbours, whose slope is mostly the tick's rounding; it is
+    widened to whichever side bends less.
+    """
     if len(hull) < 2:
-        return 0.0, 0.0
-    at = 1
-    while at < len(hull) - 1 and hull[at][0] < x_s:
-        at += 1
-    (x1, d1), (x2, d2) = hull[at - 1], hull[at]
-    return (d2 - d1) / (x2 - x1), x2 - x1
+        return 0.0
+    right = 1
+    while right < len(hull) - 1 and hull[right][0] < x_s:
+        right += 1
+    left = right - 1
+    while hull[right][0] - hull[left][0] < span_s and (left > 0 or right < len(hull) - 1):
+        slope = _slope(hull[left], hull[right])
+        bend_left = abs(_slope(hull[left - 1], hull[left]) - slope) if left > 0 else math.inf
+        bend_right = abs(_slope(hull[right], hull[right + 1]) - slope) if right < len(hull) - 1 else math.inf
+        left, right = (left - 1, right) if bend_left < bend_right else (left, right + 1)
+    return _slope(hull[left], hull[right])
+
+
+def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return (b[1] - a[1]) / (b[0] - a[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,7 +332,7 @@ class DeviceClock:
             lost = max(0, round(step_s * self.rate_hz) - 1)
         self.lost += lost
         self._last_t_ns, self._stamped_ticks = t_ns, unwrapped_ticks
-        sigma_s = math.hypot(self.envelope.sigma_s, 1.0 / self.tick_hz / math.sqrt(12.0))
+        sigma_s = math.hypot(self.envelope.sigma_s, 0.5 / self.tick_hz)
         return Stamp(t_ns, round(min(sigma_s, 1.0) * _NS), unwrapped_ticks, lost)
 
 
