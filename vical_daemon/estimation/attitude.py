@@ -4,9 +4,10 @@ All describe the same `R_a_b` (maps b vectors into a) as `so3`, and all products
 `mrp_compose(s, t)` is `R(s) @ R(t)`. Rates take the angular velocity of b relative to a, written in b (what a
 gyro fixed to b measures). Batched over leading axes.
 
-Modified Rodrigues parameters (MRP): `s = axis tan(angle / 4)`. They are singular only at 360 degrees, and
-the "shadow" set -s / |s|^2 names the same rotation by its other quaternion sign: switching to it where |s| > 1
-keeps |s| <= 1 for ever. Equations: Schaub & Junkins; Crassidis & Markley (2003) for the generalised set (GRP).
+Modified Rodrigues parameters (MRP): `s = axis tan(angle / 4)`. They are singular only at 360 degrees.
+Their "shadow" set -s / |s|^2 names the same rotation by its other quaternion sign: switching to it where
+|s| > 1 keeps |s| <= 1 for ever.
+Equations: Schaub & Junkins; Crassidis & Markley (2003) for the generalised set (GRP).
 """
 
 from __future__ import annotations

@@ -1,0 +1,102 @@
+"""Camera orientations for temporal calibration: from views of a planar target."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.camera_model import undistort
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.planar_pose import PlanarPose, PlanarPoses, planar_pose
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_MIN_POINTS = 6
+_MAX_RMS_PX = 8.0  # a pose that misses its corners by more is a wrong detection
+
+
+@dataclass(frozen=True)
+class Orientations:
+    """A stream of orientations of one camera.
+
+    Attributes:
+        t_cam_ns: Stamps in the camera's clock, ns, shape (n,).
+        R_world_cam: The world is the target (or the first camera frame), shape (n, 3, 3).
+        covariance: Of the local (right) error, rad^2, shape (n, 3, 3).
+        skipped: Frames without a usable pose.
+    """
+
+    t_cam_ns: IntArray
+    R_world_cam: FloatArray
+    covariance: FloatArray
+    skipped: int = 0
+
+
+def target_orientations(
+    frames: Iterable[PointsFrame],
+    points_m: FloatArray,
+    intrinsics: FloatArray,
+    distortion: FloatArray,
+    model: str = "radtan",
+    corner_sigma_px: float = 0.5,
+) -> Orientations:
+    """Turn views of a planar target into camera orientations.
+
+    Of a frame's two planar poses the better one is taken; where the image cannot tell them apart, the one
+    that continues the previous frames, and none if there is no previous frame nearby. Frames whose corners
+    fit worse than usual (blur, the edge of the lens) get a covariance that is larger in proportion.
+
+    Args:
+        frames: Views in order of time; ids index `points_m`.
+        points_m: Target points, z = 0, m, shape (k, 3).
+        intrinsics: fx fy cx cy, px, shape (4,).
+        distortion: Four coefficients, shape (4,).
+        model: radtan or equidistant.
+        corner_sigma_px: Noise of a corner per axis, px (scales the covariances only).
+
+    Returns:
+        The orientations with their covariances.
+    """
+    sigma = corner_sigma_px / float(np.mean(intrinsics[:2]))
+    stamps: list[int] = []
+    poses: list[PlanarPose] = []
+    skipped = 0
+    for frame in frames:
+        known = (frame.ids >= 0) & (frame.ids < len(points_m))
+        xy, ok = undistort(frame.uv_px[known], intrinsics, distortion, model)
+        found = (
+            planar_pose(points_m[frame.ids[known][ok]], xy[ok], sigma) if ok.sum() >= _MIN_POINTS else None
+        )
+        near = bool(stamps) and frame.t_cam_ns - stamps[-1] < 500_000_000
+        pose = _choose(found, poses[-1] if near else None)
+        if pose is None or pose.rms * float(intrinsics[0]) > _MAX_RMS_PX:
+            skipped += 1
+            continue
+        stamps.append(frame.t_cam_ns)
+        poses.append(pose)
+    if not poses:
+        return Orientations(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), skipped)
+    R = np.stack([pose.R_cam_target for pose in poses])
+    covariance = np.stack([pose.covariance[3:, 3:] for pose in poses])
+    rms = np.array([pose.rms for pose in poses])
+    covariance *= np.maximum(1.0, rms / np.median(rms))[:, None, None] ** 2
+    R_world_cam = np.swapaxes(R, 1, 2)
+    return Orientations(np.array(stamps), R_world_cam, R @ covariance @ R_world_cam, skipped)
+
+
+def _choose(found: PlanarPoses | None, previous: PlanarPose | None) -> PlanarPose | None:
+    """The best candidate, or where the image is undecided the one nearest to the previous frame's."""
+    if found is None or not found.candidates:
+        return None
+    if not found.ambiguous:
+        return found.candidates[0]
+    if previous is None:
+        return None
+    R = np.stack([candidate.R_cam_target for candidate in found.candidates])
+    turn = np.linalg.norm(so3.log(np.swapaxes(R, 1, 2) @ previous.R_cam_target), axis=1)
+    return found.candidates[int(np.argmin(turn))]
