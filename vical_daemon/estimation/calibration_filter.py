@@ -9,12 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from vical_daemon.estimation import unscented
+from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.imu_model import ImuSegment, Motion, compose, process_noise, strapdown
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise, IntArray
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
 from vical_daemon.estimation.retract import camera_points, motion_points, retract
 from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State, grp_from_rotation
 from vical_daemon.estimation.target_view import Rates, view
@@ -49,7 +51,7 @@ class FrameReport:
     ids: IntArray
     uv_px: FloatArray
     residual_px: FloatArray
-    accepted: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    accepted: BoolArray
     used: bool
     nis: float = 0.0
     dof: int = 0
@@ -57,15 +59,51 @@ class FrameReport:
     reason: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Image:
+    """One image as the update sees it.
+
+    Attributes:
+        camera: Camera name.
+        t_ns: Stamp for the report, camera clock, ns.
+        t_cam_s: The same, s since the base.
+        ids: Point ids, shape (n,).
+        points: Their places in the world, m, shape (n, 3).
+        uv: Measured pixels, shape (n, 2).
+        sigma_px: White noise of each corner per axis, px, shape (n,).
+    """
+
+    camera: str
+    t_ns: int
+    t_cam_s: float
+    ids: IntArray
+    points: FloatArray
+    uv: FloatArray
+    sigma_px: FloatArray
+
+
 @dataclass(slots=True)
 class _Linear:
-    """A statistical linearisation of one image: z = z_bar + H S e + curvature, in pixels."""
+    """A statistical linearisation of one image: z + H S e + curved + common, in pixels."""
 
     z: FloatArray
     linear: FloatArray
     curved: FloatArray
-    at_time: FloatArray
-    valid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    common: FloatArray | None
+    valid: BoolArray
+
+
+@dataclass(slots=True)
+class _Fit:
+    """Outcome of the correction: new root and state step, NIS, who took part, what nothing explains."""
+
+    S: FloatArray
+    dx: FloatArray
+    nis: float
+    dof: int
+    keep: BoolArray
+    rest: float
+    dof_rest: int
 
 
 @dataclass(slots=True)
@@ -80,8 +118,10 @@ class CalibrationFilter:
         corner_noise: Measured corner noise by camera.
         walk: Variance per second added to each error outside the motion model (drift of the time shift,
             slow change of the mounting), shape (n,).
+        consistency: Measured consistency, by camera.
         stamp_jitter_s: Random error of image stamps, common to all corners of an image, s, by camera.
         rates: Rates at the state's instant.
+        nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
 
     state: State
@@ -90,8 +130,10 @@ class CalibrationFilter:
     imu_noise: ImuNoise
     corner_noise: dict[str, CornerNoise]
     walk: FloatArray
+    consistency: dict[str, Consistency] = field(default_factory=dict)
     stamp_jitter_s: dict[str, float] = field(default_factory=dict)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
+    nis_level: float = 4.0
 
     # ------------------------------------------------------------------ propagation
     def predict(self, segment: ImuSegment) -> None:
@@ -149,54 +191,56 @@ class CalibrationFilter:
         self.rates = Rates(omega, state.R_world_imu @ force + state.gravity)
 
     # ------------------------------------------------------------------ update
-    def update(
-        self,
-        camera: str,
-        t_ns: int,
-        t_cam_s: float,
-        ids: IntArray,
-        points: FloatArray,
-        uv: FloatArray,
-        sigma_px: FloatArray | None = None,
-    ) -> FrameReport:
-        """Correct the state with the points of one image.
-
-        Args:
-            camera: Camera name.
-            t_ns: Image stamp for the report, ns.
-            t_cam_s: The same, s since the base (camera clock).
-            ids: Point ids, shape (n,).
-            points: Their places in the world, m, shape (n, 3).
-            uv: Measured pixels, shape (n, 2).
-            sigma_px: Relative weights from the detector, px, shape (n,), or None.
-
-        Returns:
-            The verdict.
-        """
-        noise = self.corner_noise[camera]
-        sigma = noise.sigmas(sigma_px, len(ids))
-        lin = self._linearise(camera, t_cam_s, points, uv, np.zeros(self.layout.size), self.S)
-        innovation = (uv - lin.z) / sigma[:, None]
-        keep = lin.valid & self._corner_gate(innovation, lin, sigma)
+    def update(self, image: Image) -> FrameReport:
+        """Correct the state with the points of one image; the verdict says what became of it."""
+        noise = self.corner_noise[image.camera]
+        lin = self._linearise(image, np.zeros(self.layout.size), self.S)
+        innovation = image.uv - lin.z
+        keep = lin.valid & self._corner_gate(image, innovation, lin)
         if keep.sum() < 4:
+            return self._refused(image, innovation, "too few corners pass the gate")
+        first = lin
+        fit = self._solve(image, lin, keep)
+        level = fit.nis / max(fit.dof, 1)
+        if fit.nis > chi2.isf(_FRAME_GATE_P, fit.dof) * max(1.0, self.nis_level):
+            self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
-                t_ns, camera, ids, uv, innovation * sigma[:, None], "too few corners pass the gate"
+                image, innovation, f"innovation of the image is {level:.1f} times what it should be"
             )
-        S, dx, nis, dof, keep, rest = self._solve(camera, t_cam_s, points, uv, sigma, lin, keep)
-        limit = chi2.isf(_FRAME_GATE_P, dof)
-        if nis > limit:
-            why = f"innovation of the frame is {nis / dof:.1f} times what it should be"
-            return self._refused(t_ns, camera, ids, uv, innovation * sigma[:, None], why)
-        self._accept(S, dx)
-        noise.learn(rest[0], rest[1])
-        residual = uv - self.predict_pixels(camera, t_cam_s, points)
-        return FrameReport(t_ns, camera, ids, uv, residual, keep, True, nis, dof, noise.sigma_px)
+        self.nis_level += 0.05 * (level - self.nis_level)
+        self._accept(fit.S, fit.dx)
+        noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
+        keep = fit.keep
+        residual = image.uv - self.predict_pixels(image.camera, image.t_cam_s, image.points)
+        rows = np.repeat(keep, 2)
+        self.consistency[image.camera].learn(
+            first.z[keep], innovation[keep], first.linear[rows], image.sigma_px[keep]
+        )
+        return FrameReport(
+            image.t_ns,
+            image.camera,
+            image.ids,
+            image.uv,
+            residual,
+            keep,
+            True,
+            fit.nis,
+            fit.dof,
+            noise.sigma_px,
+        )
 
-    def _refused(
-        self, t_ns: int, camera: str, ids: IntArray, uv: FloatArray, residual: FloatArray, why: str
-    ) -> FrameReport:
-        none = np.zeros(len(ids), dtype=bool)
-        return FrameReport(t_ns, camera, ids, uv, residual, none, False, 0.0, 0, 0.0, why)
+    def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
+        """Put a measurement together with the noise it has at present."""
+        sigma = self.corner_noise[frame.camera].sigmas(frame.sigma_px, len(frame.ids))
+        sigma = sigma * np.sqrt(self.consistency[frame.camera].scale)
+        return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma)
+
+    @staticmethod
+    def _refused(image: Image, residual: FloatArray, why: str) -> FrameReport:
+        none = np.zeros(len(image.ids), dtype=bool)
+        return FrameReport(
+            image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why
+        )
 
     def predict_pixels(self, camera: str, t_cam_s: float, points: FloatArray) -> FloatArray:
         """Where points should appear with the nominal state, px, shape (n, 2)."""
@@ -212,127 +256,89 @@ class CalibrationFilter:
         world: FloatArray = points * state.target_scale
         if self.layout.target_scale is not None:
             world = points * (state.target_scale + errors[:, self.layout.target_scale])[:, None, None]
+        ahead = t_cam_s - state.t_s
         rows = None
         if where.readout is not None or known.readout_s != 0.0:
-            v = self._rows_guess(camera, t_cam_s, points, motion, uv)
-            rows = v / known.resolution[1] - 0.5
-        return view(world, motion, cam, self.rates, t_cam_s - state.t_s, known.distortion_model, rows)
+            if uv is None:  # the row at which a global shutter would see the point
+                uv = view(world, motion, cam, self.rates, ahead, known.distortion_model)[0]
+            rows = uv[:, 1] / known.resolution[1] - 0.5
+        return view(world, motion, cam, self.rates, ahead, known.distortion_model, rows)
 
-    def _rows_guess(
-        self, camera: str, t_cam_s: float, points: FloatArray, motion: object, uv: FloatArray | None
-    ) -> FloatArray:
-        """Image row of each point: the measured one, or the one predicted as for a global shutter."""
-        if uv is not None:
-            return uv[:, 1]
-        one = np.zeros((1, self.layout.size))
-        known = self.state.cameras[camera]
-        flat = view(
-            points * self.state.target_scale,
-            motion_points(self.state, self.layout, one),
-            camera_points(known, self.layout, camera, one),
-            self.rates,
-            t_cam_s - self.state.t_s,
-            known.distortion_model,
-        )
-        return flat[0, :, 1]
-
-    def _linearise(
-        self, camera: str, t_cam_s: float, points: FloatArray, uv: FloatArray, dx: FloatArray, S: FloatArray
-    ) -> _Linear:
+    def _linearise(self, image: Image, dx: FloatArray, S: FloatArray) -> _Linear:
         """Statistical linearisation about `dx` with spread S (all in the chart of the prior)."""
         errors = dx + unscented.offsets(S)
-        pixels = self._project(camera, t_cam_s, points, uv, errors)
+        pixels = self._project(image.camera, image.t_cam_s, image.points, image.uv, errors)
         valid = np.isfinite(pixels).all(axis=(0, 2))
         flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
         m = unscented.moments(flat[1:] - flat[0])
         z = (flat[0] + m.shift).reshape(-1, 2)
-        at_time = np.zeros_like(z)
-        jitter = self.stamp_jitter_s.get(camera, 0.0)
+        common = None
+        jitter = self.stamp_jitter_s.get(image.camera, 0.0)
         if jitter > 0.0:
             h = 1e-4
-            base = flat[0].reshape(-1, 2)
-            at_time = (self._project(camera, t_cam_s + h, points, uv, dx[None])[0] - base) * (jitter / h)
-        return _Linear(z, m.linear, m.curved, at_time, valid)
+            later = self._project(image.camera, image.t_cam_s + h, image.points, image.uv, dx[None])[0]
+            common = ((later.ravel() - flat[0]) * (jitter / h))[:, None]
+        return _Linear(z, m.linear, m.curved, common, valid)
 
-    def _corner_gate(
-        self, innovation: FloatArray, lin: _Linear, sigma: FloatArray
-    ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    @staticmethod
+    def _corner_gate(image: Image, innovation: FloatArray, lin: _Linear) -> BoolArray:
         """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
         var = (lin.linear**2).sum(axis=1) + (lin.curved**2).sum(axis=1)
-        var = var.reshape(-1, 2) / sigma[:, None] ** 2 + (lin.at_time / sigma[:, None]) ** 2 + 1.0
-        passed: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = (innovation**2 / var).sum(
-            axis=1
-        ) < _CORNER_GATE
+        if lin.common is not None:
+            var = var + (lin.common**2).sum(axis=1)
+        var = var.reshape(-1, 2) + image.sigma_px[:, None] ** 2
+        passed: BoolArray = (innovation**2 / var).sum(axis=1) < _CORNER_GATE
         return passed
 
-    def _solve(
-        self,
-        camera: str,
-        t_cam_s: float,
-        points: FloatArray,
-        uv: FloatArray,
-        sigma: FloatArray,
-        lin: _Linear,
-        keep: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    ) -> tuple[
-        FloatArray, FloatArray, float, int, np.ndarray[tuple[int, ...], np.dtype[np.bool_]], tuple[float, int]
-    ]:
-        """Iterated posterior linearisation; drops corners whose residual stays impossible."""
+    def _solve(self, image: Image, lin: _Linear, keep: BoolArray) -> _Fit:
+        """Iterated posterior linearisation (once is enough when the prior is tight).
+
+        [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
+        """
         prior = self.S
         S, dx = prior, np.zeros(self.layout.size)
-        M, offset = lin.linear, np.zeros(2 * len(points))
+        M, offset = lin.linear, np.zeros(2 * len(image.ids))
+        weight = 1.0 / np.repeat(image.sigma_px, 2)
         for step in range(_ITERATIONS):
             if step:
-                lin = self._linearise(camera, t_cam_s, points, uv, dx, S)
+                lin = self._linearise(image, dx, S)
                 keep = keep & lin.valid
                 # H S_prior = (H S) S^-1 S_prior, and the innovation refers to the prior mean
-                H = np.linalg.solve(S.T, lin.linear.T).T
+                H = solve_triangular(S, lin.linear.T, lower=True, trans="T", check_finite=False).T
                 M, offset = H @ prior, H @ dx
-            weight = 1.0 / np.repeat(sigma, 2)
-            r = ((uv - lin.z).ravel() + offset) * weight
-            S, dx_new, nis, dof, keep, rest = self._correct(prior, M * weight[:, None], r, lin, weight, keep)
-            moved = np.linalg.norm(np.linalg.solve(S, dx_new - dx)) if step else np.inf
-            dx = dx_new
+            r = ((image.uv - lin.z).ravel() + offset) * weight
+            fit = self._correct(prior, M * weight[:, None], r, lin, weight, keep)
+            step_size = solve_triangular(fit.S, fit.dx - dx, lower=True, check_finite=False)
+            S, dx, keep = fit.S, fit.dx, fit.keep
             curved = (lin.curved * weight[:, None])[np.repeat(keep, 2)]
-            if float((curved**2).sum(axis=1).max(initial=0.0)) < _CURVED**2 or moved < 0.05:
+            straight = float((curved**2).sum(axis=1).max(initial=0.0)) < _CURVED**2
+            if straight or (step and float(np.linalg.norm(step_size)) < 0.05):
                 break
-        return S, dx, nis, dof, keep, rest
+        return fit
 
+    @staticmethod
     def _correct(
-        self,
-        prior: FloatArray,
-        M: FloatArray,
-        r: FloatArray,
-        lin: _Linear,
-        weight: FloatArray,
-        keep: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    ) -> tuple[
-        FloatArray, FloatArray, float, int, np.ndarray[tuple[int, ...], np.dtype[np.bool_]], tuple[float, int]
-    ]:
+        prior: FloatArray, M: FloatArray, r: FloatArray, lin: _Linear, weight: FloatArray, keep: BoolArray
+    ) -> _Fit:
+        """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
         n = prior.shape[0]
-        common = self._common_noise(lin, weight)
-        full = M if common is None else np.concatenate([M, common], axis=1)
+        columns = [M]
+        if lin.common is not None:
+            columns.append(lin.common * weight[:, None])
+        curved = lin.curved * weight[:, None]
+        if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
+            columns.append(curved)
+        full = np.concatenate(columns, axis=1)
         for _ in range(3):
             rows = np.repeat(keep, 2)
             small, r_small, rest, dof_rest = unscented.compress(full[rows], r[rows])
-            c = unscented.correct(prior, small[:, :n], r_small, None if common is None else small[:, n:])
+            c = unscented.correct(prior, small[:, :n], r_small, small[:, n:])
             left = (r - full @ c.solution).reshape(-1, 2)
             bad = keep & ((left**2).sum(axis=1) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
             if not bad.any() or (keep & ~bad).sum() < 4:
                 break
             keep = keep & ~bad
-        return c.S, c.dx, c.nis, len(r_small), keep, (rest, dof_rest)
-
-    @staticmethod
-    def _common_noise(lin: _Linear, weight: FloatArray) -> FloatArray | None:
-        """Whitened noise shared by the corners of a frame: stamp jitter, and curvature while it matters."""
-        columns = []
-        if lin.at_time.any():
-            columns.append((lin.at_time.ravel() * weight)[:, None])
-        curved = lin.curved * weight[:, None]
-        if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
-            columns.append(curved)
-        return np.concatenate(columns, axis=1) if columns else None
+        return _Fit(c.S, c.dx, c.nis, len(r_small), keep, rest, dof_rest)
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""

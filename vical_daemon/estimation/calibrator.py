@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from copy import deepcopy
 
 import numpy as np
 
 from vical_daemon.estimation import start
 from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
+from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.imu_model import ImuBuffer
 from vical_daemon.estimation.judge import Judge
@@ -144,18 +146,32 @@ class Calibrator:
         frames = sorted(
             ((t, f) for w in self._waiting.values() for t, f in w if t >= begin - 0.5), key=lambda e: e[0]
         )
-        self.filter = self._new_filter(result.state)
+        self.filter = self._rehearsed(result.state, frames)
         self.judge.started(begin)
         self._pending.extendleft(reversed(frames))
         for waiting in self._waiting.values():
             waiting.clear()
 
+    def _rehearsed(self, state: State, frames: list[tuple[float, PointsFrame]]) -> CalibrationFilter:
+        """Run over the start once to learn its noise, then start again from the same place.
+
+        The second start takes the better calibration as its mean, with the same wide sigmas.
+        """
+        trial = self._new_filter(deepcopy(state))
+        for t_cam_s, frame in frames:
+            self._step(trial, frame, t_cam_s)
+        fresh = self._new_filter(state)
+        for name, noise in trial.corner_noise.items():
+            fresh.corner_noise[name].sigma_px = noise.sigma_px
+            fresh.consistency[name] = trial.consistency[name]
+        return fresh
+
     def _new_filter(self, state: State) -> CalibrationFilter:
         noise = {name: CornerNoise(self.options.corner_sigma_px) for name in self.priors}
+        consistency = {name: Consistency() for name in self.priors}
         walk = np.zeros(self.layout.size)
-        return CalibrationFilter(
-            state, self.layout, np.diag(self._start_sigmas(state)), self.options.imu_noise, noise, walk
-        )
+        root = np.diag(self._start_sigmas(state))
+        return CalibrationFilter(state, self.layout, root, self.options.imu_noise, noise, walk, consistency)
 
     def _start_sigmas(self, state: State) -> FloatArray:
         """Standard deviations the filter starts with: many times what the start is really worth.
@@ -194,34 +210,34 @@ class Calibrator:
                     continue
                 break
             self._pending.popleft()
-            report = self._one(frame, t_cam_s, t_s)
+            report = self._one(frame, t_cam_s)
             if report is not None:
                 reports.append(report)
         return reports
 
-    def _one(self, frame: PointsFrame, t_cam_s: float, t_s: float) -> FrameReport | None:
-        """Propagate to one image and correct with it."""
-        f, buffer = self.filter, self._buffer
-        assert f is not None
-        assert buffer is not None
+    def _step(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
+        """Propagate a filter to one image and correct it; None where inertial data are missing."""
+        assert self._buffer is not None
+        t_s = t_cam_s + f.state.cameras[frame.camera].timeshift_s
         if t_s > f.state.t_s:
-            segment = buffer.segment(f.state.t_s, t_s)
+            segment = self._buffer.segment(f.state.t_s, t_s)
             if segment is None:
-                self.judge.frames_ignored += 1
                 return None
             f.predict(segment)
-        buffer.trim(f.state.t_s - _KEEP_S)
         if len(frame.ids) < 4:
             return None
-        report = f.update(
-            frame.camera,
-            frame.t_cam_ns,
-            t_cam_s,
-            frame.ids,
-            self.target[frame.ids],
-            frame.uv_px,
-            frame.sigma_px,
-        )
+        return f.update(f.image(frame, t_cam_s, self.target[frame.ids]))
+
+    def _one(self, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
+        """Follow one image of the stream."""
+        f = self.filter
+        assert f is not None
+        assert self._buffer is not None
+        report = self._step(f, frame, t_cam_s)
+        if report is None:
+            self.judge.frames_ignored += 1
+            return None
+        self._buffer.trim(f.state.t_s - _KEEP_S)
         self._refused_in_a_row = 0 if report.used else self._refused_in_a_row + 1
         if self._refused_in_a_row >= _RESTART_AFTER:
             self._pose_anew(frame, t_cam_s)

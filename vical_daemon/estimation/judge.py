@@ -147,12 +147,14 @@ class Judge:
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
         camera, where = f.state.cameras[name], self.layout.cameras[name]
-        sigma = f.sigmas()
+        # Errors that last over several images count less than the filter thinks: see `consistency`.
+        spread = float(np.sqrt(f.consistency[name].factor))
+        sigma = spread * f.sigmas()
         q = so3.quat_from_matrix(camera.R_imu_cam)
         square = self._square.get(name, ())
         count = sum(n for _, n in square)
         return CameraEstimate(
-            PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), pose_covariance(f, where).tolist()),
+            PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), (spread**2 * pose_covariance(f, where)).tolist()),
             camera.timeshift_s,
             float(sigma[where.timeshift]) if where.timeshift is not None else 0.0,
             camera.intrinsics.tolist(),

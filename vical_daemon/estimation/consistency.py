@@ -1,0 +1,118 @@
+"""Measured consistency of the filter: how much larger its innovations are than it thinks, and for how long.
+
+Lens models that do not quite fit, blur, a board that is not quite flat and an IMU that is not quite linear
+move all corners of an image together, and much the same way in the next images. To a filter that takes
+corners as independent such errors look like information: on a real recording it then claims a tenth of a
+millimetre where two halves of the data differ by some. Two numbers, both from the innovations projected on
+the eight smooth modes of a plane's image, make it honest again:
+
+* `scale` multiplies the variance of the corners until the innovations have the size they should have. It
+  changes the weight of images against the IMU, so it moves slowly and within bounds.
+* `factor` is the long-run over the instantaneous variance of the innovations: errors that last for k images
+  are k times less informative than the filter counts. It multiplies the *reported* covariance only; fed back
+  into the gain it would run away (less weight for images, more drift, larger innovations).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray
+
+MODES = 8
+_MIN_CORNERS = 8
+_LAGS = 20
+_SIGNIFICANT = 3.0
+_GAIN_START, _GAIN_END = 0.1, 0.01
+_MAX_SCALE = 16.0
+_CLIP = 6.0
+
+
+def modes(uv: FloatArray) -> FloatArray:
+    """Displacements that a change of pose can produce (shift, affine, perspective), RMS about 1.
+
+    Args:
+        uv: *Predicted* pixels, shape (n, 2). Over measured ones the modes would contain the very noise
+            they are to be told apart from.
+
+    Returns:
+        Columns, shape (2n, 8).
+    """
+    centred = uv - uv.mean(axis=0)
+    x, y = (centred / (np.sqrt((centred**2).mean()) + 1e-9)).T
+    out = np.zeros((len(uv), 2, MODES))
+    out[:, 0, 0] = out[:, 1, 1] = 1.0
+    out[:, 0, 2] = out[:, 1, 4] = x
+    out[:, 0, 3] = out[:, 1, 5] = y
+    out[:, 0, 6], out[:, 1, 6] = 0.5 * x * x, 0.5 * x * y
+    out[:, 0, 7], out[:, 1, 7] = 0.5 * x * y, 0.5 * y * y
+    return out.reshape(-1, MODES)
+
+
+@dataclass(slots=True)
+class Consistency:
+    """Running scale and factor of one camera.
+
+    Attributes:
+        memory: Images remembered.
+        scale: Multiplies the variance of the corners, >= 1.
+        factor: Multiplies the reported covariance, >= 1.
+        images: Images taken in.
+    """
+
+    memory: float = 800.0
+    scale: float = 1.0
+    factor: float = 1.0
+    images: int = 0
+    _weight: float = 0.0
+    _lagged: FloatArray = field(default_factory=lambda: np.zeros(_LAGS + 1))
+    _recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_LAGS))
+
+    def learn(self, uv: FloatArray, innovation: FloatArray, linear: FloatArray, sigma: FloatArray) -> None:
+        """Take in the innovation of one image.
+
+        Args:
+            uv: Predicted pixels of the accepted corners, shape (n, 2).
+            innovation: Measured minus predicted, px, shape (n, 2).
+            linear: H S for these corners (state uncertainty), px, shape (2n, c).
+            sigma: Corner noise as used, px, shape (n,).
+        """
+        if len(uv) < _MIN_CORNERS:
+            return
+        Phi = modes(uv) / np.repeat(sigma, 2)[:, None]
+        Q, R = np.linalg.qr(Phi)
+        if np.abs(np.diag(R)).min() < 1e-6 * np.abs(np.diag(R)).max():
+            return
+        whitened = 1.0 / np.repeat(sigma, 2)
+        seen = Q.T @ (innovation.ravel() * whitened)
+        state = Q.T @ (linear * whitened[:, None])
+        # Coefficients in the orthonormal basis, each over its predicted standard deviation.
+        normal = np.clip(seen / np.sqrt(1.0 + (state**2).sum(axis=1)), -_CLIP, _CLIP)
+        self.images += 1
+        self._move_scale(float(normal @ normal) / MODES)
+        self._remember(normal)
+
+    def _move_scale(self, ratio: float) -> None:
+        gain = max(_GAIN_END, _GAIN_START / (1.0 + 0.02 * self.images))
+        self.scale = float(np.clip(self.scale * (1.0 + gain * (min(ratio, 5.0) - 1.0)), 1.0, _MAX_SCALE))
+
+    def _remember(self, normal: FloatArray) -> None:
+        if self._weight >= self.memory:
+            keep = 1.0 - 1.0 / self.memory
+            self._weight *= keep
+            self._lagged *= keep
+        self._weight += 1.0
+        self._lagged[0] += normal @ normal
+        for lag, old in enumerate(reversed(self._recent), start=1):
+            self._lagged[lag] += normal @ old
+        self._recent.append(normal)
+        if self._weight < 40.0:
+            return
+        rho = self._lagged[1:] / self._lagged[0]
+        taper = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
+        total = 2.0 * float((taper * rho).sum())
+        noise = 2.0 * float(np.sqrt((taper**2).sum() / (MODES * self._weight)))
+        self.factor = 1.0 + total if total > _SIGNIFICANT * noise else 1.0
