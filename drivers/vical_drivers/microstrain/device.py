@@ -91,7 +91,7 @@ class MicrostrainImu:
         self._closed = False
         self._last_data_ns = 0
         self._next_attempt_ns = 0
-        self._rate_hz = 0.0
+        self._span: tuple[int, int, int] | None = None
         self._open()
 
     @property
@@ -125,6 +125,7 @@ class MicrostrainImu:
         self._last_data_ns = time.monotonic_ns()
         self._attempts = 0
         self._held = []
+        self._span = None
         _log.info("imu=%s model=%s serial=%s", self._path, self._info.model, self._info.serial_number)
 
     def read(self, timeout_s: float) -> list[ImuSample]:
@@ -165,6 +166,8 @@ class MicrostrainImu:
         held, self._held = self._held, []
         out = [self._to_sample(sample, ticks) for sample, ticks in held]
         self._samples += len(out)
+        first_ns, count, _ = self._span or (out[0].t_host_ns, 0, 0)
+        self._span = (first_ns, count + len(out), out[-1].t_host_ns)
         return out
 
     def _switch_to_counting(self) -> None:
@@ -233,11 +236,18 @@ class MicrostrainImu:
             checksum_errors=self._past_checksum_errors + (session.checksum_errors if session else 0),
             resync_bytes=self._past_skipped_bytes + (session.skipped_bytes if session else 0),
             reconnects=self._reconnects,
-            rate_hz=self.applied.rate_hz,
+            rate_hz=self._measured_rate_hz(),
             clock_skew_ppm=-self.clock.envelope.skew * 1e6,
             jitter_us=self.clock.envelope.jitter_s * 1e6,
             extra={"clock_restarts": float(self.clock.restarts), "group_delay_s": self.applied.group_delay_s},
         )
+
+    def _measured_rate_hz(self) -> float:
+        """Samples per host second since the connection began; nominal until there are two."""
+        if self._span is None or self._span[2] == self._span[0]:
+            return self.applied.rate_hz
+        first_ns, count, last_ns = self._span
+        return (count - 1) * 1e9 / (last_ns - first_ns)
 
     def close(self) -> None:
         """Stop the stream and free the port; may be called twice."""

@@ -23,7 +23,7 @@ SET_SENSOR = 0x80
 ACK = 0xF1
 """Descriptor of the field that acknowledges a command: its descriptor, then 0 or a reason."""
 APPLY, READ = 1, 2
-"""Function selectors of settings. 3, save, would write the EEPROM: the driver never sends it."""
+"""Function selectors of settings. 3, save, writes the EEPROM: the driver itself never sends it."""
 MAX_LENGTH = 261
 NACK_REASONS = {
     1: "unknown command",

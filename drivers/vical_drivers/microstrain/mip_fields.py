@@ -157,7 +157,8 @@ class TimeField:
             if not math.isfinite(tow_s) or (self.descriptor == GPS_TIME and not flags & 1):
                 return None
             weeks = week if self.descriptor == GPS_CORRELATION or flags & 2 else 0
-            return int(weeks) * WEEK_S * 1_000_000_000 + round(tow_s * 1e9)
+            into_week_ns: int = round(tow_s * 1e9)
+            return int(weeks) * WEEK_S * 1_000_000_000 + into_week_ns
         return None
 
 

@@ -23,6 +23,8 @@ _FLAGS_INERTIAL_ONLY = 0x0D00
 """Signal conditioning of the GX3: no orientation, no magnetometer, no compensations."""
 _LEGACY_STREAM, _SENSOR_STREAM = 1, mip.SET_SENSOR
 _UNKNOWN_COMMAND = 1
+_SAVE = 3
+"""Function selector that writes the EEPROM; only `store_gyro_bias` uses it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,6 +307,20 @@ class MipSession:
             raise DeviceRefusedError(f"{self._port.name}: the device returned no gyro bias")
         x, y, z = _THREE.unpack(answer.data)
         return x, y, z
+
+    def store_gyro_bias(self) -> None:
+        """See `Session.store_gyro_bias`."""
+        self._command(mip.SET_3DM, 0x38, bytes([_SAVE]))
+
+    def settings(self) -> dict[str, object]:
+        """See `Session.settings`."""
+        base_hz = self._base_rate_hz()
+        out: dict[str, object] = {"base_rate_hz": base_hz}
+        with contextlib.suppress(DriverError):
+            data = self._ask(mip.SET_3DM, 0x08, 0x80, bytes([mip.READ]))
+            items = [struct.unpack_from(">BH", data, 1 + 3 * i) for i in range(len(data) // 3)]
+            out["message"] = {f"0x{d:02X}": base_hz / max(1, decimation) for d, decimation in items}
+        return out
 
     def self_test(self) -> dict[str, bool]:
         """See `Session.self_test`; takes some seconds on a GX3-35."""

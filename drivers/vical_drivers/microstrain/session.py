@@ -124,6 +124,14 @@ class Session(Protocol):
         """Let the device average its gyro at rest; sets its volatile bias. Returns it, rad/s."""
         ...
 
+    def store_gyro_bias(self) -> None:
+        """Write the volatile gyro bias to the EEPROM: only ever on a user's explicit wish."""
+        ...
+
+    def settings(self) -> dict[str, object]:
+        """What is in force now, by name, for people."""
+        ...
+
     def self_test(self) -> dict[str, bool]:
         """Run the built-in test; part -> passed."""
         ...

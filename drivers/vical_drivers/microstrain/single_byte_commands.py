@@ -19,6 +19,7 @@ RESET = bytes.fromhex("FE9E3A")
 GET_FIRMWARE = b"\xe9"
 SELF_TEST = b"\xda"
 MODE_ACTIVE, MODE_CONTINUOUS, MODE_IDLE, MODE_SLEEP, MODE_DEEP_SLEEP = 1, 2, 3, 4, 5
+MODE_NAMES = {1: "active", 2: "continuous", 3: "idle", 4: "sleep", 5: "deep sleep"}
 
 FLAG_ORIENTATION = 0x0001
 FLAG_CONING_SCULLING = 0x0002

@@ -199,6 +199,25 @@ class SingleByteSession:
         x, y, z = (float(v) for v in reply.values[:3])
         return x, y, z
 
+    def store_gyro_bias(self) -> None:
+        """See `Session.store_gyro_bias`."""
+        reply = self._transact(cmd.store_bias_in_eeprom(2), 0xD0, 2.0, tries=1)
+        if reply.values[0] != 2:
+            raise DeviceRefusedError(f"{self._port.name}: the device refused to store the gyro bias")
+
+    def settings(self) -> dict[str, object]:
+        """See `Session.settings`."""
+        s = self._transact(cmd.sampling(), 0xDB).fields()
+        mode = int(self._transact(cmd.set_mode(0), 0xD4).values[0])
+        link = self._transact(cmd.communication(), 0xD9).fields()
+        return {
+            "rate_hz": cmd.BASE_RATE_HZ / max(1, int(str(s["decimation"]))),
+            "filter_width": s["filter_width"],
+            "flags": f"0x{s['flags']:04X}",
+            "mode": cmd.MODE_NAMES.get(mode, str(mode)),
+            "uart_baud": link["baud"],
+        }
+
     def self_test(self) -> dict[str, bool]:
         """See `Session.self_test`."""
         flags = int(self._transact(cmd.SELF_TEST, 0xDA, 2.0, tries=1).values[0])

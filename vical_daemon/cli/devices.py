@@ -1,0 +1,120 @@
+"""`vical devices`: what is plugged in, and how to name it in the config."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from vical_drivers.errors import DriverError
+from vical_drivers.samples import DeviceInfo
+
+from vical_daemon.cli.options import add_json
+
+HELP = "serial ports with an IMU behind them, and cameras, with how to name them in the config"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument(
+        "--port",
+        action="append",
+        default=[],
+        metavar="PORT",
+        help="look for an IMU on this port too (a pseudo terminal is not found by itself); may be repeated",
+    )
+    parser.add_argument(
+        "--no-probe", action="store_true", help="list serial ports without sending them a single byte"
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """List serial ports with what answers there, then cameras."""
+    ports = [_port(path, probe=not args.no_probe) for path in [*args.port, *serial_ports()]]
+    cameras, problem = _cameras()
+    if args.json:
+        print(json.dumps({"imus": ports, "cameras": [_camera(c) for c in cameras], "problem": problem}))
+        return 0
+    _print_ports(ports)
+    for camera in cameras:
+        print(f"camera  {camera.path:<24} {camera.model} {camera.serial_number}  -> {_config_uri(camera)}")
+        if "problem" in camera.details:
+            print(f"        {camera.details['problem']}")
+    if not cameras:
+        print("no camera found" + (f": {problem}" if problem else ""))
+    return 0
+
+
+def serial_ports() -> list[str]:
+    """Serial ports of this machine, by their stable names where udev made them."""
+    from serial.tools import list_ports
+
+    stable = {}
+    by_id = Path("/dev/serial/by-id")
+    if by_id.is_dir():
+        stable = {str(link.resolve()): str(link) for link in sorted(by_id.iterdir())}
+    return [stable.get(port.device, port.device) for port in sorted(list_ports.comports())]
+
+
+def _port(path: str, *, probe: bool) -> dict[str, object]:
+    found: dict[str, object] = {"port": path, "found": False}
+    if not probe:
+        return found
+    print(f"asking {path} ...", file=sys.stderr)
+    from vical_drivers.microstrain.probe import connect
+
+    try:
+        session, port = connect(path, patient=False)
+        try:
+            info = session.identify()
+        finally:
+            session.stop()
+            port.close()
+    except DriverError as error:
+        return {**found, "problem": str(error)}
+    return {
+        **found,
+        "found": True,
+        "protocol": info.protocol,
+        "model": info.model,
+        "serial_number": info.serial_number,
+        "firmware": info.firmware,
+        "baud": port.baud,
+        "config": {"port": path, "protocol": info.protocol},
+    }
+
+
+def _print_ports(ports: list[dict[str, object]]) -> None:
+    for p in ports:
+        if p["found"]:
+            print(
+                f"imu     {p['port']:<24} {p['model']} {p['serial_number']} firmware {p['firmware']}, "
+                f"{p['protocol']} at {p['baud']} baud  -> port: {p['port']}"
+            )
+        else:
+            print(f"serial  {p['port']:<24} {p.get('problem', 'not asked')}")
+    if not ports:
+        print("no serial port found; name one with --port")
+
+
+def _cameras() -> tuple[list[DeviceInfo], str]:
+    """Cameras, or why they cannot be listed."""
+    try:
+        from vical_drivers.camera.opening import list_cameras
+    except ImportError as error:
+        return [], str(error)
+    try:
+        return list(list_cameras()), ""
+    except DriverError as error:
+        return [], str(error)
+
+
+def _config_uri(camera: DeviceInfo) -> str:
+    return f"uri: {camera.details.get('uri', f'{camera.protocol}:{camera.path}')}"
+
+
+def _camera(camera: DeviceInfo) -> dict[str, object]:
+    return {**asdict(camera), "config": {"uri": _config_uri(camera).removeprefix("uri: ")}}
