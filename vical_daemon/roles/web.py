@@ -1,0 +1,148 @@
+"""Role web: the page with the live calibration, on loopback unless the config says otherwise.
+
+Read-only, unless a token is set on the robot: in the environment variable VICAL_WEB_TOKEN, or in the file
+`web-token` of the state directory.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import threading
+from collections.abc import Callable
+
+from aiohttp import web
+
+from vical_daemon import topics
+from vical_daemon.bus import Bus, Subscription
+from vical_daemon.config import Config
+from vical_daemon.health import StatusSender
+from vical_daemon.messages import DiagnosticStatus, Level, encode_string
+from vical_daemon.places import make_private, runtime_directory, state_directory
+from vical_daemon.wall_clock import WallClock, shared_clock
+from vical_daemon.web.images import CameraView
+from vical_daemon.web.server import PageServer
+from vical_daemon.web.state import WebState
+
+TOKEN_VARIABLE = "VICAL_WEB_TOKEN"  # noqa: S105  (the name of the variable, not a secret)
+TOKEN_FILE = "web-token"  # noqa: S105
+_log = logging.getLogger(__name__)
+
+
+class WebError(Exception):
+    """The page cannot be served; the message says where and what to try."""
+
+
+class _Feeds:
+    """Subscriptions of the page: calibrations and statuses always, images only while somebody looks."""
+
+    def __init__(self, config: Config, bus: Bus, state: WebState) -> None:
+        self._config, self._bus, self._state = config, bus, state
+        self.views = {name: CameraView(name) for name in config.cameras}
+        self._always = [
+            bus.subscribe(topics.CALIBRATION.key(config.rig, name), state.take) for name in config.cameras
+        ]
+        self._always.append(bus.subscribe(f"{topics.ROOT}/{config.rig}/status/*", state.take))
+        self._watched: dict[str, list[Subscription]] = {}
+        for sample in bus.latest(f"{topics.ROOT}/{config.rig}/**"):
+            state.take(sample)  # what is known before the first message comes
+
+    def watch(self, camera: str, on: bool) -> None:
+        """Start or stop fetching images and points of one camera."""
+        for subscription in self._watched.pop(camera, []):
+            subscription.close()
+        if on:
+            view, rig = self.views[camera], self._config.rig
+            kinds = (topics.POINTS, topics.TRACKS, topics.IMAGE, topics.COMPRESSED)
+            self._watched[camera] = [self._bus.subscribe(t.key(rig, camera), view.take) for t in kinds]
+
+    def close(self) -> None:
+        """Leave the bus."""
+        for camera in list(self._watched):
+            self.watch(camera, False)
+        for subscription in self._always:
+            subscription.close()
+
+
+def run(
+    config: Config,
+    bus: Bus,
+    stop: threading.Event,
+    *,
+    clock: WallClock | None = None,
+    ready: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the page until `stop`.
+
+    Args:
+        config: The rig; host and port in `config.web` (port 0: any free one).
+        bus: Where data come from and commands go.
+        stop: Ends the role.
+        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        ready: Called with the address once it is served.
+
+    Raises:
+        WebError: The address cannot be used.
+    """
+    clock = clock or shared_clock(make_private(runtime_directory()))
+    state = WebState(config.rig)
+    feeds = _Feeds(config, bus, state)
+    try:
+        asyncio.run(_serve(config, bus, stop, clock, state, feeds, ready))
+    finally:
+        feeds.close()
+
+
+async def _serve(
+    config: Config,
+    bus: Bus,
+    stop: threading.Event,
+    clock: WallClock,
+    state: WebState,
+    feeds: _Feeds,
+    ready: Callable[[str], None] | None,
+) -> None:
+    def command(role: str, word: str) -> None:
+        bus.publish(topics.COMMAND.key(config.rig, role), encode_string(word))
+
+    server = PageServer(state, feeds.views, feeds.watch, command, read_token())
+    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    host, port = config.web.host, config.web.port
+    try:
+        site = web.TCPSite(runner, host, port)
+        await site.start()
+    except OSError as error:
+        await runner.cleanup()
+        reason = error.strerror or str(error)
+        raise WebError(f"cannot serve the page on {host}:{port}: {reason}; set web.port") from error
+    address = f"http://{host}:{runner.addresses[0][1]}/"
+    _log.info("page at %s", address)
+    if ready is not None:
+        ready(address)
+    status = StatusSender(config.rig, "web", bus, clock)
+
+    def statuses() -> list[DiagnosticStatus]:
+        values = {"malformed": str(state.malformed), "address": address}
+        return [DiagnosticStatus(Level.OK, "web", address, "", values)]
+
+    def stopped() -> bool:
+        status.tick(statuses)
+        return stop.is_set()
+
+    try:
+        await server.run(stopped)
+    finally:
+        await runner.cleanup()
+
+
+def read_token() -> str:
+    """Return the token that allows commands; "" where none is set: then nobody may."""
+    token = os.environ.get(TOKEN_VARIABLE, "")
+    if token:
+        return token.strip()
+    try:
+        return (state_directory() / TOKEN_FILE).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""

@@ -1,0 +1,256 @@
+"use strict";
+// Listens to /events and draws. Everything from the robot goes in as text, never as HTML.
+
+const $ = (id) => document.getElementById(id);
+const page = { columns: [], rows: {}, latest: {}, devices: [], views: [], control: false, camera: null, span: 0 };
+const AXES = ["x", "y", "z"];
+const COLOURS = ["--x", "--y", "--z"];
+
+const charts = {
+  lever: new Chart($("c-lever"), { least: 0.05 }),
+  rotation: new Chart($("c-rotation"), { least: 0.001 }),
+  shift: new Chart($("c-shift"), { least: 0.002 }),
+  nis: new Chart($("c-nis"), { floor: 0, reference: 1 }),
+  gyro: new Chart($("c-gyro"), { least: 0.01 }),
+  accel: new Chart($("c-accel"), { least: 0.5 }),
+};
+
+function element(tag, kind, text) {
+  const made = document.createElement(tag);
+  if (kind) made.className = kind;
+  if (text !== undefined) made.textContent = text;
+  return made;
+}
+
+function setText(id, text) {
+  if ($(id).textContent !== text) $(id).textContent = text;
+}
+
+// A value with the digits that three sigma leave meaningful.
+function shown(value, sigma) {
+  if (value === null || value === undefined) return ["–", ""];
+  if (!sigma) return [String(value), ""];
+  const digits = Math.min(Math.max(1 - Math.floor(Math.log10(3 * sigma)), 0), 6);
+  return [value.toFixed(digits), `± ${(3 * sigma).toFixed(digits)}`];
+}
+
+function fillValues(id, entries) {
+  $(id).replaceChildren(...entries.map(([key, kind, value, sigma]) => {
+    const item = element("span");
+    const [number, band] = shown(value, sigma);
+    item.append(element("span", `k ${kind}`, key), element("b", "", number), element("span", "s", band ? ` ${band}` : ""));
+    return item;
+  }));
+}
+
+function conjugateTimes(a, b) { // conj(a) * b, quaternions w x y z
+  const [w, x, y, z] = [a[0], -a[1], -a[2], -a[3]];
+  return [
+    w * b[0] - x * b[1] - y * b[2] - z * b[3], w * b[1] + x * b[0] + y * b[3] - z * b[2],
+    w * b[2] - x * b[3] + y * b[0] + z * b[1], w * b[3] + x * b[2] - y * b[1] + z * b[0],
+  ];
+}
+
+function turnFrom(now, then) { // rotation vector in degrees of `then` seen from `now`
+  const q = conjugateTimes(now, then);
+  const sign = q[0] < 0 ? -1 : 1;
+  const length = Math.hypot(q[1], q[2], q[3]);
+  const scale = length < 1e-12 ? 2 : (2 * Math.atan2(length, sign * q[0])) / length;
+  return [1, 2, 3].map((i) => (sign * q[i] * scale * 180) / Math.PI);
+}
+
+function yawPitchRoll(q) { // Rz(yaw) Ry(pitch) Rx(roll), degrees
+  const [w, x, y, z] = q;
+  const s = Math.max(-1, Math.min(1, 2 * (w * y - z * x)));
+  return [
+    Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), Math.asin(s),
+    Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+  ].map((v) => (v * 180) / Math.PI);
+}
+
+function drawCharts() {
+  const rows = page.rows[page.camera] || [];
+  const at = (name) => page.columns.indexOf(name);
+  const column = (name) => { const i = at(name); return rows.map((r) => r[i]); };
+  const t = column("t_s");
+  const three = (names, sigmas) => AXES.map((_, i) => ({ t, v: column(names[i]), s: column(sigmas[i]), colour: COLOURS[i] }));
+  const last = rows.length ? rows[rows.length - 1] : null;
+  const value = (name) => (last ? last[at(name)] : null);
+  const show = (id, names, sigmas) => fillValues(id, AXES.map((a, i) => [a, a, value(names[i]), value(sigmas[i])]));
+
+  const P = ["px_mm", "py_mm", "pz_mm"], SP = ["spx_mm", "spy_mm", "spz_mm"];
+  charts.lever.set(three(P, SP).map((s) => centred(s)), page.span);
+  show("lever", P, SP);
+
+  const SR = ["srx_deg", "sry_deg", "srz_deg"];
+  const first = at("qw");
+  const now = last ? last.slice(first, first + 4) : [1, 0, 0, 0];
+  const turns = rows.map((r) => turnFrom(now, r.slice(first, first + 4)));
+  charts.rotation.set(AXES.map((_, i) => ({ t, v: turns.map((r) => r[i]), s: column(SR[i]), colour: COLOURS[i] })), page.span);
+  const angles = last ? yawPitchRoll(now) : [null, null, null];
+  const worst = last ? Math.max(...SR.map(value)) : 0;
+  fillValues("rotation", [["yaw", "one", angles[0], worst], ["pitch", "one", angles[1], worst], ["roll", "one", angles[2], worst]]);
+
+  charts.shift.set([{ t, v: column("shift_ms"), s: column("sshift_ms"), colour: "--one" }], page.span);
+  fillValues("shift", [["", "one", value("shift_ms"), value("sshift_ms")]]);
+  charts.nis.set([{ t, v: column("nis"), s: null, colour: "--one" }], page.span);
+  const latest = page.latest[page.camera];
+  fillValues("nis", latest ? [["NIS", "one", round(latest.nis, 3), 0], ["refused", "one", round(100 * (latest.rejected || 0), 3), 0]] : []);
+  if (latest) $("nis").lastChild.append(element("span", "s", " %"));
+
+  const G = ["gx_mrad", "gy_mrad", "gz_mrad"], SG = ["sgx_mrad", "sgy_mrad", "sgz_mrad"];
+  charts.gyro.set(three(G, SG), page.span);
+  show("gyro", G, SG);
+  const A = ["ax_mm", "ay_mm", "az_mm"], SA = ["sax_mm", "say_mm", "saz_mm"];
+  charts.accel.set(three(A, SA), page.span);
+  show("accel", A, SA);
+}
+
+function centred(series) { // relative to the newest value, so that three axes share one scale
+  const end = series.v.length ? series.v[series.v.length - 1] : 0;
+  return Object.assign({}, series, { v: series.v.map((v) => (v === null ? null : v - end)) });
+}
+
+function round(value, digits) {
+  return value === null || value === undefined ? null : Number(value.toPrecision(digits));
+}
+
+function drawWords() {
+  const latest = page.latest[page.camera];
+  const status = latest ? latest.status : "waiting";
+  $("status").className = `pill ${status}`;
+  setText("status", latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
+  document.querySelector(".say").classList.toggle("converged", status === "converged");
+  setText("sentence", latest ? latest.sentence : "No estimate yet: is the calibrate process running?");
+  setText("guidance", latest ? latest.guidance : "");
+  $("bar").style.width = `${Math.round(100 * ((latest && latest.progress) || 0))}%`;
+  setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples` : "");
+  const withheld = latest ? latest.withheld : [];
+  $("withheld").replaceChildren(...withheld.map((line) => element("li", "", line)));
+  const motion = latest ? latest.motion : { rotate: [], translate: [] };
+  for (const axis of AXES) {
+    $(`axis-${axis}`).classList.toggle("rotate", motion.rotate.includes(axis));
+    $(`axis-${axis}`).classList.toggle("move", motion.translate.includes(axis));
+  }
+  const asks = motion.rotate.length + motion.translate.length > 0;
+  setText("motiontext", asks ? [motion.rotate.length ? `turn about ${motion.rotate.join(", ")}` : "",
+    motion.translate.length ? `move along ${motion.translate.join(", ")}` : ""].filter(Boolean).join("; ")
+    : latest && status === "converged" ? "nothing is missing" : "turn and move freely, the board in view");
+  const lens = latest && latest.lens;
+  setText("lens", lens ? lensText(lens) : "not known yet");
+}
+
+function lensText(lens) {
+  const names = ["fx", "fy", "cx", "cy"];
+  const parts = lens.intrinsics.map((v, i) => `${names[i]} ${shown(v, lens.intrinsics_sigma[i]).join(" ")}`.trim());
+  const bend = lens.distortion.map((v) => (v === null ? "–" : v.toPrecision(4))).join(", ");
+  return `${parts.join(" · ")} px · ${lens.distortion_model} ${bend} · reprojection RMS ${round(lens.rms_px, 3)} px`;
+}
+
+function drawDevices() {
+  const body = $("devices").tBodies[0];
+  body.replaceChildren(...page.devices.map((d) => {
+    const line = element("tr");
+    const dot = element("span", `dot l${d.level}`);
+    dot.title = ["ok", "warning", "error", "stale"][d.level];
+    const first = element("td");
+    first.append(dot);
+    const lost = d.values.lost !== undefined ? d.values.lost : d.values.dropped;
+    const rate = d.values.rate_hz !== undefined ? Number(d.values.rate_hz).toFixed(1) : "";
+    const jitter = d.values.jitter_us !== undefined ? Number(d.values.jitter_us).toFixed(0) : "";
+    line.append(first, element("td", "", d.name), element("td", "", d.message), element("td", "n", rate),
+      element("td", "n", lost === undefined ? "" : lost), element("td", "n", jitter));
+    return line;
+  }));
+}
+
+function drawTabs() {
+  const names = [...new Set([...page.views, ...Object.keys(page.latest)])].sort();
+  if (page.camera === null && names.length) choose(names[0]);
+  if ($("tabs").dataset.names === names.join()) return;
+  $("tabs").dataset.names = names.join();
+  $("tabs").replaceChildren(...(names.length > 1 ? names.map((name) => {
+    const button = element("button", "", name);
+    button.setAttribute("role", "tab");
+    button.setAttribute("aria-selected", String(name === page.camera));
+    button.onclick = () => { choose(name); draw(); };
+    return button;
+  }) : []));
+}
+
+function choose(name) {
+  page.camera = name;
+  for (const tab of $("tabs").children) tab.setAttribute("aria-selected", String(tab.textContent === name));
+  if (page.views.includes(name)) $("picture").src = `camera/${encodeURIComponent(name)}.mjpg`;
+}
+
+function draw() {
+  drawTabs();
+  drawWords();
+  drawDevices();
+  drawCharts();
+}
+
+function take(message, full) {
+  setText("rig", message.rig);
+  document.title = `vical ${message.rig}`;
+  if (full) {
+    page.columns = message.columns;
+    page.views = message.views;
+    page.rows = {};
+    page.latest = {};
+    page.control = message.control;
+    $("control").hidden = !message.control;
+  }
+  for (const [name, camera] of Object.entries(message.cameras)) {
+    page.rows[name] = camera.rows || (page.rows[name] || []).concat(camera.fresh);
+    if (page.rows[name].length > 4000) page.rows[name] = page.rows[name].filter((_, i) => i % 2 || i > 2000);
+    page.latest[name] = camera;
+  }
+  page.devices = message.devices;
+  draw();
+}
+
+function listen() {
+  const source = new EventSource("events");
+  source.addEventListener("full", (event) => take(JSON.parse(event.data), true));
+  source.addEventListener("update", (event) => take(JSON.parse(event.data), false));
+  source.onopen = () => {
+    $("link").classList.add("on");
+    setText("link", "live");
+    if (page.camera) choose(page.camera); // the picture's connection broke as well
+  };
+  source.onerror = () => { $("link").classList.remove("on"); setText("link", "offline, trying again"); };
+}
+
+$("picture").onload = () => document.querySelector(".screen").classList.add("live");
+$("picture").onerror = () => document.querySelector(".screen").classList.remove("live");
+
+for (const button of document.querySelectorAll(".range button")) {
+  button.onclick = () => {
+    page.span = Number(button.dataset.span);
+    for (const other of document.querySelectorAll(".range button")) other.classList.toggle("on", other === button);
+    drawCharts();
+  };
+}
+
+$("token").value = sessionStorage.getItem("token") || "";
+$("form").onsubmit = async (event) => {
+  event.preventDefault();
+  const command = event.submitter ? event.submitter.value : "";
+  if (command === "reset" && !window.confirm("Forget the calibration so far and begin anew?")) return;
+  sessionStorage.setItem("token", $("token").value);
+  try {
+    const answer = await fetch("api/command", {
+      method: "POST",
+      headers: { "Content-Type": "application/json", Authorization: `Bearer ${$("token").value}` },
+      body: JSON.stringify({ command }),
+    });
+    setText("answer", answer.ok ? `sent: ${command.replace("_", " ")}` : await answer.text());
+  } catch (error) {
+    setText("answer", "the robot does not answer");
+  }
+};
+
+window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawCharts);
+listen();

@@ -1,0 +1,55 @@
+"""What the page says in words: the status as a sentence, and which motion is missing, about which axis."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import TypedDict
+
+from vical_daemon.estimation.result import CalibrationEstimate, Status
+
+_SENTENCES = {
+    Status.WAITING: "Waiting for data.",
+    Status.INITIALISING: "Looking for a first solution: move the rig before the board.",
+    Status.CONVERGING: "Getting sharper.",
+    Status.CONVERGED: "Converged: the stated sigmas are small enough.",
+    Status.DEGENERATE: "The motion so far does not reveal everything.",
+    Status.INCONSISTENT: "The data contradict the model: do not use these numbers.",
+}
+_TURN = re.compile(r"\b(rotat\w*|turn\w*|tilt\w*|roll\w*|pitch\w*|yaw\w*)\b", re.IGNORECASE)
+_MOVE = re.compile(r"\b(translat\w*|move\w*|shak\w*|accelerat\w*|closer|further|sideways)\b", re.IGNORECASE)
+_AXIS = re.compile(r"\b(?:cam(?:era)?|imu)?[ -]?([xyz])\b|\b(optical axis|line of sight|viewing direction)\b")
+
+
+class Motion(TypedDict):
+    """Axes to draw on the picture: of the camera, x right, y down, z along the line of sight."""
+
+    rotate: list[str]
+    translate: list[str]
+
+
+def sentence(estimate: CalibrationEstimate) -> str:
+    """Return the status in words, with the reason where there is one."""
+    text = _SENTENCES[estimate.status]
+    return f"{text} {estimate.reason}" if estimate.reason else text
+
+
+def motion(texts: Iterable[str]) -> Motion:
+    """Find the axes that guidance texts ask to turn about or to move along.
+
+    A clause that names a motion without an axis stands for all three axes.
+
+    >>> motion(["rotate about the optical axis"])
+    {'rotate': ['z'], 'translate': []}
+    >>> motion(["rotate about x and y; move sideways"])
+    {'rotate': ['x', 'y'], 'translate': ['x', 'y', 'z']}
+    """
+    rotate: set[str] = set()
+    translate: set[str] = set()
+    for clause in re.split(r"[;.\n]|, then", " ; ".join(texts)):
+        axes = {m.group(1) or "z" for m in _AXIS.finditer(clause)} or set("xyz")
+        if _TURN.search(clause):
+            rotate |= axes
+        elif _MOVE.search(clause):
+            translate |= axes
+    return {"rotate": sorted(rotate), "translate": sorted(translate)}
