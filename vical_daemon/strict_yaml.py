@@ -14,7 +14,15 @@ from pathlib import Path
 
 import yaml
 
-MAX_BYTES = 1_000_000
+MAX_BYTES = 250_000
+MAX_DEPTH = 32
+_OPENING = (
+    yaml.FlowSequenceStartToken,
+    yaml.FlowMappingStartToken,
+    yaml.BlockSequenceStartToken,
+    yaml.BlockMappingStartToken,
+)
+_CLOSING = (yaml.FlowSequenceEndToken, yaml.FlowMappingEndToken, yaml.BlockEndToken)
 _NUMBER = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)([eE][-+]?\d+)?$")
 _SEXAGESIMAL = re.compile(r"[-+]?\d+(:[0-5]?\d)+(\.\d*)?$")
 _LEADING_ZERO = re.compile(r"[-+]?0\d+$")
@@ -84,8 +92,7 @@ def parse(text: str, name: str) -> Document:
     """
     document = Document(name)
     try:
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ConfigError(f"{name}: YAML aliases (*name) are not accepted, repeat the value")
+        _refuse_hostile(text, name)
         node = yaml.compose(text, Loader=yaml.SafeLoader)
         value = None if node is None else _convert(node, "", document)
     except yaml.YAMLError as error:
@@ -93,14 +100,26 @@ def parse(text: str, name: str) -> Document:
         line = f" line {mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "cannot be read"
         raise ConfigError(f"{name}{line}: not valid YAML: {problem}") from None
-    except RecursionError:
-        raise ConfigError(f"{name}: nested too deeply") from None
     if value is None:
         value = {}
     if not isinstance(value, dict):
         raise ConfigError(f"{name}: expected `key: value` lines, found {describe(value)}")
     document.root = value
     return document
+
+
+def _refuse_hostile(text: str, name: str) -> None:
+    """Look at the tokens first: they come one by one, before anything is built from them."""
+    depth = 0
+    for token in yaml.scan(text):
+        if isinstance(token, yaml.AliasToken):
+            raise ConfigError(f"{name}: YAML aliases (*name) are not accepted, repeat the value")
+        if isinstance(token, _OPENING):
+            depth += 1
+        elif isinstance(token, _CLOSING):
+            depth -= 1
+        if depth > MAX_DEPTH:
+            raise ConfigError(f"{name}: nested too deeply")
 
 
 def describe(value: Value) -> str:

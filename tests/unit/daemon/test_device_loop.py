@@ -1,0 +1,189 @@
+"""Keeping a device streaming: late plug-in, loss, silence, a stuck driver, and a bus that is slow."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from vical_drivers.errors import DeviceLostError, DeviceNotFoundError
+from vical_drivers.samples import DeviceInfo, SourceStats
+
+from vical_daemon.bus import LocalBus
+from vical_daemon.device_loop import DeviceLoop
+from vical_daemon.health import STUCK_S, _judge, device_status
+from vical_daemon.messages import Level
+from vical_daemon.outbox import Outbox
+
+
+class ScriptedSource:
+    """Plays a list of batches; an exception in it is raised."""
+
+    def __init__(self, script: list[Any]) -> None:
+        self.script = script
+        self.closed = False
+
+    @property
+    def info(self) -> DeviceInfo:
+        return DeviceInfo("imu", "scripted", "S1")
+
+    def read(self, timeout_s: float) -> list[int]:
+        if not self.script:
+            time.sleep(min(timeout_s, 0.01))
+            return []
+        step = self.script.pop(0)
+        if isinstance(step, Exception):
+            raise step
+        return step
+
+    def stats(self) -> SourceStats:
+        return SourceStats(samples=3, rate_hz=100.0)
+
+    def __enter__(self) -> ScriptedSource:
+        return self
+
+    def __exit__(self, *args: object) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def stop():
+    event = threading.Event()
+    yield event
+    event.set()
+
+
+def _wait_for(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "it does not happen"
+        time.sleep(0.005)
+
+
+def _loop(opener, got, stop, **options) -> DeviceLoop[int]:
+    loop = DeviceLoop(
+        "imu/imu0", opener, got.append, stop, read_timeout_s=0.02, longest_pause_s=0.05, **options
+    )
+    loop.start()
+    return loop
+
+
+def test_a_device_that_appears_later_is_opened_then(stop) -> None:
+    attempts: list[Any] = [DeviceNotFoundError("not there"), DeviceNotFoundError("not there")]
+
+    def opener() -> ScriptedSource:
+        if attempts:
+            raise attempts.pop()
+        return ScriptedSource([[1, 2], [3]])
+
+    got: list[int] = []
+    loop = _loop(opener, got, stop)
+    _wait_for(lambda: got == [1, 2, 3])
+    assert loop.health().state == "streaming" and loop.health().problem == ""
+
+
+def test_a_lost_device_is_reported_and_comes_back_by_itself(stop) -> None:
+    source = ScriptedSource([[1], DeviceLostError("unplugged"), DeviceLostError("unplugged")])
+    got: list[int] = []
+    loop = _loop(lambda: source, got, stop)
+    _wait_for(lambda: loop.health().state == "lost")
+    assert loop.health().problem == "unplugged" and not source.closed
+    source.script.append([2])
+    _wait_for(lambda: got == [1, 2] and loop.health().state == "streaming")
+    assert loop.health().openings == 1
+
+
+def test_a_silent_device_is_opened_again(stop) -> None:
+    sources: list[ScriptedSource] = []
+
+    def opener() -> ScriptedSource:
+        sources.append(ScriptedSource([[len(sources)]]))
+        return sources[-1]
+
+    got: list[int] = []
+    loop = _loop(opener, got, stop, silence_s=0.1)
+    _wait_for(lambda: got[:3] == [0, 1, 2])
+    assert sources[0].closed and loop.health().openings >= 3
+
+
+def test_stop_closes_the_device(stop) -> None:
+    source = ScriptedSource([[1]])
+    loop = _loop(lambda: source, [], stop)
+    _wait_for(lambda: loop.health().info is not None)
+    stop.set()
+    assert loop.join(2.0) and source.closed
+
+
+def test_a_stuck_driver_makes_the_status_stale(stop) -> None:
+    blocked = threading.Event()
+
+    class Stuck(ScriptedSource):
+        def read(self, timeout_s: float) -> list[int]:
+            blocked.wait(10)
+            return []
+
+    bus = LocalBus()
+    outbox = Outbox(bus, 4, "out")
+    loop = _loop(lambda: Stuck([]), [], stop)
+    _wait_for(lambda: loop.health().info is not None)
+    loop._t_loop_s -= STUCK_S + 1
+    status = device_status("imu/imu0", loop.health(), outbox, 100.0)
+    assert status.level is Level.STALE and "stuck" in status.message
+    blocked.set()
+    stop.set()
+    outbox.close()
+
+
+def test_outbox_keeps_order_and_drops_the_oldest_when_the_bus_is_slow() -> None:
+    bus, gate, got = LocalBus(), threading.Event(), []
+
+    def slow(sample) -> None:
+        gate.wait(5)
+        got.append(sample.payload)
+
+    bus.subscribe("vical/**", slow)
+    outbox = Outbox(bus, 3, "out")
+    outbox.put("vical/a", b"0")
+    _wait_for(lambda: outbox.waiting == 0)  # the first is in the hands of the bus
+    for i in range(1, 6):
+        outbox.put("vical/a", str(i).encode())
+    assert (outbox.waiting, outbox.dropped) == (3, 2)
+    assert _judge(_streaming(), outbox, 100.0)[0] is Level.WARN
+    gate.set()
+    outbox.close()
+    assert got == [b"0", b"3", b"4", b"5"] and outbox.published == 4
+
+
+def test_a_bus_that_raises_does_not_end_acquisition() -> None:
+    class Broken(LocalBus):
+        def publish(self, key: str, payload: bytes) -> None:
+            raise RuntimeError("no link")
+
+    outbox = Outbox(Broken(), 3, "out")
+    outbox.put("vical/a", b"0")
+    _wait_for(lambda: outbox.dropped == 1)
+    outbox.put("vical/a", b"1")
+    _wait_for(lambda: outbox.dropped == 2)
+    outbox.close()
+
+
+def _streaming():
+    from vical_daemon.device_loop import DeviceHealth
+
+    return DeviceHealth("streaming", stats=SourceStats(rate_hz=100.0), data_age_s=0.01)
+
+
+def test_levels() -> None:
+    from dataclasses import replace
+
+    bus = LocalBus()
+    outbox = Outbox(bus, 3, "out")
+    good = _streaming()
+    assert _judge(good, outbox, 100.0)[0] is Level.OK
+    assert _judge(replace(good, data_age_s=3.0), outbox, 100.0)[0] is Level.ERROR
+    assert _judge(replace(good, data_age_s=3.0), outbox, 1.0)[0] is not Level.ERROR
+    assert _judge(replace(good, state="lost", problem="gone"), outbox, 100.0) == (Level.ERROR, "gone")
+    assert _judge(good, outbox, 200.0)[0] is Level.WARN
+    outbox.close()
