@@ -1,0 +1,217 @@
+"""`vical calibrate`: the real recording, repeatability, and every bad input as one line."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vical_daemon.cli import calibration_run, calibration_text, main
+from vical_daemon.estimators import Estimator
+from vical_daemon.priors import read_initial
+from vical_daemon.recording import open_recording
+
+SHARED = Path(__file__).parents[4] / "shared" / "data" / "euroc_imu_april"
+G = 9.80665
+
+
+@pytest.fixture(scope="session")
+def euroc() -> Path:
+    if not SHARED.is_dir():
+        pytest.skip(f"shared data absent: {SHARED}")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def short(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first 9 s of the recording, with its target and initial values."""
+    folder = tmp_path_factory.mktemp("short")
+    for name in ("target.yaml", "initial.yaml"):
+        shutil.copy(euroc / name, folder / name)
+    lines = (euroc / "mav0/imu0/data.csv").read_text().splitlines()[: 200 * 9]
+    end_ns = int(lines[-1].split(",")[0])
+    (folder / "mav0/imu0").mkdir(parents=True)
+    (folder / "mav0/imu0/data.csv").write_text("\n".join(lines) + "\n")
+    (folder / "mav0/cam0").mkdir()
+    with gzip.open(euroc / "mav0/cam0/corners.csv.gz", "rt") as file:
+        kept = [row for row in file if row[0] == "#" or int(row.split(",")[0]) < end_ns]
+    (folder / "mav0/cam0/corners.csv").write_text("".join(kept))
+    return folder
+
+
+@pytest.fixture
+def copy(short: Path, tmp_path: Path) -> Path:
+    """A copy of the short recording that a test may spoil."""
+    return Path(shutil.copytree(short, tmp_path / "copy"))
+
+
+def _arguments(folder: Path, *more: str) -> list[str]:
+    target, initial = str(folder / "target.yaml"), str(folder / "initial.yaml")
+    return ["calibrate", str(folder), "--target", target, "--initial", initial, "--fix", "intrinsics", *more]
+
+
+def _calibrate(folder: Path, capsys: pytest.CaptureFixture[str]) -> dict:
+    code = main(_arguments(folder, "--json"))
+    out = capsys.readouterr().out
+    assert code == 0
+    return json.loads(out)
+
+
+def test_json_has_the_promised_keys_and_two_runs_are_identical(short: Path, capsys) -> None:
+    first, second = _calibrate(short, capsys), _calibrate(short, capsys)
+    assert first.pop("cpu_s") > 0 and second.pop("cpu_s") > 0
+    assert json.dumps(first) == json.dumps(second)
+    camera = first["cameras"]["cam0"]
+    assert np.asarray(camera["T_imu_cam"]["covariance"]).shape == (6, 6)
+    assert camera["intrinsics_sigma"] == [0, 0, 0, 0] and camera["resolution"] == [752, 480]
+    for key in ("status", "reason", "duration_s", "frames", "imu_samples", "imu", "gravity_world_mps2"):
+        assert key in first
+    assert {"t_s", "p_m", "p_sigma_m", "q_wxyz", "r_sigma_rad", "timeshift_s", "timeshift_sigma_s"} <= set(
+        first["trace"][0]
+    )
+    assert 4 <= len(first["trace"]) <= 10
+    assert "cam0 in the imu frame" in calibration_text.describe(first | {"cpu_s": 1.0})
+
+
+def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
+    short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every sample and every frame reaches the estimator, by stamp, bit for bit."""
+    fed: list[tuple] = []
+
+    class Listener:
+        def __init__(self, inner: Estimator) -> None:
+            self._inner = inner
+
+        def add_imu(self, t_imu_ns, gyro_rps, specific_force_mps2) -> None:
+            fed.append((t_imu_ns, *gyro_rps, *specific_force_mps2))
+
+        def add_points(self, frame) -> None:
+            fed.append((frame.t_cam_ns, frame.ids.tobytes(), frame.uv_px.tobytes()))
+
+        def process(self) -> list:
+            return []
+
+        finish = process
+
+        def __getattr__(self, name: str):
+            return getattr(self._inner, name)
+
+    make = calibration_run.make_estimator
+    monkeypatch.setattr(calibration_run, "make_estimator", lambda *a: Listener(make(*a)))
+    recording = open_recording(short)
+    job = calibration_run.make_job(
+        recording, read_initial(short / "initial.yaml"), target=str(short / "target.yaml")
+    )
+    calibration_run.run_job(job, lambda share, estimate: None)
+    samples = recording.imu_arrays("imu0")
+    expected = [
+        (int(t), *map(float, g), *map(float, a))
+        for t, g, a in zip(samples.t_ns, samples.gyro_rps, samples.specific_force_mps2, strict=True)
+    ]
+    assert [entry for entry in fed if len(entry) == 7] == expected
+    frames = [(f.t_cam_ns, f.ids.tobytes(), f.uv_px.tobytes()) for f in recording.points_frames("cam0")]
+    assert [entry for entry in fed if len(entry) == 3] == frames
+    assert [entry[0] for entry in fed] == sorted(entry[0] for entry in fed)
+
+
+def _scale_csv(path: Path, columns: slice, factor: float) -> None:
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    for row in rows:
+        if not row[0].startswith("#"):
+            row[columns] = [repr(float(v) * factor) for v in row[columns]]
+    path.write_text("\n".join(",".join(row) for row in rows) + "\n")
+
+
+def _spoil_missing(folder: Path) -> list[str]:
+    return ["calibrate", str(folder / "nothing.mcap"), "--target", str(folder / "target.yaml")]
+
+
+def _spoil_text(folder: Path) -> list[str]:
+    (folder / "log.mcap").write_text("this is no log\n" * 100)
+    return ["calibrate", str(folder / "log.mcap"), "--target", str(folder / "target.yaml")]
+
+
+def _spoil_degrees(folder: Path) -> list[str]:
+    _scale_csv(folder / "mav0/imu0/data.csv", slice(1, 4), 180 / np.pi)
+    return _arguments(folder)
+
+
+def _spoil_g(folder: Path) -> list[str]:
+    _scale_csv(folder / "mav0/imu0/data.csv", slice(4, 7), 1 / G)
+    return _arguments(folder)
+
+
+def _spoil_camera_rate(folder: Path) -> list[str]:
+    path = folder / "mav0/cam0/corners.csv"
+    rows = [line.split(",") for line in path.read_text().splitlines()]
+    begin = int(rows[1][0])
+    for row in rows[1:]:
+        row[0] = str(begin + 100 * (int(row[0]) - begin))
+    path.write_text("\n".join(",".join(row) for row in rows) + "\n")
+    return _arguments(folder)
+
+
+def _spoil_target_key(folder: Path) -> list[str]:
+    (folder / "target.yaml").write_text("target_type: aprilgrid\ntagCols: 6\ntagRows: 6\ntagSize: -1\n")
+    return _arguments(folder)
+
+
+def _spoil_initial(folder: Path) -> list[str]:
+    (folder / "initial.yaml").write_text("cam0: {intrinsiks: [1, 2, 3, 4]}\n")
+    return _arguments(folder)
+
+
+def _spoil_nothing_fixed(folder: Path) -> list[str]:
+    return _arguments(folder, "--fix", "timeshift")
+
+
+def _spoil_fix(folder: Path) -> list[str]:
+    return _arguments(folder, "--fix", "intrinsic")
+
+
+def _spoil_estimate(folder: Path) -> list[str]:
+    return _arguments(folder, "--estimate", "everything")
+
+
+def _spoil_camera_name(folder: Path) -> list[str]:
+    return _arguments(folder, "--camera", "cam7")
+
+
+def _spoil_size(folder: Path) -> list[str]:
+    (folder / "initial.yaml").write_text("cam0: {intrinsics: [458, 457, 367, 248]}\n")
+    return _arguments(folder)
+
+
+def _spoil_report(folder: Path) -> list[str]:
+    return _arguments(folder, "--report", str(folder / "nowhere" / "r.html"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code", "words"),
+    [
+        (_spoil_missing, 1, "does not exist"),
+        (_spoil_text, 1, "log.mcap"),
+        (_spoil_degrees, 1, "deg/s"),
+        (_spoil_g, 1, "looks like g"),
+        (_spoil_camera_rate, 1, "cam0"),
+        (_spoil_target_key, 1, "tagSize"),
+        (_spoil_initial, 2, "did you mean intrinsics"),
+        (_spoil_nothing_fixed, 2, "does not give it"),
+        (_spoil_fix, 2, "did you mean intrinsics"),
+        (_spoil_estimate, 2, "imu_intrinsics"),
+        (_spoil_camera_name, 1, "cam7"),
+        (_spoil_size, 2, "image size"),
+        (_spoil_report, 2, "folder does not exist"),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)
+def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str) -> None:
+    assert main(spoil(copy)) == code
+    out, err = capsys.readouterr()
+    assert out == "" and "Traceback" not in err
+    assert words in err.splitlines()[-1] and err.splitlines()[-1].startswith("vical: error: ")
