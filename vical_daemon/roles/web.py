@@ -107,7 +107,7 @@ async def _serve(
         bus.publish(topics.COMMAND.key(config.rig, role), encode_string(word))
 
     server = PageServer(state, feeds.views, feeds.watch, command, read_token())
-    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=1.0)
+    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=0.3)
     await runner.setup()
     host, port = config.web.host, config.web.port
     try:

@@ -105,3 +105,16 @@ def _simulate(rng, positions=24, axes=None):
         + 8e-4 * np.sqrt(IMU_RATE_HZ) * rng.standard_normal(force.shape)
     )
     return gyro_m, force_m
+
+
+@pytest.fixture(scope="session")
+def web_feed():
+    """The module that feeds a bus with what a rig sends (shared with the system tests)."""
+    import importlib.util
+    from pathlib import Path
+
+    path = Path(__file__).parents[2] / "system" / "output" / "web_feed.py"
+    spec = importlib.util.spec_from_file_location("vical_web_feed", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -32,8 +32,9 @@ def estimate(t_s, rng, status=None, guidance="", withheld=()):
     q = (Rotation.from_euler("zyx", [89, 1.2, 0.3], degrees=True) * Rotation.from_rotvec(error[3:])).as_quat(
         scalar_first=True
     )
+    p = np.array([0.08, 0.02, -0.03]) + error[:3]
     camera = CameraEstimate(
-        PoseEstimate((np.array([0.08, 0.02, -0.03]) + error[:3]).tolist(), q.tolist(), np.diag(sigma**2).tolist()),
+        PoseEstimate(p.tolist(), q.tolist(), np.diag(sigma**2).tolist()),
         -0.0052 + 2e-4 * shrink * rng.standard_normal(), 2e-4 * shrink,
         [520.3, 519.9, 321.2, 240.5], [0.3, 0.3, 0.2, 0.2], "radtan", [-0.28, 0.07, 0.0002, 0.0], [1e-3] * 4,
         0.24, 0.22, list(withheld),
@@ -72,7 +73,7 @@ def publish_image(bus, number, *, with_points=True, width=640):
     bus.publish(topics.IMAGE.key(RIG, CAMERA), encode_image(stamp, CAMERA, image, "mono8"))
     if with_points:
         grid = np.stack(np.meshgrid(np.arange(1, 9), np.arange(1, 7)), axis=-1).reshape(-1, 2) * 45.0
-        uv = grid + [130 + shift, 90] - 0.5
+        uv = grid + np.array([130 + shift, 90.0]) - 0.5
         payload = encode_points(stamp, CAMERA, np.arange(48), uv, None, (width, height))
         bus.publish(topics.POINTS.key(RIG, CAMERA), payload)
     return stamp

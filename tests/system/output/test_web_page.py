@@ -1,0 +1,187 @@
+"""The page over HTTP and in a real browser, with data flowing."""
+
+import asyncio
+import json
+import os
+import socket
+import threading
+from pathlib import Path
+
+import aiohttp
+import pytest
+
+from vical_daemon.bus import LocalBus
+from vical_daemon.config import Config, WebConfig
+from vical_daemon.messages import decode_string
+from vical_daemon.roles import web
+from vical_daemon.wall_clock import private_clock
+
+pytestmark = pytest.mark.system
+
+
+def request(method, url, **options):
+    async def go():
+        async with (
+            aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(20)) as session,
+            session.request(method, url, **options) as answer,
+        ):
+            return answer.status, dict(answer.headers), await answer.text()
+
+    return asyncio.run(go())
+
+
+def test_files_and_headers(served):
+    for name, kind in (("", "text/html"), ("style.css", "text/css"), ("app.js", "javascript")):
+        status, headers, text = request("GET", served.address + name)
+        assert status == 200
+        assert kind in headers["Content-Type"]
+        assert "default-src 'self'" in headers["Content-Security-Policy"]
+        assert "http" not in text.replace("http-equiv", "")  # nothing from outside
+    for name in ("nothing", "../server.py", "server.py", "%2e%2e/server.py", "camera/none.mjpg"):
+        assert request("GET", served.address + name)[0] == 404
+
+
+def test_events_start_full_and_go_on(fed):
+    async def listen():
+        kinds, documents = [], []
+        async with aiohttp.ClientSession() as session, session.get(fed.address + "events") as answer:
+            assert answer.headers["Content-Type"] == "text/event-stream"
+            async for line in answer.content:
+                text = line.decode().strip()
+                if text.startswith("event: "):
+                    kinds.append(text[7:])
+                if text.startswith("data: "):
+                    documents.append(json.loads(text[6:]))
+                if len(documents) == 5:
+                    return kinds, documents
+        return None
+
+    kinds, documents = asyncio.run(listen())
+    assert kinds[0] == "full"
+    assert "update" in kinds[1:]
+    rows = []
+    for kind, document in zip(kinds, documents, strict=True):
+        camera = document["cameras"]["cam0"]
+        rows = camera["rows"] if kind == "full" else rows + camera["fresh"]
+    times = [row[0] for row in rows]
+    assert times == sorted(set(times))  # nothing twice, nothing out of order
+    assert len(times) >= 149
+
+
+def test_pictures_come_while_somebody_looks(fed):
+    async def look():
+        async with (
+            aiohttp.ClientSession() as session,
+            session.get(fed.address + "camera/cam0.mjpg") as answer,
+        ):
+            assert answer.headers["Content-Type"].startswith("multipart/x-mixed-replace")
+            data = b""
+            while data.count(b"--frame") < 3:
+                data += await answer.content.readany()
+            return data
+
+    assert b"\xff\xd8\xff" in asyncio.run(look())
+
+
+def test_metrics(fed):
+    status, headers, text = request("GET", fed.address + "metrics")
+    assert (status, headers["Content-Type"]) == (200, "text/plain; version=0.0.4")
+    assert "vical_timeshift_sigma_seconds" in text
+
+
+@pytest.mark.parametrize(
+    ("token", "body", "status"),
+    [
+        (None, {"command": "reset"}, 401),
+        ("wrong", {"command": "reset"}, 401),
+        ("open sesame", {"command": "shutdown"}, 400),
+        ("open sesame", [], 400),
+        ("open sesame", {"command": "reset"}, 200),
+    ],
+)
+def test_commands_need_the_token(served, token, body, status):
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    assert request("POST", served.address + "api/command", json=body, headers=headers)[0] == status
+    sent = [(s.key, decode_string(s.payload)) for s in served.commands]
+    assert sent == ([("vical/rig0/command/estimate", "reset")] if status == 200 else [])
+
+
+def test_without_a_token_nobody_commands(served, monkeypatch, tmp_path):
+    monkeypatch.delenv("VICAL_WEB_TOKEN")
+    monkeypatch.setenv("VICAL_STATE_DIR", str(tmp_path))
+    assert web.read_token() == ""
+    (tmp_path / "web-token").write_text("secret\n")
+    assert web.read_token() == "secret"
+
+
+def test_taken_port_is_said():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        config = Config(web=WebConfig(enabled=True, port=taken.getsockname()[1]))
+        with pytest.raises(web.WebError, match=r"set web\.port"):
+            web.run(config, LocalBus(), threading.Event(), clock=private_clock())
+
+
+def shots():
+    """Folder for screenshots to look at: VICAL_SHOTS, else none are kept."""
+    folder = os.environ.get("VICAL_SHOTS")
+    return Path(folder) if folder else None
+
+
+def test_in_a_browser(fed, browser, tmp_path):
+    keep = shots() or tmp_path
+
+    async def script(page):
+        await page.open(fed.address)
+        await page.wait("document.getElementById('link').textContent === 'live'")
+        await page.wait("document.getElementById('picture').naturalWidth === 640")
+        status = await page.wait("document.getElementById('status').classList.contains('converged')")
+        lever = await page.evaluate("document.getElementById('lever').textContent")
+        before = await page.evaluate("page.rows.cam0.length")
+        await page.wait(f"page.rows.cam0.length > {before}")  # live
+        drawn = await page.evaluate(
+            "(() => { const c = document.getElementById('c-lever'), d = c.getContext('2d')"
+            ".getImageData(0, 0, c.width, c.height).data; return d.some((v) => v); })()"
+        )
+        devices = await page.evaluate("document.querySelector('#devices tbody').textContent")
+        outside = await page.evaluate(
+            "performance.getEntriesByType('resource').filter((e) => !e.name.startsWith(location.origin)"
+            " && !e.name.startsWith('data:')).length"
+        )
+        await page.screenshot(keep / "page.png")
+        return status, lever, drawn, devices, outside, page.errors
+
+    status, lever, drawn, devices, outside, errors = browser.drive(script, tmp_path / "profile")
+    assert errors == []
+    assert status
+    assert lever.startswith("x")
+    assert "±" in lever
+    assert drawn
+    assert "imu/imu0" in devices
+    assert outside == 0
+    assert (keep / "page.png").stat().st_size > 20_000
+
+
+def test_commands_and_a_phone_in_a_browser(fed, browser, tmp_path):
+    keep = shots() or tmp_path
+
+    async def script(page):
+        await page.open(fed.address, 390, 844, dark=True)
+        await page.wait("!document.getElementById('control').hidden")
+        wide = await page.evaluate("document.documentElement.scrollWidth")
+        await page.evaluate("document.getElementById('token').value = 'wrong'")
+        await page.evaluate("document.querySelector('button[value=record_start]').click()")
+        await page.wait("document.getElementById('answer').textContent === 'wrong token'")
+        await page.evaluate("document.getElementById('token').value = 'open sesame'")
+        await page.evaluate("document.querySelector('button[value=record_start]').click()")
+        await page.wait("document.getElementById('answer').textContent.startsWith('sent')")
+        await page.wait("document.getElementById('picture').naturalWidth === 640")
+        await page.evaluate("window.scrollTo(0, 0)")
+        await page.screenshot(keep / "phone.png")
+        return wide
+
+    assert browser.drive(script, tmp_path / "profile") <= 390  # nothing to scroll sideways
+    assert [(s.key, decode_string(s.payload)) for s in fed.commands] == [
+        ("vical/rig0/command/record", "start")
+    ]
