@@ -13,11 +13,11 @@ from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from vical_daemon.estimation import unscented
-from vical_daemon.estimation.consistency import Consistency
+from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.imu_model import ImuSegment, Motion, compose, process_noise, strapdown
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
-from vical_daemon.estimation.retract import camera_points, motion_points, retract
+from vical_daemon.estimation.retract import camera_points, motion_points, pose_points, retract
 from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State, grp_from_rotation
 from vical_daemon.estimation.target_view import Rates, view
 
@@ -242,16 +242,27 @@ class CalibrationFilter:
             image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why
         )
 
+    def surprise(self, image: Image) -> float | None:
+        """Mean squared innovation of an image in the smooth modes, over its prediction."""
+        lin = self._linearise(image, np.zeros(self.layout.size), self.S)
+        keep = lin.valid & self._corner_gate(image, image.uv - lin.z, lin)
+        if keep.sum() < len(keep) // 2:
+            return 36.0
+        rows = np.repeat(keep, 2)
+        normal = normalised(lin.z[keep], (image.uv - lin.z)[keep], lin.linear[rows], image.sigma_px[keep])
+        return None if normal is None else float(normal @ normal) / len(normal)
+
     def predict_pixels(self, camera: str, t_cam_s: float, points: FloatArray) -> FloatArray:
         """Where points should appear with the nominal state, px, shape (n, 2)."""
-        return self._project(camera, t_cam_s, points, None, np.zeros((1, self.layout.size)))[0]
+        uv: FloatArray = self._project(camera, t_cam_s, points, None, np.zeros((1, self.layout.size)))[0]
+        return uv
 
     def _project(
         self, camera: str, t_cam_s: float, points: FloatArray, uv: FloatArray | None, errors: FloatArray
     ) -> FloatArray:
         state, where = self.state, self.layout.cameras[camera]
         known = state.cameras[camera]
-        motion = motion_points(state, self.layout, errors)
+        motion = pose_points(state, errors)
         cam = camera_points(known, self.layout, camera, errors)
         world: FloatArray = points * state.target_scale
         if self.layout.target_scale is not None:
@@ -268,7 +279,7 @@ class CalibrationFilter:
         """Statistical linearisation about `dx` with spread S (all in the chart of the prior)."""
         errors = dx + unscented.offsets(S)
         pixels = self._project(image.camera, image.t_cam_s, image.points, image.uv, errors)
-        valid = np.isfinite(pixels).all(axis=(0, 2))
+        valid: BoolArray = np.asarray(np.isfinite(pixels).all(axis=(0, 2)))
         flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
         m = unscented.moments(flat[1:] - flat[0])
         z = (flat[0] + m.shift).reshape(-1, 2)

@@ -16,6 +16,7 @@ from vical_daemon.estimation import start
 from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
+from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_model import ImuBuffer
 from vical_daemon.estimation.judge import Judge
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
@@ -27,7 +28,6 @@ from vical_daemon.estimation.state import (
     GYRO_BIAS,
     POSITION,
     VELOCITY,
-    Layout,
     State,
     make_layout,
 )
@@ -67,12 +67,11 @@ class Calibrator:
         self._pending: deque[tuple[float, PointsFrame]] = deque()
         self._next_attempt_s = -np.inf
         self._refused_in_a_row = 0
-        self._early: deque[tuple[int, FloatArray, FloatArray]] = deque(maxlen=64)
-        self._start_reason = ""
+        self._held_back = HeldBack()
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
-        """Take one inertial reading (imu clock, ns; rad/s; m/s^2). Old or non-finite ones are counted only."""
+        """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         if self._buffer is None:
             self._base_ns = t_imu_ns
             self._buffer = ImuBuffer(t_imu_ns)
@@ -82,12 +81,12 @@ class Calibrator:
         )
         fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
         if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
-            self.judge.saw_imu(t_imu_ns, gyro, accel)
+            self.judge.saw_imu(t_imu_ns, accel)
         else:
             self.judge.imu_refused += 1
 
     def add_points(self, frame: PointsFrame) -> None:
-        """Take the points of one image; unknown cameras, ids off the board and empty images are counted only."""
+        """Take the points of one image; those of unknown cameras or off the board are only counted."""
         ok = np.isfinite(frame.uv_px).all(axis=1) & (frame.ids >= 0) & (frame.ids < len(self.target))
         if frame.camera not in self.priors or self._buffer is None:
             self.judge.frames_ignored += 1
@@ -95,7 +94,9 @@ class Calibrator:
         if not ok.all():
             sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
-        self._pending.append(((frame.t_cam_ns - self._base_ns) * 1e-9, frame))
+        t_cam_s = (frame.t_cam_ns - self._base_ns) * 1e-9
+        self.judge.saw_points(t_cam_s, len(frame.ids))
+        self._pending.append((t_cam_s, frame))
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
@@ -140,7 +141,7 @@ class Calibrator:
             self._buffer, self._waiting, self.priors, self.options, self.layout, self.target
         )
         if result.state is None:
-            self.judge.waiting(result.reason)
+            self.judge.waiting(result.reason, result.motion_missing)
             return
         begin = result.state.t_s
         frames = sorted(
@@ -238,6 +239,9 @@ class Calibrator:
             self.judge.frames_ignored += 1
             return None
         self._buffer.trim(f.state.t_s - _KEEP_S)
+        ratio = self._held_back.follow(f, frame, t_cam_s, self.target, self._buffer)
+        if ratio is not None:
+            self.judge.held_back(ratio)
         self._refused_in_a_row = 0 if report.used else self._refused_in_a_row + 1
         if self._refused_in_a_row >= _RESTART_AFTER:
             self._pose_anew(frame, t_cam_s)
@@ -256,7 +260,7 @@ class Calibrator:
         R = seen.R_target_cam @ camera.R_imu_cam.T
         f.reset_motion(R, seen.p_target_cam - R @ camera.p_imu_cam)
         self._refused_in_a_row = 0
-        self.judge.pose_lost()
+        self.judge.announce("pose lost and taken anew from the image")
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

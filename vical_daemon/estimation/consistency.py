@@ -29,6 +29,7 @@ _SIGNIFICANT = 3.0
 _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 16.0
 _CLIP = 6.0
+_DEAD_BAND = 1.3
 
 
 def modes(uv: FloatArray) -> FloatArray:
@@ -52,6 +53,27 @@ def modes(uv: FloatArray) -> FloatArray:
     return out.reshape(-1, MODES)
 
 
+def normalised(
+    uv: FloatArray, innovation: FloatArray, linear: FloatArray, sigma: FloatArray
+) -> FloatArray | None:
+    """Innovation in the eight modes, each over its predicted standard deviation; arguments as `learn`.
+
+    Returns:
+        Shape (8,), clipped at six; None where the corners do not span the modes.
+    """
+    if len(uv) < _MIN_CORNERS:
+        return None
+    whitened = 1.0 / np.repeat(sigma, 2)
+    Q, R = np.linalg.qr(modes(uv) * whitened[:, None])
+    diagonal = np.abs(np.diag(R))
+    if diagonal.min() < 1e-6 * diagonal.max():
+        return None
+    seen = Q.T @ (innovation.ravel() * whitened)
+    state = Q.T @ (linear * whitened[:, None])
+    out: FloatArray = np.clip(seen / np.sqrt(1.0 + (state**2).sum(axis=1)), -_CLIP, _CLIP)
+    return out
+
+
 @dataclass(slots=True)
 class Consistency:
     """Running scale and factor of one camera.
@@ -67,6 +89,7 @@ class Consistency:
     scale: float = 1.0
     factor: float = 1.0
     images: int = 0
+    _level: float = 1.0
     _weight: float = 0.0
     _lagged: FloatArray = field(default_factory=lambda: np.zeros(_LAGS + 1))
     _recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_LAGS))
@@ -80,24 +103,19 @@ class Consistency:
             linear: H S for these corners (state uncertainty), px, shape (2n, c).
             sigma: Corner noise as used, px, shape (n,).
         """
-        if len(uv) < _MIN_CORNERS:
+        normal = normalised(uv, innovation, linear, sigma)
+        if normal is None:
             return
-        Phi = modes(uv) / np.repeat(sigma, 2)[:, None]
-        Q, R = np.linalg.qr(Phi)
-        if np.abs(np.diag(R)).min() < 1e-6 * np.abs(np.diag(R)).max():
-            return
-        whitened = 1.0 / np.repeat(sigma, 2)
-        seen = Q.T @ (innovation.ravel() * whitened)
-        state = Q.T @ (linear * whitened[:, None])
-        # Coefficients in the orthonormal basis, each over its predicted standard deviation.
-        normal = np.clip(seen / np.sqrt(1.0 + (state**2).sum(axis=1)), -_CLIP, _CLIP)
         self.images += 1
         self._move_scale(float(normal @ normal) / MODES)
         self._remember(normal)
 
     def _move_scale(self, ratio: float) -> None:
+        """Follow the ratio; a level that is 1 within its own scatter stays exactly 1, at no cost."""
         gain = max(_GAIN_END, _GAIN_START / (1.0 + 0.02 * self.images))
-        self.scale = float(np.clip(self.scale * (1.0 + gain * (min(ratio, 5.0) - 1.0)), 1.0, _MAX_SCALE))
+        moved = self._level * (1.0 + gain * (min(ratio, 5.0) * self.scale / self._level - 1.0))
+        self._level = float(np.clip(moved, 0.5, _MAX_SCALE))
+        self.scale = self._level if self._level > _DEAD_BAND else 1.0
 
     def _remember(self, normal: FloatArray) -> None:
         if self._weight >= self.memory:

@@ -34,7 +34,7 @@ class CornerNoise:
         self._sum = self._dof * self.guess_px**2
 
     def sigmas(self, stated_px: FloatArray | None, n: int) -> FloatArray:
-        """Noise of each corner: the measured level, shared out by the detector's own weights if it has any."""
+        """Noise of each corner: the measured level, shared out by the detector's own weights."""
         if stated_px is None or not len(stated_px):
             return np.full(n, self.sigma_px)
         relative = stated_px / np.sqrt(np.mean(stated_px**2))

@@ -77,13 +77,13 @@ def linear_start(
     A[:, :, 9:12] = R_world_imu
     A[:, :, 12:15] = -B
     w = 1.0 / position_sigma
-    A = (A * w[:, None, None]).reshape(-1, 15)
+    rows = (A * w[:, None, None]).reshape(-1, 15)
     y = ((p_world_cam - D) * w[:, None]).ravel()
     prior = np.zeros((3, 15))
     prior[:, 12:15] = eye / _ACCEL_BIAS_PRIOR
-    A_all, y_all = np.vstack([A, prior]), np.concatenate([y, np.zeros(3)])
+    A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(3)])
     x, *_ = np.linalg.lstsq(A_all, y_all, rcond=None)
-    residual = (y - A @ x).reshape(-1, 3)
+    residual = (y - rows @ x).reshape(-1, 3)
     variance = float(np.mean(residual**2))
     cov = np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)
     rms = float(np.sqrt(np.mean((residual / w[:, None]) ** 2)))

@@ -119,7 +119,7 @@ class _Normal:
             A -= C.T @ inverse @ C
             b -= C.T @ inverse @ c
             inverses.append(inverse)
-        d = np.linalg.solve(A, b)
+        d: FloatArray = np.linalg.solve(A, b).astype(np.float64)
         return d, [i @ (c - C @ d) for i, (_, C, c) in zip(inverses, self.views, strict=True)]
 
 

@@ -1,30 +1,36 @@
-"""Says how far to trust the filter: status, reasons in words, progress, trace, withheld directions."""
+"""Says how far to trust the filter: status, reasons in words, progress, withheld directions."""
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
+from vical_daemon.estimation.guidance import Gap, gaps
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
-from vical_daemon.estimation.result import (
-    CalibrationEstimate,
-    CameraEstimate,
-    ImuEstimate,
-    PoseEstimate,
-    Status,
-    TracePoint,
-)
-from vical_daemon.estimation.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices, Layout
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
+from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate
+from vical_daemon.estimation.state import Layout
+
+_ENOUGH_FRAMES = 60
+_ENOUGH_S = 5.0
+_PATIENCE_S = 15.0
+_LOST = 3.0  # a direction this far above its target after the patience is called unobservable
+_NIS_BAD = 4.0
+_HELD_BACK_BAD = 9.0
+_HYSTERESIS = 2.0
+_RECENT = 60
+_TRACE_MOST = 7200
 
 
 class Judge:
     """Watches what goes in and out of the filter.
 
     Args:
-        options: Switches.
+        options: Switches and targets.
         layout: Where the errors live.
     """
 
@@ -34,41 +40,75 @@ class Judge:
         self.imu_samples = 0
         self.imu_refused = 0
         self.frames = 0
+        self.frames_seen = 0
         self.frames_ignored = 0
         self.frames_refused = 0
-        self.reason = "no inertial data yet"
         self.events: list[str] = []
-        self._first_ns = 0
-        self._newest_ns = 0
+        self.status = Status.WAITING
+        self.bumped = ""
+        self._start_reason = ""
+        self._motion_missing = False
+        self._first_ns = self._newest_ns = 0
+        self._first_frame_s: float | None = None
+        self._started_s: float | None = None
         self._points = [0, 0]
-        self._nis: deque[tuple[float, int]] = deque(maxlen=600)
+        self._nis: deque[tuple[float, int]] = deque(maxlen=300)
+        self._recent_used: deque[bool] = deque(maxlen=_RECENT)
+        self._held_back: deque[float] = deque(maxlen=40)
         self._square: dict[str, deque[tuple[float, int]]] = {}
         self._trace: dict[str, list[TracePoint]] = {}
+        self._size: deque[float] = deque(maxlen=400)
 
     # ------------------------------------------------------------------ what happens
-    def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
+    def saw_imu(self, t_ns: int, accel: FloatArray) -> None:
         """Count one inertial reading."""
         if not self.imu_samples:
             self._first_ns = t_ns
         self.imu_samples += 1
         self._newest_ns = t_ns
+        if self.imu_samples % 16 == 1:
+            self._size.append(float(np.sqrt(accel @ accel)))
 
-    def waiting(self, why: str) -> None:
-        """The start is not possible yet."""
-        self.reason = why
+    def saw_points(self, t_s: float, count: int) -> None:
+        """Count one image with `count` points in it."""
+        if count >= 4:
+            self.frames_seen += 1
+            if self._first_frame_s is None:
+                self._first_frame_s = t_s
+
+    def waiting(self, why: str, motion_missing: bool = False) -> None:
+        """The start is not possible yet; `motion_missing`: more motion, not more time, would help."""
+        self._start_reason, self._motion_missing = why, motion_missing
 
     def started(self, t_s: float) -> None:
         """The filter runs from `t_s` on."""
-        self.reason = ""
+        self._start_reason, self._started_s = "", t_s
+        self._recent_used.clear()
+        self._nis.clear()
+        self._held_back.clear()
+        if self.bumped:
+            self.events.append("recovered: calibrating anew after the change")
 
-    def pose_lost(self) -> None:
-        """The pose was taken anew."""
-        self.events.append("pose lost and found again")
+    def announce(self, event: str) -> None:
+        """Put an event into the next estimate."""
+        self.events.append(event)
+
+    def changed(self, why: str) -> None:
+        """The rig is not what it was: the calibration is being taken anew."""
+        self.bumped = why
+        self.events.append(f"bumped: {why}")
+        self._started_s = None
+        self.status = Status.INCONSISTENT
+
+    def held_back(self, ratio: float) -> None:
+        """Squared error of an image that was predicted by the IMU alone, over its predicted variance."""
+        self._held_back.append(ratio)
 
     def saw_frame(self, report: FrameReport, f: CalibrationFilter) -> None:
         """Take the verdict of one frame."""
         self._points[0] += int((~report.accepted).sum())
         self._points[1] += len(report.accepted)
+        self._recent_used.append(report.used)
         if not report.used:
             self.frames_refused += 1
             return
@@ -85,22 +125,21 @@ class Judge:
         if trace and t - trace[-1].t_s < 1.0:
             return
         e = self._camera(camera, f)
-        cov = np.diag(np.array(e.T_imu_cam.covariance))
-        sigma = np.sqrt(cov)
-        trace.append(
-            TracePoint(
-                t,
-                e.T_imu_cam.p_m,
-                sigma[:3].tolist(),
-                e.T_imu_cam.q_wxyz,
-                sigma[3:].tolist(),
-                e.timeshift_cam_imu_s,
-                e.timeshift_sigma_s,
-                self.nis_per_dof(),
-            )
+        sigma = np.sqrt(np.diag(np.array(e.T_imu_cam.covariance)))
+        point = TracePoint(
+            t,
+            e.T_imu_cam.p_m,
+            sigma[:3].tolist(),
+            e.T_imu_cam.q_wxyz,
+            sigma[3:].tolist(),
+            e.timeshift_cam_imu_s,
+            e.timeshift_sigma_s,
+            self.nis_per_dof(),
+            str(self.status),
         )
-        if len(trace) > 7200:
-            del trace[1:3600:2]
+        trace.append(point)
+        if len(trace) > _TRACE_MOST:
+            del trace[1 : _TRACE_MOST // 2 : 2]
 
     # ------------------------------------------------------------------ what is said
     def nis_per_dof(self) -> float:
@@ -114,67 +153,109 @@ class Judge:
 
     def estimate(self, f: CalibrationFilter | None) -> CalibrationEstimate:
         """Put everything together."""
-        cameras, imu, gravity = {}, None, []
-        status = Status.WAITING if not self.imu_samples else Status.INITIALISING
-        if f is not None:
-            cameras = {name: self._camera(name, f) for name in self.layout.cameras}
-            sigma = f.sigmas()
-            imu = ImuEstimate(
-                f.state.gyro_bias.tolist(),
-                f.state.accel_bias.tolist(),
-                sigma[GYRO_BIAS].tolist(),
-                sigma[ACCEL_BIAS].tolist(),
-            )
-            gravity = f.state.gravity.tolist()
-            status = Status.CONVERGING
+        cameras = {} if f is None else {name: self._camera(name, f) for name in self.layout.cameras}
+        missing = {} if f is None else {name: self._gaps(e, name) for name, e in cameras.items()}
+        self.status, reason, guidance = self._decide(f, missing)
+        if f is not None and self.status == Status.DEGENERATE:
+            cameras = {name: _withheld(e, missing[name]) for name, e in cameras.items()}
         events, self.events = self.events, []
         return CalibrationEstimate(
             self._newest_ns,
-            status,
-            self.reason,
-            0.0,
-            "",
+            self.status,
+            reason,
+            self._progress(missing),
+            guidance,
             (self._newest_ns - self._first_ns) * 1e-9,
             self.frames,
             self.imu_samples,
             cameras,
-            imu,
-            gravity,
+            None if f is None else imu_estimate(f),
+            [] if f is None else f.state.gravity.tolist(),
             self.nis_per_dof(),
             self._points[0] / max(self._points[1], 1),
             events,
         )
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
-        camera, where = f.state.cameras[name], self.layout.cameras[name]
-        # Errors that last over several images count less than the filter thinks: see `consistency`.
-        spread = float(np.sqrt(f.consistency[name].factor))
-        sigma = spread * f.sigmas()
-        q = so3.quat_from_matrix(camera.R_imu_cam)
         square = self._square.get(name, ())
         count = sum(n for _, n in square)
-        return CameraEstimate(
-            PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), (spread**2 * pose_covariance(f, where)).tolist()),
-            camera.timeshift_s,
-            float(sigma[where.timeshift]) if where.timeshift is not None else 0.0,
-            camera.intrinsics.tolist(),
-            sigma[where.intrinsics].tolist() if where.intrinsics is not None else [0.0] * 4,
-            camera.distortion_model,
-            camera.distortion.tolist(),
-            sigma[where.distortion].tolist() if where.distortion is not None else [0.0] * 4,
-            float(np.sqrt(sum(s for s, _ in square) / count)) if count else 0.0,
-            f.corner_noise[name].sigma_px,
-            [],
-            camera.readout_s,
-            float(sigma[where.readout]) if where.readout is not None else 0.0,
-        )
+        rms = float(np.sqrt(sum(s for s, _ in square) / count)) if count else 0.0
+        return camera_estimate(f, name, rms)
+
+    def _gaps(self, e: CameraEstimate, name: str) -> list[Gap]:
+        if self.layout.cameras[name].position is None and self.layout.cameras[name].timeshift is None:
+            return []
+        R = so3.matrix_from_quat(np.array(e.T_imu_cam.q_wxyz))
+        return gaps(np.array(e.T_imu_cam.covariance), R, e.timeshift_sigma_s, self.options.targets)
+
+    def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[Gap]]) -> tuple[Status, str, str]:
+        """Status, reason and guidance."""
+        if f is None:
+            return self._before_start()
+        trouble = self._trouble()
+        if trouble:
+            return Status.INCONSISTENT, trouble, ""
+        span = f.state.t_s - (self._started_s or 0.0)
+        all_gaps = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
+        if self.status == Status.CONVERGED:
+            all_gaps = [g for g in all_gaps if g.excess > _HYSTERESIS]
+        if not all_gaps:
+            if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
+                return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
+            if not self._held_back_fine():
+                return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
+            return Status.CONVERGED, "", ""
+        worst = all_gaps[0]
+        if span > _PATIENCE_S and worst.excess > _LOST:
+            names = "; ".join(g.said for g in all_gaps[:3])
+            return Status.DEGENERATE, f"the motion does not show: {names}", worst.motion
+        return Status.CONVERGING, f"{worst.said}", worst.motion
+
+    def _before_start(self) -> tuple[Status, str, str]:
+        if self.bumped:
+            return Status.INCONSISTENT, f"{self.bumped}; calibrating anew: {self._start_reason}", ""
+        if not self.imu_samples:
+            return Status.WAITING, "no inertial data yet", ""
+        unit = self._unit_trouble()
+        if unit:
+            return Status.INCONSISTENT, unit, ""
+        if self._first_frame_s is None:
+            return Status.WAITING, "the target has not been seen yet: show the whole board to the camera", ""
+        seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
+        if self._motion_missing and seen_for > _PATIENCE_S:
+            return Status.DEGENERATE, self._start_reason, "turn the rig about all three axes while moving it"
+        return Status.INITIALISING, self._start_reason or "collecting the first seconds", ""
+
+    def _unit_trouble(self) -> str:
+        if len(self._size) < 20:
+            return ""
+        size = float(np.median(self._size))
+        if 0.7 < size < 1.4:
+            return (
+                f"specific force has a median size of {size:.2f}: is the accelerometer in g instead of m/s^2?"
+            )
+        return ""
+
+    def _trouble(self) -> str:
+        """Why the filter cannot be believed at present; empty when it can."""
+        refused = self._recent_used.count(False)
+        if len(self._recent_used) >= 20 and refused > len(self._recent_used) // 3:
+            return f"{refused} of the last {len(self._recent_used)} images do not fit the motion"
+        if len(self._nis) >= 40 and self.nis_per_dof() > _NIS_BAD:
+            return f"innovations are {self.nis_per_dof():.1f} times what they should be"
+        return ""
+
+    def _held_back_fine(self) -> bool:
+        return len(self._held_back) >= 2 and float(np.median(self._held_back)) < _HELD_BACK_BAD
+
+    def _progress(self, missing: dict[str, list[Gap]]) -> float:
+        if self.status == Status.CONVERGED:
+            return 1.0
+        if not missing:
+            return min(0.1, 0.001 * self.frames_seen)
+        worst = max((g.excess for gs in missing.values() for g in gs), default=1.0)
+        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
 
 
-def pose_covariance(f: CalibrationFilter, where: CameraSlices) -> FloatArray:
-    """Covariance of T_imu_cam, order [px py pz rx ry rz], shape (6, 6); zeros where held fixed."""
-    if where.position is None or where.rotation is None:
-        return np.zeros((6, 6))
-    rows = list(range(where.position.start, where.position.stop)) + list(
-        range(where.rotation.start, where.rotation.stop)
-    )
-    return f.covariance(rows)
+def _withheld(e: CameraEstimate, missing: list[Gap]) -> CameraEstimate:
+    return replace(e, unobservable=[f"{g.name}: {g.motion}" for g in missing if g.excess > _LOST])

@@ -69,6 +69,15 @@ class PointsFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class ConvergenceTargets:
+    """A calibration counts as converged when every sigma lies below these (m, rad, s)."""
+
+    position_m: float = 0.005
+    rotation_rad: float = float(np.deg2rad(0.1))
+    timeshift_s: float = 5e-4
+
+
+@dataclass(frozen=True, slots=True)
 class CalibrationOptions:
     """Switches of the estimator; names as on the command line.
 
@@ -78,6 +87,8 @@ class CalibrationOptions:
         target_free: Landmarks are estimated, no target is known.
         gravity_mps2: Magnitude of gravity, m/s^2.
         corner_sigma_px: First guess of the corner noise; measured from the data afterwards.
+        imu_noise: Densities of the IMU.
+        targets: What counts as converged.
     """
 
     fix: frozenset[str] = frozenset()
@@ -86,3 +97,4 @@ class CalibrationOptions:
     gravity_mps2: float = 9.80665
     corner_sigma_px: float = 0.5
     imu_noise: ImuNoise = field(default_factory=ImuNoise)
+    targets: ConvergenceTargets = field(default_factory=ConvergenceTargets)

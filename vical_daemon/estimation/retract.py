@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vical_daemon.estimation.imu_model import Motion
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.state import (
     ACCEL_BIAS,
@@ -63,6 +64,15 @@ def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoi
         tilted_gravity(state.gravity, errors[:, GRAVITY]),
         gyro_matrix,
         accel_matrix,
+    )
+
+
+def pose_points(state: State, errors: FloatArray) -> Motion:
+    """Apply errors (S, >= 9) to attitude, position and velocity only (what an image depends on)."""
+    return Motion(
+        state.R_world_imu @ rotation_from_grp(errors[:, ATTITUDE]),
+        state.p_world_imu + errors[:, POSITION],
+        state.v_world_imu + errors[:, VELOCITY],
     )
 
 

@@ -65,12 +65,21 @@ class SeenPose:
 
 @dataclass(slots=True)
 class StartResult:
-    """What one attempt gave: a state, or the reason why there is none yet (and what motion would help)."""
+    """What one attempt gave: a state, or the reason why there is none yet.
+
+    Attributes:
+        state: Where the filter can start.
+        reason: Why it cannot, in words.
+        timing: TD-ICP's answer by camera, as far as it came.
+        linear: The linear start of the first camera.
+        motion_missing: It is motion that is missing, not time.
+    """
 
     state: State | None
     reason: str
     timing: dict[str, TdIcpResult] = field(default_factory=dict)
     linear: LinearStart | None = None
+    motion_missing: bool = False
 
 
 def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) -> SeenPose | None:
@@ -127,10 +136,10 @@ def attempt(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )
         seen[name] = poses
-        result = _timing(buffer, poses, prior, lens)
+        result = _timing(buffer, poses, lens)
         timing[name] = result
         if result.reason:
-            return StartResult(None, f"{name}: {result.reason}", timing)
+            return StartResult(None, f"{name}: {result.reason}", timing, motion_missing=True)
         cameras[name] = CameraState(
             result.R_imu_cam,
             np.zeros(3),
@@ -143,12 +152,12 @@ def attempt(
         )
         why = _not_sure_yet(result)
         if why:
-            return StartResult(None, f"{name}: {why}", timing)
+            return StartResult(None, f"{name}: {why}", timing, motion_missing=True)
         _hold_priors(cameras[name], prior, options)
     return _motion_start(buffer, seen, cameras, timing, options)
 
 
-def _timing(buffer: ImuBuffer, poses: list[SeenPose], prior: CameraPrior, lens: Lens) -> TdIcpResult:
+def _timing(buffer: ImuBuffer, poses: list[SeenPose], lens: Lens) -> TdIcpResult:
     rows = buffer.rows
     sigma = np.array([np.sqrt(np.trace(p.pose.covariance[3:, 3:]) / 3.0) for p in poses])
     floor = 0.2 / float(lens.intrinsics[0])
@@ -164,7 +173,8 @@ def _timing(buffer: ImuBuffer, poses: list[SeenPose], prior: CameraPrior, lens: 
 def _not_sure_yet(result: TdIcpResult) -> str:
     """Why TD-ICP's answer does not do yet; empty when it does."""
     if result.timeshift_sigma_s > _SHIFT_SIGMA_S:
-        return f"time shift known to {1e3 * result.timeshift_sigma_s:.1f} ms so far: turn the rig faster, about changing axes"
+        known = 1e3 * result.timeshift_sigma_s
+        return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
     if float(np.max(result.rotation_sigma_rad)) > _ROTATION_SIGMA_RAD:
         worst = np.rad2deg(float(np.max(result.rotation_sigma_rad)))
         return f"mounting rotation known to {worst:.1f} deg so far: turn the rig about a second axis"
@@ -197,7 +207,10 @@ def _motion_start(
         linear = _linear(buffer, inside, camera, timing[name])
         if linear is None or float(np.max(linear.sigma_p_imu_cam)) > 0.1:
             return StartResult(
-                None, f"{name}: lever arm not yet visible: turn the rig about two axes", timing
+                None,
+                f"{name}: lever arm not yet visible: turn the rig about two axes",
+                timing,
+                motion_missing=True,
             )
         if "extrinsics" not in options.fix:
             camera.p_imu_cam = linear.p_imu_cam

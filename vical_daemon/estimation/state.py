@@ -185,11 +185,12 @@ def grp_from_rotation(R: FloatArray) -> FloatArray:
 
 def tilt_basis(gravity: FloatArray) -> FloatArray:
     """Two unit vectors across gravity, shape (3, 2): the directions in which it can tilt."""
-    axis = gravity / np.linalg.norm(gravity)
-    other = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    first = np.cross(axis, other)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(axis, first)], axis=1)
+    x, y, z = gravity / np.sqrt(gravity @ gravity)
+    # Householder frame: continuous everywhere but at z = -1 (or +1 for the other half)
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
 
 
 def tilted_gravity(gravity: FloatArray, tilt: FloatArray) -> FloatArray:

@@ -13,8 +13,9 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import project
+from vical_daemon.estimation.imu_model import Motion, cross
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.retract import CameraPoints, MotionPoints
+from vical_daemon.estimation.retract import CameraPoints
 
 
 class Rates(NamedTuple):
@@ -29,7 +30,7 @@ class Rates(NamedTuple):
     accel: FloatArray
 
 
-def moved(motion: MotionPoints, rates: Rates, delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+def moved(motion: Motion, rates: Rates, delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return attitude and position `delay_s` later; delay shape (S,) or (1,)."""
     d = delay_s[:, None]
     R = motion.R @ so3.exp(rates.omega * d)
@@ -39,7 +40,7 @@ def moved(motion: MotionPoints, rates: Rates, delay_s: FloatArray) -> tuple[Floa
 
 def view(
     points: FloatArray,
-    motion: MotionPoints,
+    motion: Motion,
     camera: CameraPoints,
     rates: Rates,
     t_cam_minus_state_s: float,
@@ -70,7 +71,7 @@ def view(
 
 def _rolling(
     x_imu: FloatArray,
-    motion: MotionPoints,
+    motion: Motion,
     R: FloatArray,
     rates: Rates,
     readout_s: FloatArray,
@@ -81,7 +82,7 @@ def _rolling(
     v_imu = np.matmul(motion.v[:, None, :], R)
     a_imu = np.matmul(rates.accel, R)[:, None, :]
     w = rates.omega
-    x1 = -np.cross(w, x_imu) - v_imu
-    x2 = -np.cross(w, x1) + np.cross(w, v_imu) - a_imu
+    x1 = -cross(w, x_imu) - v_imu
+    x2 = -cross(w, x1) + cross(w, v_imu) - a_imu
     out: FloatArray = e * x1 + (0.5 * e * e) * x2
     return out

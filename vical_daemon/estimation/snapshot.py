@@ -1,0 +1,63 @@
+"""Turns the filter's state into the plain numbers of an estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+from vical_daemon.estimation.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
+
+
+def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float) -> CameraEstimate:
+    """One camera as it is known now.
+
+    Sigmas are the filter's times the square root of the measured correlation factor: errors that last for
+    several images count less than the filter thinks (see `consistency`).
+    """
+    camera, where = f.state.cameras[name], f.layout.cameras[name]
+    spread = float(np.sqrt(f.consistency[name].factor))
+    sigma = spread * f.sigmas()
+    q = so3.quat_from_matrix(camera.R_imu_cam)
+    return CameraEstimate(
+        PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), (spread**2 * pose_covariance(f, where)).tolist()),
+        camera.timeshift_s,
+        float(sigma[where.timeshift]) if where.timeshift is not None else 0.0,
+        camera.intrinsics.tolist(),
+        sigma[where.intrinsics].tolist() if where.intrinsics is not None else [0.0] * 4,
+        camera.distortion_model,
+        camera.distortion.tolist(),
+        sigma[where.distortion].tolist() if where.distortion is not None else [0.0] * 4,
+        reprojection_rms_px,
+        f.corner_noise[name].sigma_px,
+        [],
+        camera.readout_s,
+        float(sigma[where.readout]) if where.readout is not None else 0.0,
+    )
+
+
+def imu_estimate(f: CalibrationFilter) -> ImuEstimate:
+    """Biases and, where estimated, the matrices."""
+    sigma = f.sigmas()
+    matrices = f.layout.gyro_matrix is not None
+    return ImuEstimate(
+        f.state.gyro_bias.tolist(),
+        f.state.accel_bias.tolist(),
+        sigma[GYRO_BIAS].tolist(),
+        sigma[ACCEL_BIAS].tolist(),
+        f.state.gyro_matrix.tolist() if matrices else [],
+        f.state.accel_matrix.tolist() if matrices else [],
+    )
+
+
+def pose_covariance(f: CalibrationFilter, where: CameraSlices) -> FloatArray:
+    """The filter's covariance of T_imu_cam, order [px py pz rx ry rz], shape (6, 6); zeros where fixed."""
+    if where.position is None or where.rotation is None:
+        return np.zeros((6, 6))
+    rows = [
+        *range(where.position.start, where.position.stop),
+        *range(where.rotation.start, where.rotation.stop),
+    ]
+    return f.covariance(rows)
