@@ -172,7 +172,8 @@ class IidcDevice:
         self.call("video_get_supported_framerates", mode, byref(rates), doing="list its frame rates")
         offered = [r for r in rates.framerates[: rates.num] if r in abi.FRAMERATES_HZ]
         if rate_hz is None:
-            return max(offered, default=None)
+            current = self.number("video_get_framerate", doing="tell its frame rate")
+            return current if current in offered else max(offered, default=None)
         return next((r for r in offered if abs(abi.FRAMERATES_HZ[r] - rate_hz) < 0.01 * rate_hz), None)
 
     def _format7(self, settings: CameraSettings, mode: int, wanted: tuple[str, ...]) -> IidcMode:
@@ -303,7 +304,6 @@ class IidcDevice:
         context, self._context = self._context, None
         if context:
             self._library.dc1394_free(context)
-
 
     def _free_ring(self) -> None:
         """Free what libdc1394 leaves behind when the camera is gone: it returns before it frees."""

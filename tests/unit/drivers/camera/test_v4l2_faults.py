@@ -169,7 +169,8 @@ def test_check_camera_reports_in_words(kernel) -> None:
 
 def test_hundred_fault_cycles_leak_nothing(open_fake, kernel) -> None:
     threads = threading.active_count()
-    camera = FakeCamera(faults={2: "empty", 3: "flagged", 4: "lost", 6: "unplug"})
+    faults = {2: "empty", 3: "flagged", 4: "lost", 6: "unplug"}
+    camera = FakeCamera(formats={"GREY": {(64, 48): (30.0,)}}, faults=faults)
     source = open_fake(camera, exposure_s=0.004)
     for cycle in range(100):
         with pytest.raises(errors.DeviceLostError):

@@ -9,7 +9,7 @@ import pytest
 from vical_drivers.camera.uvc import UvcClock, clock_frequency_hz, parse_metadata
 from vical_mocks.v4l2_camera import FakeCamera, UvcClockModel
 
-SIZES = {"YUYV": {(320, 240): (30.0,)}}
+SIZES = {"YUYV": {(64, 48): (30.0,)}}
 
 
 def usb_camera(**clock: float) -> FakeCamera:

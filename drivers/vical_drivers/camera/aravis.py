@@ -1,0 +1,401 @@
+"""GenICam cameras through Aravis, grabbed by a small process under the system's Python.
+
+The arrival of a frame's first packet dates it. The camera's own stamps (nanoseconds of its clock) take
+the network's jitter off: the lower envelope of (camera's stamp, first packet) is the way of the luckiest
+packets. No one-way method can see the constant part of that way, so what is published is still the first
+packet, only without its jitter, and half an exposure earlier.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import select
+import shutil
+import struct
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Layout, PixelFormat
+from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.stamps import Anchor, SequenceCounter
+from vical_drivers.camera.statistics import FrameStatistics
+from vical_drivers.camera.v4l2_stamp import SIGMA_NS, ExposureStamper, RawStamp
+from vical_drivers.clock import LowerEnvelope
+from vical_drivers.errors import (
+    DeviceBusyError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceRefusedError,
+    DeviceTimeoutError,
+    DriverError,
+    MissingLibraryError,
+)
+from vical_drivers.samples import DeviceInfo, Frame, SourceStats
+
+_log = logging.getLogger(__name__)
+
+PACKAGES = "gir1.2-aravis-0.8 python3-gi"
+_GRABBER = Path(__file__).with_name("aravis_grabber.py")
+_HEADER = struct.Struct("<4sII")
+_MAGIC = b"VGRB"
+_OPEN_TIMEOUT_S = 15.0
+_PIPE_BYTES = 1 << 20
+_MIN_AGE_S = 1.0
+_FORMATS: dict[str, PixelFormat] = {
+    "Mono8": FORMATS["GREY"],
+    "Mono10": FORMATS["Y10"],
+    "Mono12": FORMATS["Y12"],
+    "Mono16": FORMATS["Y16"],
+    "RGB8": FORMATS["RGB3"],
+    "RGB8Packed": FORMATS["RGB3"],
+    "BGR8": FORMATS["BGR3"],
+    "BGR8Packed": FORMATS["BGR3"],
+    **{
+        f"Bayer{name}8": PixelFormat(f"Bayer{name}8", Layout.BAYER, order=order)
+        for name, order in (("RG", "RGGB"), ("GB", "GBRG"), ("GR", "GRBG"), ("BG", "BGGR"))
+    },
+}
+_ERRORS: dict[str, type[DriverError]] = {
+    "not-found": DeviceNotFoundError,
+    "busy": DeviceBusyError,
+    "refused": DeviceRefusedError,
+}
+
+
+class _Grabber:
+    """The process at the other end of a pipe, and its messages."""
+
+    def __init__(self, request: dict[str, Any]) -> None:
+        python = system_python()
+        self._buffer = bytearray()
+        self._process = subprocess.Popen(
+            # -I: nothing of this environment's packages may leak into the other Python
+            [python, "-I", str(_GRABBER), json.dumps(request)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        assert self._process.stdout is not None and self._process.stdin is not None
+        self._out = self._process.stdout.fileno()
+        self._in = self._process.stdin
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+
+    def receive(self, timeout_s: float) -> tuple[dict[str, Any], memoryview] | None:
+        """Return the next message and its data; None after `timeout_s`.
+
+        Raises:
+            DriverError: The process reported a failure, or ended.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            message = self._parse()
+            if message is not None:
+                return self._check(message)
+            left_s = deadline - time.monotonic()
+            poller = select.poll()
+            poller.register(self._out, select.POLLIN)
+            if not poller.poll(max(0.0, left_s) * 1e3):
+                return None
+            data = os.read(self._out, _PIPE_BYTES)
+            if not data:
+                raise DeviceLostError("aravis: the grabber process ended")
+            self._buffer += data
+
+    def _parse(self) -> tuple[dict[str, Any], memoryview] | None:
+        if len(self._buffer) < _HEADER.size:
+            return None
+        magic, text_bytes, data_bytes = _HEADER.unpack_from(self._buffer)
+        if magic != _MAGIC:
+            raise DeviceLostError("aravis: the grabber process sent nonsense")
+        start = _HEADER.size + text_bytes
+        end = start + data_bytes
+        if len(self._buffer) < end:
+            return None
+        # what belongs to this message is cut off, so that its pixels need no copy
+        message, self._buffer = self._buffer[:end], self._buffer[end:]
+        return json.loads(message[_HEADER.size : start]), memoryview(message)[start:]
+
+    @staticmethod
+    def _check(message: tuple[dict[str, Any], memoryview]) -> tuple[dict[str, Any], memoryview]:
+        fields = message[0]
+        if fields["kind"] == "lost":
+            raise DeviceLostError(f"aravis: {fields['text']}")
+        if fields["kind"] == "error":
+            if fields["error"] == "missing":
+                raise MissingLibraryError(f"GenICam cameras need Aravis: sudo apt install {PACKAGES}")
+            raise _ERRORS[fields["error"]](fields["text"])
+        return message
+
+    def send(self, command: dict[str, Any]) -> None:
+        try:
+            self._in.write(json.dumps(command).encode() + b"\n")
+            self._in.flush()
+        except OSError as error:
+            raise DeviceLostError("aravis: the grabber process ended") from error
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._in.close()  # the end of its input ends it
+        try:
+            self._process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+
+def system_python() -> str:
+    """Return the distribution's Python, which has the bindings; VICAL_SYSTEM_PYTHON names another.
+
+    Raises:
+        MissingLibraryError: There is none.
+    """
+    python = os.environ.get("VICAL_SYSTEM_PYTHON", "/usr/bin/python3")
+    if shutil.which(python) is None:
+        raise MissingLibraryError(f"GenICam cameras need {python}: sudo apt install python3 {PACKAGES}")
+    return python
+
+
+class AravisCamera:
+    """A `FrameSource` over one GenICam camera.
+
+    Args:
+        name: Aravis' id ("Vendor-serial") or network address; "": the only camera there is.
+        settings: What is asked of the camera.
+        interfaces: Further interfaces of Aravis to search ("Fake").
+
+    Raises:
+        DriverError: One line, with what to try.
+    """
+
+    def __init__(
+        self, name: str, settings: CameraSettings | None = None, *, interfaces: tuple[str, ...] = ()
+    ) -> None:
+        self._settings = s = settings or CameraSettings()
+        self._request = {
+            "id": name, "width": s.width, "height": s.height, "rate_hz": s.rate_hz, "gain": s.gain,
+            "pixel_format": s.pixel_format, "exposure_s": s.exposure_s, "controls": dict(s.controls),
+            "interfaces": list(interfaces),
+        }  # fmt: skip
+        self._statistics = FrameStatistics()
+        self._stamper = ExposureStamper(s)
+        self._pending_loss = 0
+        self._closed = False
+        self._grabber: _Grabber | None = None
+        self._open()
+
+    def _open(self) -> None:
+        self._grabber = grabber = _Grabber(self._request)
+        try:
+            answer = grabber.receive(_OPEN_TIMEOUT_S)
+            if answer is None:
+                raise DeviceTimeoutError(f"aravis:{self._request['id']}: no answer from the camera")
+            self._info = self._describe(answer[0])
+            self._decode = self._make_decoder(answer[0])
+        except BaseException:
+            self._drop()
+            raise
+        self._stamper.set_exposure(_ns(answer[0]["exposure_s"]), 0)
+        self._counter = SequenceCounter(16, skips_zero=True)
+        self._sequence = 0
+        self._envelope = LowerEnvelope()
+        self._first: tuple[int, int] | None = None
+        self._device_ns = 0
+
+    def _describe(self, opened: dict[str, Any]) -> DeviceInfo:
+        device = opened["device"]
+        _, _, width, height = opened["region"]
+        exposure_s = opened["exposure_s"]
+        return DeviceInfo(
+            kind="camera",
+            model=f"{device['vendor']} {device['model']}",
+            serial_number=device["serial_number"] or device["id"],
+            path=device["address"] or "",
+            protocol="aravis",
+            details={
+                "uri": f"aravis:{device['id']}",
+                "transport": device["protocol"],
+                "pixel_format": opened["pixel_format"],
+                "size": f"{width}x{height}",
+                "rate_hz": f"{opened['rate_hz']:g}",
+                "encoding": self._settings.encoding,
+                "exposure_s": "unknown" if exposure_s is None else f"{exposure_s:g}",
+            },
+        )
+
+    def _make_decoder(self, opened: dict[str, Any]) -> FrameDecoder:
+        name = opened["pixel_format"]
+        _, _, width, height = opened["region"]
+        uri = self._info.details["uri"]
+        if name not in _FORMATS:
+            raise DeviceRefusedError(f"{uri}: pixel format {name} is none of {', '.join(_FORMATS)}")
+        wanted = (self._settings.width, self._settings.height)
+        if wanted[0] is not None and wanted != (width, height):
+            raise DeviceRefusedError(f"{uri}: asked for {wanted[0]}x{wanted[1]}, got {width}x{height}")
+        try:
+            return FrameDecoder(_FORMATS[name], width, height, encoding=self._settings.encoding)
+        except ValueError as error:
+            raise DeviceRefusedError(f"{uri}: {error}") from error
+
+    def _drop(self) -> None:
+        grabber, self._grabber = self._grabber, None
+        if grabber is not None:
+            grabber.close()
+
+    @property
+    def info(self) -> DeviceInfo:
+        """Who the camera is and, in `details`, what was obtained of what was asked."""
+        return self._info
+
+    def set_exposure(self, exposure_s: float) -> None:
+        """Ask for another exposure time; frames that began before it took effect keep the old one."""
+        if self._grabber is None:
+            raise DeviceLostError(f"{self._info.details['uri']}: the camera is away")
+        self._grabber.send({"exposure_s": exposure_s})
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, or None after `timeout_s` without one.
+
+        Raises:
+            DeviceLostError: The camera or its process went away; call again.
+        """
+        deadline = time.monotonic() + timeout_s
+        try:
+            if self._grabber is None:
+                self._come_back()
+            while True:
+                frame = self._next(max(0.0, deadline - time.monotonic()))
+                if frame is not None or time.monotonic() >= deadline:
+                    return frame
+        except DeviceLostError:
+            self._drop()
+            raise
+
+    def _come_back(self) -> None:
+        if self._closed:
+            raise DeviceLostError(f"{self._info.details['uri']}: the camera is closed")
+        try:
+            self._open()  # searching the network takes its time: no further wait is needed
+        except DriverError as error:
+            raise DeviceLostError(f"{self._info.details['uri']}: not back yet ({error})") from error
+        self._statistics.restart()
+
+    def _next(self, timeout_s: float) -> Frame | None:
+        assert self._grabber is not None
+        message = self._grabber.receive(timeout_s)
+        if message is None:
+            return None
+        fields, data = message
+        if fields["kind"] == "exposure":
+            self._stamper.set_exposure(_ns(fields["exposure_s"]), fields["t_ns"])
+            self._first = None  # the way from the camera's stamp to its first packet is another now
+            return None
+        missing = self._counter.missing_before(fields["frame_id"])
+        self._sequence += missing + 1
+        self._pending_loss += missing
+        if not fields["whole"]:
+            self._statistics.count(f"buffers_{fields['status'].replace('-', '_')}")
+            self._pending_loss += 1
+            return None
+        return self._finish(fields, data)
+
+    def _finish(self, fields: dict[str, Any], data: memoryview) -> Frame | None:
+        raw = self._raw_stamp(fields["device_ns"], fields["first_packet_ns"])
+        try:
+            image = self._decode(np.frombuffer(data, dtype=np.uint8))
+        except CorruptImageError as error:
+            _log.debug("corrupt image: %s", error)
+            self._statistics.corrupt += 1
+            self._pending_loss += 1
+            return None
+        stamp, exposure_ns = self._stamper.stamp(raw)
+        dropped, self._pending_loss = self._pending_loss, 0
+        self._statistics.add(stamp.t_exposure_mid_ns, dropped)
+        return Frame(
+            t_exposure_mid_ns=stamp.t_exposure_mid_ns,
+            t_arrival_ns=fields["arrival_ns"],
+            sequence=self._sequence,
+            image=image,
+            encoding=self._settings.encoding,
+            stamp_rule=stamp.rule,
+            exposure_ns=exposure_ns,
+            readout_ns=self._settings.shutter.row_spread_ns,
+            t_sigma_ns=raw.t_sigma_ns,
+            dropped_before=dropped,
+        )
+
+    def _raw_stamp(self, device_ns: int, first_packet_ns: int) -> RawStamp:
+        packet = RawStamp(first_packet_ns, Anchor.FIRST_PACKET, None, SIGMA_NS[Anchor.FIRST_PACKET])
+        if device_ns <= self._device_ns:  # no clock, or it was set anew
+            self._first = None
+        self._device_ns = device_ns
+        if device_ns <= 0:
+            return packet
+        if self._first is None:
+            self._first, self._envelope = (device_ns, first_packet_ns), LowerEnvelope()
+        x_s = (device_ns - self._first[0]) * 1e-9
+        self._envelope.add(x_s, (first_packet_ns - self._first[1]) * 1e-9 - x_s)
+        if x_s < _MIN_AGE_S:
+            return packet
+        forced = self._settings.stamp
+        anchor = Anchor.FIRST_PACKET if forced in ("auto", "raw") else Anchor(forced)
+        t_ns = self._first[1] + round((x_s + self._envelope.line(x_s)) * 1e9)
+        sigma_ns = round(self._envelope.sigma_s * 1e9)
+        return RawStamp(t_ns, anchor, f"{anchor.value}(device-clock)", sigma_ns)
+
+    def stats(self) -> SourceStats:
+        """Counters since the source was opened."""
+        return self._statistics.snapshot(clock_skew_ppm=-self._envelope.skew * 1e6)
+
+    def close(self) -> None:
+        """Stop the camera and end its process; may be called twice."""
+        self._closed = True
+        self._drop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _ns(seconds: float | None) -> int | None:
+    return None if seconds is None else round(seconds * 1e9)
+
+
+def list_aravis_cameras(interfaces: tuple[str, ...] = ()) -> list[DeviceInfo]:
+    """Return the GenICam cameras that Aravis finds on network and USB (it takes about a second).
+
+    Raises:
+        MissingLibraryError: Aravis' bindings are not installed.
+    """
+    grabber = _Grabber({"list": True, "interfaces": list(interfaces)})
+    try:
+        answer = grabber.receive(_OPEN_TIMEOUT_S)
+    finally:
+        grabber.close()
+    devices = [] if answer is None else answer[0]["devices"]
+    return [
+        DeviceInfo(
+            kind="camera",
+            model=f"{d['vendor']} {d['model']}",
+            serial_number=d["serial_number"] or d["id"],
+            path=d["address"] or "",
+            protocol="aravis",
+            details={"uri": f"aravis:{d['id']}", "transport": d["protocol"]},
+        )
+        for d in devices
+    ]
