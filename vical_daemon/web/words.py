@@ -16,8 +16,9 @@ _SENTENCES = {
     Status.DEGENERATE: "The motion so far does not reveal everything.",
     Status.INCONSISTENT: "The data contradict the model: do not use these numbers.",
 }
-_TURN = re.compile(r"\b(rotat\w*|turn\w*|tilt\w*|roll\w*|pitch\w*|yaw\w*)\b", re.IGNORECASE)
-_MOVE = re.compile(r"\b(translat\w*|move\w*|shak\w*|accelerat\w*|closer|further|sideways)\b", re.IGNORECASE)
+# Imperatives only: "rotation about the optical axis" names what is not known, not what to do.
+_TURN = re.compile(r"\b(rotate|rotating|turn|turning|tilt|tilting|nod|roll|pitch|yaw) ", re.IGNORECASE)
+_MOVE = re.compile(r"\b(translat\w*|move|moving|accelerate|closer|further|sideways)\b", re.IGNORECASE)
 _AXIS = re.compile(r"\b(?:cam(?:era)?|imu)?[ -]?([xyz])\b|\b(optical axis|line of sight|viewing direction)\b")
 
 
@@ -41,12 +42,14 @@ def motion(texts: Iterable[str]) -> Motion:
 
     >>> motion(["rotate about the optical axis"])
     {'rotate': ['z'], 'translate': []}
+    >>> motion(["lever arm along the optical axis: rotate about the image's x axis (nod)"])
+    {'rotate': ['x'], 'translate': []}
     >>> motion(["rotate about x and y; move sideways"])
     {'rotate': ['x', 'y'], 'translate': ['x', 'y', 'z']}
     """
     rotate: set[str] = set()
     translate: set[str] = set()
-    for clause in re.split(r"[;.\n]|, then", " ; ".join(texts)):
+    for clause in re.split(r"[;:.\n]|, then", " ; ".join(f"{text} " for text in texts)):
         axes = {m.group(1) or "z" for m in _AXIS.finditer(clause)} or set("xyz")
         if _TURN.search(clause):
             rotate |= axes

@@ -136,6 +136,10 @@ def test_devices_and_metrics(bus, state, web_feed):
         (["move closer and further"], [], ["x", "y", "z"]),
         ([""], [], []),
         (["clean the lens"], [], []),
+        (["rotation about the optical axis (roll): +-0.2 deg"], [], []),
+        (["collecting the first seconds: move the rig, keep the target in view"], [], ["x", "y", "z"]),
+        (["turn the rig back and forth faster, changing direction"], ["x", "y", "z"], []),
+        (["rotate about the image's x axis (nod) and about the image's y axis (shake)"], ["x", "y"], []),
     ],
 )
 def test_motion_is_read_from_the_words(texts, rotate, translate):
