@@ -19,8 +19,11 @@ import numpy as np
 from vical_drivers.errors import DeviceLostError, DeviceTimeoutError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
+from vical_mocks.clock import SkewedClock
+from vical_mocks.imu import ADC_DELAY_S, BASE_RATE_HZ, GYRO_ANALOG_DELAY_S
 from vical_mocks.rig import Rig, reference_rig
 
+TICK_HZ = 62_500  # the GX3's timer
 SERIAL_IMU, SERIAL_CAMERA = "6223-00001", "SIM-00001"
 _HEADER = struct.Struct("<qqqii")  # stamp, exposure ns, sequence, height, width
 _START_TIMEOUT_S = 60.0
@@ -88,6 +91,7 @@ class LiveRig:
         self.rig = settings.rig()
         self.port = ""
         self.t_start_s = 0.0
+        self._imu_clock: SkewedClock | None = None
         self._processes: list[multiprocessing.process.BaseProcess] = []
         self._pipes: list[Connection] = []
 
@@ -107,7 +111,7 @@ class LiveRig:
             for pipe, what in zip(self._pipes, ("imu", "camera"), strict=True):
                 if not pipe.poll(_START_TIMEOUT_S):
                     raise DeviceTimeoutError(f"simulated {what}: its process does not start")
-            self.port = self._pipes[0].recv()
+            self.port, self._imu_clock = self._pipes[0].recv()
             self._pipes[1].recv()
         except BaseException:
             self.__exit__(None, None, None)
@@ -124,6 +128,17 @@ class LiveRig:
             if process.is_alive():
                 process.terminate()
                 process.join()
+
+    def imu_instant_ns(self, device_ticks: int, filter_samples: int) -> int:
+        """When the gyro really measured what came with these ticks, CLOCK_MONOTONIC ns.
+
+        What the host stamps differs from it by what no host can know: how long the shortest way of a byte
+        takes, and that gyro and accelerometer have different analog filters.
+        """
+        assert self._imu_clock is not None
+        t_host_s = self._imu_clock.host_s(device_ticks / TICK_HZ)
+        window_s = (filter_samples - 1) / 2 / BASE_RATE_HZ
+        return round((t_host_s - ADC_DELAY_S - GYRO_ANALOG_DELAY_S - window_s) * 1e9)
 
     def camera(self) -> LiveCamera:
         """Return the camera as a `FrameSource`."""
@@ -212,7 +227,7 @@ def _run_imu(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> N
     )
     emulator.plug()
     with emulator:
-        pipe.send(emulator.port_name)
+        pipe.send((emulator.port_name, emulator._clock))
         _wait_for_close(pipe)
 
 

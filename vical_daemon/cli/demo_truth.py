@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from vical_drivers.samples import ImuSample, ImuSource
 
+from vical_daemon.config import ImuConfig
 from vical_daemon.estimation import so3
+from vical_daemon.roles.imu import open_imu
 
 SIGMAS_ALLOWED = 4.0
 
@@ -30,6 +34,52 @@ class Comparison:
         if self.sigma > 0:
             return abs(self.error) / self.sigma
         return 0.0 if abs(self.error) < 1e-12 else math.inf
+
+
+class StampWitness:
+    """Stands between driver and role, and compares each stamp with when the emulator really measured.
+
+    What a time shift relates are the *stamps* of two sensors. How late those of the IMU are on this machine
+    (the shortest time from the device to the end of a read, 0.1 to 0.3 ms) is part of the truth that a
+    calibration should find; only an emulation knows it.
+
+    Args:
+        instant_ns: Device ticks and filter width -> when the gyro measured, CLOCK_MONOTONIC ns.
+        filter_samples: Width of the device's moving average.
+    """
+
+    def __init__(self, instant_ns: Callable[[int, int], int], filter_samples: int) -> None:
+        self._instant_ns, self._filter_samples = instant_ns, filter_samples
+        self._errors_ns: list[int] = []
+
+    @property
+    def error_s(self) -> float:
+        """Median of stamp minus truth, s."""
+        return float(np.median(self._errors_ns)) * 1e-9 if self._errors_ns else 0.0
+
+    def open(self, config: ImuConfig) -> ImuSource:
+        """Open the real driver and listen to what it gives."""
+        source = open_imu(config)
+        read = source.read
+
+        def heard(timeout_s: float) -> list[ImuSample]:
+            samples = read(timeout_s)
+            for sample in samples:
+                true_ns = self._instant_ns(sample.device_ticks, self._filter_samples)
+                self._errors_ns.append(sample.t_host_ns - true_ns)
+            return samples
+
+        source.read = heard  # type: ignore[method-assign]
+        return source
+
+
+def truth_of_stamps(simulated: dict[str, Any], imu_stamp_error_s: float, camera: str) -> dict[str, Any]:
+    """Return the truth in the form of a result; the time shift is that between the stamps (see above)."""
+    entry = simulated["cameras"][camera]
+    simulated_s = entry["timeshift_cam_imu_s"]
+    entry = entry | {"timeshift_cam_imu_s": simulated_s + imu_stamp_error_s}
+    extra = {"simulated_timeshift_s": simulated_s, "imu_stamp_error_s": imu_stamp_error_s}
+    return simulated | {"cameras": {camera: entry}} | extra
 
 
 def compare(result: dict[str, Any], truth: dict[str, Any], camera: str) -> list[Comparison]:
