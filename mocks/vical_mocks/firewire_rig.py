@@ -71,6 +71,14 @@ class FireWireRig:
             self._map = mmap.mmap(file.fileno(), ctypes.sizeof(Rig))
         self.shared = Rig.from_buffer(self._map)
 
+    def exposures_of(self, counter: int) -> Exposure:
+        """Return the truth of one of the latest frames; KeyError where it is too old."""
+        for back in range(1, min(self.shared.frames, 256) + 1):
+            t = self.shared.truth[(self.shared.frames - back) % TRUTHS]
+            if t.counter == counter:
+                return Exposure((t.t_open_ns + t.t_close_ns) // 2, t.t_close_ns - t.t_open_ns)
+        raise KeyError(counter)
+
     def exposures(self) -> dict[int, Exposure]:
         """Return the truth of the latest frames by frame counter."""
         found = {}

@@ -104,6 +104,7 @@ class FakeCamera:
         flags: Time-stamp flags of its buffers; None: MONOTONIC with the anchor of `stamps`.
         faults: Frame number -> "empty", "flagged", "short", "lost" or "unplug".
         stamp_offset_ns: Added to the stamps (another clock).
+        static: Pictures do not change but for their number: costs no time, for benchmarks.
     """
 
     name: str = "Fake Cam: Fake Cam"
@@ -123,6 +124,7 @@ class FakeCamera:
     picture: Picture | None = None
     faults: dict[int, str] = field(default_factory=dict)
     stamp_offset_ns: int = 0
+    static: bool = False
     open_errno: int = 0
     request_errno: dict[int, int] = field(default_factory=dict)
     max_buffers: int = 32
@@ -194,7 +196,8 @@ class FakeCamera:
         key = (self.pixel_format, self.width, self.height)
         if key not in self._cache:
             self._cache[key] = (np.arange(self.image_bytes, dtype=np.uint32) % 251).astype(np.uint8)
-        memory[: self.image_bytes] = self._cache[key]
+        if not self.static:
+            memory[: self.image_bytes] = self._cache[key]
         memory[:4] = np.frombuffer(struct.pack("<I", number), dtype=np.uint8)
         return self.image_bytes
 
