@@ -176,6 +176,10 @@ class CalibrationFilter:
         A = np.zeros((n, n + d + 9 + 6 + len(drift)))
         A[:, :n] = self.S
         A[:9, :d] = m.linear
+        for name, where in self.layout.cameras.items():
+            if where.timeshift is not None and where.skew is not None:
+                A[where.timeshift, :n] += dt * self.S[where.skew]
+                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
         A[:9, n : n + d] = m.curved
         A[:9, n + d : n + d + 9] = np.linalg.cholesky(Q + 1e-30 * np.eye(9))
         at = n + d + 9
@@ -364,6 +368,12 @@ class CalibrationFilter:
                 self.S[s] = J @ self.S[s]
             self.S = unscented.lower_root(self.S)
         self.state = retract(self.state, self.layout, dx)
+
+    def reopen(self, index: int, sigma: float) -> None:
+        """Add independent uncertainty to one error: what was known about it is in doubt."""
+        column = np.zeros((self.layout.size, 1))
+        column[index] = sigma
+        self.S = unscented.lower_root(np.concatenate([self.S, column], axis=1))
 
     def reset_motion(self, R_world_imu: FloatArray, p_world_imu: FloatArray) -> None:
         """Forget where the rig is and keep the calibration: motion anew, with no tie to the rest."""

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 
 from vical_daemon.estimation import start
 from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
+from vical_daemon.estimation.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.held_back import HeldBack
@@ -35,7 +37,8 @@ from vical_daemon.estimation.state import (
 _ATTEMPT_EVERY_S = 0.5
 _MAX_GAP_S = 0.5
 _KEEP_S = 5.0
-_RESTART_AFTER = 12  # refused frames in a row before the pose is taken anew
+_SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
+_SKEW_OPEN = 1e-4  # s/s: two bad crystals
 
 
 class Calibrator:
@@ -66,7 +69,8 @@ class Calibrator:
         self._waiting: dict[str, list[tuple[float, PointsFrame]]] = {name: [] for name in cameras}
         self._pending: deque[tuple[float, PointsFrame]] = deque()
         self._next_attempt_s = -np.inf
-        self._refused_in_a_row = 0
+        self.watch = ChangeWatch()
+        self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
 
     # ------------------------------------------------------------------ input
@@ -149,6 +153,8 @@ class Calibrator:
         )
         self.filter = self._rehearsed(result.state, frames)
         self.judge.started(begin)
+        self.watch.started(begin)
+        self._stale = None
         self._pending.extendleft(reversed(frames))
         for waiting in self._waiting.values():
             waiting.clear()
@@ -165,6 +171,7 @@ class Calibrator:
         for name, noise in trial.corner_noise.items():
             fresh.corner_noise[name].sigma_px = noise.sigma_px
             fresh.consistency[name] = trial.consistency[name]
+            fresh.consistency[name].alarm = 0.0
         return fresh
 
     def _new_filter(self, state: State) -> CalibrationFilter:
@@ -190,8 +197,8 @@ class Calibrator:
             focal = float(state.cameras[name].intrinsics[0])
             if where.position is not None and where.rotation is not None:
                 s[where.position], s[where.rotation] = 0.15, 0.1
-            if where.timeshift is not None:
-                s[where.timeshift] = 5e-3
+            if where.timeshift is not None and where.skew is not None:
+                s[where.timeshift], s[where.skew] = 5e-3, _SKEW_CLOSED
             if where.intrinsics is not None and where.distortion is not None:
                 s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
             if where.readout is not None:
@@ -242,16 +249,28 @@ class Calibrator:
         ratio = self._held_back.follow(f, frame, t_cam_s, self.target, self._buffer)
         if ratio is not None:
             self.judge.held_back(ratio)
-        self._refused_in_a_row = 0 if report.used else self._refused_in_a_row + 1
-        if self._refused_in_a_row >= _RESTART_AFTER:
-            self._pose_anew(frame, t_cam_s)
         self.judge.saw_frame(report, f)
+        self._act(self.watch.look(report, f), frame, t_cam_s)
         return report
 
-    def _pose_anew(self, frame: PointsFrame, t_cam_s: float) -> None:
-        """After a run of refused images: take attitude and position from the image, keep the calibration."""
+    def _act(self, action: Action, frame: PointsFrame, t_cam_s: float) -> None:
+        """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
+        if action is Action.POSE:
+            self._pose_anew(f, frame, t_cam_s)
+        elif action is Action.SKEW:
+            where = f.layout.cameras[frame.camera]
+            assert where.timeshift is not None
+            assert where.skew is not None
+            f.reopen(where.skew, _SKEW_OPEN)
+            f.reopen(where.timeshift, _SKEW_OPEN * 10.0)
+            self.judge.announce(f"{frame.camera}: {self.watch.why}; the drift is now estimated too")
+        elif action is Action.RESTART:
+            self._restart(f)
+
+    def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
+        """After a run of refused images: take attitude and position from the image, keep the calibration."""
         camera = f.state.cameras[frame.camera]
         lens = start.Lens(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)
         seen = start.pose_of(frame, t_cam_s, lens, self.target)
@@ -259,13 +278,24 @@ class Calibrator:
             return
         R = seen.R_target_cam @ camera.R_imu_cam.T
         f.reset_motion(R, seen.p_target_cam - R @ camera.p_imu_cam)
-        self._refused_in_a_row = 0
         self.judge.announce("pose lost and taken anew from the image")
+
+    def _restart(self, f: CalibrationFilter) -> None:
+        """The rig has changed: forget mounting and delay, keep the lens, and start from the data to come."""
+        for name, camera in f.state.cameras.items():
+            self.priors[name] = replace(
+                self.priors[name],
+                intrinsics=tuple(camera.intrinsics.tolist()),
+                distortion=tuple(camera.distortion.tolist()),
+            )
+        self.judge.changed(self.watch.why)
+        self._stale, self.filter = f, None
+        self._next_attempt_s = -np.inf
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
-        return self.judge.estimate(self.filter)
+        return self.judge.estimate(self.filter, self._stale)
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

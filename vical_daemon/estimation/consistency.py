@@ -25,11 +25,14 @@ from vical_daemon.estimation.measurements import FloatArray
 MODES = 8
 _MIN_CORNERS = 8
 _LAGS = 20
-_SIGNIFICANT = 3.0
+_SIGNIFICANT = 5.0
+_FLOOR = 0.5
 _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 16.0
 _CLIP = 6.0
 _DEAD_BAND = 1.3
+_CUSUM_DRIFT = 1.8
+_CUSUM_LIMIT = 8.0
 
 
 def modes(uv: FloatArray) -> FloatArray:
@@ -83,16 +86,23 @@ class Consistency:
         scale: Multiplies the variance of the corners, >= 1.
         factor: Multiplies the reported covariance, >= 1.
         images: Images taken in.
+        alarm: Cumulated excess of the innovations over their usual level; above `alarm_at` the rig changed.
     """
 
     memory: float = 800.0
     scale: float = 1.0
     factor: float = 1.0
     images: int = 0
+    alarm: float = 0.0
     _level: float = 1.0
     _weight: float = 0.0
     _lagged: FloatArray = field(default_factory=lambda: np.zeros(_LAGS + 1))
     _recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_LAGS))
+
+    @property
+    def alarmed(self) -> bool:
+        """The innovations have jumped: allowed for by how long this rig's errors usually last."""
+        return self.images > _LAGS and self.alarm > _CUSUM_LIMIT * self.factor
 
     def learn(self, uv: FloatArray, innovation: FloatArray, linear: FloatArray, sigma: FloatArray) -> None:
         """Take in the innovation of one image.
@@ -107,7 +117,12 @@ class Consistency:
         if normal is None:
             return
         self.images += 1
-        self._move_scale(float(normal @ normal) / MODES)
+        ratio = float(normal @ normal) / MODES
+        # One-sided CUSUM: at the usual level it drifts down by 0.8 an image; the chance that eight
+        # degrees of freedom drive it to 8 is below 1e-10 an image.
+        usual = max(1.0, self._lagged[0] / (MODES * self._weight)) if self._weight else 1.0
+        self.alarm = max(0.0, self.alarm + min(ratio / usual, 5.0) - _CUSUM_DRIFT)
+        self._move_scale(ratio)
         self._remember(normal)
 
     def _move_scale(self, ratio: float) -> None:
@@ -133,4 +148,4 @@ class Consistency:
         taper = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
         total = 2.0 * float((taper * rho).sum())
         noise = 2.0 * float(np.sqrt((taper**2).sum() / (MODES * self._weight)))
-        self.factor = 1.0 + total if total > _SIGNIFICANT * noise else 1.0
+        self.factor = 1.0 + total if total > max(_SIGNIFICANT * noise, _FLOOR) else 1.0

@@ -87,7 +87,8 @@ class Judge:
         self._nis.clear()
         self._held_back.clear()
         if self.bumped:
-            self.events.append("recovered: calibrating anew after the change")
+            self.events.append("started anew after the change")
+            self.bumped = ""
 
     def announce(self, event: str) -> None:
         """Put an event into the next estimate."""
@@ -151,9 +152,12 @@ class Judge:
         """The development of one camera."""
         return list(self._trace.get(camera, []))
 
-    def estimate(self, f: CalibrationFilter | None) -> CalibrationEstimate:
-        """Put everything together."""
-        cameras = {} if f is None else {name: self._camera(name, f) for name in self.layout.cameras}
+    def estimate(
+        self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
+    ) -> CalibrationEstimate:
+        """Put everything together; `stale`: what was known before a change, shown while starting anew."""
+        shown = f or stale
+        cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._gaps(e, name) for name, e in cameras.items()}
         self.status, reason, guidance = self._decide(f, missing)
         if f is not None and self.status == Status.DEGENERATE:
@@ -169,8 +173,8 @@ class Judge:
             self.frames,
             self.imu_samples,
             cameras,
-            None if f is None else imu_estimate(f),
-            [] if f is None else f.state.gravity.tolist(),
+            None if shown is None else imu_estimate(shown),
+            [] if shown is None else shown.state.gravity.tolist(),
             self.nis_per_dof(),
             self._points[0] / max(self._points[1], 1),
             events,

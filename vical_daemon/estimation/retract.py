@@ -110,6 +110,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
             camera.distortion_model,
             camera.resolution,
             float(c.readout_s[0]),
+            camera.skew + (float(dx[skew]) if (skew := layout.cameras[name].skew) is not None else 0.0),
         )
     scale = state.target_scale
     if layout.target_scale is not None:

@@ -32,6 +32,7 @@ class CameraSlices:
     position: slice | None  # m, p_imu_cam
     rotation: slice | None  # rad, local (right) error of R_imu_cam
     timeshift: int | None  # s
+    skew: int | None  # s/s, drift of the time shift
     intrinsics: slice | None  # px, fx fy cx cy
     distortion: slice | None  # 4 coefficients
     readout: int | None  # s
@@ -82,13 +83,14 @@ def make_layout(
 
     for name in cameras:
         position, rotation = take("extrinsics" not in fix, 3), take("extrinsics" not in fix, 3)
-        shift = take("timeshift" not in fix, 1)
+        shift, skew = take("timeshift" not in fix, 1), take("timeshift" not in fix, 1)
         intrinsics, distortion = take("intrinsics" not in fix, 4), take("intrinsics" not in fix, 4)
         readout = take("readout" in estimate, 1)
         blocks[name] = CameraSlices(
             position,
             rotation,
             shift.start if shift else None,
+            skew.start if skew else None,
             intrinsics,
             distortion,
             readout.start if readout else None,
@@ -99,7 +101,7 @@ def make_layout(
 
 @dataclass(slots=True)
 class CameraState:
-    """Nominal values of one camera (see `CameraEstimate` for meanings)."""
+    """Nominal values of one camera (see `CameraEstimate`); `skew` is the drift of the time shift, s/s."""
 
     R_imu_cam: FloatArray
     p_imu_cam: FloatArray
@@ -109,6 +111,7 @@ class CameraState:
     distortion_model: str
     resolution: tuple[int, int]
     readout_s: float = 0.0
+    skew: float = 0.0
 
 
 @dataclass(slots=True)

@@ -1,0 +1,51 @@
+"""Notices that a parameter taken as constant is not: two estimates of the same filter, some time apart.
+
+For a consistent filter the later estimate is the earlier one plus news, and the variance of their difference
+is P_earlier - P_later. A difference far outside it means that the parameter moved (a clock that drifts, a
+mount that creeps), however small the filter believes its error to be. [Hausman, 1978, applied to a filter]
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+_EVERY_S = 1.0
+_SPAN = 20
+_LIMIT = 6.0
+
+
+@dataclass(slots=True)
+class DriftWatch:
+    """Watches one scalar parameter.
+
+    Attributes:
+        floor: Smallest standard deviation of a difference that is taken seriously, in the parameter's unit.
+    """
+
+    floor: float
+    _past: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=_SPAN))
+
+    def drifts(self, t_s: float, value: float, variance: float, factor: float) -> bool:
+        """Take the estimate at `t_s`; True when it has left where an earlier one said it would be.
+
+        Args:
+            t_s: Time of the estimate, s.
+            value: Estimate.
+            variance: The filter's own.
+            factor: Measured correlation factor (`Consistency.factor`), widens the test.
+        """
+        if self._past and t_s < self._past[-1][0] + _EVERY_S:
+            return False
+        found = any(
+            abs(value - old) > _LIMIT * np.sqrt(factor * max(old_variance - variance, 0.0) + self.floor**2)
+            for _, old, old_variance in self._past
+        )
+        self._past.append((t_s, value, variance))
+        return found
+
+    def forget(self) -> None:
+        """Start anew (after the parameter was reopened)."""
+        self._past.clear()
