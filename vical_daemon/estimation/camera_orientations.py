@@ -49,7 +49,8 @@ def target_orientations(
 
     Of a frame's two planar poses the better one is taken; where the image cannot tell them apart, the one
     that continues the previous frames, and none if there is no previous frame nearby. Frames whose corners
-    fit worse than usual (blur, the edge of the lens) get a covariance that is larger in proportion.
+    fit worse than usual (blur, the edge of the lens) get a covariance that grows with the fourth power of
+    the misfit: what bends the corners out of line also turns the pose.
 
     Args:
         frames: Views in order of time; ids index `points_m`.

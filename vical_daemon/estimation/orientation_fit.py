@@ -51,8 +51,7 @@ class OrientationSensor:
         used: Orientations that passed the gate, shape (n,).
         log_scale: Log of the factor by which the noise is larger than `covariance` says (in sigma).
         log_slow: Log of the slow error that a second brings over the noise of one orientation. Slow errors
-            come
-            from lens and board models which are not exact, and change with the view.
+            come from lens and board models which are not exact, and change with the view.
         jitter_s: Standard deviation of the stamps, s; independent from orientation to orientation.
     """
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.rotation_curves import RotationCurve
+from vical_daemon.estimation.rotation_curves import GyroCurve, RotationCurve
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -129,6 +129,44 @@ def shift_costs(
     return out
 
 
+def _agreement_scale(turns: Turns) -> float:
+    """How far two turns may differ and still agree: a quarter of a usual turn, at least 0.6 deg."""
+    return max(0.25 * float(np.quantile(turns.angle, 0.4)), 0.01)
+
+
+def debiased_start(
+    t_imu_s: FloatArray,
+    gyro_rps: FloatArray,
+    t_cam_s: FloatArray,
+    q_world_cam: FloatArray,
+    shifts_s: tuple[float, float],
+) -> tuple[Start | None, FloatArray]:
+    """Find a start from a raw gyro, anew with the bias it reveals where that bias blurs the agreement.
+
+    Args:
+        t_imu_s: Stamps, s, shape (m,).
+        gyro_rps: Rates, rad/s, shape (m, 3).
+        t_cam_s: Camera stamps, s, shape (n,).
+        q_world_cam: Camera orientations, shape (n, 4).
+        shifts_s: Lowest and highest shift to look at, s.
+
+    Returns:
+        The start or None, and the gyro bias, rad/s, shape (3,).
+    """
+    bias = np.zeros(3)
+    start: Start | None = None
+    for _ in range(3):
+        curve = GyroCurve.integrate(t_imu_s, gyro_rps, bias)
+        start = coarse_start(curve, t_cam_s, q_world_cam, shifts_s)
+        if start is None:
+            break
+        bias = bias + start.bias_rps
+        turns = camera_turns(t_cam_s, q_world_cam)
+        if np.linalg.norm(start.bias_rps) * _BASELINE_S < 0.25 * _agreement_scale(turns):
+            break
+    return start, bias
+
+
 def _minima(costs: FloatArray, apart: int) -> list[int]:
     """Return the lowest points of a sampled curve, best first, none closer than `apart` samples."""
     found: list[int] = []
@@ -160,7 +198,7 @@ def coarse_start(
     turns = camera_turns(t_cam_s, q_world_cam)
     if len(turns.first) < 8:
         return None
-    scale = max(0.25 * float(np.quantile(turns.angle, 0.4)), 0.004)
+    scale = _agreement_scale(turns)
     grid = np.arange(np.floor(shifts_s[0] / _GRID_S), np.ceil(shifts_s[1] / _GRID_S) + 1.0) * _GRID_S
     if len(grid) < 2:
         grid = np.array([grid[0], grid[0] + _GRID_S])
@@ -223,14 +261,17 @@ def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mo
     """Robust Wahba: R with turn_imu = R turn_cam + bias dt, by reweighting; watches for mirrored axes."""
     weight = np.ones(len(dt))
     bias = np.zeros(3)
-    R, mirror_gain, s = np.eye(3), 0.0, np.ones(3)
+    R, s = np.eye(3), np.ones(3)
     residual = turn_imu
-    for _ in range(8):
+    mirrored = False
+    for i in range(8):
         target = turn_imu - bias * dt[:, None]
         U, s, Vt = np.linalg.svd((target * weight[:, None]).T @ turn_cam)
         sign = np.sign(np.linalg.det(U @ Vt))
-        # s2 is what the third direction adds if the mounting may mirror, and what a rotation must pay
-        mirror_gain = float(s[2]) if sign < 0 else 0.0
+        # the smallest singular value is what a mirrored mounting would gain and a rotation must pay; later
+        # rounds have put aside what disagrees with a rotation
+        if i == 0:
+            mirrored = bool(sign < 0 and s[2] > 0.25 * s[1] and s[2] > 0.02 * s[0])
         R = (U * np.array([1.0, 1.0, sign])) @ Vt
         residual = turn_imu - turn_cam @ R.T
         bias = np.sum(residual * (weight * dt)[:, None], axis=0) / np.sum(weight * dt * dt)
@@ -238,7 +279,7 @@ def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mo
         length2 = np.einsum("ij,ij->i", residual, residual)
         weight = 1.0 / (1.0 + length2 / max(2.0 * float(np.median(length2)), 1e-12)) ** 2
     misfit = float(np.sqrt(np.median(np.einsum("ij,ij->i", residual, residual))))
-    return _Mounting(R, bias, misfit, s / len(dt), mirror_gain > 0.25 * float(s[1]))
+    return _Mounting(R, bias, misfit, s / len(dt), mirrored)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ Stages: `rotation_registration` (coarse start over several seconds, mounting, cl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ from vical_daemon.estimation.rotation_registration import (
     Start,
     camera_turns,
     closest_point_registration,
-    coarse_start,
+    debiased_start,
 )
 
 FloatArray = npt.NDArray[np.float64]
@@ -61,7 +61,7 @@ class TdIcpOptions:
     timeshift_guess_s: float = 0.0
     gyro_density: float = 5.2e-4
     gyro_walk: float = 2.0e-5
-    gyro_log_sigma: float = 0.5
+    gyro_log_sigma: float = 0.2
     bias_sigma_rps: float = 0.1
     stamp_jitter_s: float = 0.0
     estimate_noise: bool = True
@@ -169,8 +169,8 @@ def td_icp(
         The result; never raises on data: a refusal says why in `reason`.
     """
     options = options or TdIcpOptions()
-    imu = _clean_imu(t_imu_s, gyro_rps)
-    cam = _clean_camera(t_cam_s, R_world_cam, rotation_sigma)
+    imu = clean_gyro(t_imu_s, gyro_rps)
+    cam = clean_orientations(t_cam_s, R_world_cam, rotation_sigma)
     n_given = len(t_cam_s)
     if isinstance(imu, str) or isinstance(cam, str):
         return TdIcpResult(REFUSED, imu if isinstance(imu, str) else str(cam), rejected=n_given)
@@ -181,22 +181,22 @@ def td_icp(
     reason = _refuse_motion(t_imu, gyro, t_cam, q, options)
     if reason:
         return TdIcpResult(REFUSED, reason, rejected=n_given)
-    curve = GyroCurve.integrate(t_imu, gyro, np.zeros(3))
     guess, reach = options.timeshift_guess_s, options.search_s
-    start = coarse_start(curve, t_cam, q, (guess - reach, guess + reach))
-    reason = _refuse_start(start, t_cam, q, options)
+    start, bias = debiased_start(t_imu, gyro, t_cam, q, (guess - reach, guess + reach))
+    reason = refuse_start(start, t_cam, q, options)
     if reason or start is None:
         return TdIcpResult(REFUSED, reason, rejected=n_given)
-    curve = GyroCurve.integrate(t_imu, gyro, start.bias_rps)
-    rough = closest_point_registration(curve, t_cam, q, start)
+    curve = GyroCurve.integrate(t_imu, gyro, bias)
+    rough = closest_point_registration(curve, t_cam, q, replace(start, bias_rps=np.zeros(3)))
     try:
-        fit = _polish(t_imu, gyro, t_cam, R, covariance, start.bias_rps, rough, options)
+        fit = _polish(t_imu, gyro, t_cam, R, covariance, bias, rough, options)
     except np.linalg.LinAlgError:
         return TdIcpResult(REFUSED, "the orientations do not fit the gyro at any delay", rejected=n_given)
     return _result(fit, rough, (t_imu[0], t_imu[-1]), index, n_given)
 
 
-def _clean_imu(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArray] | str:
+def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArray] | str:
+    """Sort, drop what is not a number or stamped twice; a string says why nothing is left."""
     t_s, gyro = np.asarray(t_s, dtype=np.float64), np.asarray(gyro, dtype=np.float64)
     good = np.isfinite(t_s) & np.isfinite(gyro).all(axis=-1) if len(t_s) else np.zeros(0, dtype=bool)
     t_s, gyro = t_s[good], gyro[good]
@@ -208,10 +208,14 @@ def _clean_imu(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArra
     return t_s[keep], gyro[keep]
 
 
-def _clean_camera(
+def clean_orientations(
     t_s: FloatArray, R: FloatArray, rotation_sigma: float | FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.intp]] | str:
-    """Sort, drop what is not a number, and bring the noise into the form of covariances."""
+    """Sort, drop what is not a number, and bring the noise into the form of covariances.
+
+    Returns:
+        Stamps, orientations, covariances, and the index of each in the input; or why nothing is left.
+    """
     t_s, R = np.asarray(t_s, dtype=np.float64), np.asarray(R, dtype=np.float64)
     n = len(t_s)
     if n < _MIN_ORIENTATIONS:
@@ -270,7 +274,7 @@ def _refuse_motion(
     return ""
 
 
-def _refuse_start(start: Start | None, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions) -> str:
+def refuse_start(start: Start | None, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions) -> str:
     """Say why no start was found; empty if there is one."""
     reach = f"within {options.search_s:g} s of {options.timeshift_guess_s:g} s"
     if start is None:
