@@ -1,0 +1,78 @@
+"""Full search for a checkerboard: OpenCV's sector-based finder, with its answer put in order.
+
+The finder needs the whole board in view and is sometimes wrong by tens of pixels on partly hidden boards, so
+its corners are only a start; `guided` refines and checks each. Its order may be turned: colours settle that
+where the board allows it, otherwise the order nearest to the last frame, or the one whose rows run downwards.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from vical_daemon.vision.detection import FloatArray, Gray
+from vical_daemon.vision.layout import BoardLayout
+from vical_daemon.vision.saddle import SaddleImage
+from vical_daemon.vision.tag_code import sample
+from vical_daemon.vision.target import Checkerboard
+
+SMALL_IMAGE_PX = 700
+
+
+def search_checkerboard(gray: Gray, target: Checkerboard) -> FloatArray | None:
+    """Find the inner corners, shape (rows * cols, 2), px, in the finder's own order; None without a board."""
+    size = (target.cols, target.rows)
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCornersSB(gray, size, flags=flags)
+    if not found:
+        return None
+    uv = np.asarray(corners, np.float64).reshape(-1, 2)
+    return uv if len(uv) == target.cols * target.rows else None
+
+
+def orders(target: Checkerboard) -> list[np.ndarray]:
+    """Index arrays that turn the board's corners by the quarter turns that keep its outline."""
+    grid = np.arange(target.cols * target.rows).reshape(target.rows, target.cols)
+    turned = [grid, grid[::-1, ::-1]]
+    if target.cols == target.rows:
+        turned += [np.rot90(grid), np.rot90(grid, -1)]
+    return [t.ravel() for t in turned]
+
+
+def put_in_order(
+    image: SaddleImage, layout: BoardLayout, uv_px: FloatArray, last_px: FloatArray | None
+) -> FloatArray:
+    """Return the corners in the order of the point ids.
+
+    Args:
+        image: The picture, for the colours.
+        layout: The checkerboard.
+        uv_px: All corners in the finder's order, shape (n, 2).
+        last_px: Where the corners were (or are expected), nan where unknown; None: no memory.
+    """
+    assert isinstance(layout.target, Checkerboard)
+    candidates = [_unmirrored(uv_px[order], layout.target) for order in orders(layout.target)]
+    colours = [_colour_match(image, layout.target, uv) for uv in candidates]
+    best = max(colours)
+    candidates = [uv for uv, c in zip(candidates, colours, strict=True) if c >= best - 0.5 * abs(best)]
+    if last_px is not None and np.isfinite(last_px).any():
+        return min(candidates, key=lambda uv: float(np.nanmedian(np.linalg.norm(uv - last_px, axis=1))))
+    return max(candidates, key=lambda uv: float(uv[-1] @ [1, 2] - uv[0] @ [1, 2]))
+
+
+def _unmirrored(uv: FloatArray, target: Checkerboard) -> FloatArray:
+    """Flip the columns if the finder walked the board as its mirror image."""
+    grid = uv.reshape(target.rows, target.cols, 2)
+    along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    mirrored = along[0] * down[1] - along[1] * down[0] < 0
+    return grid[:, ::-1].reshape(-1, 2) if mirrored else uv
+
+
+def _colour_match(image: SaddleImage, target: Checkerboard, uv: FloatArray) -> float:
+    """Mean grey of the squares that should be white minus those that should be black."""
+    grid = uv.reshape(target.rows, target.cols, 2)
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    level = sample(image.smooth, centres)
+    row, col = np.indices(level.shape)
+    black = (row + col) % 2 == 0
+    return float(level[~black].mean() - level[black].mean())

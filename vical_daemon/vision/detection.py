@@ -1,0 +1,48 @@
+"""What a detector returns, and the grey picture it works on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Gray = npt.NDArray[np.uint8]
+AnyImage = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """Target points found in one image.
+
+    Attributes:
+        ids: Point ids, ascending, shape (n,), int64.
+        uv_px: Pixel coordinates (u right, v down, pixel centres at integers), shape (n, 2).
+        sigma_px: One-sigma per axis from pixel noise, contrast and blur at each point, shape (n,);
+            errors that a whole frame shares are not in it. None where the detector cannot tell.
+    """
+
+    ids: IntArray
+    uv_px: FloatArray
+    sigma_px: FloatArray | None = None
+
+
+def as_gray(image: AnyImage) -> Gray:
+    """Return the picture as 8-bit grey: BGR is mixed, 16 bit is scaled by its own brightest pixel.
+
+    Raises:
+        ValueError: The shape is neither (h, w) nor (h, w, 3), or the type is not uint8 or uint16.
+    """
+    if image.ndim == 3 and image.shape[2] == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if image.ndim != 2:
+        raise ValueError(f"image of shape {image.shape}: expected (height, width) or (height, width, 3)")
+    if image.dtype == np.uint16:
+        brightest = max(int(image.max()), 1)
+        return np.asarray(cv2.convertScaleAbs(image, alpha=255.0 / brightest), np.uint8)
+    if image.dtype != np.uint8:
+        raise ValueError(f"image of type {image.dtype}: expected uint8 or uint16")
+    return np.ascontiguousarray(image, np.uint8)

@@ -1,0 +1,227 @@
+"""The detector a role uses: full search once, guided from then on, full search again on loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vical_daemon.vision.aprilgrid import search_tags
+from vical_daemon.vision.checkerboard import put_in_order, search_checkerboard
+from vical_daemon.vision.detection import AnyImage, Detection, FloatArray, Gray, as_gray
+from vical_daemon.vision.grid_model import GridModel, fit_grid
+from vical_daemon.vision.guided import (
+    BoardFix,
+    BoolArray,
+    check_codes,
+    complete_board,
+    predict_with_residuals,
+    refine_predicted,
+)
+from vical_daemon.vision.layout import BoardLayout
+from vical_daemon.vision.saddle import SaddleImage
+from vical_daemon.vision.target import AprilGrid, Target
+
+MIN_POINTS = 4
+FLOW_POINTS = 24
+FLOW_WINDOW = (17, 17)
+FLOW_LEVELS = 3
+KEEP_SHARE = 0.5
+"""Guided detection holds while it finds this share of the corners that should be in view."""
+MAX_GAP_NS = 400_000_000
+
+
+@dataclass
+class DetectorStats:
+    """What the detector did so far.
+
+    Attributes:
+        frames: Pictures given.
+        found: Pictures with a board.
+        guided: Of these, found without a full search.
+        searches: Full searches.
+        losses: Times that guided detection gave up.
+    """
+
+    frames: int = 0
+    found: int = 0
+    guided: int = 0
+    searches: int = 0
+    losses: int = 0
+
+
+@dataclass(frozen=True)
+class _Memory:
+    """The last frame with a board."""
+
+    fix: BoardFix
+    gray: Gray
+    t_ns: int | None
+    velocity_px: FloatArray
+    """Motion of each corner per second (per frame without stamps), nan where unknown."""
+
+
+class BoardDetector:
+    """Detects one target in a stream of pictures of one camera.
+
+    Args:
+        target: The board.
+        guided: Use the last frames; False: full search on every picture.
+    """
+
+    def __init__(self, target: Target, guided: bool = True) -> None:
+        self.target = target
+        self.stats = DetectorStats()
+        self._layout = BoardLayout.of(target)
+        self._guided = guided
+        self._memory: _Memory | None = None
+        self._lens = -0.1
+
+    def reset(self) -> None:
+        """Forget the last frames."""
+        self._memory = None
+
+    def detect(
+        self, image: AnyImage, t_ns: int | None = None, predicted_uv: FloatArray | None = None
+    ) -> Detection | None:
+        """Find the board.
+
+        Args:
+            image: Shape (height, width) uint8/uint16 or (height, width, 3) uint8 (BGR).
+            t_ns: Stamp, ns; lets the guided search scale velocities over dropped frames.
+            predicted_uv: Where the estimator expects each point, shape (points, 2), nan where unseen; used
+                instead of the last frames' motion.
+
+        Returns:
+            The points found (at least four), or None.
+
+        Raises:
+            ValueError: The picture has a shape or type that no camera of ours gives.
+        """
+        gray = as_gray(image)
+        picture = SaddleImage(gray)
+        self.stats.frames += 1
+        fix = self._follow(picture, gray, t_ns, predicted_uv) if self._guided else None
+        if fix is not None:
+            self.stats.guided += 1
+        else:
+            fix = self._search(picture, gray, predicted_uv)
+        if fix is None or fix.found.sum() < MIN_POINTS:
+            self._memory = None
+            return None
+        self.stats.found += 1
+        self._remember(fix, gray, t_ns)
+        ids = np.flatnonzero(fix.found).astype(np.int64)
+        return Detection(ids, fix.uv_px[ids], fix.sigma_px[ids])
+
+    def _search(self, picture: SaddleImage, gray: Gray, predicted_uv: FloatArray | None) -> BoardFix | None:
+        self.stats.searches += 1
+        uv = np.full((len(self._layout.xy_m), 2), np.nan)
+        if isinstance(self.target, AprilGrid):
+            tags, corners = search_tags(picture, gray, self.target)
+            for tag, quad in zip(tags, corners, strict=True):
+                uv[4 * tag : 4 * tag + 4] = quad
+        else:
+            found = search_checkerboard(gray, self.target)
+            if found is None:
+                return None
+            last = predicted_uv
+            if last is None and self._memory is not None:
+                last = np.where(self._memory.fix.found[:, None], self._memory.fix.uv_px, np.nan)
+            uv = put_in_order(picture, self._layout, found, last)
+        return complete_board(picture, self._layout, uv, np.isfinite(uv).all(axis=1), self._lens)
+
+    def _follow(
+        self, picture: SaddleImage, gray: Gray, t_ns: int | None, predicted_uv: FloatArray | None
+    ) -> BoardFix | None:
+        """Guided detection; None when there is nothing to follow or the board is lost."""
+        start = self._given(picture, predicted_uv) if predicted_uv is not None else None
+        if start is None:
+            start = self._flow(gray, t_ns)
+        if start is None:
+            return None
+        model, predicted = start
+        fix = refine_predicted(picture, self._layout, model, predicted, search_px=5.0)
+        if fix is not None:
+            missing = BoardFix(fix.uv_px, fix.sigma_px, fix.found, fix.model)
+            again = refine_predicted(
+                picture, self._layout, fix.model, predict_with_residuals(missing, self._layout), 3.0
+            )
+            fix = again if again is not None else fix
+            fix = check_codes(picture, self._layout, fix)
+        if fix is None or not self._holds(fix, picture.shape):
+            self.stats.losses += 1
+            return None
+        return fix
+
+    def _given(self, picture: SaddleImage, predicted_uv: FloatArray) -> tuple[GridModel, FloatArray] | None:
+        """Start from the estimator's prediction."""
+        valid = np.isfinite(predicted_uv).all(axis=1)
+        model = fit_grid(self._layout.xy_m[valid], predicted_uv[valid], picture.shape, self._lens)
+        return None if model is None else (model, predicted_uv)
+
+    def _flow(self, gray: Gray, t_ns: int | None) -> tuple[GridModel, FloatArray] | None:
+        """Start from the last frame, moved by the optical flow of a few well spread corners."""
+        memory = self._memory
+        if memory is None or memory.gray.shape != gray.shape:
+            return None
+        step = _elapsed(memory.t_ns, t_ns)
+        if step is None:
+            return None
+        moved = np.nan_to_num(memory.velocity_px * step)
+        found = np.flatnonzero(memory.fix.found)
+        chosen = found[np.linspace(0, len(found) - 1, min(len(found), FLOW_POINTS)).round().astype(int)]
+        before = memory.fix.uv_px[chosen].astype(np.float32)
+        after, status, _ = cv2.calcOpticalFlowPyrLK(
+            memory.gray,
+            gray,
+            before[:, None, :],
+            np.ascontiguousarray((before + moved[chosen])[:, None, :], np.float32),
+            winSize=FLOW_WINDOW,
+            maxLevel=FLOW_LEVELS,
+            criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.05),
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
+        good = status.ravel() > 0
+        if good.sum() < 4:
+            return None
+        where = after.reshape(-1, 2)[good].astype(np.float64)
+        model = fit_grid(
+            self._layout.xy_m[chosen[good]], where, gray.shape, float(memory.fix.model.parameters[8])
+        )
+        if model is None:
+            return None
+        shift = predict_with_residuals(memory.fix, self._layout) - memory.fix.model.predict(self._layout.xy_m)
+        return model, model.predict(self._layout.xy_m) + shift
+
+    def _holds(self, fix: BoardFix, shape: tuple[int, int]) -> bool:
+        """Whether guided detection still finds most of what should be in view."""
+        uv = fix.model.predict(self._layout.xy_m)
+        margin = 12.0
+        with np.errstate(invalid="ignore"):
+            inside = (uv > margin) & (uv < np.array([shape[1], shape[0]]) - 1 - margin)
+        expected: BoolArray = np.asarray(inside.all(axis=1))
+        found = int(fix.found.sum())
+        return found >= 8 and found >= KEEP_SHARE * int(expected.sum())
+
+    def _remember(self, fix: BoardFix, gray: Gray, t_ns: int | None) -> None:
+        velocity = np.full(fix.uv_px.shape, np.nan)
+        if self._memory is not None:
+            step = _elapsed(self._memory.t_ns, t_ns)
+            if step is not None:
+                both = fix.found & self._memory.fix.found
+                velocity[both] = (fix.uv_px - self._memory.fix.uv_px)[both] / step
+                if both.any():
+                    velocity[~both] = np.median(velocity[both], axis=0)
+        if fix.found.sum() >= 24:
+            self._lens += 0.2 * (float(fix.model.parameters[8]) - self._lens)
+        self._memory = _Memory(fix, gray, t_ns, velocity)
+
+
+def _elapsed(before_ns: int | None, now_ns: int | None) -> float | None:
+    """Seconds between stamps; 1.0 (one frame) without stamps; None when too long ago or not after."""
+    if before_ns is None or now_ns is None:
+        return 1.0
+    gap = now_ns - before_ns
+    return gap * 1e-9 if 0 < gap <= MAX_GAP_NS else None

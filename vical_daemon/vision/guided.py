@@ -1,0 +1,205 @@
+"""Find every corner of a board whose place is roughly known: refine, check, and grow to what is left.
+
+The start may come from decoded tags, from the last frame or from the filter's prediction. A corner counts
+only if it is a saddle, if its four sectors have the right colours, and if it lies where its neighbours say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.vision.detection import FloatArray
+from vical_daemon.vision.grid_model import GridModel, fit_grid, outliers
+from vical_daemon.vision.layout import BoardLayout
+from vical_daemon.vision.saddle import SaddleImage
+from vical_daemon.vision.tag_code import BITS, agreement, bit_centres, sample
+from vical_daemon.vision.target import AprilGrid
+
+BoolArray = npt.NDArray[np.bool_]
+
+MIN_RADIUS_PX = 1.6
+MIN_CONTRAST = 0.3
+"""Of the board's median corner contrast: below, a corner is hidden or washed out."""
+MIN_CONTRAST_DN = 6.0
+MAX_SIGMA_PX = 2.0
+GROW_ROUNDS = 3
+MIN_AGREEMENT = 0.3
+MIN_BOARD_AGREEMENT = 0.35
+
+
+@dataclass(frozen=True)
+class BoardFix:
+    """All corners of the board in one picture, in the order of the point ids.
+
+    Attributes:
+        uv_px: Where each corner was found; meaningless where `found` is False, shape (n, 2).
+        sigma_px: One-sigma per axis, shape (n,).
+        found: Shape (n,).
+        model: Fitted to the corners found.
+    """
+
+    uv_px: FloatArray
+    sigma_px: FloatArray
+    found: BoolArray
+    model: GridModel
+
+
+def complete_board(
+    image: SaddleImage, layout: BoardLayout, uv_px: FloatArray, known: BoolArray, lens: float = -0.1
+) -> BoardFix | None:
+    """Find the whole board from some of its corners.
+
+    Args:
+        image: The picture.
+        layout: The board.
+        uv_px: Roughly known corners, shape (n, 2); read only where `known`.
+        known: Shape (n,).
+        lens: First guess of the grid model's lens coefficient.
+
+    Returns:
+        Every corner that could be found, or None if nothing consistent is there.
+    """
+    if known.sum() < 4:
+        return None
+    model = fit_grid(layout.xy_m[known], uv_px[known], image.shape, lens)
+    if model is None:
+        return None
+    keep = known.copy()
+    keep[known] = ~outliers(model, layout.xy_m[known], uv_px[known], floor_px=2.5)
+    if keep.sum() < 4:
+        return None
+    return grow_board(image, layout, model.refit(layout.xy_m[keep], uv_px[keep]), uv_px, keep)
+
+
+def grow_board(
+    image: SaddleImage, layout: BoardLayout, model: GridModel, uv_px: FloatArray, known: BoolArray
+) -> BoardFix | None:
+    """Refine `known` corners and find the others around them, nearest first by rounds."""
+    fix = BoardFix(uv_px.copy(), np.full(len(uv_px), np.inf), known.copy(), model)
+    for _ in range(GROW_ROUNDS):
+        before = int(np.isfinite(fix.sigma_px).sum())
+        predicted = predict_with_residuals(fix, layout)
+        grown = refine_predicted(image, layout, fix.model, predicted, search_px=3.0)
+        if grown is None:
+            return None
+        fix = grown
+        if int(fix.found.sum()) <= before:
+            break
+    return check_codes(image, layout, fix)
+
+
+def predict_with_residuals(fix: BoardFix, layout: BoardLayout) -> FloatArray:
+    """Predict all corners: found ones where they are, others by the model plus what near ones miss it by."""
+    predicted = fix.model.predict(layout.xy_m)
+    residual = (fix.uv_px - predicted)[fix.found]
+    apart = np.linalg.norm(layout.xy_m[:, None] - layout.xy_m[None, fix.found], axis=2)
+    weight = 1.0 / (apart + 1e-3 * fix.model.scale_m) ** 4
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.where(fix.found[:, None], fix.uv_px, predicted + weight @ residual)
+
+
+def refine_predicted(
+    image: SaddleImage,
+    layout: BoardLayout,
+    model: GridModel,
+    predicted_px: FloatArray,
+    search_px: float,
+) -> BoardFix | None:
+    """Refine corners at predicted places and keep those that pass every check.
+
+    Args:
+        image: The picture.
+        layout: The board.
+        model: Roughly where the board is: gives local axes and so window sizes.
+        predicted_px: A place for each corner, shape (n, 2); nan where there is none.
+        search_px: Largest distance between prediction and corner.
+
+    Returns:
+        None where fewer than four corners pass.
+    """
+    axes = model.axes_px(layout.xy_m)
+    radius = layout.radius_px(axes)
+    usable = np.isfinite(predicted_px).all(axis=1) & (radius >= MIN_RADIUS_PX)
+    index = np.flatnonzero(usable)
+    if len(index) < 4:
+        return None
+    reach = np.minimum(search_px, 0.5 * radius[index] + 1.5)
+    saddles = image.refine(predicted_px[index], radius[index], reach)
+    contrast = corner_contrast(image, layout, saddles.uv_px, axes[index], index)
+    ok = saddles.ok & (saddles.sigma_px < MAX_SIGMA_PX) & (contrast > MIN_CONTRAST_DN)
+    if ok.sum() < 4:
+        return None
+    ok &= contrast > MIN_CONTRAST * float(np.median(contrast[ok]))
+    xy = layout.xy_m[index]
+    for _ in range(2):
+        if ok.sum() < 4:
+            return None
+        model = model.refit(xy[ok], saddles.uv_px[ok])
+        ok[ok] = ~outliers(model, xy[ok], saddles.uv_px[ok])
+    if ok.sum() < 4:
+        return None
+    uv, sigma = np.full((len(usable), 2), np.nan), np.full(len(usable), np.inf)
+    uv[index], sigma[index] = saddles.uv_px, saddles.sigma_px
+    found = np.zeros(len(usable), bool)
+    found[index] = ok
+    return BoardFix(uv, np.where(found, sigma, np.inf), found, model)
+
+
+def corner_contrast(
+    image: SaddleImage,
+    layout: BoardLayout,
+    uv_px: FloatArray,
+    axes_px: FloatArray,
+    index: npt.NDArray[np.intp],
+) -> FloatArray:
+    """White minus black sectors around each corner, grey levels; negative where the colours are swapped."""
+    arm = 0.6 * layout.reach_m * axes_px
+    diagonals = np.stack([arm[:, 0] + arm[:, 1], arm[:, 0] - arm[:, 1]], axis=1)
+    spots = uv_px[:, None, None, :] + diagonals[:, :, None, :] * np.array([1.0, -1.0])[:, None]
+    level = sample(image.smooth, spots)
+    same, other = level[:, 0], level[:, 1]
+    mean = (same.sum(axis=1) - other.sum(axis=1)) / 2
+    # The weaker side counts: a half-hidden corner has one sector of the wrong colour.
+    polarity = layout.polarity[index]
+    weakest = np.where(
+        polarity > 0, same.min(axis=1) - other.max(axis=1), other.min(axis=1) - same.max(axis=1)
+    )
+    return np.asarray(np.minimum(mean * polarity, weakest + 0.5 * np.abs(mean)))
+
+
+def check_codes(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> BoardFix | None:
+    """Compare the tags' bits with what the ids promise; a board shifted by a tag does not pass.
+
+    Returns:
+        The fix without the corners of hidden tags; None if the board as a whole is not where it seems. A
+        checkerboard has no codes and passes.
+    """
+    if not isinstance(layout.target, AprilGrid):
+        return fix
+    target = layout.target
+    origin = layout.xy_m[::4]
+    spots = origin[:, None, :] + bit_centres()[None] * target.tag_size_m
+    uv = fix.model.predict(spots.reshape(-1, 2)).reshape(len(origin), BITS * BITS, 2)
+    uv += _tag_residual(fix, layout)[:, None, :]
+    height, width = image.shape
+    inside = ((uv > 0) & (uv < [width - 1, height - 1])).all(axis=(1, 2))
+    seen = np.flatnonzero(inside & fix.found.reshape(-1, 4).any(axis=1))
+    if not len(seen):
+        return None
+    match = agreement(sample(image.smooth, uv[seen]), seen)
+    if match.mean() < MIN_BOARD_AGREEMENT:
+        return None
+    hidden = np.zeros(len(origin), bool)
+    hidden[seen] = match < MIN_AGREEMENT
+    found = fix.found & ~np.repeat(hidden, 4)
+    return BoardFix(fix.uv_px, np.where(found, fix.sigma_px, np.inf), found, fix.model)
+
+
+def _tag_residual(fix: BoardFix, layout: BoardLayout) -> FloatArray:
+    """Mean distance of each tag's found corners from the model, px, shape (tags, 2)."""
+    residual = np.where(fix.found[:, None], fix.uv_px - fix.model.predict(layout.xy_m), 0.0)
+    count = np.maximum(fix.found.reshape(-1, 4).sum(axis=1), 1)
+    return np.asarray(residual.reshape(-1, 4, 2).sum(axis=1) / count[:, None])

@@ -1,0 +1,103 @@
+"""The 36h11 code words, and reading them from a picture."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.vision.detection import FloatArray, IntArray
+from vical_daemon.vision.target import TAG_FAMILY_SIZE
+
+BITS = 6
+BORDER = 2
+MODULES = BITS + 2 * BORDER
+MAX_WRONG_BITS = 3
+"""Corrected bits; the family keeps any two words at least 11 bits apart."""
+MIN_CONTRAST_DN = 12.0
+
+
+@lru_cache(maxsize=1)
+def tag_bits() -> npt.NDArray[np.bool_]:
+    """White bits of every tag, shape (587, 6, 6), first row on top, upright as Kalibr prints them.
+
+    OpenCV stores the family turned by half a turn against the published words, whose most significant bit
+    is at the upper left.
+    """
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    words = [
+        cv2.aruco.Dictionary.getBitsFromByteList(family.bytesList[i : i + 1], BITS)
+        for i in range(TAG_FAMILY_SIZE)
+    ]
+    return np.asarray(np.rot90(np.array(words, bool), 2, axes=(1, 2)))
+
+
+@lru_cache(maxsize=1)
+def bit_centres() -> FloatArray:
+    """Centres of the 36 bits in a tag's own frame (lower-left corner (0,0), size 1), shape (36, 2)."""
+    row, col = np.divmod(np.arange(BITS * BITS), BITS)
+    return np.stack([(col + BORDER + 0.5) / MODULES, 1 - (row + BORDER + 0.5) / MODULES], axis=1)
+
+
+def sample(image: npt.NDArray[np.float32], uv_px: FloatArray) -> FloatArray:
+    """Bilinear grey levels at pixels, shape (...,); points outside repeat the edge."""
+    flat = np.nan_to_num(uv_px.reshape(-1, 2), nan=-1e4).astype(np.float32)
+    rows = 16384
+    parts = [
+        cv2.remap(image, flat[i : i + rows, None, :], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for i in range(0, len(flat), rows)
+    ]
+    return np.concatenate(parts).reshape(uv_px.shape[:-1]).astype(np.float64)
+
+
+def decode(image: npt.NDArray[np.float32], quads_px: FloatArray, tags: int) -> tuple[IntArray, FloatArray]:
+    """Read the tags in quadrilaterals.
+
+    Args:
+        image: Grey picture, float32.
+        quads_px: Corners of each candidate, counter-clockwise for the viewer, any first corner, (n, 4, 2).
+        tags: Only ids below this are looked for.
+
+    Returns:
+        Tag ids, shape (n,), -1 where there is none, and the corners turned so that corner 0 comes first.
+    """
+    if not len(quads_px):
+        return np.zeros(0, np.int64), quads_px
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    spots = np.concatenate(
+        [
+            cv2.perspectiveTransform(
+                bit_centres()[None], cv2.getPerspectiveTransform(unit, quad.astype(np.float32))
+            )
+            for quad in quads_px
+        ]
+    )
+    levels = sample(image, spots)
+    dark, bright = np.percentile(levels, [15, 85], axis=1)
+    signs = np.where(levels > ((dark + bright) / 2)[:, None], 1.0, -1.0)
+    score = signs @ _turned_words(tags).T
+    best = np.argmax(score, axis=1)
+    wrong = (BITS * BITS - score[np.arange(len(best)), best]) / 2
+    good = (wrong <= MAX_WRONG_BITS) & (bright - dark > MIN_CONTRAST_DN)
+    ids, turn = best % tags, best // tags
+    order = (np.arange(4)[None, :] - turn[:, None]) % 4
+    return np.where(good, ids, -1), np.take_along_axis(quads_px, order[:, :, None], axis=1)
+
+
+def agreement(levels: FloatArray, ids: IntArray) -> FloatArray:
+    """Correlation of sampled bit levels (n, 36) with the words of `ids`: near 1 right, near 0 wrong tag."""
+    words = np.where(tag_bits()[ids].reshape(len(ids), -1), 1.0, -1.0)
+    a = levels - levels.mean(axis=1, keepdims=True)
+    b = words - words.mean(axis=1, keepdims=True)
+    scale = np.sqrt(np.sum(a * a, axis=1) * np.sum(b * b, axis=1))
+    return np.asarray(np.sum(a * b, axis=1) / np.maximum(scale, 1e-9))
+
+
+@lru_cache(maxsize=8)
+def _turned_words(tags: int) -> FloatArray:
+    """Words as +-1 when the first quad corner is corner j of the tag, rows j * tags + id, (4 * tags, 36)."""
+    bits = tag_bits()[:tags]
+    turned = [np.rot90(bits, -j, axes=(1, 2)).reshape(tags, -1) for j in range(4)]
+    return np.where(np.concatenate(turned), 1.0, -1.0)
