@@ -240,6 +240,12 @@ class Stamp:
 class DeviceClock:
     """Maps ticks to the host: unwraps, notices restarts, counts lost samples, fits the envelope.
 
+    Attributes:
+        restarts: How often the device's timer began anew.
+        outliers: Samples dropped because their time cannot be true.
+        repeats: Samples dropped because their time is that of the one before.
+        lost: Samples missing between those that came.
+
     Args:
         tick_hz: Ticks per device second.
         tick_bits: Width of the counter on the wire; None where it does not wrap.
@@ -255,6 +261,7 @@ class DeviceClock:
         self.rate_hz = rate_hz
         self.restarts = 0
         self.outliers = 0
+        self.repeats = 0
         self.lost = 0
         self._options = options
         self._unwrap = TickUnwrapper(tick_bits)
@@ -276,7 +283,7 @@ class DeviceClock:
         return 0.0 if self._first_ticks is None else (self._last_ticks - self._first_ticks) / self.tick_hz
 
     def add(self, ticks: int, t_arrival_ns: int) -> int | None:
-        """Take one sample; return its unwrapped ticks, None where the value cannot be true.
+        """Take one sample; return its unwrapped ticks, None where the value cannot be true or was seen.
 
         A value from the future is either damage or a restarted (or newly set) device timer. One such
         value is dropped; a second one that fits the first is a restart, and the mapping begins anew.
@@ -290,6 +297,9 @@ class DeviceClock:
             self.outliers -= 1
             self._begin()
         self._suspect = None
+        if self._first_ticks is not None and self._unwrap.step(ticks) == 0:
+            self.repeats += 1
+            return None
         unwrapped = self._unwrap.accept(ticks)
         if self._first_ticks is None:
             self._first_ticks, self._t0_ns = unwrapped, t_arrival_ns
@@ -350,6 +360,7 @@ class SampleCounter:
 
     def __init__(self, rate_hz: float, memory: int = 50) -> None:
         self._period_ns = _NS / rate_hz
+        self._memory = memory
         self._recent: deque[float] = deque(maxlen=memory)
         self._before: deque[float] = deque(maxlen=memory * 20)
         self._ticks = 0
@@ -361,14 +372,13 @@ class SampleCounter:
             self._first_ns = t_arrival_ns
         self._ticks += 1
         lateness = (t_arrival_ns - self._first_ns) - self._ticks * self._period_ns
-        if len(self._recent) == self._recent.maxlen:
+        if len(self._recent) == self._memory:
             self._before.append(self._recent[0])
         self._recent.append(lateness)
-        if len(self._before) >= self._recent.maxlen if self._recent.maxlen else False:
+        if len(self._before) >= self._memory:
             behind = (min(self._recent) - min(self._before)) / self._period_ns
             if behind > 0.75:
-                missed = round(behind)
-                self._ticks += missed
+                self._ticks += round(behind)
                 self._before.clear()
                 self._recent.clear()
         return self._ticks

@@ -24,6 +24,7 @@ from typing import Self
 import numpy as np
 
 from vical_mocks.clock import LINKS, SkewedClock, make_link
+from vical_mocks.faults import ByteFaults, FaultyLink
 from vical_mocks.gx3_device import Gx3Device
 from vical_mocks.gx3_mip import MODELS
 from vical_mocks.gx3_state import Identity, Settings
@@ -50,6 +51,8 @@ class Gx3Emulator:
         eeprom: Settings at power-up; default as from the factory.
         baud_matters: Compare the terminal's baud with the device's and garble what does not match, as a real
             UART does; None: for every link but "usb" and "direct".
+        faults: Damage to the bytes towards the host.
+        stall_every_s: Mean time between stalls of the link; 0 for none.
     """
 
     def __init__(
@@ -67,9 +70,13 @@ class Gx3Emulator:
         eeprom: Settings | None = None,
         first_ticks: int = 0,
         baud_matters: bool | None = None,
+        faults: ByteFaults | None = None,
+        stall_every_s: float = 0.0,
     ) -> None:
         self._motion = motion
         self._clock = SkewedClock(time.monotonic(), clock_skew_ppm, clock_wander_ppm)
+        self._faults = faults
+        self._stall_every_s = stall_every_s
         self._rng = np.random.default_rng([seed, 7])
         self._link_kind = link
         self._baud_matters = link in ("uart", "ftdi") if baud_matters is None else baud_matters
@@ -100,9 +107,13 @@ class Gx3Emulator:
             name = Path(self.port_name)
             name.unlink(missing_ok=True)
             name.symlink_to(os.ttyname(self._slave))
-            self._link = make_link(self._link_kind, self._rng, self.device.baud)
             if replugged:
                 self.device.power_up(time.monotonic())
+            self._link = FaultyLink(
+                make_link(self._link_kind, self._rng, self.device.baud),
+                self._faults,
+                stall_every_s=self._stall_every_s,
+            )
         self._wake()
 
     def unplug(self) -> None:
@@ -114,6 +125,13 @@ class Gx3Emulator:
             os.close(self._slave)
             os.close(self._master)
             self._master = self._slave = -1
+
+    def damage(self, faults: ByteFaults | None) -> None:
+        """Begin (None: end) to damage the bytes towards the host."""
+        with self._lock:
+            self._faults = faults
+            if self._master >= 0:
+                self._link = FaultyLink(make_link(self._link_kind, self._rng, self.device.baud), faults)
 
     def start(self) -> Self:
         """Begin to run."""
@@ -214,6 +232,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=None, help="end by itself after this time")
     parser.add_argument("--serial-number", default="6223-12345")
+    parser.add_argument("--lose", type=float, default=0.0, metavar="P", help="lost bytes, probability each")
+    parser.add_argument("--flip", type=float, default=0.0, metavar="P", help="flipped bits, probability each")
+    parser.add_argument("--garbage", type=int, default=0, metavar="N", help="random bytes before the first")
+    parser.add_argument("--stall", type=float, default=0.0, metavar="S", help="mean time between stalls")
     parser.add_argument("--streaming", action="store_true", help="already streams 0xC2 at power-up")
     parser.add_argument("--baud", type=int, default=115_200, help="left at this baud by someone")
     return parser
@@ -242,6 +264,8 @@ def main(argv: list[str] | None = None) -> int:
         seed=args.seed,
         serial_number=args.serial_number,
         eeprom=eeprom,
+        faults=ByteFaults(lose=args.lose, flip=args.flip, at_start=args.garbage, seed=args.seed),
+        stall_every_s=args.stall,
     ) as emulator:
         sys.stdout.write(emulator.port_name + "\n")
         sys.stdout.flush()

@@ -104,11 +104,9 @@ def _cameras() -> tuple[list[DeviceInfo], str]:
     """Cameras, or why they cannot be listed."""
     try:
         from vical_drivers.camera.opening import list_cameras
-    except ImportError as error:
-        return [], str(error)
-    try:
+
         return list(list_cameras()), ""
-    except DriverError as error:
+    except (DriverError, ImportError) as error:
         return [], str(error)
 
 

@@ -31,12 +31,14 @@ def write(
     figure, (over_time, spread) = plt.subplots(
         1, 2, figsize=(10, 4), width_ratios=(3, 1), sharey=True, layout="constrained"
     )
+    both_ms = np.concatenate([before_ms, after_ms])
+    bins = np.linspace(both_ms.min() - 0.1, both_ms.max() + 0.1, 80)
     for interval_ms, colour, name in ((before_ms, _BEFORE, "arrival"), (after_ms, _AFTER, "stamp")):
         std_us = float(np.std(interval_ms)) * 1e3
         over_time.plot(
             since_s, interval_ms, ".", ms=3, color=colour, alpha=0.6, label=f"{name}: std {std_us:.0f} us"
         )
-        spread.hist(interval_ms, bins=100, orientation="horizontal", color=colour, alpha=0.6, log=True)
+        spread.hist(interval_ms, bins=bins, orientation="horizontal", color=colour, alpha=0.6, log=True)
     over_time.axhline(1e3 / rate_hz, color="0.4", lw=0.8)
     over_time.set(xlabel="time, s", ylabel="interval between samples, ms")
     over_time.legend(loc="upper right")

@@ -20,6 +20,8 @@ WARM_UP_S = 1.0
 """Samples are held back this long at first: the clock mapping needs some arrivals."""
 SILENCE_S = 2.0
 """A stream that is silent for this long counts as lost."""
+_STUCK_SAMPLES = 20
+"""So many samples with one and the same device time: the timer stands."""
 _BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 
 
@@ -91,6 +93,7 @@ class MicrostrainImu:
         self._closed = False
         self._last_data_ns = 0
         self._next_attempt_ns = 0
+        self._last_stamp_ns = 0
         self._span: tuple[int, int, int] | None = None
         self._open()
 
@@ -125,6 +128,7 @@ class MicrostrainImu:
         self._last_data_ns = time.monotonic_ns()
         self._attempts = 0
         self._held = []
+        self._stuck = 0
         self._span = None
         _log.info("imu=%s model=%s serial=%s", self._path, self._info.model, self._info.serial_number)
 
@@ -154,11 +158,15 @@ class MicrostrainImu:
         for sample in raw:
             if sample.ticks is None and self._counter is None:
                 self._switch_to_counting()
-            elif sample.ticks is not None and self._counter is not None and self.applied.tick_hz:
-                self._switch_to_ticks()
             raw_ticks = sample.ticks if self._counter is None else self._counter.count(sample.t_arrival_ns)
             assert raw_ticks is not None
+            restarts, repeats = self.clock.restarts, self.clock.repeats
             ticks = self.clock.add(raw_ticks, sample.t_arrival_ns)
+            if self.clock.restarts != restarts:
+                self._held.clear()
+            self._stuck = self._stuck + 1 if self.clock.repeats != repeats else 0
+            if self._stuck > _STUCK_SAMPLES:
+                self._switch_to_counting()
             if ticks is not None:
                 self._held.append((sample, ticks))
         if not self._held or self.clock.age_s < self._options.warm_up_s:
@@ -171,13 +179,10 @@ class MicrostrainImu:
         return out
 
     def _switch_to_counting(self) -> None:
-        """The device stopped dating its samples (no GPS time yet): count them instead."""
+        """The device does not date its samples (no GPS time yet, a timer that stands): count them."""
+        self._stuck = 0
         self._counter = SampleCounter(self.applied.rate_hz)
         self._renew_clock(self.applied.rate_hz, None)
-
-    def _switch_to_ticks(self) -> None:
-        self._counter = None
-        self._renew_clock(self.applied.tick_hz, self.applied.tick_bits)
 
     def _renew_clock(self, tick_hz: float, tick_bits: int | None) -> None:
         self._held = []
@@ -190,8 +195,10 @@ class MicrostrainImu:
     def _to_sample(self, raw: RawSample, ticks: int) -> ImuSample:
         stamp = self.clock.stamp(ticks)
         self._lost += stamp.lost_before
+        # A new clock (restart, reconnect) may begin a little before the old one ended.
+        self._last_stamp_ns = max(stamp.t_device_event_ns - self._delay_ns, self._last_stamp_ns + 1)
         return ImuSample(
-            t_host_ns=stamp.t_device_event_ns - self._delay_ns,
+            t_host_ns=self._last_stamp_ns,
             t_arrival_ns=raw.t_arrival_ns,
             device_ticks=ticks,
             gyro_rps=raw.gyro_rps,
@@ -239,7 +246,12 @@ class MicrostrainImu:
             rate_hz=self._measured_rate_hz(),
             clock_skew_ppm=-self.clock.envelope.skew * 1e6,
             jitter_us=self.clock.envelope.jitter_s * 1e6,
-            extra={"clock_restarts": float(self.clock.restarts), "group_delay_s": self.applied.group_delay_s},
+            extra={
+                "clock_restarts": float(self.clock.restarts),
+                "impossible_times": float(self.clock.outliers),
+                "repeated_times": float(self.clock.repeats),
+                "group_delay_s": self.applied.group_delay_s,
+            },
         )
 
     def _measured_rate_hz(self) -> float:

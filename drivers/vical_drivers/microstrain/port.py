@@ -199,7 +199,9 @@ def _explain(path: str, error: Exception) -> DriverError:
         return DeviceNotFoundError(f"{path}: no such port; `vical devices` lists those that exist")
     if code in (errno.ENXIO, errno.ENODEV, errno.EIO):
         return DeviceNotFoundError(f"{path}: nothing is connected to this port")
-    return DeviceNotFoundError(f"{path}: this is no serial port ({error})")
+    if isinstance(error, ValueError):
+        return DeviceNotFoundError(f"{path}: the port does not take these settings ({error})")
+    return DeviceNotFoundError(f"{path}: this is no serial port; `vical devices` lists those that exist")
 
 
 def _group_of(path: str) -> str:

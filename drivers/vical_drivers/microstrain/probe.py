@@ -18,7 +18,9 @@ PROBE_BAUDS = (115_200, 921_600, 460_800, 230_400)
 _ANSWER_S = 0.25
 _SLOW_ANSWER_S = 1.2
 """A GX3 sampling at 1 Hz takes commands once a second: the second round waits for it."""
-STOP_LIMIT_S = 1.0
+_QUIET_S = 0.06
+_STOP_LIMIT_S = 0.25
+"""A stream at the right baud stops within a sampling cycle; noise at a wrong one never does."""
 
 
 def connect(
@@ -26,7 +28,7 @@ def connect(
 ) -> tuple[MipSession | SingleByteSession, SerialPort]:
     """Open a port and find the device on it; its stream is stopped.
 
-    Takes 0.4 s where the device is as expected, and at most about 9 s where nothing answers (3 s with
+    Takes 0.4 s where the device is as expected, and at most about 10 s where nothing answers (4 s with
     `patient` off).
 
     Raises:
@@ -60,7 +62,7 @@ def probe_port(
             if baud != port.baud:
                 port.set_baud(baud)
             if (session := _answering(port, protocol, answer_s)) is not None:
-                _log.info("port=%s baud=%d protocol=%s", port.name, baud, session.protocol)
+                _log.debug("port=%s baud=%d protocol=%s", port.name, baud, session.protocol)
                 return session
     return None
 
@@ -71,10 +73,12 @@ def _answering(port: SerialPort, protocol: str, answer_s: float) -> MipSession |
     First both stop commands: each protocol takes the other's as noise, and a stream would drown replies. MIP
     is asked before single-byte because a MIP unit may also know E9, whereas 0x75 is nothing to an old GX3.
     """
-    port.write(cmd.STOP_STREAM + mip.idle())
-    wait_for_silence(port, quiet_s=0.06, limit_s=STOP_LIMIT_S)
-    port.write(cmd.STOP_STREAM + mip.idle())
-    wait_for_silence(port, quiet_s=0.1, limit_s=STOP_LIMIT_S)
+    silent = False
+    for _ in range(2):
+        port.write(cmd.STOP_STREAM + mip.idle())
+        silent = wait_for_silence(port, _QUIET_S, _STOP_LIMIT_S)
+    if not silent and answer_s < _SLOW_ANSWER_S:
+        return None
     kinds: list[type[MipSession] | type[SingleByteSession]] = [MipSession, SingleByteSession]
     for kind in kinds:
         if protocol in ("auto", kind.protocol):

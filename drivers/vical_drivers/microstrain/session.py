@@ -8,22 +8,20 @@ from typing import NamedTuple, Protocol
 from vical_drivers.samples import DeviceInfo
 
 GYRO_ANALOG_DELAY_S = 0.57e-3
-ACCEL_ANALOG_DELAY_S = 0.70e-3
-"""Analog filters of the GX3 (2-pole RC 358 Hz, 1-pole RC 226 Hz)."""
+"""Analog filter of the GX3's gyro (2-pole RC, 358 Hz)."""
 _ADC_AVERAGE_DELAY_S = 29.0 / 60.0 * 1e-3
 
 
 def group_delay_s(filter_width: int) -> float:
-    """Delay of a GX3's sampling chain, s: 30 taps at 30 kHz, M taps at 1 kHz, and the analog filters.
+    """Delay of a GX3's gyro chain, s: 30 taps at 30 kHz, M taps at 1 kHz, and the analog filter.
 
-    Gyro and accelerometer differ by 0.13 ms in their analog part; one sample has one stamp, so the mean is
-    taken: the gyro, which carries the time shift of a camera, is then off by 0.065 ms of constant lag.
+    The accelerometer's analog filter (1-pole RC, 226 Hz) is 0.13 ms slower. One sample has one stamp, and it
+    is the gyro's: the time shift of a camera hangs on it, while 0.13 ms hardly change a specific force.
 
     >>> round(group_delay_s(15) * 1e3, 2)
-    8.12
+    8.05
     """
-    analog_s = 0.5 * (GYRO_ANALOG_DELAY_S + ACCEL_ANALOG_DELAY_S)
-    return _ADC_AVERAGE_DELAY_S + (filter_width - 1) / 2.0 * 1e-3 + analog_s
+    return _ADC_AVERAGE_DELAY_S + (filter_width - 1) / 2.0 * 1e-3 + GYRO_ANALOG_DELAY_S
 
 
 @dataclass(frozen=True, slots=True)
