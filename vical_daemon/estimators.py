@@ -7,6 +7,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Protocol
 
+from vical_daemon import topics
 from vical_daemon.config import Config, ConfigError
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
@@ -61,6 +62,13 @@ def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None)
 
     assert config.target_path is not None  # `config.load` has seen to it
     return Calibrator(options, priors, load_target(config.target_path).points_m)
+
+
+def input_keys(config: Config) -> list[str]:
+    """Return the keys that the estimator reads: one IMU, and points or tracks of each camera."""
+    key_of = topics.tracks_key if config.calibration.mode == "target_free" else topics.points_key
+    imu = topics.imu_key(config.rig, config.calibration_imu)
+    return [imu, *(key_of(config.rig, camera) for camera in config.calibration_cameras)]
 
 
 def _target_free(options: CalibrationOptions, priors: dict[str, CameraPrior]) -> Estimator:

@@ -12,7 +12,7 @@ from vical_daemon.bus import Bus, Sample
 from vical_daemon.config import Config
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate
-from vical_daemon.estimators import Estimator, make_estimator
+from vical_daemon.estimators import Estimator, input_keys, make_estimator
 from vical_daemon.health import StatusSender
 from vical_daemon.inbox import Inbox
 from vical_daemon.messages import (
@@ -150,10 +150,3 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     inbox.close()
     publish(bus, role.finish())
     status.tick(lambda: role.statuses(inbox.dropped), force=True)
-
-
-def input_keys(config: Config) -> list[str]:
-    """Return the keys that the estimator reads: one IMU, and points or tracks of each camera."""
-    key_of = topics.tracks_key if config.calibration.mode == "target_free" else topics.points_key
-    imu = topics.imu_key(config.rig, config.calibration_imu)
-    return [imu, *(key_of(config.rig, camera) for camera in config.calibration_cameras)]

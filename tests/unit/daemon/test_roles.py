@@ -22,6 +22,7 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
+from vical_daemon.estimators import input_keys
 from vical_daemon.messages import (
     Level,
     decode_calibration,
@@ -40,7 +41,7 @@ from vical_daemon.roles import camera as camera_module
 from vical_daemon.roles import imu as imu_module
 from vical_daemon.roles.camera import CameraRole
 from vical_daemon.roles.detect import DetectRole
-from vical_daemon.roles.estimate import EstimateRole, input_keys
+from vical_daemon.roles.estimate import EstimateRole
 from vical_daemon.vision.detection import Detection
 from vical_daemon.wall_clock import WallClock
 

@@ -1,0 +1,50 @@
+"""The watchdog is fed only while every role speaks and none says that it is stuck."""
+
+from __future__ import annotations
+
+import pytest
+
+from vical_daemon.bus import Sample
+from vical_daemon.liveness import Liveness
+from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics
+
+
+def _status(role: str, level: Level = Level.OK, message: str = "") -> Sample:
+    statuses = [DiagnosticStatus(level, f"{role}/x", message), DiagnosticStatus(Level.OK, "clock")]
+    return Sample(f"vical/rig0/status/{role}", encode_diagnostics(1, role, statuses), 0)
+
+
+@pytest.fixture
+def liveness() -> Liveness:
+    liveness = Liveness(["imu", "camera"])
+    liveness.take(_status("imu"), 10.0)
+    return liveness
+
+
+def test_ready_when_every_role_has_spoken(liveness: Liveness) -> None:
+    assert not liveness.ready() and "camera" in liveness.problem(10.0)
+    liveness.take(_status("camera"), 10.5)
+    assert liveness.ready() and liveness.problem(11.0) == ""
+
+
+def test_silence_of_one_role_is_a_problem(liveness: Liveness) -> None:
+    liveness.take(_status("camera"), 16.0)
+    assert liveness.problem(16.0) == "imu has been silent for 6 s"
+
+
+def test_a_stuck_thread_is_a_problem_a_lost_device_is_not(liveness: Liveness) -> None:
+    liveness.take(_status("camera", Level.ERROR, "unplugged"), 10.0)
+    assert liveness.problem(10.0) == ""
+    liveness.take(_status("camera", Level.STALE, "its thread is stuck"), 11.0)
+    assert "stuck" in liveness.problem(11.0)
+
+
+def test_others_and_junk_are_ignored(liveness: Liveness) -> None:
+    liveness.take(_status("record"), 10.0)
+    liveness.take(Sample("vical/rig0/status/camera", b"junk", 0), 10.0)
+    assert not liveness.ready()
+
+
+def test_the_worst_comes_first_in_the_summary(liveness: Liveness) -> None:
+    liveness.take(_status("camera", Level.ERROR, "unplugged"), 10.0)
+    assert liveness.summary() == "camera/x: unplugged; imu/x"
