@@ -1,0 +1,74 @@
+"""`vical check` against an emulated IMU, a port where nobody answers, and a wrong config."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+from pathlib import Path
+
+import pytest
+from vical_mocks.gx3_emulator import Gx3Emulator
+
+from vical_daemon.cli import main
+from vical_daemon.vision.target import Checkerboard
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture
+def rig(tmp_path: Path):
+    """Write a config with an IMU on the given port and no camera."""
+
+    def write(port: str, more: str = "") -> str:
+        (tmp_path / "target.yaml").write_text(Checkerboard(8, 5, 0.05, 0.05).to_yaml())
+        (tmp_path / "vical.yaml").write_text(
+            f"imus: {{imu0: {{port: {port}, protocol: single-byte, rate_hz: 100}}}}\ntarget: target.yaml\n"
+            f"record: {{directory: {tmp_path / 'log'}}}\n{more}"
+        )
+        return str(tmp_path / "vical.yaml")
+
+    return write
+
+
+def test_all_is_well_with_an_emulated_imu(rig, capsys) -> None:
+    emulator = Gx3Emulator(link="direct", serial_number="6223-00042")
+    emulator.plug()
+    with emulator:
+        assert main(["check", "-c", rig(emulator.port_name)]) == 0
+    out = capsys.readouterr().out
+    assert "6223-00042" in out and "100.0 Hz" in out and out.rstrip().endswith("all is well")
+    assert "checkerboard, 40 points over 0.350 x 0.200 m" in out
+
+
+def test_a_port_where_nobody_answers_is_one_line(rig, capsys) -> None:
+    master, slave = pty.openpty()
+    try:
+        assert main(["check", "-c", rig(os.ttyname(slave))]) == 1
+    finally:
+        os.close(master)
+        os.close(slave)
+    out, err = capsys.readouterr()
+    assert "FAIL imus.imu0" in out and "Traceback" not in err
+    assert err.startswith("vical: error: ") and err.count("\n") == 1
+
+
+def test_json_lists_every_problem(rig, capsys) -> None:
+    config = rig("/dev/nothing", "cameras: {cam0: {uri: 'v4l2:/dev/video77'}}\n")
+    (Path(config).parent / "target.yaml").write_text("target_type: aprilgrid\ntagCols: 6\n")
+    assert main(["check", "-c", config, "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert result["ok"] is False and len(result["problems"]) == 3
+    assert [c["what"] for c in result["checked"] if c["problem"]] == ["target", "imus.imu0", "cameras.cam0"]
+
+
+def test_a_wrong_config_exits_2_with_all_of_it(rig, capsys) -> None:
+    config = rig("/dev/x", "rat: 5\nweb: {prt: 1}\n")
+    assert main(["check", "-c", config, "--no-devices"]) == 2
+    out, err = capsys.readouterr()
+    assert out.count("FAIL") == 2 and "and 1 more" in err
+
+
+def test_no_devices_opens_nothing(rig, capsys) -> None:
+    assert main(["check", "-c", rig("/dev/nothing"), "--no-devices"]) == 0
+    assert "imus.imu0" not in capsys.readouterr().out
