@@ -258,7 +258,7 @@ class StartErrors:
         focal_relative: Of the focal length, one-sigma.
         centre_px: Of the image centre, one-sigma.
         extrinsics: (angle rad, distance m), exact sizes in random directions; None: no mounting given.
-        timeshift_s: One-sigma; None: no time shift given.
+        timeshift_s: Size, of random sign; None: no time shift given.
     """
 
     focal_relative: float = 0.02
@@ -283,7 +283,7 @@ def camera_prior(run: SimulatedRun, seed: int, errors: StartErrors, *, exact_len
         extrinsics = (run.rig.R_imu_cam @ exp_so3(angle_rad * axis), run.rig.p_imu_cam + distance_m * offset)
     shift = None
     if errors.timeshift_s is not None:
-        shift = run.rig.timeshift_cam_imu_s + errors.timeshift_s * rng.standard_normal()
+        shift = run.rig.timeshift_cam_imu_s + errors.timeshift_s * float(rng.choice([-1.0, 1.0]))
     f = tuple(float(x) for x in intrinsics)
     return CameraPrior(
         lens.resolution,

@@ -8,6 +8,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from vical_mocks.points import SimulatedRun, simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
@@ -39,6 +40,7 @@ class Case:
         skew_ppm: Drift of the camera's clock.
         gravity_error_mps2: Added to the magnitude that the estimator is told.
         target_free: Landmarks instead of a board.
+        random_mounting: The camera points anywhere on the imu, 20 cm away.
         trials: How many when not told otherwise.
         simulation: Options of the simulation.
         rig: Changes of the rig.
@@ -52,6 +54,7 @@ class Case:
     skew_ppm: float = 0.0
     gravity_error_mps2: float = 0.0
     target_free: bool = False
+    random_mounting: bool = False
     trials: int = 100
     simulation: dict[str, Any] = field(default_factory=dict)
     rig: dict[str, Any] = field(default_factory=dict)
@@ -72,6 +75,10 @@ CASES: dict[str, Case] = {
     "given 10 deg 100 mm 50 ms off": Case(start=_FAR),
     "shift +200 ms": Case(timeshift_s=0.2, trials=20),
     "shift -200 ms": Case(timeshift_s=-0.2, trials=20),
+    "given 20 deg 200 mm 200 ms off": Case(
+        start=StartErrors(0.05, 10.0, (float(np.deg2rad(20.0)), 0.20), 0.2), trials=50
+    ),
+    "any mounting, nothing given": Case(start=StartErrors(0.05, 10.0), random_mounting=True, trials=50),
     "0.1 px": Case(simulation={"corner_sigma_px": 0.1}, trials=20),
     "5 % outliers, 30 % half-hidden": Case(
         simulation={"outlier_fraction": 0.05, "hidden_fraction": 0.3}, trials=20
@@ -89,7 +96,12 @@ def make_run(case: Case, seed: int, seconds: float) -> SimulatedRun:
     shift = case.timeshift_s
     if shift is None:
         shift = float(np.random.default_rng([seed, 61]).uniform(-0.05, 0.05))
-    rig = reference_rig(seed, timeshift_cam_imu_s=shift, clock_skew_ppm=case.skew_ppm, **case.rig)
+    changes = dict(case.rig)
+    if case.random_mounting:
+        rng = np.random.default_rng([seed, 62])
+        changes["R_imu_cam"] = Rotation.random(rng=rng).as_matrix()
+        changes["p_imu_cam"] = 0.2 * rng.standard_normal(3) / np.sqrt(3)
+    rig = reference_rig(seed, timeshift_cam_imu_s=shift, clock_skew_ppm=case.skew_ppm, **changes)
     make = simulate_tracks if case.target_free else simulate
     return make(seed, seconds, rig=rig, **case.simulation)
 

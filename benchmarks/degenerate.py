@@ -1,0 +1,106 @@
+"""Motions that do not show everything: never `converged`, the right direction named, the rest right."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from vical_mocks import trajectory
+from vical_mocks.points import simulate
+from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
+from vical_mocks.trajectory import Trajectory
+
+from benchmarks import runner
+from benchmarks.bound import Bound, BoundOptions, bounds
+from benchmarks.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
+from benchmarks.montecarlo import bound_sigmas
+from vical_daemon.estimation.measurements import CalibrationOptions
+
+_MOUNT = (NOMINAL_R_IMU_CAM, NOMINAL_P_IMU_CAM)
+MOTIONS: dict[str, Callable[[int], Trajectory]] = {
+    "still": lambda _: trajectory.still(T_imu_cam=_MOUNT),
+    "pure translation": lambda seed: trajectory.pure_translation(seed, T_imu_cam=_MOUNT),
+    "one axis (camera x)": lambda seed: trajectory.one_axis(seed, [1, 0, 0], T_imu_cam=_MOUNT),
+    "one axis (optical)": lambda seed: trajectory.one_axis(seed, [0, 0, 1], T_imu_cam=_MOUNT),
+    "constant rate": lambda _: trajectory.constant_rate(T_imu_cam=_MOUNT),
+    "fronto-parallel": lambda seed: trajectory.fronto_parallel(seed, T_imu_cam=_MOUNT),
+    "slow 1 deg/s": lambda seed: trajectory.hand_motion(seed, 1.0, T_imu_cam=_MOUNT),
+    "hand (control)": lambda seed: trajectory.hand_motion(seed, T_imu_cam=_MOUNT),
+}
+# With its prior only (StartErrors) a parameter is called lost by the bound above these sigmas.
+_LOST = np.array([5e-3] * 3 + [np.deg2rad(0.3)] * 3 + [1e-3])
+
+
+def trial(motion: str, lens_known: bool, given: bool, seconds: float, seed: int) -> runner.Result:
+    """One recording of a degenerate motion; `given`: mounting and shift are given roughly."""
+    rig = reference_rig(seed, timeshift_cam_imu_s=0.02, trajectory=MOTIONS[motion](seed))
+    run = simulate(seed, seconds, rig=rig)
+    start = (
+        StartErrors(extrinsics=(float(np.deg2rad(3.0)), 0.03), timeshift_s=0.005) if given else StartErrors()
+    )
+    prior = camera_prior(run, seed, start, exact_lens=lens_known)
+    fix = frozenset({"intrinsics"}) if lens_known else frozenset[str]()
+    record = feed(
+        run, CalibratorSubject(CalibrationOptions(fix=fix, imu_noise=imu_noise(run)), prior, run.points_m)
+    )
+    limit: Bound = bounds(run, BoundOptions(intrinsics=not lens_known, distortion=not lens_known))[0]
+    lost = [name for name, s, most in zip(PARAMETERS, bound_sigmas(limit), _LOST, strict=False) if s > most]
+    last = record.snapshots[-1] if record.snapshots else None
+    z = None if last is None else last.error[:7] / np.sqrt(np.diag(last.covariance))[:7]
+    return {
+        "ever_converged": any(status == "converged" for _, status, _ in record.statuses),
+        "statuses": record.statuses,
+        "reason": record.statuses[-1][2] if record.statuses else "",
+        "unobservable": record.unobservable,
+        "guidance": record.guidance,
+        "lost_by_bound": lost,
+        "z": z,
+        "sigma": None if last is None else np.sqrt(np.diag(last.covariance))[:7],
+        "events": record.events,
+    }
+
+
+def main(argv: list[str]) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks degenerate", description=__doc__)
+    runner.add_arguments(parser, trials=3, seconds=40.0)
+    parser.add_argument("--lens-known", action="store_true")
+    parser.add_argument("--given", action="store_true", help="mounting and shift are given roughly")
+    args = parser.parse_args(argv)
+    code = runner.fingerprint(
+        "vical_daemon/estimation", "benchmarks/feed.py", "benchmarks/degenerate.py", "mocks/vical_mocks"
+    )
+    print(
+        "| motion | ever converged | last status | lost by the bound | withheld | largest z of the rest "
+        "| reason |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for name in args.case or MOTIONS:
+        slug = "".join(c if c.isalnum() else "_" for c in name)
+        kind = f"{'known' if args.lens_known else 'unknown'}_{'given' if args.given else 'nothing'}"
+        results = runner.run_trials(
+            f"degenerate_{slug}_{kind}_{args.seconds:g}s",
+            partial(trial, name, args.lens_known, args.given, args.seconds),
+            runner.seeds_of(args),
+            args,
+            code,
+        )
+        print(_row(name, results), flush=True)
+    return 0
+
+
+def _row(name: str, results: list[runner.Result]) -> str:
+    converged = sum(r["ever_converged"] for r in results)
+    first = results[0]
+    status = ", ".join(sorted({r["statuses"][-1][1] for r in results if r["statuses"]}))
+    worst = 0.0
+    for r in results:
+        if r["z"] is not None:
+            rest = [z for p, z in zip(PARAMETERS, r["z"], strict=False) if p not in r["lost_by_bound"]]
+            worst = max(worst, float(np.nanmax(np.abs(rest), initial=0.0)))
+    return (
+        f"| {name} | {converged}/{len(results)} | {status} | {' '.join(first['lost_by_bound']) or '-'} "
+        f"| {'; '.join(first['unobservable']) or '-'} | {worst:.1f} | {first['reason']} |"
+    )
