@@ -1,0 +1,297 @@
+"""`vical td-icp INPUT`: temporal calibration alone, from the rotations of any sensors."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.options import add_json
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from vical_daemon.estimation.td_icp import TdIcpOptions, TdIcpResult
+    from vical_daemon.estimation.td_icp_joint import JointResult, OrientationStream
+    from vical_daemon.estimation.td_icp_monitor import DelayReport
+    from vical_daemon.priors import Initial
+    from vical_daemon.recording import Recording
+
+HELP = "the delay between imu, cameras and other sensors, from their rotations alone"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of COMMANDS."""
+    parser.add_argument(
+        "input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a trajectory file"
+    )
+    parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format (not needed for tracks)")
+    parser.add_argument("--initial", metavar="FILE", help="the lens and the imu's noise: Kalibr's files")
+    parser.add_argument("--camera", metavar="NAME", help="only this camera")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
+    parser.add_argument(
+        "--sensors",
+        metavar="A,B,C",
+        help="several sensors jointly: names of imus and cameras, topics with poses, odometry or attitude, "
+        "trajectory files (TUM, EuRoC)",
+    )
+    parser.add_argument(
+        "--search", metavar="S", type=float, default=5.0, help="look for delays up to +-S seconds (5)"
+    )
+    parser.add_argument(
+        "--watch",
+        metavar="S",
+        type=float,
+        help="also follow the delay through the recording in windows of S seconds",
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate and print; 1 if there is no answer."""
+    if not 0.0 < args.search <= 60.0:
+        raise CliError("--search must be above 0 and at most 60 seconds", EXIT_USAGE)
+    if args.watch is not None and not 3.0 <= args.watch <= 120.0:
+        raise CliError("--watch must be 3 to 120 seconds", EXIT_USAGE)
+    from vical_daemon.priors import Initial, read_initial
+
+    initial = read_initial(args.initial) if args.initial else Initial()
+    if not Path(args.input).exists():
+        raise CliError(f"{args.input} does not exist")
+    names = [name.strip() for name in (args.sensors or "").split(",") if name.strip()]
+    if names or _is_trajectory(Path(args.input)):
+        return _joint(args, initial, names)
+    return _single(args, initial)
+
+
+def _is_trajectory(path: Path) -> bool:
+    return path.is_file() and path.suffix in (".txt", ".csv", ".tum")
+
+
+def _options(args: argparse.Namespace, initial: Initial) -> TdIcpOptions:
+    from vical_daemon.estimation.td_icp import TdIcpOptions
+
+    noise = initial.imu_noise
+    if noise is None:
+        # an unknown imu: the default class, loosely
+        return TdIcpOptions(search_s=args.search, gyro_log_sigma=0.7)
+    return TdIcpOptions(search_s=args.search, gyro_density=noise.gyro_density, gyro_walk=noise.gyro_walk)
+
+
+def _open(path: str) -> Recording:
+    from vical_daemon.recording import open_recording
+
+    recording = open_recording(path, check=False)  # wrong units are found here, with the reason
+    for warning in recording.warnings:
+        print(f"vical: warning: {warning}", file=sys.stderr)
+    return recording
+
+
+def _gyro(
+    recording: Recording, name: str | None
+) -> tuple[str, npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    imus = recording.imus
+    if not imus:
+        raise CliError(f"{recording.path} holds no imu data")
+    if name is None and len(imus) > 1:
+        raise CliError(
+            f"{recording.path} holds the imus {', '.join(imus)}; choose one with --imu", EXIT_USAGE
+        )
+    chosen = name or next(iter(imus))
+    if chosen not in imus:
+        raise CliError(f"{recording.path} holds no imu {chosen!r}, only {', '.join(imus)}", EXIT_USAGE)
+    arrays = recording.imu_arrays(chosen)
+    return chosen, arrays.t_ns, arrays.gyro_rps
+
+
+def _single(args: argparse.Namespace, initial: Initial) -> int:
+    """One imu and one camera."""
+    from vical_daemon.cli.td_icp_sources import camera_stream, seconds
+    from vical_daemon.estimation.td_icp import REFUSED, td_icp
+
+    recording = _open(args.input)
+    cameras = recording.cameras
+    if not cameras:
+        raise CliError(f"{recording.path} holds no camera: neither images nor points")
+    if args.camera is None and len(cameras) > 1:
+        raise CliError(
+            f"{recording.path} holds the cameras {', '.join(cameras)}; choose one with --camera, "
+            "or several with --sensors",
+            EXIT_USAGE,
+        )
+    camera = args.camera or next(iter(cameras))
+    if camera not in cameras:
+        raise CliError(f"{recording.path} holds no camera {camera!r}, only {', '.join(cameras)}", EXIT_USAGE)
+    imu, t_ns, gyro = _gyro(recording, args.imu)
+    base = int(t_ns[0])
+    options = _options(args, initial)
+    stream = camera_stream(recording, cameras[camera], _prior(initial, camera), args.target, base)
+    t_imu = seconds(t_ns, base)
+    result = td_icp(t_imu, gyro, stream.t_s, stream.R_world_sensor, stream.rotation_sigma, options)
+    document: dict[str, Any] = {**result.to_json(), "imu": imu, "camera": camera}
+    if args.watch is not None and result.status != REFUSED:
+        document["watch"] = [_report_json(r) for r in _watch(t_imu, gyro, stream, options, args.watch)]
+    if args.json:
+        print(json.dumps(document))
+    elif result.status != REFUSED:
+        _print_single(imu, camera, result, document.get("watch", []))
+    if result.status == REFUSED:
+        raise CliError(f"no delay found: {result.reason}")
+    if result.reason:
+        print(f"vical: warning: {result.reason}", file=sys.stderr)
+    return 0
+
+
+def _prior(initial: Initial, camera: str) -> Any:
+    prior = initial.cameras.get(camera)
+    if prior is None and len(initial.cameras) == 1:
+        prior = next(iter(initial.cameras.values()))
+    return prior
+
+
+def _watch(
+    t_imu: npt.NDArray[np.float64],
+    gyro: npt.NDArray[np.float64],
+    stream: OrientationStream,
+    options: TdIcpOptions,
+    window_s: float,
+) -> list[DelayReport]:
+    """Replay the streams through the monitor in order of their stamps."""
+    import numpy as np
+
+    from vical_daemon.estimation.td_icp_monitor import DelayMonitor
+
+    monitor = DelayMonitor(options, window_s, window_s / 2.0)
+    sigma = np.asarray(stream.rotation_sigma)
+    reports, k = [], 0
+    ahead = options.search_s  # imu data beyond the camera's stamp, so that a positive delay finds its samples
+    for i, t in enumerate(stream.t_s):
+        while k < len(t_imu) and t_imu[k] <= t + ahead:
+            monitor.add_gyro(float(t_imu[k]), gyro[k])
+            k += 1
+        covariance = sigma[i] if sigma.ndim == 3 else np.eye(3) * float(sigma.mean()) ** 2
+        report = monitor.add_orientation(float(t), stream.R_world_sensor[i], covariance)
+        if report is not None:
+            reports.append(report)
+    return reports
+
+
+def _report_json(report: DelayReport) -> dict[str, Any]:
+    return {
+        "t_s": report.t_s,
+        "timeshift_s": report.timeshift_s,
+        "timeshift_sigma_s": report.timeshift_sigma_s,
+        "drift_ppm": 1e6 * report.drift,
+        "drift_sigma_ppm": 1e6 * report.drift_sigma,
+        "jumped": report.jumped,
+        "window_s": report.window.timeshift_cam_imu_s,
+        "window_sigma_s": report.window.timeshift_sigma_s,
+    }
+
+
+def _print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[str, Any]]) -> None:
+    import numpy as np
+
+    from vical_daemon.estimation.so3 import quat_from_matrix
+
+    q = quat_from_matrix(result.R_imu_cam)
+    sigma_deg, bias = np.rad2deg(result.rotation_sigma_rad), np.rad2deg(result.gyro_bias_rps)
+    print(
+        f"{camera} against {imu} ({result.status}), {result.pairs} orientations, {result.rejected} rejected"
+    )
+    print(
+        f"  time shift   {1e3 * result.timeshift_cam_imu_s:+.3f} +- {1e3 * result.timeshift_sigma_s:.3f} ms"
+    )
+    print("               t_imu = t_cam + shift")
+    print(f"  R_imu_cam    q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f}")
+    print(f"               +- {sigma_deg[0]:.3f} {sigma_deg[1]:.3f} {sigma_deg[2]:.3f} deg")
+    print(f"  gyro bias    {bias[0]:+.3f} {bias[1]:+.3f} {bias[2]:+.3f} deg/s")
+    print(f"  noise of one orientation  {np.rad2deg(result.camera_noise_rad):.3f} deg")
+    for row in watch:
+        jump = "  jumped" if row["jumped"] else ""
+        delay = f"{1e3 * row['timeshift_s']:+.3f} +- {1e3 * row['timeshift_sigma_s']:.3f} ms"
+        drift = f"{row['drift_ppm']:+.1f} +- {row['drift_sigma_ppm']:.1f} ppm"
+        print(f"  {row['t_s']:8.1f} s  {delay}  drift {drift}{jump}")
+
+
+def _joint(args: argparse.Namespace, initial: Initial, names: list[str]) -> int:
+    """Any number of sensors."""
+    from vical_daemon.estimation.td_icp import REFUSED
+
+    result = _register(args, initial, names)
+    if args.json:
+        print(json.dumps(result.to_json()))
+    elif result.status != REFUSED:
+        _print_joint(result)
+    if result.status == REFUSED:
+        raise CliError(f"no delays found: {result.reason}")
+    if result.reason:
+        print(f"vical: warning: {result.reason}", file=sys.stderr)
+    return 0
+
+
+def _register(args: argparse.Namespace, initial: Initial, names: list[str]) -> JointResult:
+    from vical_daemon.cli import td_icp_sources as sources
+    from vical_daemon.estimation.td_icp_joint import joint_of_orientations, joint_with_gyro
+
+    path = Path(args.input)
+    if _is_trajectory(path):
+        first, base = sources.trajectory_file(path, None)
+        others = [sources.trajectory_file(Path(name), base)[0] for name in names if _file(name)]
+        return joint_of_orientations([first, *others], _options(args, initial))
+    recording = _open(args.input)
+    gyros = [name for name in names if name in recording.imus]
+    if len(gyros) > 1:
+        raise CliError(f"one imu can be the reference, {' and '.join(gyros)} are two", EXIT_USAGE)
+    base = recording.begin_ns
+    streams = []
+    for name in names:
+        if name in gyros:
+            continue
+        if name in recording.cameras:
+            camera = recording.cameras[name]
+            streams.append(sources.camera_stream(recording, camera, _prior(initial, name), args.target, base))
+        elif Path(name).is_file():
+            streams.append(sources.trajectory_file(Path(name), base)[0])
+        elif name.startswith("/"):
+            streams.append(sources.pose_topic(recording, name, base))
+        else:
+            known = ", ".join([*recording.imus, *recording.cameras])
+            raise CliError(
+                f"--sensors: {name!r} is no sensor of the recording ({known}), no /topic and no file",
+                EXIT_USAGE,
+            )
+    if gyros:
+        imu, t_ns, gyro = _gyro(recording, gyros[0])
+        return joint_with_gyro(imu, sources.seconds(t_ns, base), gyro, streams, _options(args, initial))
+    return joint_of_orientations(streams, _options(args, initial))
+
+
+def _file(name: str) -> bool:
+    if not Path(name).is_file():
+        raise CliError(f"--sensors: {name} does not exist; with a trajectory as INPUT all sensors are files")
+    return True
+
+
+def _print_joint(result: JointResult) -> None:
+    import numpy as np
+
+    from vical_daemon.estimation.so3 import quat_from_matrix
+
+    print(f"reference: {result.reference}   (t_b = t_a + shift)")
+    for pair in result.pairs:
+        print(
+            f"  {pair.a:>12s} -> {pair.b:<12s} {1e3 * pair.timeshift_s:+10.3f} "
+            f"+- {1e3 * pair.timeshift_sigma_s:.3f} ms"
+        )
+    for name, sensor in result.sensors.items():
+        q = quat_from_matrix(sensor.R_ref_sensor)
+        sigma = np.rad2deg(sensor.rotation_sigma_rad).max()
+        print(
+            f"  {name}: R_{result.reference}_{name} q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f} "
+            f"+- {sigma:.3f} deg, {sensor.pairs} orientations, {sensor.rejected} rejected"
+        )
