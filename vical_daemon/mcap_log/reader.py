@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -26,8 +26,11 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK_LIMIT = 256 * 2**20
 # What the parsers of the mcap package and of lz4 raise on damaged input.
 _DAMAGE = (ValueError, RuntimeError, KeyError, OverflowError, EOFError, struct.error, McapError)
+_OP_MESSAGE = int(Opcode.MESSAGE)
 _LENGTH = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
+_END = struct.Struct("<BQQQI8s")  # footer and magic
+_SUMMARY_LIMIT = 64 * 2**20
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
 
 
@@ -42,9 +45,11 @@ class LogChannel:
     schema_encoding: str
 
 
-@dataclass(frozen=True, slots=True)
-class LogMessage:
-    """One message of a log; `log_time_ns` is when it was received (UNIX), not its own stamp."""
+class LogMessage(NamedTuple):
+    """One message of a log; `log_time_ns` is when it was received (UNIX), not its own stamp.
+
+    A tuple because millions of them are made.
+    """
 
     channel: LogChannel
     payload: bytes
@@ -106,6 +111,7 @@ class LogReader:
         size = self.path.stat().st_size
         try:
             with self.path.open("rb") as file:
+                self._learn_from_summary(file, size)
                 file.seek(len(MAGIC))
                 yield from self._read_data(file, size)
         except OSError as error:
@@ -125,6 +131,23 @@ class LogReader:
         self._channels.clear()
         self.complete = False
         self._damaged = 0
+
+    def _learn_from_summary(self, file: BinaryIO, size: int) -> None:
+        """Take topics from the end of the file, where they stand again: their own chunk may be damaged."""
+        file.seek(max(0, size - _END.size))
+        tail = file.read()
+        if len(tail) < _END.size or not tail.endswith(MAGIC):
+            return
+        opcode, length, begin, _, _, _ = _END.unpack(tail)
+        if opcode != Opcode.FOOTER or length != 20 or not 0 < begin < size - _END.size:
+            return
+        file.seek(begin)
+        summary = file.read(min(size - _END.size - begin, _SUMMARY_LIMIT))
+        try:
+            for _ in self._read_records(summary):
+                pass
+        except _DAMAGE:
+            return
 
     def _read_data(self, file: BinaryIO, size: int) -> Iterator[LogMessage]:
         while True:
@@ -187,7 +210,7 @@ class LogReader:
             position += _LENGTH.size
             if length > end - position:
                 return
-            if opcode == Opcode.MESSAGE:
+            if opcode == _OP_MESSAGE:
                 message = self._message(data, position, length)
                 if message is not None:
                     yield message

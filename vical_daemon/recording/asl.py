@@ -1,0 +1,282 @@
+"""Reads ASL/EuRoC folders: ``mav0/imu0/data.csv`` and ``mav0/cam0/`` with images, corners or tracks."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.messages import encode_compressed_image, encode_imu, encode_points
+from vical_daemon.recording.model import (
+    ImuArrays,
+    Kind,
+    Recording,
+    RecordingError,
+    Stream,
+    stream_statistics,
+)
+from vical_daemon.topics import TopicError, compressed_key, imu_key, points_key, tracks_key
+
+RIG = "rig0"
+_IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
+_POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
+_IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+_UNPACKED_LIMIT = 2 * 2**30
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A stream, its sorted stamps, and how to build its i-th message."""
+
+    stream: Stream
+    t_ns: IntArray
+    build: Callable[[int], bytes]
+
+
+class AslRecording(Recording):
+    """An ASL folder; numbers are kept bit for bit as the text says them."""
+
+    def __init__(self, folder: Path) -> None:
+        """Parse all tables (images are read later, one by one).
+
+        Raises:
+            RecordingError: No imu or no camera there, or a table that cannot be read.
+        """
+        self.path = folder
+        self.rig = RIG
+        self.warnings = []
+        self.imu_tables: dict[str, ImuArrays] = {}
+        root = folder / "mav0" if (folder / "mav0").is_dir() else folder
+        self._sources: list[_Source] = []
+        for table in sorted(root.glob("imu*/data.csv")):
+            self._sources.append(self._read_imu(table))
+        for camera in sorted(path for path in root.glob("cam*") if path.is_dir()):
+            source = self._read_camera(camera)
+            if source is not None:
+                self._sources.append(source)
+        self.streams = tuple(source.stream for source in self._sources)
+        if not self.streams:
+            raise RecordingError(
+                f"{folder} is no ASL folder: expected mav0/imu0/data.csv and mav0/cam0/ with data.csv, "
+                "corners.csv[.gz] or tracks.csv[.gz]"
+            )
+
+    def imu_arrays(self, name: str) -> ImuArrays:
+        """See `Recording.imu_arrays`."""
+        return self.imu_tables[name]
+
+    def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]:
+        sources = sorted(
+            (s for s in self._sources if s.stream.key in keys),
+            key=lambda s: (s.stream.kind != "imu", s.stream.key),
+        )
+        if not sources:
+            return
+        stamps = np.concatenate([source.t_ns for source in sources])
+        owner = np.concatenate([np.full(len(s.t_ns), i) for i, s in enumerate(sources)])
+        index = np.concatenate([np.arange(len(source.t_ns)) for source in sources])
+        order = np.lexsort((index, owner, stamps))
+        for which, i in zip(owner[order].tolist(), index[order].tolist(), strict=True):
+            source = sources[which]
+            yield source.stream.key, source.build(i)
+
+    def _read_imu(self, path: Path) -> _Source:
+        name = path.parent.name
+        rows = _load(path, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
+        finite = np.isfinite(rows["values"]).all(axis=1)
+        rows = self._sorted(rows[finite], name, drop_equal=True)
+        if not finite.all():
+            self.warnings.append(f"{name}: {int((~finite).sum())} samples that are not finite left out")
+        gyro = np.ascontiguousarray(rows["values"][:, :3])
+        force = np.ascontiguousarray(rows["values"][:, 3:])
+        t_ns = np.ascontiguousarray(rows["t"])
+        self.imu_tables[name] = ImuArrays(t_ns, gyro, force)
+        stamps, gyro_rows, force_rows = t_ns.tolist(), gyro.tolist(), force.tolist()
+
+        def build(i: int) -> bytes:
+            return encode_imu(stamps[i], name, gyro_rows[i], force_rows[i])
+
+        return _Source(self._stream("imu", name, path, t_ns), t_ns, build)
+
+    def _read_camera(self, folder: Path) -> _Source | None:
+        kinds: tuple[tuple[str, Kind], ...] = (("corners", "points"), ("tracks", "tracks"))
+        for stem, kind in kinds:
+            for path in (folder / f"{stem}.csv", folder / f"{stem}.csv.gz"):
+                if path.is_file():
+                    return self._read_points(path, folder.name, kind)
+        path = folder / "data.csv"
+        return self._read_images(path, folder) if path.is_file() else None
+
+    def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
+        rows = _load(path, _POINT_ROW, "timestamp [ns], id, u and v columns")
+        finite = np.isfinite(rows["uv"]).all(axis=1)
+        if not finite.all():
+            self.warnings.append(f"{name}: {int((~finite).sum())} points that are not finite left out")
+        rows = self._sorted(rows[finite], name, drop_equal=False)
+        rows = self._without_twins(rows, name)
+        t_ns, begins = np.unique(rows["t"], return_index=True)
+        ends = np.append(begins[1:], len(rows)).tolist()
+        ids, uv = np.ascontiguousarray(rows["id"]), np.ascontiguousarray(rows["uv"])
+        first, stamps = begins.tolist(), t_ns.tolist()
+        stream = self._stream(kind, name, path, t_ns)
+        size = stream.resolution or (0, 0)
+
+        def build(i: int) -> bytes:
+            part = slice(first[i], ends[i])
+            return encode_points(stamps[i], name, ids[part], uv[part], image_size=size)
+
+        return _Source(stream, t_ns, build)
+
+    def _read_images(self, table: Path, folder: Path) -> _Source:
+        stamps, files = _image_list(table, folder)
+        if not stamps:
+            raise RecordingError(f"{table}: no images listed")
+        order = np.argsort(np.array(stamps, dtype=np.int64), kind="stable")
+        t_ns = np.array(stamps, dtype=np.int64)[order]
+        files = [files[i] for i in order.tolist()]
+
+        def build(i: int) -> bytes:
+            path = files[i]
+            try:
+                data = path.read_bytes()
+            except OSError as error:
+                raise RecordingError(f"{path}: {error.strerror}") from None
+            return encode_compressed_image(
+                int(t_ns[i]), folder.name, _IMAGE_SUFFIXES[path.suffix.lower()], data
+            )
+
+        return _Source(self._stream("compressed", folder.name, table, t_ns), t_ns, build)
+
+    def _sorted(self, rows: npt.NDArray[Any], name: str, *, drop_equal: bool) -> npt.NDArray[Any]:
+        """Return the rows in order of their stamps."""
+        if (np.diff(rows["t"]) < 0).any():
+            self.warnings.append(f"{name}: rows were not in order of their stamps; sorted")
+            rows = rows[np.argsort(rows["t"], kind="stable")]
+        if drop_equal and len(rows):
+            fresh = np.append(True, np.diff(rows["t"]) > 0)
+            if not fresh.all():
+                self.warnings.append(f"{name}: {int((~fresh).sum())} samples with a repeated stamp left out")
+                rows = rows[fresh]
+        return rows
+
+    def _without_twins(self, rows: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+        """Keep the first of several points with one id in one image."""
+        order = np.lexsort((rows["id"], rows["t"]))
+        ordered = rows[order]
+        twin = np.append(False, (np.diff(ordered["t"]) == 0) & (np.diff(ordered["id"]) == 0))
+        if not twin.any():
+            return rows
+        self.warnings.append(f"{name}: {int(twin.sum())} points with an id seen twice in one image left out")
+        kept: npt.NDArray[Any] = rows[np.sort(order[~twin])]
+        return kept
+
+    def _stream(self, kind: Kind, name: str, path: Path, t_ns: IntArray) -> Stream:
+        keys = {"imu": imu_key, "points": points_key, "tracks": tracks_key, "compressed": compressed_key}
+        if not len(t_ns):
+            raise RecordingError(f"{path}: no data")
+        try:
+            key = keys[kind](RIG, name)
+        except TopicError as error:
+            raise RecordingError(f"{path}: {error}") from None
+        resolution = None if kind == "imu" else _resolution(path.parent)
+        return Stream(key, kind, name, str(path), *stream_statistics(t_ns), resolution)
+
+
+def _load(path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
+    """Parse a table of numbers, plain or gzipped; stamps as integers, no digit is lost."""
+    text = _read_text(path)
+    begin = _first_data_row(text)
+    try:
+        rows: npt.NDArray[Any] = np.loadtxt(
+            io.BytesIO(text[begin:]),
+            dtype=dtype,
+            delimiter=",",
+            comments="#",
+            ndmin=1,
+            usecols=range(_width(dtype)),
+        )
+    except (ValueError, OverflowError, UnicodeDecodeError) as error:
+        reason = str(error).split(";")[0].rstrip(".")
+        raise RecordingError(f"{path}: {reason}; expected {columns}") from None
+    return rows
+
+
+def _width(dtype: np.dtype[Any]) -> int:
+    names = dtype.names or ()
+    return sum(int(np.prod(dtype[name].shape)) for name in names)
+
+
+def _read_text(path: Path) -> bytes:
+    try:
+        if path.suffix != ".gz":
+            return path.read_bytes()
+        with gzip.open(path) as file:
+            text = file.read(_UNPACKED_LIMIT)
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        raise RecordingError(f"{path} is no sound gzip file; unpack or download it again") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from None
+    if not text.strip():
+        raise RecordingError(f"{path} is empty")
+    return text
+
+
+def _first_data_row(text: bytes) -> int:
+    """Return the offset behind a title line without ``#``."""
+    end = text.find(b"\n")
+    first = text[: end if end >= 0 else len(text)].strip()
+    if first and not first.startswith(b"#") and not first[:1].isdigit() and first[:1] not in b"-+":
+        return end + 1 if end >= 0 else 0
+    return 0
+
+
+def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path]]:
+    """Return stamps and files of ``data.csv``; names may not lead out of the folder."""
+    stamps, files = [], []
+    for number, line in enumerate(_read_text(table).decode("utf-8", "replace").splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        stamp, _, name = (part.strip() for part in line.partition(","))
+        name = name.split(",")[0].strip() or f"{stamp}.png"
+        if not stamp.lstrip("-").isdigit() or Path(name).name != name:
+            raise RecordingError(
+                f"{table} line {number}: expected 'timestamp [ns],filename', found '{line[:80]}'"
+            )
+        path = next((p for p in (folder / "data" / name, folder / name) if p.is_file()), None)
+        if path is None:
+            raise RecordingError(f"{table} line {number}: there is no image {name} beside it")
+        if path.suffix.lower() not in _IMAGE_SUFFIXES:
+            raise RecordingError(f"{path}: images must be png or jpg")
+        stamps.append(int(stamp))
+        files.append(path)
+    return stamps, files
+
+
+def _resolution(folder: Path) -> tuple[int, int] | None:
+    """Return the size of the images from ``sensor.yaml`` or the first PNG."""
+    sensor = folder / "sensor.yaml"
+    if sensor.is_file():
+        import yaml
+
+        try:
+            size = yaml.safe_load(sensor.read_text())["resolution"]
+            return int(size[0]), int(size[1])
+        except (yaml.YAMLError, OSError, KeyError, TypeError, ValueError, IndexError):
+            pass  # EuRoC's own files begin with %YAML:1.0 and are no YAML for some parsers
+    first = next(iter(sorted((folder / "data").glob("*.png"))), None)
+    if first is not None:
+        with first.open("rb") as file:
+            head = file.read(24)
+        if head[12:16] == b"IHDR":
+            width, height = struct.unpack(">II", head[16:24])
+            return width, height
+    return None
