@@ -13,6 +13,7 @@ from vical_mocks.points import SimulatedFrame, SimulatedRun
 from vical_mocks.rotations import exp_so3, log_so3
 
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.result import CameraEstimate
 
 FloatArray = npt.NDArray[np.float64]
 CAMERA = "cam0"
@@ -195,12 +196,7 @@ class CalibratorSubject:
             camera.intrinsics,
             camera.distortion,
         )
-        covariance = self._joint_covariance()
-        if covariance is None:  # only the published blocks, without what ties them
-            covariance = np.zeros((15, 15))
-            covariance[:6, :6] = np.asarray(pose.covariance)
-            sigmas = [camera.timeshift_sigma_s, *camera.intrinsics_sigma, *camera.distortion_sigma]
-            covariance[range(6, 15), range(6, 15)] = np.square(sigmas)
+        covariance = self._published_covariance(camera)
         gravity = np.asarray(estimate.gravity_world_mps2) - run.rig.gravity_world_mps2
         extra = {
             "nis_per_dof": estimate.nis_per_dof,
@@ -210,27 +206,42 @@ class CalibratorSubject:
         }
         return Snapshot(t_s, status, error, covariance, extra)
 
-    def _joint_covariance(self) -> FloatArray | None:
-        """Covariance of the whole calibration block from the filter itself."""
+    def _published_covariance(self, camera: CameraEstimate) -> FloatArray:
+        """What the estimate claims; the correlations between its blocks come from the filter."""
+        claimed = np.zeros((15, 15))
+        claimed[:6, :6] = np.asarray(camera.T_imu_cam.covariance)
+        sigmas = [camera.timeshift_sigma_s, *camera.intrinsics_sigma, *camera.distortion_sigma]
+        claimed[range(6, 15), range(6, 15)] = np.square(sigmas)
         inner = getattr(self.calibrator, "filter", None)
-        if inner is None or not hasattr(inner, "layout"):
-            return None
-        where = inner.layout.cameras[CAMERA]
-        rows: list[int] = []
-        places: list[int] = []
-        for block, first in (
+        if inner is None or not hasattr(inner, "covariance"):
+            return claimed
+        rows, places = self._rows(inner.layout.cameras[CAMERA])
+        joint = inner.covariance(rows)
+        correlation = joint / np.sqrt(np.outer(np.diag(joint), np.diag(joint)))
+        sigma = np.sqrt(np.diag(claimed))[places]
+        full = np.zeros((15, 15))
+        full[np.ix_(places, places)] = correlation * np.outer(sigma, sigma)
+        full[:6, :6] = claimed[:6, :6]
+        return full
+
+    @staticmethod
+    def _rows(where: Any) -> tuple[list[int], list[int]]:
+        """Rows of the calibration block in the filter, and their places in the error vector."""
+        shift = None if where.timeshift is None else slice(where.timeshift, where.timeshift + 1)
+        blocks = (
             (where.position, 0),
             (where.rotation, 3),
-            (None if where.timeshift is None else slice(where.timeshift, where.timeshift + 1), 6),
+            (shift, 6),
             (where.intrinsics, 7),
             (where.distortion, 11),
-        ):
+        )
+        rows: list[int] = []
+        places: list[int] = []
+        for block, first in blocks:
             if block is not None:
                 rows += range(block.start, block.stop)
                 places += range(first, first + block.stop - block.start)
-        covariance = np.zeros((15, 15))
-        covariance[np.ix_(places, places)] = inner.covariance(rows)
-        return covariance
+        return rows, places
 
 
 def _make_calibrator(options: CalibrationOptions, prior: CameraPrior, points_m: FloatArray | None) -> Any:

@@ -260,6 +260,8 @@ def main(argv: list[str]) -> int:
     if unknown:
         parser.error(f"no case {sorted(unknown)}; there are: {', '.join(CASES)}")
     kinds = ("vical", "ekf") if args.subject == "both" else (args.subject,)
+    for kind in kinds:
+        code_under_test(kind)  # now, not hours later: somebody may edit the code meanwhile
     all_results: dict[str, list[runner.Result]] = {}
     print(scores.HEADER)
     asked = args.trials

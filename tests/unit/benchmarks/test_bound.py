@@ -147,7 +147,7 @@ def test_noise_of_a_still_imu_is_the_textbook_one():
 
 
 def test_more_knowledge_never_makes_it_worse():
-    run = simulate(2, 4.0)
+    run = simulate(2, 2.5)
     sigma = {
         name: bounds(run, options)[0].sigma("p_imu_cam")
         for name, options in {
@@ -164,7 +164,7 @@ def test_more_knowledge_never_makes_it_worse():
 
 
 def test_stamp_jitter_costs_time_shift_only():
-    run = simulate(2, 4.0)
+    run = simulate(2, 2.5)
     calm, jittery = (bounds(run, BoundOptions(stamp_jitter_s=s))[0] for s in (0.0, 1e-3))
     expected = np.hypot(calm.sigma("timeshift")[0], 1e-3 / np.sqrt(len(run.frames)))
     assert jittery.sigma("timeshift")[0] == pytest.approx(expected, rel=0.25)
