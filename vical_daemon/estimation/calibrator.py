@@ -6,7 +6,6 @@ lag (so that inertial data always bracket each image) -> `judge` says how far to
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -18,6 +17,7 @@ from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameR
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
+from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_model import ImuBuffer
 from vical_daemon.estimation.judge import Judge
@@ -37,6 +37,7 @@ from vical_daemon.estimation.state import (
 _ATTEMPT_EVERY_S = 0.5
 _MAX_GAP_S = 0.5
 _KEEP_S = 5.0
+_LATE_S = 2e-3  # an image this little before the state is used by moving the pose back
 _SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
 _SKEW_OPEN = 1e-4  # s/s: two bad crystals
 
@@ -67,7 +68,7 @@ class Calibrator:
         self._buffer: ImuBuffer | None = None
         self._base_ns = 0
         self._waiting: dict[str, list[tuple[float, PointsFrame]]] = {name: [] for name in cameras}
-        self._pending: deque[tuple[float, PointsFrame]] = deque()
+        self._pending = FrameQueue(list(cameras))
         self._next_attempt_s = -np.inf
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
@@ -100,7 +101,7 @@ class Calibrator:
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
         t_cam_s = (frame.t_cam_ns - self._base_ns) * 1e-9
         self.judge.saw_points(t_cam_s, len(frame.ids))
-        self._pending.append((t_cam_s, frame))
+        self._pending.push(t_cam_s, frame)
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
@@ -125,8 +126,7 @@ class Calibrator:
 
     def _collect(self) -> None:
         """Move arrived frames to the starting set, thinning the oldest half when it grows too long."""
-        while self._pending:
-            t, frame = self._pending.popleft()
+        for t, frame in self._pending.take_all():
             waiting = self._waiting[frame.camera]
             waiting.append((t, frame))
             if len(waiting) > start.MAX_FRAMES:
@@ -148,14 +148,17 @@ class Calibrator:
             self.judge.waiting(result.reason, result.motion_missing)
             return
         begin = result.state.t_s
-        frames = sorted(
-            ((t, f) for w in self._waiting.values() for t, f in w if t >= begin - 0.5), key=lambda e: e[0]
-        )
+        shifts = {name: c.timeshift_s for name, c in result.state.cameras.items()}
+        frames = [
+            (t, f) for w in self._waiting.values() for t, f in w if t + shifts[f.camera] > begin - _LATE_S
+        ]
+        frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
         self.filter = self._rehearsed(result.state, frames)
         self.judge.started(begin)
         self.watch.started(begin)
         self._stale = None
-        self._pending.extendleft(reversed(frames))
+        for t, frame in frames:
+            self._pending.push(t, frame)
         for waiting in self._waiting.values():
             waiting.clear()
 
@@ -208,17 +211,12 @@ class Calibrator:
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
         reports: list[FrameReport] = []
-        while self._pending and self.filter is not None and self._buffer is not None:
-            t_cam_s, frame = self._pending[0]
-            t_s = t_cam_s + self.filter.state.cameras[frame.camera].timeshift_s
-            if t_s > self._buffer.newest_s:
-                if flush:
-                    self.judge.frames_ignored += 1
-                    self._pending.popleft()
-                    continue
+        while self.filter is not None and self._buffer is not None:
+            shifts = {name: c.timeshift_s for name, c in self.filter.state.cameras.items()}
+            item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
+            if item is None:
                 break
-            self._pending.popleft()
-            report = self._one(frame, t_cam_s)
+            report = self._one(item[1], item[0])
             if report is not None:
                 reports.append(report)
         return reports
@@ -227,6 +225,8 @@ class Calibrator:
         """Propagate a filter to one image and correct it; None where inertial data are missing."""
         assert self._buffer is not None
         t_s = t_cam_s + f.state.cameras[frame.camera].timeshift_s
+        if t_s < f.state.t_s - _LATE_S:
+            return None
         if t_s > f.state.t_s:
             segment = self._buffer.segment(f.state.t_s, t_s)
             if segment is None:

@@ -1,0 +1,156 @@
+"""The estimator as the roles see it, on simulated corners: truth, changes, bad input, repeatability."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.result import Status
+from vical_mocks.points import simulate
+from vical_mocks.rig import Bump, reference_rig
+
+
+def prior(run):
+    lens = run.rig.lens
+    return {"cam0": CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))}
+
+
+def calibrate(run, options=None, cameras=None, force_scale=1.0, each=None):
+    c = Calibrator(
+        options or CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise()),
+        cameras or prior(run),
+        run.points_m,
+    )
+    frames = iter(run.frames)
+    frame = next(frames, None)
+    for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True):
+        c.add_imu(int(t), w, f * force_scale)
+        while frame is not None and frame.t_cam_ns <= t:
+            c.add_points(PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px))
+            c.process()
+            if each is not None:
+                each(c)
+            frame = next(frames, None)
+    c.finish()
+    return c
+
+
+def errors(estimate, run, t_s=None):
+    """Error over sigma for [p r shift], sigma of each."""
+    truth = run.truth(t_s)["cameras"]["cam0"]
+    e = estimate.cameras["cam0"]
+    turn = Rotation.from_quat(np.roll(truth["T_imu_cam"]["q_wxyz"], -1)).inv() * Rotation.from_quat(
+        np.roll(e.T_imu_cam.q_wxyz, -1)
+    )
+    x = np.concatenate(
+        [
+            np.array(e.T_imu_cam.p_m) - truth["T_imu_cam"]["p_m"],
+            turn.as_rotvec(),
+            [e.timeshift_cam_imu_s - truth["timeshift_cam_imu_s"]],
+        ]
+    )
+    return x, np.sqrt([*np.diag(e.T_imu_cam.covariance), e.timeshift_sigma_s**2])
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate(5, 12.0, timeshift_cam_imu_s=-0.035)
+
+
+@pytest.fixture(scope="module")
+def done(run):
+    return calibrate(run)
+
+
+def test_nothing_is_known_about_mounting_and_delay_and_all_is_found(run, done):
+    estimate = done.estimate()
+    x, sigma = errors(estimate, run)
+    assert estimate.status == Status.CONVERGED
+    assert np.abs(x / sigma).max() < 4.0
+    assert np.all(sigma[:3] < 1e-3)
+    assert np.all(sigma[3:6] < np.deg2rad(0.05))
+    assert sigma[6] < 1e-4
+    assert estimate.nis_per_dof == pytest.approx(1.0, abs=0.2)
+    assert len(done.trace("cam0")) >= 8
+
+
+def test_runs_are_bit_identical(run, done):
+    again = calibrate(run).estimate()
+    assert again.cameras["cam0"] == done.estimate().cameras["cam0"]
+
+
+def test_still_rig_never_converges_and_says_why():
+    still = simulate(1, 25.0, rig=reference_rig(1, mean_rate_dps=0.05))
+    c = calibrate(still)
+    estimate = c.estimate()
+    assert estimate.status in (Status.DEGENERATE, Status.INITIALISING)
+    assert estimate.reason
+
+
+def test_accelerometer_in_g_is_named(run):
+    estimate = calibrate(run, force_scale=1 / 9.80665).estimate()
+    assert estimate.status == Status.INCONSISTENT
+    assert "in g" in estimate.reason
+
+
+def test_a_knock_is_announced_and_followed():
+    rig = reference_rig(2, bumps=(Bump(12.0, timeshift_s=0.02),))
+    knocked = simulate(2, 24.0, rig=rig)
+    events = []
+
+    def each(c):
+        estimate = c.estimate()
+        events.extend((c.filter.state.t_s if c.filter else None, e) for e in estimate.events)
+
+    estimate = calibrate(knocked, each=each).estimate()
+    assert any(e.startswith("bumped") for _, e in events)
+    x, sigma = errors(estimate, knocked)
+    assert estimate.status == Status.CONVERGED
+    assert np.abs(x / sigma).max() < 4.5
+
+
+def test_junk_is_counted_and_never_raises(run):
+    c = Calibrator(CalibrationOptions(), prior(run), run.points_m)
+    c.add_points(PointsFrame("cam0", 1, np.array([1]), np.zeros((1, 2))))
+    c.add_imu(1000, [0.0, np.nan, 0.0], [0.0, 0.0, 9.8])
+    for k in range(100):
+        c.add_imu(10**7 * (k + 1), np.zeros(3), [0.0, 0.0, 9.8])
+    c.add_imu(5, np.zeros(3), [0.0, 0.0, 9.8])
+    c.add_points(PointsFrame("nobody", 10**8, np.array([1]), np.zeros((1, 2))))
+    c.add_points(PointsFrame("cam0", 10**8, np.array([-1, 10**6, 2]), np.full((3, 2), np.inf)))
+    c.process()
+    c.finish()
+    estimate = c.estimate()
+    assert c.judge.imu_refused == 2
+    assert c.judge.frames_ignored >= 1
+    assert estimate.status in (Status.WAITING, Status.INITIALISING)
+    assert estimate.to_json()["status"] == str(estimate.status)
+
+
+def test_two_cameras_on_one_imu_are_estimated_together(run):
+    """The second camera is the first one's data under another name, delayed: both must agree."""
+    c = Calibrator(
+        CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise()),
+        {"cam0": prior(run)["cam0"], "cam1": prior(run)["cam0"]},
+        run.points_m,
+    )
+    frames = list(run.frames)
+    k = 0
+    for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True):
+        c.add_imu(int(t), w, f)
+        while k < len(frames) and frames[k].t_cam_ns <= t:
+            frame = frames[k]
+            name = "cam0" if k % 2 else "cam1"
+            late = 7_000_000 if name == "cam1" else 0
+            c.add_points(PointsFrame(name, frame.t_cam_ns + late, frame.ids, frame.uv_px))
+            c.process()
+            k += 1
+    c.finish()
+    cameras = c.estimate().cameras
+    difference = cameras["cam1"].timeshift_cam_imu_s - cameras["cam0"].timeshift_cam_imu_s
+    assert difference == pytest.approx(
+        -0.007, abs=4 * (cameras["cam0"].timeshift_sigma_s + cameras["cam1"].timeshift_sigma_s)
+    )
+    gap = np.array(cameras["cam1"].T_imu_cam.p_m) - cameras["cam0"].T_imu_cam.p_m
+    assert np.linalg.norm(gap) < 4e-3

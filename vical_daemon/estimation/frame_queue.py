@@ -1,0 +1,61 @@
+"""Images that wait for the filter, in the order of the imu's clock whatever each camera's delay is."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from vical_daemon.estimation.measurements import PointsFrame
+
+_WAIT_S = 0.3  # for a camera that lags behind the others
+_MOST = 2000  # images per camera; the oldest go first
+
+
+class FrameQueue:
+    """One queue per camera, merged by `stamp + time shift`.
+
+    Args:
+        cameras: Names.
+    """
+
+    def __init__(self, cameras: list[str]) -> None:
+        self._queues: dict[str, deque[tuple[float, PointsFrame]]] = {n: deque() for n in cameras}
+        self.dropped = 0
+
+    def push(self, t_cam_s: float, frame: PointsFrame) -> None:
+        """Append an image; stamps of one camera that go backwards are dropped and counted."""
+        queue = self._queues[frame.camera]
+        if queue and t_cam_s <= queue[-1][0]:
+            self.dropped += 1
+            return
+        queue.append((t_cam_s, frame))
+        if len(queue) > _MOST:
+            queue.popleft()
+            self.dropped += 1
+
+    def pop(
+        self, shifts_s: dict[str, float], newest_imu_s: float, *, flush: bool
+    ) -> tuple[float, PointsFrame] | None:
+        """Return the next image that inertial data bracket; None while there is none.
+
+        Args:
+            shifts_s: Present time shift of each camera.
+            newest_imu_s: Time of the newest inertial reading.
+            flush: No more data will come: do not wait for the other cameras.
+        """
+        heads = {name: q[0][0] + shifts_s[name] for name, q in self._queues.items() if q}
+        if not heads:
+            return None
+        first = min(heads, key=lambda name: heads[name])
+        if heads[first] > newest_imu_s:
+            return None
+        waits = len(heads) < len(self._queues) and newest_imu_s < heads[first] + _WAIT_S
+        if waits and not flush:
+            return None
+        return self._queues[first].popleft()
+
+    def take_all(self) -> list[tuple[float, PointsFrame]]:
+        """Empty the queues."""
+        out = [item for q in self._queues.values() for item in q]
+        for q in self._queues.values():
+            q.clear()
+        return sorted(out, key=lambda item: item[0])
