@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from vical_daemon.topics import parse_key
+
 
 @dataclass(frozen=True, slots=True)
 class Sample:
@@ -101,35 +103,22 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
     return bool(chunks) and pattern[0] in ("*", chunks[0]) and _match(pattern[1:], chunks[1:])
 
 
-class LocalSubscription:
-    """Subscription of a `LocalBus`: a deque guarded by a condition."""
+class SampleQueue:
+    """A bounded queue between the bus and a reader; what does not fit is counted."""
 
-    def __init__(
-        self, bus: LocalBus, expression: str, handler: Handler | None, depth: int, newest_wins: bool
-    ) -> None:
-        self.expression = expression
-        self.handler = handler
-        self._bus = bus
+    def __init__(self, depth: int, newest_wins: bool) -> None:
         self._depth = depth
         self._newest_wins = newest_wins
         self._queue: deque[Sample] = deque()
         self._ready = threading.Condition()
-        self._dropped = 0
         self._closed = False
+        self.dropped = 0
 
-    @property
-    def dropped(self) -> int:
-        """Samples lost to a full queue."""
-        return self._dropped
-
-    def deliver(self, sample: Sample) -> None:
-        """Hand one sample over (called by the bus)."""
-        if self.handler is not None:
-            self.handler(sample)
-            return
+    def put(self, sample: Sample) -> None:
+        """Append a sample; when full the oldest or this one goes, never waits."""
         with self._ready:
             if len(self._queue) >= self._depth:
-                self._dropped += 1
+                self.dropped += 1
                 if not self._newest_wins:
                     return
                 self._queue.popleft()
@@ -137,17 +126,49 @@ class LocalSubscription:
             self._ready.notify()
 
     def recv(self, timeout_s: float | None = None) -> Sample | None:
-        """Return the next sample, or None after the timeout or once closed."""
+        """Return the next sample, or None after the timeout or once closed and empty."""
         with self._ready:
             self._ready.wait_for(lambda: self._queue or self._closed, timeout_s)
             return self._queue.popleft() if self._queue else None
 
     def close(self) -> None:
-        """Leave the bus and wake whoever waits."""
-        self._bus.remove(self)
+        """Wake whoever waits; what is queued can still be taken."""
         with self._ready:
             self._closed = True
             self._ready.notify_all()
+
+
+class LocalSubscription:
+    """Subscription of a `LocalBus`."""
+
+    def __init__(
+        self, bus: LocalBus, expression: str, handler: Handler | None, depth: int, newest_wins: bool
+    ) -> None:
+        self.expression = expression
+        self._bus = bus
+        self._handler = handler
+        self._queue = SampleQueue(depth, newest_wins)
+
+    @property
+    def dropped(self) -> int:
+        """Samples lost to a full queue."""
+        return self._queue.dropped
+
+    def deliver(self, sample: Sample) -> None:
+        """Hand one sample over (called by the bus)."""
+        if self._handler is not None:
+            self._handler(sample)
+        else:
+            self._queue.put(sample)
+
+    def recv(self, timeout_s: float | None = None) -> Sample | None:
+        """Return the next sample, or None after the timeout or once closed."""
+        return self._queue.recv(timeout_s)
+
+    def close(self) -> None:
+        """Leave the bus and wake whoever waits."""
+        self._bus.remove(self)
+        self._queue.close()
 
 
 class LocalBus:
@@ -165,7 +186,9 @@ class LocalBus:
             number = self._numbers.get(key, 0)
             self._numbers[key] = number + 1
             sample = Sample(key, payload, number)
-            self._last[key] = sample
+            parsed = parse_key(key)
+            if parsed is not None and parsed.topic.keep_last:
+                self._last[key] = sample
             targets = [s for s in self._subscriptions if key_matches(s.expression, key)]
         for subscription in targets:
             subscription.deliver(sample)

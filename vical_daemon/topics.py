@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 from vical_daemon import messages
 
@@ -140,6 +141,7 @@ def check_name(name: str) -> str:
     return name
 
 
+@lru_cache(maxsize=1024)
 def parse_key(key: str) -> ParsedKey | None:
     """Tell what a key of ours says; None for a key that is not in the table.
 

@@ -215,9 +215,8 @@ def test_full_disk_is_an_error_and_costs_only_the_end(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "write", full)
-    fill(writer, 10, 200)  # in memory only
     with pytest.raises(LogError, match="No space left"):
-        writer.flush()
+        fill(writer, 200, 200)
     with pytest.raises(LogError, match="No space left"):
         writer.close()
     monkeypatch.setattr(os, "write", real)
