@@ -17,6 +17,7 @@ from vical_daemon.vision.guided import (
     check_codes,
     complete_board,
     predict_with_residuals,
+    refine_missing,
     refine_predicted,
 )
 from vical_daemon.vision.layout import BoardLayout
@@ -144,12 +145,7 @@ class BoardDetector:
         model, predicted = start
         fix = refine_predicted(picture, self._layout, model, predicted, search_px=5.0)
         if fix is not None:
-            missing = BoardFix(fix.uv_px, fix.sigma_px, fix.found, fix.model)
-            again = refine_predicted(
-                picture, self._layout, fix.model, predict_with_residuals(missing, self._layout), 3.0
-            )
-            fix = again if again is not None else fix
-            fix = check_codes(picture, self._layout, fix)
+            fix = check_codes(picture, self._layout, refine_missing(picture, self._layout, fix))
         if fix is None or not self._holds(fix, picture.shape):
             self.stats.losses += 1
             return None
@@ -187,11 +183,7 @@ class BoardDetector:
         if good.sum() < 4:
             return None
         where = after.reshape(-1, 2)[good].astype(np.float64)
-        model = fit_grid(
-            self._layout.xy_m[chosen[good]], where, gray.shape, float(memory.fix.model.parameters[8])
-        )
-        if model is None:
-            return None
+        model = memory.fix.model.refit(self._layout.xy_m[chosen[good]], where)
         shift = predict_with_residuals(memory.fix, self._layout) - memory.fix.model.predict(self._layout.xy_m)
         return model, model.predict(self._layout.xy_m) + shift
 

@@ -68,7 +68,7 @@ def complete_board(
     if model is None:
         return None
     keep = known.copy()
-    keep[known] = ~outliers(model, layout.xy_m[known], uv_px[known], floor_px=2.5)
+    keep &= ~outliers(uv_px - model.predict(layout.xy_m), known, layout.neighbours, floor_px=2.5)
     if keep.sum() < 4:
         return None
     return grow_board(image, layout, model.refit(layout.xy_m[keep], uv_px[keep]), uv_px, keep)
@@ -78,14 +78,13 @@ def grow_board(
     image: SaddleImage, layout: BoardLayout, model: GridModel, uv_px: FloatArray, known: BoolArray
 ) -> BoardFix | None:
     """Refine `known` corners and find the others around them, nearest first by rounds."""
-    fix = BoardFix(uv_px.copy(), np.full(len(uv_px), np.inf), known.copy(), model)
+    start = BoardFix(uv_px, np.full(len(uv_px), np.inf), known, model)
+    fix = refine_predicted(image, layout, model, predict_with_residuals(start, layout), search_px=3.0)
+    if fix is None:
+        return None
     for _ in range(GROW_ROUNDS):
-        before = int(np.isfinite(fix.sigma_px).sum())
-        predicted = predict_with_residuals(fix, layout)
-        grown = refine_predicted(image, layout, fix.model, predicted, search_px=3.0)
-        if grown is None:
-            return None
-        fix = grown
+        before = int(fix.found.sum())
+        fix = refine_missing(image, layout, fix)
         if int(fix.found.sum()) <= before:
             break
     return check_codes(image, layout, fix)
@@ -95,10 +94,13 @@ def predict_with_residuals(fix: BoardFix, layout: BoardLayout) -> FloatArray:
     """Predict all corners: found ones where they are, others by the model plus what near ones miss it by."""
     predicted = fix.model.predict(layout.xy_m)
     residual = (fix.uv_px - predicted)[fix.found]
-    apart = np.linalg.norm(layout.xy_m[:, None] - layout.xy_m[None, fix.found], axis=2)
-    weight = 1.0 / (apart + 1e-3 * fix.model.scale_m) ** 4
-    weight /= weight.sum(axis=1, keepdims=True)
-    return np.where(fix.found[:, None], fix.uv_px, predicted + weight @ residual)
+    missing = ~fix.found
+    if missing.any():
+        apart = np.linalg.norm(layout.xy_m[missing, None] - layout.xy_m[None, fix.found], axis=2)
+        weight = 1.0 / (apart + 1e-3 * fix.model.scale_m) ** 4
+        predicted[missing] += (weight @ residual) / weight.sum(axis=1, keepdims=True)
+    predicted[fix.found] = fix.uv_px[fix.found]
+    return predicted
 
 
 def refine_predicted(
@@ -133,19 +135,46 @@ def refine_predicted(
     if ok.sum() < 4:
         return None
     ok &= contrast > MIN_CONTRAST * float(np.median(contrast[ok]))
-    xy = layout.xy_m[index]
-    for _ in range(2):
-        if ok.sum() < 4:
-            return None
-        model = model.refit(xy[ok], saddles.uv_px[ok])
-        ok[ok] = ~outliers(model, xy[ok], saddles.uv_px[ok])
-    if ok.sum() < 4:
-        return None
     uv, sigma = np.full((len(usable), 2), np.nan), np.full(len(usable), np.inf)
     uv[index], sigma[index] = saddles.uv_px, saddles.sigma_px
     found = np.zeros(len(usable), bool)
     found[index] = ok
-    return BoardFix(uv, np.where(found, sigma, np.inf), found, model)
+    return consistent(layout, BoardFix(uv, sigma, found, model))
+
+
+def consistent(layout: BoardLayout, fix: BoardFix) -> BoardFix | None:
+    """Fit the model to the corners found and drop those that stand out; None below four."""
+    model, found = fix.model, fix.found.copy()
+    for _ in range(2):
+        if found.sum() < 4:
+            return None
+        model = model.refit(layout.xy_m[found], fix.uv_px[found])
+        wrong = outliers(fix.uv_px - model.predict(layout.xy_m), found, layout.neighbours)
+        found &= ~wrong
+        if not wrong.any():
+            break
+    if found.sum() < 4:
+        return None
+    return BoardFix(fix.uv_px, np.where(found, fix.sigma_px, np.inf), found, model)
+
+
+def refine_missing(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> BoardFix:
+    """Look once more for the corners that are not found yet, from where their neighbours put them."""
+    predicted = predict_with_residuals(fix, layout)
+    predicted[fix.found] = np.nan
+    height, width = image.shape
+    with np.errstate(invalid="ignore"):
+        predicted[~((predicted > 0) & (predicted < [width, height])).all(axis=1)] = np.nan
+    more = refine_predicted(image, layout, fix.model, predicted, search_px=3.0)
+    if more is None:
+        return fix
+    merged = BoardFix(
+        np.where(fix.found[:, None], fix.uv_px, more.uv_px),
+        np.minimum(fix.sigma_px, more.sigma_px),
+        fix.found | more.found,
+        fix.model,
+    )
+    return consistent(layout, merged) or fix
 
 
 def corner_contrast(

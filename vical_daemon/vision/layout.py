@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.vision.detection import FloatArray
+from vical_daemon.vision.detection import FloatArray, IntArray
+from vical_daemon.vision.grid_model import neighbour_table
 from vical_daemon.vision.target import AprilGrid, Target
 
 TAG_BORDER_SHARE = 0.2
@@ -24,24 +25,27 @@ class BoardLayout:
         xy_m: Corner positions on the board, shape (n, 2), m; the row index is the point id.
         polarity: -1 where the sectors towards (+x, +y) and (-x, -y) are black, +1 where the other two are.
         reach_m: Distance along the axes within which a corner's four sectors are undisturbed, m.
+        neighbours: Nearest other corners of each, see `grid_model.neighbour_table`.
     """
 
     target: Target
     xy_m: FloatArray
     polarity: npt.NDArray[np.int64]
     reach_m: float
+    neighbours: IntArray
 
     @classmethod
     def of(cls, target: Target) -> BoardLayout:
         """Derive the layout of a target."""
         xy = np.ascontiguousarray(target.points_m[:, :2])
         index = np.arange(len(xy))
+        near = neighbour_table(xy)
         if isinstance(target, AprilGrid):
             reach = min(TAG_BORDER_SHARE * target.tag_size_m, target.gap_m)
-            return cls(target, xy, np.where(index % 2 == 0, -1, 1), reach)
+            return cls(target, xy, np.where(index % 2 == 0, -1, 1), reach, near)
         row, col = np.divmod(index, target.cols)
         reach = SQUARE_SHARE * min(target.row_spacing_m, target.col_spacing_m)
-        return cls(target, xy, np.where((row + col) % 2 == 0, -1, 1), reach)
+        return cls(target, xy, np.where((row + col) % 2 == 0, -1, 1), reach, near)
 
     def radius_px(self, axes_px: FloatArray) -> FloatArray:
         """Radius of a window that stays within `reach_m`, px, from the local axes (n, 2, 2) in px per m."""

@@ -31,8 +31,10 @@ SMOOTHED_NOISE = 0.10
 """Variance of white pixel noise after the smoothing and an average bilinear look-up."""
 GRID = 32
 """`cv2.remap` looks up on a grid of 1/32 px: centres are put on it, the rest is solved for."""
-RADII = (2, 3, 4, 5, 6, 7)
-SADDLE_STEPS = 3
+RADII = (2, 3, 4, 6)
+SADDLE_STEPS = 4
+NEAR_PX = 0.4
+"""Saddle steps stop when all corners are this close; the symmetry steps do the rest."""
 SYMMETRY_STEPS = 2
 SIGMA_FLOOR_PX = 0.008
 """Errors that the residual does not show: edge curvature by distortion, interpolation."""
@@ -74,7 +76,7 @@ class SaddleImage:
         """
         count = len(uv_px)
         found = Saddles(uv_px.copy(), np.full(count, np.inf), np.zeros(count, bool))
-        bins = np.clip(np.floor(radius_px), RADII[0], RADII[-1])
+        bins = np.array(RADII)[np.searchsorted(RADII, np.clip(radius_px, RADII[0], None), side="right") - 1]
         limit = np.broadcast_to(np.asarray(max_shift_px, np.float64), (count,))
         for radius in RADII:
             chosen = np.flatnonzero((bins == radius) & self._inside(uv_px, radius))
@@ -101,6 +103,8 @@ class SaddleImage:
             ok &= saddle
             uv = np.where(ok[:, None], uv + step, uv)
             ok &= (np.linalg.norm(uv - start, axis=1) <= limit) & self._inside(uv, radius)
+            if not np.any(np.abs(step[ok]) > NEAR_PX):
+                break
         sigma = np.full(len(start), np.inf)
         for _ in range(SYMMETRY_STEPS):
             centre = np.round(uv * GRID) / GRID
@@ -157,6 +161,14 @@ def _window(radius: int) -> tuple[FloatArray, npt.NDArray[np.float32]]:
     return weight, fit[:5].astype(np.float32)
 
 
+@lru_cache(maxsize=16)
+def _half_window(radius: int) -> tuple[npt.NDArray[np.float32], float]:
+    """Weight and its square for one pixel of each symmetric pair, shape (pairs, 2); sum of all weights."""
+    weight, _ = _window(radius)
+    half = weight.ravel()[: weight.size // 2]
+    return np.stack([half, half * half], axis=1).astype(np.float32), float(weight.sum())
+
+
 def _saddle_step(patches: Patches, radius: int) -> tuple[FloatArray, BoolArray]:
     """Step to the stationary point of the fitted quadratic, and whether that is a saddle."""
     _, fit = _window(radius)
@@ -175,28 +187,32 @@ def _symmetry_step(
     patches: Patches, radius: int, noise_dn: float
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Step to the centre of point symmetry, its sigma, and whether the system could be solved."""
-    weight, _ = _window(radius)
-    gx = (patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]) * 0.5
-    gy = (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]) * 0.5
-    gx, gy = (gx - gx[:, ::-1, ::-1]) * 0.5, (gy - gy[:, ::-1, ::-1]) * 0.5
-    inner = patches[:, 1:-1, 1:-1]
-    difference = inner - inner[:, ::-1, ::-1]
-    gradient = np.stack([gx, gy], axis=-1).reshape(len(patches), -1, 2).astype(np.float64)
-    w = weight.reshape(1, -1, 1)
-    flat = difference.reshape(len(patches), -1, 1).astype(np.float64)
-    weighted = gradient * w
-    M = np.swapaxes(weighted, 1, 2) @ gradient
-    right = np.sum(weighted * flat, axis=1) * -0.5
-    spread = np.swapaxes(weighted, 1, 2) @ weighted
-    det = M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] ** 2
-    solved = det > 1e-9 * (M[:, 0, 0] + M[:, 1, 1]) ** 2 + 1e-9
-    inverse = np.linalg.inv(np.where(solved[:, None, None], M, np.eye(2)))
-    step = np.einsum("nij,nj->ni", inverse, right)
-    length = np.linalg.norm(step, axis=1)
-    step *= np.minimum(1.0, 1.0 / np.maximum(length, 1e-9))[:, None]
-    left_over = flat[..., 0] + 2 * np.einsum("npk,nk->np", gradient, step)
-    local = np.sum(w[..., 0] * left_over**2, axis=1) / (2 * np.sum(weight) * SMOOTHED_NOISE)
+    weights, total = _half_window(radius)
+    gx = (patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]).reshape(len(patches), -1)
+    gy = (patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]).reshape(len(patches), -1)
+    level = patches[:, 1:-1, 1:-1].reshape(len(patches), -1)
+    # Gradients and differences are odd about the centre: one half of the window says everything.
+    half = len(weights)
+    gx = (gx[:, :half] - gx[:, : -half - 1 : -1]) * np.float32(0.25)
+    gy = (gy[:, :half] - gy[:, : -half - 1 : -1]) * np.float32(0.25)
+    difference = level[:, :half] - level[:, : -half - 1 : -1]
+    xx, xx2 = (2.0 * (gx * gx) @ weights).T.astype(np.float64)
+    xy, xy2 = (2.0 * (gx * gy) @ weights).T.astype(np.float64)
+    yy, yy2 = (2.0 * (gy * gy) @ weights).T.astype(np.float64)
+    rx = -((gx * difference) @ weights[:, 0]).astype(np.float64)
+    ry = -((gy * difference) @ weights[:, 0]).astype(np.float64)
+    unlike = 2.0 * ((difference * difference) @ weights[:, 0]).astype(np.float64)
+    det = xx * yy - xy * xy
+    solved = det > 1e-9 * (xx + yy) ** 2 + 1e-9
+    det = np.where(solved, det, 1.0)
+    dx, dy = (yy * rx - xy * ry) / det, (xx * ry - xy * rx) / det
+    # sum w (D + 2 G delta)^2 at the solution is sum w D^2 - 4 delta' right
+    local = np.maximum(unlike - 4 * (dx * rx + dy * ry), 0.0) / (2 * total * SMOOTHED_NOISE)
     variance = np.maximum(local, noise_dn**2)
-    covariance = variance[:, None, None] * (inverse @ spread @ inverse)
-    sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2 + SIGMA_FLOOR_PX**2)
+    # trace of M^-1 S M^-1 = sum over columns of M^-1 of their S-norm
+    cov_x = (yy * yy * xx2 - 2 * yy * xy * xy2 + xy * xy * yy2) / det**2
+    cov_y = (xy * xy * xx2 - 2 * xx * xy * xy2 + xx * xx * yy2) / det**2
+    sigma = np.sqrt(variance * (cov_x + cov_y) / 2 + SIGMA_FLOOR_PX**2)
+    step = np.stack([dx, dy], axis=1)
+    step *= np.minimum(1.0, 1.0 / np.maximum(np.hypot(dx, dy), 1e-9))[:, None]
     return step, sigma, solved
