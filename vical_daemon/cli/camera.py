@@ -261,10 +261,14 @@ def _controls(args: argparse.Namespace) -> int:
     with _open(args) as source:
         if not isinstance(source, V4l2Camera):
             raise CliError(f"{args.device}: only V4L2 cameras list their controls")
-        controls = [(c, source.controls.get(c.name)) for c in source.controls.all()]
+        controls = [(c, source.controls.get(c.name) if c.readable else None) for c in source.controls.all()]
     if args.json:
         print(json.dumps([{**asdict(control), "value": value} for control, value in controls]))
         return 0
     for control, value in controls:
-        print(f"{control.name:<36} {value:>8}  (default {control.default}; {control.range_text})")
+        if control.kind == "button":
+            print(f"{control.name:<36}   button")
+        else:
+            shown = "-" if value is None else value
+            print(f"{control.name:<36} {shown:>8}  (default {control.default}; {control.range_text})")
     return 0

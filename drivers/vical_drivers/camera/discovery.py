@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vical_drivers.camera import v4l2_abi as abi
+from vical_drivers.camera.formats import FORMATS
 from vical_drivers.camera.kernel import Kernel
 from vical_drivers.camera.v4l2_node import VideoNode
 from vical_drivers.errors import DeviceNotFoundError, DriverError
@@ -177,7 +178,7 @@ def list_v4l2_cameras(kernel: Kernel) -> list[DeviceInfo]:
 
 def _offers(node: VideoNode) -> list[str]:
     offers = []
-    for name in node.pixel_formats():
+    for name in (n for n in FORMATS if n in node.pixel_formats()):
         sizes = node.sizes(name)
         largest = max(sizes, key=lambda s: s[0] * s[1], default=None)
         offers.append(f"{name} up to {largest[0]}x{largest[1]}" if largest else name)

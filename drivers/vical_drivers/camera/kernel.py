@@ -12,12 +12,18 @@ import mmap
 import os
 import select
 import time
+import weakref
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.mmap.restype = ctypes.c_void_p
+_libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+_libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 
 
 class Mapping(Protocol):
@@ -74,13 +80,20 @@ class Kernel(Protocol):
 
 
 class _MappedMemory:
-    """An mmap whose views may outlive it: then the last view frees the memory."""
+    """Shared memory of a device, unmapped when its last view goes.
+
+    Not `mmap.mmap`: that duplicates the descriptor, and a picture somebody still holds would keep a camera
+    busy that was closed long ago.
+    """
 
     def __init__(self, fd: int, length: int, offset: int) -> None:
-        self._map: mmap.mmap | None = mmap.mmap(
-            fd, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset
-        )
-        self._array: npt.NDArray[np.uint8] | None = np.frombuffer(self._map, dtype=np.uint8)
+        address = _libc.mmap(None, length, mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_SHARED, fd, offset)
+        if address in (None, ctypes.c_void_p(-1).value):
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code))
+        memory = (ctypes.c_uint8 * length).from_address(address)
+        weakref.finalize(memory, _libc.munmap, address, length)
+        self._array: npt.NDArray[np.uint8] | None = np.ctypeslib.as_array(memory)
 
     @property
     def array(self) -> npt.NDArray[np.uint8]:
@@ -90,14 +103,8 @@ class _MappedMemory:
         return self._array
 
     def close(self) -> None:
-        """Unmap; memory that a borrowed frame still shows goes when that frame goes."""
+        """Let go; memory that a borrowed frame still shows goes when that frame goes."""
         self._array = None
-        if self._map is not None:
-            try:
-                self._map.close()
-            except BufferError:
-                pass
-            self._map = None
 
 
 class LinuxKernel:

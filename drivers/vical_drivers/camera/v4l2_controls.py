@@ -33,8 +33,10 @@ _SIMPLE_TYPES = frozenset(
         abi.CTRL_TYPE_MENU,
         abi.CTRL_TYPE_INTEGER64,
         abi.CTRL_TYPE_INTEGER_MENU,
+        abi.CTRL_TYPE_BUTTON,
     }
 )
+_KINDS = {abi.CTRL_TYPE_BOOLEAN: "boolean", abi.CTRL_TYPE_BUTTON: "button"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Control:
     Attributes:
         name: Lower case with underscores, as `v4l2-ctl` prints it.
         control_id: The kernel's number.
-        kind: integer, boolean or menu.
+        kind: integer, boolean, menu or button (writing any value presses it; it cannot be read).
         minimum, maximum, step, default: Range, in the control's own unit.
         flags: The kernel's CTRL_FLAG_* bits.
         menu: Value -> text, for menus.
@@ -59,6 +61,11 @@ class Control:
     default: int
     flags: int
     menu: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def readable(self) -> bool:
+        """Whether it holds a value."""
+        return self.kind != "button" and not self.flags & abi.CTRL_FLAG_WRITE_ONLY
 
     @property
     def range_text(self) -> str:
@@ -101,7 +108,7 @@ class Controls:
 
     def _describe(self, query: abi.QueryExtCtrl) -> Control:
         is_menu = query.type in (abi.CTRL_TYPE_MENU, abi.CTRL_TYPE_INTEGER_MENU)
-        kind = "menu" if is_menu else "boolean" if query.type == abi.CTRL_TYPE_BOOLEAN else "integer"
+        kind = "menu" if is_menu else _KINDS.get(query.type, "integer")
         return Control(
             name=control_name(query.name.decode("utf-8", "replace")),
             control_id=query.id,
@@ -157,7 +164,8 @@ class Controls:
                 automatic control is on.
         """
         control = self._need(name)
-        if not control.minimum <= value <= control.maximum or (control.menu and value not in control.menu):
+        in_range = control.minimum <= value <= control.maximum and (not control.menu or value in control.menu)
+        if not in_range and control.kind != "button":
             raise DeviceRefusedError(
                 f"{self._node.path}: {control.name} = {value} is out of range: {control.range_text}"
             )
