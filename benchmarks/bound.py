@@ -2,8 +2,8 @@
 
 Model: one state (attitude, velocity, position, gyro and accelerometer bias) per frame, tied to the next
 one by the inertial readings in between (white noise and bias walks as continuous-time densities, error
-equations integrated in 5 ms steps at the truth), to the pixels by the projection, and to constants: lever
-arm, mounting, time shift, gravity, and as asked lens, target scale, IMU scale, landmarks. The information
+equations integrated in steps of at most 10 ms at the truth), to the pixels by the projection, and to
+constants: lever arm, mounting, time shift, gravity, and as asked lens, target scale, IMU scale, landmarks. The information
 matrix over [newest state, constants, landmarks in view] goes forward from frame to frame; the state left
 behind and landmarks seen for the last time are eliminated by Schur complements. That is exact, so its
 inverse at time t is the bound for any estimator that uses the data up to t.
@@ -14,7 +14,7 @@ Uses the simulation's truth (`vical_mocks`), and nothing of `vical_daemon`.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,7 +29,7 @@ from benchmarks.projection import View, jacobians
 FloatArray = npt.NDArray[np.float64]
 
 STATE = 15  # attitude (local), velocity, position, gyro bias, accelerometer bias
-_MAX_STEP_S = 5.1e-3
+_MAX_STEP_S = 10.1e-3
 # One-sigma priors so wide that they tell nothing next to seconds of data (rad, m/s, m, rad/s, m/s^2).
 _STATE_PRIOR = np.repeat([3.0, 10.0, 10.0, 0.3, 2.0], 3)
 
@@ -206,33 +206,56 @@ def _eliminate(information: FloatArray, gone: npt.NDArray[np.int64]) -> FloatArr
     return np.asarray((left + left.T) / 2)
 
 
-def inertial_factors(rig: Rig, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def inertial_factors(
+    rig: Rig, times_s: FloatArray, matrices: bool = False
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Error transitions from each frame to the next at the truth, for n + 1 times.
 
+    Args:
+        rig: Truth.
+        times_s: Of the frames.
+        matrices: The imu's matrices are unknown, too.
+
     Returns:
-        Transitions (n, 15, 15); influence of [gravity 3, gyro matrix 9, accelerometer matrix 6]
-        (n, 15, 18); noise covariances (n, 15, 15).
+        Transitions (n, 15, 15); influence of gravity (n, 15, 3), or of [gravity 3, gyro matrix 9,
+        accelerometer matrix 6] (n, 15, 18); noise covariances (n, 15, 15).
     """
     gaps_s = np.diff(times_s)
-    count = max(1, int(np.ceil(np.max(gaps_s) / _MAX_STEP_S)))
-    step_s = gaps_s / count
+    counts = np.maximum(1, np.ceil(gaps_s / _MAX_STEP_S)).astype(np.int64)
+    inputs = 18 if matrices else 3
+    transition, influence = np.empty((len(gaps_s), STATE, STATE)), np.empty((len(gaps_s), STATE, inputs))
+    noise = np.empty((len(gaps_s), STATE, STATE))
+    for count in np.unique(counts):  # gaps of like length together
+        some = counts == count
+        total, noise[some] = _integrate(
+            rig, times_s[:-1][some], gaps_s[some] / count, int(count), STATE + inputs
+        )
+        transition[some], influence[some] = total[:, :STATE, :STATE], total[:, :STATE, STATE:]
+    return transition, influence, noise
+
+
+def _integrate(
+    rig: Rig, start_s: FloatArray, step_s: FloatArray, count: int, used: int
+) -> tuple[FloatArray, FloatArray]:
+    """`count` steps from each start: transitions of the first `used` errors, and noise covariances."""
     densities = rig.densities
     diffusion = (
         np.repeat([densities.gyro, densities.accel, 0.0, densities.gyro_walk, densities.accel_walk], 3) ** 2
     )
-    eye, small = np.eye(STATE + 18), np.eye(STATE)
-    total = np.tile(eye, (len(gaps_s), 1, 1))
-    noise = np.zeros((len(gaps_s), STATE, STATE))
+    eye, small = np.eye(used), np.eye(STATE)
+    total = np.tile(eye, (len(start_s), 1, 1))
+    noise = np.zeros((len(start_s), STATE, STATE))
     for k in range(count):
-        a = _error_slopes(rig, times_s[:-1] + (k + 0.5) * step_s) * step_s[:, None, None]
+        slopes = _error_slopes(rig, start_s + (k + 0.5) * step_s)[:, :used, :used]
+        a = slopes * step_s[:, None, None]
         step = eye + a @ (eye + a @ (eye + a / 3) / 2)
         phi, inner = step[:, :STATE, :STATE], a[:, :STATE, :STATE]
         half = small + inner / 2 + inner @ inner / 8
-        # Simpson's rule for the integral of phi(s) D phi(s)^T: exact to the order that matters at 5 ms.
+        # Simpson's rule for the integral of phi(s) D phi(s)^T: exact to the order that matters at 10 ms.
         added = np.diag(diffusion) + 4 * _spread(half, diffusion) + _spread(phi, diffusion)
         noise = phi @ noise @ np.swapaxes(phi, 1, 2) + added * (step_s / 6)[:, None, None]
         total = step @ total
-    return total[:, :STATE, :STATE], total[:, :STATE, STATE:], noise
+    return total, noise
 
 
 def _spread(phi: FloatArray, diffusion: FloatArray) -> FloatArray:
@@ -262,20 +285,29 @@ def _error_slopes(rig: Rig, t_s: FloatArray) -> FloatArray:
     return F
 
 
-def pixel_jacobians(rig: Rig, frame: SimulatedFrame, points_m: FloatArray) -> dict[str, FloatArray]:
-    """Derivatives of a frame's pixels at the truth; see `benchmarks.projection.jacobians`."""
-    t_s = np.asarray(frame.t_s)
+def pixel_jacobians(
+    rig: Rig, frames: Sequence[SimulatedFrame], points_m: Sequence[FloatArray]
+) -> list[dict[str, FloatArray]]:
+    """Derivatives of each frame's pixels at the truth; see `benchmarks.projection.jacobians`."""
+    counts = [len(points) for points in points_m]
+    t_s = np.repeat([frame.t_s for frame in frames], counts)
     R_imu_cam, p_imu_cam = rig.extrinsics_at(t_s)
+    path = rig.trajectory
     view = View(
-        rig.trajectory.R_world_imu(t_s),
-        rig.trajectory.p_world_imu(t_s),
-        rig.trajectory.v_world_imu(t_s),
-        rig.trajectory.omega_imu_rps(t_s),
+        path.R_world_imu(t_s),
+        path.p_world_imu(t_s),
+        path.v_world_imu(t_s),
+        path.omega_imu_rps(t_s),
         R_imu_cam,
         p_imu_cam,
         rig.lens,
     )
-    return jacobians(view, points_m)
+    together = jacobians(view, np.concatenate(points_m))
+    ends = 2 * np.cumsum(counts)
+    return [
+        {name: block[end - 2 * count : end] for name, block in together.items()}
+        for count, end in zip(counts, ends, strict=True)
+    ]
 
 
 def _pixel_information(jacobian: FloatArray, by_time: FloatArray, options: BoundOptions) -> FloatArray:
@@ -307,7 +339,8 @@ def bounds(
     information = _Information(_Constants.of(chosen), run.rig, chosen)
     frames = [f for f in run.frames if 0.0 <= f.t_s <= run.duration_s]
     last_seen = {int(i): n for n, f in enumerate(frames) for i in f.ids} if chosen.target_free else {}
-    factors = inertial_factors(run.rig, np.array([f.t_s for f in frames]))
+    factors = inertial_factors(run.rig, np.array([f.t_s for f in frames]), chosen.imu_matrix_prior > 0)
+    seen = _derivatives(run, frames)
     found: list[Bound] = []
     for n, frame in enumerate(frames):
         while len(found) < len(wanted) and frame.t_s > wanted[len(found)]:
@@ -316,7 +349,7 @@ def bounds(
             return found
         if n > 0:
             _propagate(information, *(factor[n - 1] for factor in factors))
-        _update(information, run, frame, chosen)
+        _update(information, frame, next(seen), chosen)
         if chosen.target_free:
             information.remove_landmarks({i for i in information.landmarks if last_seen[i] <= n})
     return found + [_snapshot(information, t_s) for t_s in wanted[len(found) :]]
@@ -345,14 +378,20 @@ def _propagate(
     information.propagate(transition, inputs, noise)
 
 
+def _derivatives(run: SimulatedRun, frames: Sequence[SimulatedFrame]) -> Iterator[dict[str, FloatArray]]:
+    """Pixel derivatives of one frame after the other, worked out many frames at a time; outliers left out."""
+    for start in range(0, len(frames), 50):
+        some = frames[start : start + 50]
+        rows = [[run.landmark_of.get(int(i), int(i)) for i in f.ids[~f.outlier]] for f in some]
+        yield from pixel_jacobians(run.rig, some, [run.points_m[np.array(r, dtype=np.int64)] for r in rows])
+
+
 def _update(
-    information: _Information, run: SimulatedRun, frame: SimulatedFrame, options: BoundOptions
+    information: _Information, frame: SimulatedFrame, by: dict[str, FloatArray], options: BoundOptions
 ) -> None:
     ids = frame.ids[~frame.outlier]
     if len(ids) == 0:
         return
-    rows = np.array([run.landmark_of.get(int(i), int(i)) for i in ids])
-    by = pixel_jacobians(run.rig, frame, run.points_m[rows])
     if options.target_free:
         for identity in ids:
             if int(identity) not in information.landmarks:

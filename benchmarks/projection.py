@@ -14,7 +14,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class View:
-    """Where a camera is and how it moves at the instant of a frame.
+    """Where a camera is and how it moves at the instant of a frame (or of each point: leading axis n).
 
     Attributes:
         R_world_imu: (3, 3).
@@ -35,12 +35,17 @@ class View:
     lens: Lens
 
     def points_in_imu(self, points_m: FloatArray) -> FloatArray:
-        """World points in the imu frame, m."""
-        return (points_m - self.p_world_imu) @ self.R_world_imu
+        """World points (n, 3) in the imu frame, m."""
+        return _turn(np.swapaxes(self.R_world_imu, -1, -2), points_m - self.p_world_imu)
 
     def points_in_cam(self, points_m: FloatArray) -> FloatArray:
-        """World points in the camera frame, m."""
-        return (self.points_in_imu(points_m) - self.p_imu_cam) @ self.R_imu_cam
+        """World points (n, 3) in the camera frame, m."""
+        return _turn(np.swapaxes(self.R_imu_cam, -1, -2), self.points_in_imu(points_m) - self.p_imu_cam)
+
+
+def _turn(R: FloatArray, v: FloatArray) -> FloatArray:
+    """Rotate n vectors, by one rotation or by n."""
+    return np.asarray((R @ v[..., None])[..., 0])
 
 
 def jacobians(view: View, points_m: FloatArray) -> dict[str, FloatArray]:
@@ -52,10 +57,11 @@ def jacobians(view: View, points_m: FloatArray) -> dict[str, FloatArray]:
     """
     in_imu, in_cam = view.points_in_imu(points_m), view.points_in_cam(points_m)
     by_cam, by_lens = lens_derivatives(view.lens, in_cam)
-    by_imu = by_cam @ view.R_imu_cam.T
-    by_world = by_imu @ view.R_world_imu.T
+    by_imu = by_cam @ np.swapaxes(view.R_imu_cam, -1, -2)
+    by_world = by_imu @ np.swapaxes(view.R_world_imu, -1, -2)
     # d z / d t_d = A ([P_imu] x omega - R^T v): the camera a moment later
-    moving = np.cross(in_imu, view.omega_imu_rps) - view.R_world_imu.T @ view.v_world_imu
+    resting = _turn(np.swapaxes(view.R_world_imu, -1, -2), np.broadcast_to(view.v_world_imu, in_imu.shape))
+    moving = np.cross(in_imu, view.omega_imu_rps) - resting
     by_time = np.einsum("nij,nj->ni", by_imu, moving)
     uv, _ = view.lens.project(in_cam)
     row_share = uv[:, 1] / view.lens.resolution[1] - 0.5
