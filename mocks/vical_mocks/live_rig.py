@@ -78,7 +78,11 @@ class LiveRigSettings:
 
 
 class LiveRig:
-    """Both devices, running; a context manager.
+    """The devices, running; a context manager.
+
+    Args:
+        settings: What is simulated.
+        devices: Of imu and camera, those that are to run.
 
     Attributes:
         port: Name of the IMU's terminal.
@@ -86,33 +90,35 @@ class LiveRig:
         t_start_s: See above.
     """
 
-    def __init__(self, settings: LiveRigSettings) -> None:
+    def __init__(self, settings: LiveRigSettings, devices: tuple[str, ...] = ("imu", "camera")) -> None:
         self.settings = settings
+        self.devices = devices
         self.rig = settings.rig()
         self.port = ""
         self.t_start_s = 0.0
         self._imu_clock: SkewedClock | None = None
         self._processes: list[multiprocessing.process.BaseProcess] = []
-        self._pipes: list[Connection] = []
+        self._pipes: dict[str, Connection] = {}
 
     def __enter__(self) -> Self:
         context = multiprocessing.get_context("spawn")  # fork would copy locks held by other threads
         self.t_start_s = time.monotonic()
         try:
-            for target in (_run_imu, _run_camera):
+            for device in self.devices:
                 here, there = context.Pipe()
                 process = context.Process(
-                    target=target, args=(self.settings, self.t_start_s, there), daemon=True
+                    target=_DEVICES[device], args=(self.settings, self.t_start_s, there), daemon=True
                 )
                 process.start()
                 there.close()
                 self._processes.append(process)
-                self._pipes.append(here)
-            for pipe, what in zip(self._pipes, ("imu", "camera"), strict=True):
+                self._pipes[device] = here
+            for device, pipe in self._pipes.items():
                 if not pipe.poll(_START_TIMEOUT_S):
-                    raise DeviceTimeoutError(f"simulated {what}: its process does not start")
-            self.port, self._imu_clock = self._pipes[0].recv()
-            self._pipes[1].recv()
+                    raise DeviceTimeoutError(f"simulated {device}: its process does not start")
+                answer = pipe.recv()
+                if device == "imu":
+                    self.port, self._imu_clock = answer
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -121,7 +127,7 @@ class LiveRig:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for pipe in self._pipes:
+        for pipe in self._pipes.values():
             pipe.close()  # each process ends when its pipe does
         for process in self._processes:
             process.join(5)
@@ -142,7 +148,7 @@ class LiveRig:
 
     def camera(self) -> LiveCamera:
         """Return the camera as a `FrameSource`."""
-        return LiveCamera(self._pipes[1])
+        return LiveCamera(self._pipes["camera"])
 
 
 class LiveCamera:
@@ -269,3 +275,6 @@ def _wait_for_close(pipe: Connection) -> None:
         pipe.recv()
     except (EOFError, OSError):
         return
+
+
+_DEVICES = {"imu": _run_imu, "camera": _run_camera}

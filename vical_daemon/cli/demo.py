@@ -32,7 +32,7 @@ rig: demo
 imus:
   {imu}:
     port: {port}
-    rate_hz: 200
+    rate_hz: 100
     noise: {{gyro_density: 3.8e-4, accel_density: 1.2e-3}}
 cameras:
   {camera}:

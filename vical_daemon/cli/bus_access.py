@@ -1,0 +1,109 @@
+"""How a command comes to the bus: as its host, as a client of the rig's router, or of somebody else's."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vical_daemon import notify
+from vical_daemon.bus import Bus
+from vical_daemon.config import BusConfig, Config, load
+from vical_daemon.places import make_private, runtime_directory
+from vical_daemon.zenoh_bus import BusError, open_bus
+
+_log = logging.getLogger(__name__)
+SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
+_HOSTS = {"imu", "camera"}
+_RETRY_S = 0.5
+_PATIENCE_S = 20.0
+
+
+def socket_path(bus: BusConfig) -> Path:
+    """Where the router of a rig listens."""
+    return Path(bus.socket) if bus.socket else runtime_directory() / "zenoh.sock"
+
+
+def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) -> Bus | None:
+    """Open the bus for a process with these roles: the one that acquires hosts it, others are clients.
+
+    A client waits for its router as long as it takes (None when told to stop meanwhile): services start
+    in any order. A process with only one of the acquiring roles hosts the bus unless another one does.
+
+    Raises:
+        BusError: The bus cannot be hosted.
+    """
+    make_private(socket_path(config.bus).parent)
+    if _HOSTS & set(roles):
+        try:
+            return _host(config)
+        except BusError:
+            if set(roles) >= _HOSTS:
+                raise
+            _log.info("the bus is hosted by another process: joining it")
+    return _wait_for_router(config, stop)
+
+
+def open_client(config_path: str | None, endpoint: str | None) -> Bus:
+    """Open the bus for a command that only listens or asks.
+
+    Args:
+        config_path: The rig's YAML; None: the defaults.
+        endpoint: A router to use instead, e.g. ``tcp/127.0.0.1:7447``.
+
+    Raises:
+        BusError: Nobody hosts a bus there.
+    """
+    bus = load(config_path).bus if config_path else BusConfig()
+    credentials = _credentials(bus)
+    if endpoint:
+        return open_bus(mode="client", connect=[endpoint], **credentials)
+    candidates = [socket_path(bus)] if bus.socket or config_path else [socket_path(bus), SERVICE_SOCKET]
+    for path in candidates:
+        if path.exists() and os.access(path, os.W_OK):
+            return open_bus(mode="client", socket=path, **credentials)
+    return open_bus(mode="client", tcp_port=bus.tcp_port or BusConfig().tcp_port, **credentials)
+
+
+def _host(config: Config) -> Bus:
+    bus = config.bus
+    return open_bus(
+        mode="router",
+        socket=socket_path(bus),
+        tcp_port=bus.tcp_port,
+        listen=bus.listen,
+        connect=bus.connect,
+        password_file=bus.password_file,
+        readers=bus.readers,
+        **_credentials(bus),
+    )
+
+
+def _wait_for_router(config: Config, stop: threading.Event) -> Bus | None:
+    path, begin_s, told = socket_path(config.bus), time.monotonic(), False
+    while not stop.is_set():
+        try:
+            return open_bus(mode="client", socket=path, **_credentials(config.bus))
+        except BusError as error:
+            if not told:
+                _log.info("waiting for the bus: %s", error)
+            told = True
+        if time.monotonic() - begin_s > _PATIENCE_S:  # or systemd takes a late router for our failure
+            notify.ready("waiting for the bus")
+            notify.watchdog()
+        stop.wait(_RETRY_S)
+    return None
+
+
+def _credentials(bus: BusConfig) -> dict[str, Any]:
+    return {
+        "tls_ca": bus.tls_ca,
+        "tls_certificate": bus.tls_certificate,
+        "tls_key": bus.tls_key,
+        "user": bus.user,
+        "password": bus.password,
+    }

@@ -1,0 +1,169 @@
+"""`vical run [ROLE ...] -c FILE`: the daemon, or single processes and roles of it."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.errors import CliError
+from vical_daemon.cli.options import add_config, add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.bus import Bus
+    from vical_daemon.cli.process_sets import RoleThreads
+    from vical_daemon.config import Config
+
+HELP = "the daemon, or single roles of it"
+_log = logging.getLogger(__name__)
+_TICK_S = 1.0
+_CHILD_STOP_S = 15.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of COMMANDS."""
+    parser.add_argument(
+        "roles",
+        metavar="ROLE",
+        nargs="*",
+        help="acquire, record, calibrate, web (processes) or imu, camera, record, detect, estimate, web "
+        "(roles); none: all processes that the config asks for, as children",
+    )
+    add_config(parser)
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run until SIGTERM or SIGINT; 1 if a role or a child failed."""
+    from vical_daemon.cli import process_sets
+    from vical_daemon.config import load
+
+    config = load(args.config)
+    if not config.imus and not config.cameras:
+        raise CliError(f"{args.config}: neither imus nor cameras: there is nothing to run", 2)
+    if not args.roles:
+        return _run_children(args, process_sets.needed_processes(config))
+    roles = process_sets.role_names(args.roles)
+    with _signals() as stop:
+        code = _run_roles(config, roles, stop)
+    return _leave(code)
+
+
+def _leave(code: int) -> int:
+    """End the process here: everything is closed, and what the libraries' threads still do is not wanted.
+
+    Threads of zenoh that wait for the interpreter while it shuts down are killed by it in the middle of
+    foreign code, which aborts the process ("exception not rethrown") and looks like a crash to systemd.
+    """
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
+    """Run roles as threads of this process; consumers are started first and stopped last."""
+    from vical_daemon.cli.bus_access import open_for_roles
+    from vical_daemon.cli.process_sets import RoleThreads
+
+    bus = open_for_roles(config, roles, stop)
+    if bus is None:  # told to stop while waiting for the router
+        return 0
+    threads = RoleThreads(config, bus)
+    try:
+        for role in reversed(roles):
+            threads.start(role)
+        _attend(config, bus, roles, threads, stop)
+    finally:
+        clean = threads.stop_all()
+        bus.close()
+    threads.raise_failure()
+    return 0 if clean else 1
+
+
+def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, stop: threading.Event) -> None:
+    """Tell systemd how it goes, once a second, until the end."""
+    from vical_daemon import notify, topics
+    from vical_daemon.liveness import Liveness
+
+    liveness = Liveness(roles)
+    key = topics.STATUS.pattern.format(rig=config.rig, name="*")
+    bus.subscribe(key, lambda sample: liveness.take(sample, time.monotonic()))
+    gc.collect()
+    gc.freeze()  # what was loaded stays: the collector need not walk through it in the middle of a read
+    ready, said = False, ""
+    while not stop.is_set() and not threads.failed.is_set():
+        stop.wait(_TICK_S)
+        if not ready and liveness.ready():
+            ready = notify.ready(liveness.summary()) or True
+            _log.info("ready: %s", ", ".join(roles))
+        problem = liveness.problem(time.monotonic())
+        if not problem:
+            notify.watchdog()
+        elif ready and problem != said:
+            _log.error("not alive: %s", problem)
+        said = problem
+        notify.status(problem or liveness.summary())
+    notify.stopping()
+
+
+@contextmanager
+def _signals() -> Iterator[threading.Event]:
+    """Give an event that SIGTERM and SIGINT set; a second signal ends the process at once."""
+    stop = threading.Event()
+
+    def on_signal(number: int, _frame: object) -> None:
+        if stop.is_set():
+            raise SystemExit(128 + number)
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run_children(args: argparse.Namespace, names: list[str]) -> int:
+    """Start each process as a child; when one ends, all end. Restarting them is systemd's work, not ours."""
+    children: dict[str, subprocess.Popen[bytes]] = {}
+    more = [flag for flag in ("--verbose", "--quiet") if getattr(args, flag[2:])]
+    config = str(Path(args.config).absolute())
+    with _signals() as stop:
+        try:
+            for name in names:
+                command = [sys.executable, "-m", "vical_daemon", "run", name, "-c", config, *more]
+                children[name] = subprocess.Popen(command, start_new_session=True)
+            _log.info("started %s", ", ".join(f"{n} ({c.pid})" for n, c in children.items()))
+            while not stop.is_set():
+                stop.wait(0.2)
+                ended = {n: c.returncode for n, c in children.items() if c.poll() is not None}
+                if ended and not stop.is_set():
+                    name, code = next(iter(ended.items()))
+                    raise CliError(f"process {name} ended with code {code}; see its messages above")
+        finally:
+            _stop_children(children)
+    return 0
+
+
+def _stop_children(children: dict[str, subprocess.Popen[bytes]]) -> None:
+    """End consumers last to first started: acquire, which hosts the bus, goes last."""
+    for child in reversed(children.values()):
+        if child.poll() is None:
+            child.terminate()
+            try:
+                child.wait(_CHILD_STOP_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
