@@ -3,10 +3,10 @@
 Model: one state (attitude, velocity, position, gyro and accelerometer bias) per frame, tied to the next
 one by the inertial readings in between (white noise and bias walks as continuous-time densities, error
 equations integrated in steps of at most 10 ms at the truth), to the pixels by the projection, and to
-constants: lever arm, mounting, time shift, gravity, and as asked lens, target scale, IMU scale, landmarks. The information
-matrix over [newest state, constants, landmarks in view] goes forward from frame to frame; the state left
-behind and landmarks seen for the last time are eliminated by Schur complements. That is exact, so its
-inverse at time t is the bound for any estimator that uses the data up to t.
+constants: lever arm, mounting, time shift, gravity, and as asked lens, target scale, IMU scale, landmarks.
+The information matrix over [newest state, constants, landmarks in view] goes forward from frame to frame;
+the state left behind and landmarks seen for the last time are eliminated by Schur complements. That is
+exact, so its inverse at time t is the bound for any estimator that uses the data up to t.
 
 Uses the simulation's truth (`vical_mocks`), and nothing of `vical_daemon`.
 """
