@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plots", metavar="DIR", help="write gyro.png and accel.png there")
     parser.add_argument(
         "--tau-min", type=float, metavar="S",
-        help="shortest averaging time used (default 0.1): longer than the sensor's own filter",
+        help="shortest averaging time used, longer than the sensor's filter (default: 0.1 to 1)",
     )  # fmt: skip
     parser.epilog = _EPILOG
     add_json(parser)

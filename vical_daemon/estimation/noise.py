@@ -25,7 +25,7 @@ CLUSTERS_MIN = 5  # an averaging time needs at least this many clusters in the r
 TERM_ALPHA = (2, 0, -1, -2)
 TERM_GAIN = 16.0  # drop in chi^2 that admits flicker or quantisation (4 sigma)
 # Ratio of true scatter to the sigma of independent points, per term, by Monte Carlo (benchmarks allan).
-OVERLAP_INFLATION = np.array([1.25, 1.25, 1.8, 1.8])
+OVERLAP_INFLATION = np.array([1.7, 1.7, 1.8, 1.8])
 
 
 class TooShortError(ValueError):
@@ -234,14 +234,13 @@ def fit_noise(curve: AllanCurve, tau_min_s: float | None = None) -> NoiseFit:
 
     Args:
         curve: From `allan_curve`.
-        tau_min_s: Shortest averaging time used; None: 0.1 s, at least 4 samples. Below it the sensor's
-            own filter correlates neighbouring samples and the curve bends away from the model.
+        tau_min_s: Shortest averaging time used; None: `shortest_tau`.
 
     Returns:
         Coefficients with standard deviations. Points an octave apart enter the fit: closer ones are
         correlated and would make the sigmas too small.
     """
-    shortest = max(0.1, 4.0 / curve.rate_hz) if tau_min_s is None else tau_min_s
+    shortest = shortest_tau(curve) if tau_min_s is None else tau_min_s
     octaves = np.log2(curve.tau_s * curve.rate_hz)
     use = (np.abs(octaves - np.round(octaves)) < 1e-9) & (curve.tau_s >= shortest)
     if np.count_nonzero(use) < 4:
@@ -263,6 +262,17 @@ def fit_noise(curve: AllanCurve, tau_min_s: float | None = None) -> NoiseFit:
         quantisation=quantisation,
         flicker=flicker,
     )
+
+
+def shortest_tau(curve: AllanCurve) -> float:
+    """Return the shortest averaging time that a fit should use, s: 0.1 s to 1 s, with the length.
+
+    A sensor's own filter (15 ms in a GX3-25) correlates neighbouring samples: the Allan variance lies below
+    the model by about (filter / tau), while its sampling error falls as sqrt(tau / T). For four hours both
+    are equal near 1 s; shorter recordings need the shorter times.
+    """
+    duration_s = curve.samples / curve.rate_hz
+    return max(min(max(duration_s / 14400.0, 0.1), 1.0), 4.0 / curve.rate_hz)
 
 
 def _coefficient(square: float, square_sigma: float) -> Coefficient:

@@ -57,7 +57,7 @@ def test_updates_add_up_to_the_full_state(bus, state, web_feed):
 
 def test_history_is_thinned_towards_the_past(bus, state, web_feed):
     rng = np.random.default_rng(3)
-    for k in range(HISTORY + 900):
+    for k in range(HISTORY + 300):
         web_feed.publish_estimate(bus, web_feed.estimate(0.2 * (k + 1), rng))
         if k % 500 == 0:
             state.tick()

@@ -1,0 +1,25 @@
+"""Sphinx: Markdown pages (MyST); reference pages are made from the code by `_ext/vical_reference.py`."""
+
+import sys
+from importlib.metadata import version as package_version
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "vical"
+author = "the vical authors"
+copyright = "the vical authors, Apache-2.0"
+release = version = package_version("vical")
+
+extensions = ["myst_parser", "vical_reference"]
+source_suffix = {".md": "markdown"}
+exclude_patterns = ["_build", "_ext"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 3
+# Other parts of the project may link pages that are not in a toctree.
+suppress_warnings = ["toc.not_included"]
+
+html_theme = "furo"
+html_title = f"vical {release}"
+html_static_path = ["_static"]
+html_copy_source = False
