@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 HELP = "the whole system without hardware, truth beside the estimate at the end"
 CAMERA, IMU = "cam0", "imu0"
+RATE_HZ = 12.5
 MOST, AFTER_CONVERGENCE = 80.0, 10.0  # seconds of data
 BOARD = {"kind": "checkerboard", "cols": 9, "rows": 6, "row_spacing_m": 0.045, "col_spacing_m": 0.045}
 _CONFIG = """\
@@ -68,21 +69,22 @@ def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not 5 <= args.seconds <= 3600:
         raise CliError("--seconds: 5 to 3600 are of use", 2)
     out = _folder(args.out)
+    before = set(out.rglob("*.mcap"))
     from vical_mocks.live_rig import LiveRig, LiveRigSettings
 
     from vical_daemon.cli import demo_truth
 
     _say(f"simulating a 3DM-GX3-25 on a pseudo terminal and a camera before a checkerboard; files in {out}")
-    settings = LiveRigSettings(board=BOARD, seed=args.seed)
+    settings = LiveRigSettings(board=BOARD, seed=args.seed, camera_rate_hz=RATE_HZ)
     with LiveRig(settings) as rig:
-        config = _write_config(out, rig.port, settings.camera_rate_hz)
+        config = _write_config(out, rig.port)
         stamps = demo_truth.StampWitness(rig.imu_instant_ns, config.imus[IMU].filter_samples)
         estimate, trace = _run_roles(config, rig, stamps, args)
     truth = demo_truth.truth_of_stamps(rig.rig.truth(0.0, CAMERA), stamps.error_s, CAMERA)
     result = estimate.to_json() | {"status": str(estimate.status), "trace": trace}
     result |= {"cpu_s": time.process_time(), "truth": truth}
-    result["recordings"] = sorted(str(path) for path in out.rglob("*.mcap"))
-    problem = "no solution"
+    result["recordings"] = sorted(str(path) for path in set(out.rglob("*.mcap")) - before)
+    problem = f"no solution: {estimate.reason or estimate.guidance}"
     if CAMERA in estimate.cameras:
         table = demo_truth.compare(result, result["truth"], CAMERA)
         result["error"] = demo_truth.as_json(table)
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(text)
     if problem:
-        raise CliError(f"the demo failed: {problem}")
+        raise CliError(f"the demo failed: {problem}{_busy(result)}")
     return 0
 
 
@@ -112,7 +114,7 @@ def _run_roles(
     watch = Watch(bus, config.rig, CAMERA)
     started: list[str] = []
     try:
-        for role in ("estimate", "detect", "camera", "imu"):
+        for role in ("record", "estimate", "detect", "camera", "imu"):
             options: dict[str, Any] = {"clock": clock}
             if role == "camera":
                 options["open_source"] = lambda _camera: rig.camera()
@@ -130,6 +132,17 @@ def _run_roles(
     return watch.latest(), watch.trace
 
 
+def _busy(result: dict[str, Any]) -> str:
+    """Name the usual cause of a failure: a machine that cannot do it in real time."""
+    expected = result["duration_s"] * RATE_HZ
+    if result["frames"] > 0.6 * expected:
+        return ""
+    return (
+        f" (only {result['frames']} of {expected:.0f} frames were used in time: this machine is busy; "
+        "end other programs or try again)"
+    )
+
+
 def _follow(watch: Watch, roles: RoleThreads, args: argparse.Namespace) -> None:
     """Show progress until the data are as long as asked for, or converged for a while, or time is up."""
     from vical_daemon.cli.demo_screen import Screen
@@ -145,7 +158,7 @@ def _follow(watch: Watch, roles: RoleThreads, args: argparse.Namespace) -> None:
             screen.show(watch)
 
 
-def _write_config(out: Path, port: str, rate_hz: float) -> Config:
+def _write_config(out: Path, port: str) -> Config:
     from vical_daemon.config import load
     from vical_daemon.vision.target import Checkerboard
 
@@ -155,7 +168,7 @@ def _write_config(out: Path, port: str, rate_hz: float) -> Config:
         imu=IMU,
         camera=CAMERA,
         port=port,
-        rate=rate_hz,
+        rate=RATE_HZ,
         log=json.dumps(str(out)),
         store=json.dumps(str(out / "store")),
     )
