@@ -64,7 +64,7 @@ def _section(kind: type, path: str, done: list[type]) -> list[str]:
     done.append(kind)
     meaning, attributes = _docstring(kind)
     title = f"`{path}`" if path else "Top level"
-    lines = [f"### {title}", meaning, "| key | type | default | meaning |\n|---|---|---|---|"]
+    lines = [f"## {title}", meaning, "| key | type | default | meaning |\n|---|---|---|---|"]
     below: list[str] = []
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
@@ -151,9 +151,9 @@ def commands_text() -> str:
         parser, _ = cli.build_parser(name)
         actions = [a for a in parser._actions if hasattr(a, "choices") and isinstance(a.choices, dict)]
         child = actions[0].choices[name]
-        parts.append(f"### vical {name}\n\n{command.summary[0].upper()}{command.summary[1:]}.")
-        for leaf in [child, *(p for p in options.leaves(child) if p is not child)]:
-            parts.append(f"```text\n{leaf.format_help().rstrip()}\n```")
+        parts.append(f"## vical {name}\n\n{command.summary[0].upper()}{command.summary[1:]}.")
+        leaves = [child, *(p for p in options.leaves(child) if p is not child)]
+        parts += [f"```text\n{leaf.format_help().rstrip()}\n```" for leaf in leaves]
     return "\n\n".join(parts)
 
 

@@ -71,7 +71,7 @@ def test_reference_pages_cover_the_code(reference):
     for key in ("rate_hz", "imus.NAME", "calibration.convergence", "position_sigma_m", "**required**"):
         assert key in settings
     commands = reference.commands_text()
-    assert all(f"### vical {name}" in commands for name in table.available())
+    assert all(f"## vical {name}" in commands for name in table.available())
     modules = reference.modules_text()
     assert "`vical_drivers.clock`" in modules
     assert "`vical_daemon.report.writer`" in modules
