@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -47,9 +47,15 @@ class LogWriter:
         self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
         self._channels: dict[str, Any] = {}
         self.messages = 0
-        for name, values in (metadata or {}).items():
-            self._writer.write_metadata(name, dict(values))
-        self.flush()
+        try:
+            for name, values in (metadata or {}).items():
+                self.add_metadata(name, values)
+            self.flush()
+        except LogError:
+            self._writer = None
+            self._file.close()
+            self.part_path.unlink(missing_ok=True)
+            raise
 
     @property
     def part_path(self) -> Path:
@@ -94,12 +100,17 @@ class LogWriter:
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append a metadata record."""
-        self._writer.write_metadata(name, dict(values))
+        self._guard(self._writer.write_metadata, name, dict(values))
 
     def attach(self, name: str, media_type: str, data: bytes, log_time_ns: int) -> None:
         """Append an attachment (a config or calibration file); JSON belongs here, never into a channel."""
-        self._writer.attach(
-            log_time=log_time_ns, create_time=log_time_ns, name=name, media_type=media_type, data=data
+        self._guard(
+            self._writer.attach,
+            log_time=log_time_ns,
+            create_time=log_time_ns,
+            name=name,
+            media_type=media_type,
+            data=data,
         )
 
     def flush(self) -> None:
@@ -108,16 +119,20 @@ class LogWriter:
         Raises:
             LogError: The disk refuses.
         """
-        try:
-            self._writer.flush()
-        except Exception as error:
-            raise LogError(f"cannot write {self.part_path}: {error}") from None
-        if self._file.error is not None:
-            self._raise()
+        self._guard(self._writer.flush)
 
     def sync(self) -> None:
         """Force what was flushed to the disk (any thread; takes 20 ms and more)."""
         self._file.sync()
+
+    def _guard(self, call: Callable[..., None], *args: Any, **kwargs: Any) -> None:
+        """Call the native writer; whatever it raises, the file knows the true reason."""
+        try:
+            call(*args, **kwargs)
+        except Exception as error:
+            self._file.error = self._file.error or OSError(str(error))
+        if self._file.error is not None:
+            self._raise()
 
     def _raise(self) -> None:
         error = self._file.error

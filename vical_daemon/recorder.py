@@ -1,0 +1,278 @@
+"""The recorder without its thread: a queue that favours the small messages, and the state of a recording."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections import deque
+from importlib.metadata import PackageNotFoundError, version
+from typing import NamedTuple
+
+from vical_daemon.bus import Sample
+from vical_daemon.config import Config
+from vical_daemon.mcap_log import Attachment, LogError, LogFolder, LogSession
+from vical_daemon.messages import (
+    DiagnosticStatus,
+    Level,
+    MessageError,
+    decode_calibration,
+    decode_diagnostics,
+    decode_string,
+    merge_calibrations,
+)
+from vical_daemon.topics import CALIBRATION, STATUS, Topic, command_key, parse_key
+from vical_daemon.wall_clock import WallClock
+
+_log = logging.getLogger(__name__)
+QUEUE_BYTES = 128 * 2**20
+_RETRY_NS = 5_000_000_000
+
+
+class Arrival(NamedTuple):
+    """A message with the time at which it arrived (UNIX, ns)."""
+
+    topic: Topic
+    key: str
+    payload: bytes
+    log_time_ns: int
+
+
+class RecordQueue:
+    """What waits for the disk. When it piles up images go first, and inertial data last."""
+
+    def __init__(self, limit_bytes: int = QUEUE_BYTES) -> None:
+        self._limit_bytes = limit_bytes
+        self._queue: deque[Arrival] = deque()
+        self._ready = threading.Condition()
+        self._bytes = 0
+        self.dropped: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def put(self, item: Arrival) -> None:
+        """Append; beyond half of the limit no images, beyond the limit nothing."""
+        image = item.topic.kind in ("image", "compressed")
+        with self._ready:
+            if self._bytes + len(item.payload) > self._limit_bytes / (2 if image else 1):
+                self.dropped[item.topic.kind] = self.dropped.get(item.topic.kind, 0) + 1
+                return
+            self._queue.append(item)
+            self._bytes += len(item.payload)
+            self._ready.notify()
+
+    def take(self, timeout_s: float) -> list[Arrival]:
+        """Return all that waits; [] after the timeout."""
+        with self._ready:
+            self._ready.wait_for(lambda: bool(self._queue), timeout_s)
+            items = list(self._queue)
+            self._queue.clear()
+            self._bytes = 0
+            return items
+
+
+class Recorder:
+    """Turns arrivals and commands into segments on the disk; never raises because of disk or data."""
+
+    def __init__(self, config: Config, folder: LogFolder, clock: WallClock) -> None:
+        self._config, self._folder, self._clock = config, folder, clock
+        self._wanted = config.record.enabled
+        self._session: LogSession | None = None
+        self._problem = ""
+        self._retry_ns = 0
+        self._command_key = command_key(config.rig, "record")
+        self._serials: dict[str, str] = {}
+        self._calibrations: dict[str, bytes] = {}
+        self._latched: dict[str, bytes] = {}
+        self.messages = 0
+
+    @property
+    def recording(self) -> bool:
+        """A segment is open."""
+        return self._session is not None
+
+    def wants(self, topic: Topic) -> bool:
+        """Whether messages of this kind are recorded."""
+        return topic.recorded and (self._config.record.images or topic.kind not in ("image", "compressed"))
+
+    def write(self, item: Arrival) -> None:
+        """Take one arrival: learn from it, obey it, record it."""
+        self._learn(item)
+        if self._session is None:
+            return
+        try:
+            self._session.write(item.key, item.payload, item.log_time_ns, latched=_latches(item.topic))
+            self.messages += 1
+        except LogError as error:
+            self._fail(str(error))
+
+    def _learn(self, item: Arrival) -> None:
+        if item.key == self._command_key:
+            self._obey(item.payload)
+        elif item.topic is CALIBRATION:
+            self._calibrations[item.key] = item.payload
+        elif item.topic is STATUS:
+            self._note_serials(item.payload)
+        if _latches(item.topic):
+            self._latched[item.key] = item.payload
+
+    def _obey(self, payload: bytes) -> None:
+        try:
+            word = decode_string(payload).strip()
+        except MessageError:
+            return
+        if word == "start":
+            self._wanted, self._retry_ns = True, 0
+            self.tick()
+        elif word == "stop":
+            self._wanted = False
+            self.close()
+        elif word == "split" and self._session is not None:
+            try:
+                self._session.rotate(self._clock.now_ns())
+            except LogError as error:
+                self._fail(str(error))
+        else:
+            _log.warning("command %r is not known: start, stop or split", word[:40])
+
+    def _note_serials(self, payload: bytes) -> None:
+        try:
+            message = decode_diagnostics(payload)
+        except MessageError:
+            return
+        for status in message.statuses:
+            if status.hardware_id and len(self._serials) < 64:
+                self._serials[status.name] = status.hardware_id
+
+    def tick(self) -> None:
+        """Do what time demands: flush, rotate, quota, reserve, and begin again after a failure."""
+        now_ns = self._clock.now_ns()
+        try:
+            if self._session is not None:
+                self._session.tick(now_ns)
+                self._folder.enforce_quota(self._session.segment_bytes)
+                if not self._folder.has_room():
+                    self._end("the disk has reached record.reserve_bytes; waiting for space")
+            elif self._wanted and now_ns >= self._retry_ns:
+                self._retry_ns = now_ns + _RETRY_NS
+                self._begin(now_ns)
+        except (LogError, OSError) as error:
+            self._fail(str(error))
+
+    def _begin(self, now_ns: int) -> None:
+        if not self._folder.lock():
+            self._problem = f"standing by: another recorder writes into {self._folder.path}"
+            return
+        for recovery in self._folder.recover():
+            _log.info("recovered %s: %d messages", recovery.output.name, recovery.messages)
+        self._folder.enforce_quota(0)
+        if not self._folder.has_room(resuming=bool(self._problem)):
+            self._problem = "the disk has reached record.reserve_bytes; waiting for space"
+            return
+        record = self._config.record
+        self._session = LogSession(
+            self._folder, self._config.rig, now_ns,
+            rotate_s=record.rotate_s, rotate_bytes=record.rotate_bytes,
+            metadata=self._metadata, attachments=self._attachments,
+        )  # fmt: skip
+        self._problem = ""
+        for key, payload in self._latched.items():
+            self._session.write(key, payload, now_ns, latched=True)
+        _log.info("recording into %s", self._session.path)
+
+    def _end(self, problem: str) -> None:
+        session, self._session = self._session, None
+        self._problem = problem
+        if session is not None:
+            session.close(self._clock.now_ns())
+
+    def _fail(self, problem: str) -> None:
+        """Give up the segment (its part can be recovered) and try again in a while."""
+        _log.error("%s; trying again in %d s", problem, _RETRY_NS // 10**9)
+        session, self._session = self._session, None
+        self._problem, self._retry_ns = problem, self._clock.now_ns() + _RETRY_NS
+        if session is not None:
+            try:
+                session.close(self._clock.now_ns())
+            except LogError:
+                pass  # said already; `recover` mends the part
+
+    def close(self) -> None:
+        """Finish the open segment and let another recorder take over; may be called twice."""
+        try:
+            self._end("")
+        except LogError as error:
+            self._problem = str(error)
+            _log.error("%s", error)
+        self._folder.unlock()
+
+    def _metadata(self) -> dict[str, dict[str, str]]:
+        try:
+            program = version("vical")
+        except PackageNotFoundError:
+            program = "unknown"
+        about = {"version": program, "rig": self._config.rig, **self._clock.status_values()}
+        return {"vical": about, "devices": dict(self._serials)}
+
+    def _attachments(self) -> list[Attachment]:
+        items = []
+        for name, path in (("config.yaml", self._config.path), ("target.yaml", self._config.target_path)):
+            if path is not None and path.is_file():
+                items.append(Attachment(name, "text/yaml", _without_secrets(path.read_bytes())))
+        estimates = []
+        for payload in self._calibrations.values():
+            try:
+                estimates.append(decode_calibration(payload))
+            except MessageError:
+                continue
+        if estimates:
+            text = json.dumps(merge_calibrations(estimates).to_json(), indent=1)
+            items.append(Attachment("calibration.json", "application/json", text.encode()))
+        return items
+
+    def status(self, queue: RecordQueue, lost: int) -> DiagnosticStatus:
+        """Return the health of the recorder."""
+        session = self._session
+        values = {
+            "state": "recording" if session else ("waiting" if self._wanted else "stopped"),
+            "file": session.path.name if session else "",
+            "segment_bytes": str(session.segment_bytes if session else 0),
+            "messages": str(self.messages),
+            "queue_depth": str(len(queue)),
+            "dropped": str(sum(queue.dropped.values())),
+            "lost_on_bus": str(lost),
+            "files_deleted": str(self._folder.deleted),
+        }
+        try:
+            values["disk_free_bytes"] = str(self._folder.free_bytes())
+        except OSError:
+            pass
+        if self._problem:
+            return DiagnosticStatus(Level.ERROR, "record", self._problem, values=values)
+        if queue.dropped or lost:
+            return DiagnosticStatus(
+                Level.WARN, "record", f"{values['dropped']} dropped, {lost} lost", values=values
+            )
+        message = f"recording, {self.messages} messages" if session else "stopped by command"
+        return DiagnosticStatus(Level.OK, "record", message, values=values)
+
+
+def arrival(sample: Sample, clock: WallClock) -> Arrival | None:
+    """Return a sample as it is recorded; None for keys that are not in the topics table."""
+    parsed = parse_key(sample.key)
+    return Arrival(parsed.topic, sample.key, sample.payload, clock.now_ns()) if parsed else None
+
+
+def _latches(topic: Topic) -> bool:
+    """What a segment must hold from its beginning to be readable alone."""
+    return topic.kind in ("camera_info", "tf_static")
+
+
+def _without_secrets(text: bytes) -> bytes:
+    """Return a config without its passwords: logs are handed around."""
+    lines = [
+        line.split(b"password:")[0] + b"password: removed" if b"password:" in line else line
+        for line in text.splitlines()
+    ]
+    return b"\n".join(lines) + b"\n"
