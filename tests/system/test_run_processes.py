@@ -1,0 +1,153 @@
+"""`vical run`: real processes, a real bus, an emulated IMU on a real terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from vical_mocks.gx3_emulator import Gx3Emulator
+
+from vical_daemon.bus import Sample
+from vical_daemon.messages import decode_diagnostics, decode_imu
+from vical_daemon.recording import open_recording
+from vical_daemon.vision.target import Checkerboard
+from vical_daemon.zenoh_bus import open_bus
+
+pytestmark = pytest.mark.system
+
+
+class Daemon:
+    """A folder with a config, and the `vical` processes started on it."""
+
+    def __init__(self, folder: Path, port: str) -> None:
+        self.folder = folder
+        self.processes: list[subprocess.Popen[str]] = []
+        self.environment = os.environ | {
+            "VICAL_RUNTIME_DIR": str(folder / "run"),
+            "VICAL_STATE_DIR": str(folder / "state"),
+            "OMP_NUM_THREADS": "1",
+        }
+        (folder / "target.yaml").write_text(Checkerboard(8, 5, 0.05, 0.05).to_yaml())
+        (folder / "vical.yaml").write_text(
+            f"rig: rover\nimus: {{imu0: {{port: {port}, rate_hz: 100}}}}\n"
+            "cameras: {cam0: {uri: 'v4l2:/dev/video77'}}\ntarget: target.yaml\nbus: {tcp_port: 0}\n"
+        )
+
+    def vical(self, *words: str, **more: Any) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "vical_daemon", *words, "-c", str(self.folder / "vical.yaml")]
+        process = subprocess.Popen(
+            command, env=self.environment | more, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self.processes.append(process)
+        return process
+
+    @property
+    def socket(self) -> Path:
+        return self.folder / "run" / "zenoh.sock"
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[Daemon]:
+    emulator = Gx3Emulator(link="direct", serial_number="6223-00007")
+    emulator.plug()
+    with emulator:
+        daemon = Daemon(tmp_path, emulator.port_name)
+        yield daemon
+        for process in daemon.processes:
+            if process.poll() is None:
+                process.terminate()
+            try:
+                process.communicate(timeout=15)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.communicate()
+
+
+def _wait_for(condition: Callable[[], Any], timeout_s: float = 30.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "it does not happen"
+        time.sleep(0.05)
+
+
+def test_all_processes_run_record_and_stop_cleanly(daemon: Daemon) -> None:
+    parent = daemon.vical("run")
+    _wait_for(daemon.socket.exists)
+    bus = open_bus(mode="client", socket=daemon.socket)
+    got: list[Sample] = []
+    bus.subscribe("vical/rover/**", got.append)
+    roles = {"imu", "camera", "record", "detect", "estimate"}
+    _wait_for(lambda: {s.key.split("/")[3] for s in list(got) if "/status/" in s.key} == roles)
+    _wait_for(lambda: sum("/imu/imu0" in s.key for s in list(got)) > 50)
+    _wait_for(lambda: any("/calibration/cam0" in s.key for s in list(got)))
+    watch = daemon.vical("watch", "--once", "--json")
+    out, _ = watch.communicate(timeout=30)
+    assert json.loads(out)["rig"] == "rover" and json.loads(out)["status"] == "waiting"
+    bus.close()
+    parent.send_signal(signal.SIGTERM)
+    _, err = parent.communicate(timeout=30)
+    assert parent.returncode == 0, err
+    assert "Traceback" not in err
+    offsets = {
+        component.values["wall_minus_monotonic_ns"]
+        for sample in got
+        if "/status/" in sample.key
+        for component in decode_diagnostics(sample.payload).statuses
+        if component.name == "clock"
+    }
+    assert len(offsets) == 1  # one clock for all processes
+    numbers = [s.sequence for s in got if s.key.endswith("/imu/imu0")]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # none lost on the bus
+    (log,) = (daemon.folder / "state" / "log").glob("*.mcap")
+    recorded = open_recording(log, check=False).imus["imu0"]
+    live = [decode_imu(s.payload).stamp_ns for s in got if s.key.endswith("/imu/imu0")]
+    assert recorded.count >= len(live) and recorded.largest_gap_s < 0.05
+
+
+def test_systemd_is_told_ready_alive_and_stopping(daemon: Daemon) -> None:
+    path = daemon.folder / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(path))
+        systemd.settimeout(30)
+        process = daemon.vical("run", "acquire", NOTIFY_SOCKET=str(path))
+        said: list[str] = []
+        while not {"READY=1", "WATCHDOG=1"} <= set("\n".join(said).split("\n")):
+            said.append(systemd.recv(4096).decode())
+        assert "READY=1" in said[0].split("\n") or "STATUS=" in said[0]
+        process.send_signal(signal.SIGTERM)
+        while "STOPPING=1" not in said[-1]:
+            said.append(systemd.recv(4096).decode())
+    assert process.wait(15) == 0
+    status = next(line for text in said for line in text.split("\n") if line.startswith("STATUS="))
+    assert "camera/cam0: /dev/video77" in status  # a camera that is missing is said, and is no reason to die
+
+
+def test_a_second_host_of_the_bus_is_one_line(daemon: Daemon) -> None:
+    first = daemon.vical("run", "acquire")
+    _wait_for(daemon.socket.exists)
+    second = daemon.vical("run", "acquire")
+    _, err = second.communicate(timeout=30)
+    assert second.returncode == 1 and "already hosts the bus" in err.splitlines()[-1]
+    assert first.poll() is None
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["run", "aquire"], 2, "did you mean acquire"),
+        (["watch", "--once"], 1, "no bus at"),
+    ],
+)
+def test_mistakes_are_one_line(daemon: Daemon, words: list[str], code: int, text: str) -> None:
+    process = daemon.vical(*words)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == code and text in err.splitlines()[-1] and "Traceback" not in err
