@@ -197,6 +197,12 @@ def code_under_test(kind: str) -> str:
     return runner.fingerprint(subject, "benchmarks/feed.py", "benchmarks/montecarlo.py", "mocks/vical_mocks")
 
 
+@cache
+def _code_of_the_bound() -> str:
+    files = ("bound", "error_model", "projection")
+    return runner.fingerprint(*(f"benchmarks/{name}.py" for name in files), "mocks/vical_mocks")
+
+
 def results_of(name: str, case: Case, kind: str, args: argparse.Namespace) -> list[runner.Result]:
     """Trials of a case joined with their bounds."""
     seeds = runner.seeds_of(args)
@@ -206,7 +212,7 @@ def results_of(name: str, case: Case, kind: str, args: argparse.Namespace) -> li
         partial(bound_trial, case, args.seconds),
         seeds,
         args,
-        runner.fingerprint("benchmarks/bound.py", "mocks/vical_mocks"),
+        _code_of_the_bound(),
     )
     results = runner.run_trials(
         f"{kind}_{file}", partial(trial, case, args.seconds, kind), seeds, args, code_under_test(kind)
@@ -262,6 +268,7 @@ def main(argv: list[str]) -> int:
     kinds = ("vical", "ekf") if args.subject == "both" else (args.subject,)
     for kind in kinds:
         code_under_test(kind)  # now, not hours later: somebody may edit the code meanwhile
+    _code_of_the_bound()
     all_results: dict[str, list[runner.Result]] = {}
     print(scores.HEADER)
     asked = args.trials

@@ -13,7 +13,8 @@ from vical_mocks.rig import ImuDensities, reference_rig
 from vical_mocks.tracks import simulate_tracks
 from vical_mocks.trajectory import still
 
-from benchmarks.bound import STATE, BoundOptions, bounds, inertial_factors
+from benchmarks.bound import BoundOptions, bounds
+from benchmarks.error_model import STATE, inertial_factors
 
 STATE_PRIOR = np.repeat([3.0, 10.0, 10.0, 0.3, 2.0], 3)
 
@@ -44,7 +45,7 @@ def moved(rig, start_s, end_s, dx, gravity):
     R = (R0 * Rotation.from_rotvec(dx[:, :3])).as_matrix()
     v, p = v0 + dx[:, 3:6], p0 + dx[:, 6:9]
     bias_g, bias_a = dx[:, 9:12], dx[:, 12:15]
-    steps = 60
+    steps = 40
     h = (end_s - start_s) / steps
     for i in range(steps):
         t_s = start_s + i * h
