@@ -214,7 +214,8 @@ class FakeCamera:
             t_host_ns = t_sent_ns + clock.delay_floor_ns + round(self._rng.exponential(clock.delay_mean_ns))
             sof = (t_sent_ns // 1_000_000) & 0x7FF
             header = struct.pack("<BBIIH", 12, 0x8C, pts, clock.ticks(read_ns), sof)
-            entries.append(struct.pack("<QH", t_host_ns, (t_host_ns // 1_000_000) & 0x7FF) + header)
+            host = struct.pack("<QH", t_host_ns + self.stamp_offset_ns, (t_host_ns // 1_000_000) & 0x7FF)
+            entries.append(host + header)
         return b"".join(entries)
 
     def usb_descriptors(self) -> bytes:

@@ -127,8 +127,9 @@ def find_again(kernel: Kernel, lost: NodeEntry) -> NodeEntry | None:
 
 def metadata_node(kernel: Kernel, camera: NodeEntry) -> NodeEntry | None:
     """Return the metadata node of a UVC camera; None where it has none or it cannot be asked."""
+    # a device with several cameras has several: the driver makes each right after its picture node
     for entry in list_nodes(kernel):
-        if entry.port != camera.port or entry.path == camera.path:
+        if entry.port != camera.port or entry.index <= camera.index:
             continue
         try:
             node = VideoNode(kernel, entry.path, abi.BUF_TYPE_META_CAPTURE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections import OrderedDict
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -14,6 +15,7 @@ from vical_drivers.camera.kernel import Kernel
 from vical_drivers.camera.stamps import Anchor
 from vical_drivers.camera.uvc import (
     ClockHealth,
+    PayloadHeader,
     UvcClock,
     clock_frequency_hz,
     metadata_bytes,
@@ -21,7 +23,7 @@ from vical_drivers.camera.uvc import (
     plausible_capture,
 )
 from vical_drivers.camera.v4l2_node import DequeuedBuffer, VideoNode
-from vical_drivers.camera.v4l2_stamp import RawStamp
+from vical_drivers.camera.v4l2_stamp import RawStamp, to_monotonic_ns
 from vical_drivers.errors import DriverError
 
 _log = logging.getLogger(__name__)
@@ -35,15 +37,18 @@ class UvcMetadata:
     """Streams the metadata node and stamps frames by their PTS.
 
     Args:
+        kernel: The system-call boundary.
         node: Open metadata node, already streaming.
         frequency_hz: Of the camera's clock; None where its descriptors do not say.
     """
 
-    def __init__(self, node: VideoNode, frequency_hz: float | None) -> None:
+    def __init__(self, kernel: Kernel, node: VideoNode, frequency_hz: float | None) -> None:
+        self._kernel = kernel
         self._node = node
         self._clock = UvcClock(frequency_hz)
         self._pts: OrderedDict[int, int] = OrderedDict()
         self._said = ""
+        self._driver_stamps_capture = hwtimestamps(kernel)
 
     @classmethod
     def open(cls, kernel: Kernel, camera: NodeEntry) -> Self | None:
@@ -58,7 +63,7 @@ class UvcMetadata:
             obtained = node.set_metadata_format("UVCH")
             if obtained == "UVCH":
                 node.start(_BUFFERS)
-                return cls(node, _frequency(kernel, camera))
+                return cls(kernel, node, _frequency(kernel, camera))
             _log.warning("uvc metadata path=%s: no UVCH but %s", entry.path, obtained)
         except DriverError as error:
             _log.warning("uvc metadata unusable: %s: frames are dated by their first packet", error)
@@ -75,7 +80,7 @@ class UvcMetadata:
         if not reason and pts is None:
             reason = "frames without PTS"
         t_ns = None if reason or pts is None else self._clock.to_host_ns(pts)
-        if t_ns is not None and not plausible_capture(t_ns, buffer.t_ns):
+        if t_ns is not None and not plausible_capture(t_ns, self._arrived_ns(buffer)):
             reason, t_ns = "PTS does not fit the arrival of the frames", None
         self._say(reason)
         if t_ns is None:
@@ -92,12 +97,25 @@ class UvcMetadata:
             while (buffer := self._node.dequeue()) is not None:
                 mapping = self._node.mappings[buffer.index]
                 for header in parse_metadata(metadata_bytes(mapping.array, buffer.bytes_used)):
-                    self._clock.add(header)
+                    self._add(header)
                     if header.pts is not None:
                         self._pts[buffer.sequence] = header.pts
                 self._node.queue(buffer.index)
         while len(self._pts) > _KEEP:
             self._pts.popitem(last=False)
+
+    def _arrived_ns(self, buffer: DequeuedBuffer) -> int:
+        """When the frame's first packet arrived, or at the latest did."""
+        now_ns = self._kernel.monotonic_ns()
+        if self._driver_stamps_capture:
+            return now_ns
+        return to_monotonic_ns(buffer.t_ns, now_ns, self._kernel.realtime_ns()) or now_ns
+
+    def _add(self, header: PayloadHeader) -> None:
+        monotonic_ns, realtime_ns = self._kernel.monotonic_ns(), self._kernel.realtime_ns()
+        t_ns = to_monotonic_ns(header.t_host_ns, monotonic_ns, realtime_ns)
+        if t_ns is not None:  # uvcvideo may run on CLOCK_REALTIME (its parameter "clock")
+            self._clock.add(header if t_ns == header.t_host_ns else replace(header, t_host_ns=t_ns))
 
     def _say(self, reason: str) -> None:
         if reason != self._said:
@@ -108,6 +126,15 @@ class UvcMetadata:
     def close(self) -> None:
         """Stop and free the node; may be called twice."""
         self._node.close()
+
+
+def hwtimestamps(kernel: Kernel) -> bool:
+    """Tell whether the uvcvideo module makes stamps of its own from PTS (its parameter hwtimestamps)."""
+    try:
+        text = (kernel.sysfs / "module/uvcvideo/parameters/hwtimestamps").read_text(encoding="ascii")
+    except OSError:
+        return False
+    return text.strip() in ("1", "Y")
 
 
 def _frequency(kernel: Kernel, camera: NodeEntry) -> float | None:

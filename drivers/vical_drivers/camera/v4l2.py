@@ -29,7 +29,7 @@ from vical_drivers.camera.negotiate import negotiate
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import SequenceCounter
 from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.uvc_stream import UvcMetadata
+from vical_drivers.camera.uvc_stream import UvcMetadata, hwtimestamps
 from vical_drivers.camera.v4l2_controls import Controls
 from vical_drivers.camera.v4l2_exposure import apply_settings, read_exposure_ns, set_exposure
 from vical_drivers.camera.v4l2_node import DequeuedBuffer, NodeIdentity, ObtainedFormat, VideoNode
@@ -60,7 +60,9 @@ class _Session:
             apply_settings(self.controls, settings)
             self.exposure_ns = read_exposure_ns(self.controls)
             self._watch_exposure()
+            self.uvc_hwtimestamps = False
             if self.identity.driver == _UVC_DRIVER and settings.stamp == "auto":
+                self.uvc_hwtimestamps = hwtimestamps(kernel)
                 self.metadata = UvcMetadata.open(kernel, entry)
             self.buffers = self.node.start(settings.buffers)
         except BaseException:
@@ -335,6 +337,7 @@ class V4l2Camera:
             monotonic_ns=t_arrival_ns,
             realtime_ns=self._kernel.realtime_ns(),
             forced=self._settings.stamp,
+            uvc_hwtimestamps=session.uvc_hwtimestamps,
         )
 
     def _say_rule(self, rule: str) -> None:

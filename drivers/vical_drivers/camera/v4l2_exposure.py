@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 from vical_drivers.camera import v4l2_abi as abi
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.v4l2_controls import Control, Controls
@@ -42,8 +44,9 @@ def set_exposure(controls: Controls, exposure_s: float) -> int:
         if mode is not None:
             controls.set(abi.CID_EXPOSURE_AUTO, mode)
     if controls.find(abi.CID_EXPOSURE_AUTO_PRIORITY) is not None:
-        # else the camera halves its frame rate in the dark
-        controls.set(abi.CID_EXPOSURE_AUTO_PRIORITY, 0)
+        # else the camera halves its frame rate in the dark; some refuse it in manual mode, where it is moot
+        with contextlib.suppress(DeviceRefusedError):
+            controls.set(abi.CID_EXPOSURE_AUTO_PRIORITY, 0)
     value = max(1, round(exposure_s * 1e9 / abi.EXPOSURE_UNIT_NS))
     obtained = controls.set(abi.CID_EXPOSURE_ABSOLUTE, value)
     return obtained * abi.EXPOSURE_UNIT_NS

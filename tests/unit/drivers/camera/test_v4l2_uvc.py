@@ -75,6 +75,25 @@ def test_without_metadata_node_the_grabber_says_so(open_fake, caplog) -> None:
     assert source.info.details["uvc_metadata"] == "no"
 
 
+def test_hwtimestamps_of_the_driver_are_taken_for_what_they_are(open_fake, kernel) -> None:
+    parameters = kernel.sysfs / "module/uvcvideo/parameters"
+    parameters.mkdir(parents=True)
+    (parameters / "hwtimestamps").write_text("1\n")
+    camera = FakeCamera(driver="uvcvideo", stamps="soe", formats=SIZES)
+    frame = open_fake(camera, exposure_s=0.012).read(1.0)
+    assert frame.stamp_rule == "soe(hwtimestamps)+exposure/2"
+    assert abs(frame.t_exposure_mid_ns - camera.truth[0].t_mid_ns) < 1000
+
+
+def test_a_driver_on_the_wall_clock_is_brought_back(open_fake) -> None:
+    camera = usb_camera()
+    camera.stamp_offset_ns = 1_700_000_000_000_000_000
+    source = open_fake(camera, exposure_s=0.012)
+    errors, rules = errors_us(camera, source, 600)
+    assert rules[-1] == "uvc-pts+exposure/2"
+    assert np.abs(errors[300:]).max() < 50.0
+
+
 def test_a_restarted_camera_clock_starts_a_new_fit() -> None:
     clock = UvcClock(1e6)
     t_ns = 0
