@@ -9,7 +9,7 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
-from vical_daemon.estimation.guidance import Gap, gaps
+from vical_daemon.estimation.gaps import Gap, gaps
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
 from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.guidance import gaps
+from vical_daemon.estimation.gaps import gaps
 from vical_daemon.estimation.measurements import ConvergenceTargets
 
 TARGETS = ConvergenceTargets(0.005, 0.002, 5e-4)
