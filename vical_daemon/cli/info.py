@@ -1,0 +1,87 @@
+"""`vical info LOG`: topics, rates, gaps, drops, jitter, duration of a recording."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.options import add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.recording.summary import Summary, TopicSummary
+
+HELP = "topics, rates, gaps, drops, jitter and duration of a recording"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of COMMANDS."""
+    parser.add_argument("log", metavar="LOG", help="an MCAP or bag file, a bag folder or an ASL folder")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what the recording holds, and whether `vical calibrate` would take it."""
+    from vical_daemon.recording import RecordingError, check_recording, open_recording
+    from vical_daemon.recording.summary import summarise_log, summarise_recording
+
+    path = Path(args.log)
+    problem = ""
+    if path.is_file() and (path.suffix == ".mcap" or path.name.endswith(".mcap.part")):
+        summary = summarise_log(path)
+        try:
+            check_recording(open_recording(path, check=False))
+        except RecordingError as error:
+            problem = str(error)
+    else:
+        recording = open_recording(path, check=False)
+        try:
+            check_recording(recording)
+        except RecordingError as error:
+            problem = str(error)
+        summary = summarise_recording(recording)
+    if args.json:
+        print(json.dumps(_as_json(summary, problem)))
+    else:
+        print(_as_text(summary, problem))
+    return 0
+
+
+def _as_json(summary: Summary, problem: str) -> dict[str, object]:
+    values = dataclasses.asdict(summary)
+    values["path"] = str(summary.path)
+    values["problem"] = problem
+    return values
+
+
+def _as_text(summary: Summary, problem: str) -> str:
+    begin = datetime.fromtimestamp(summary.begin_ns * 1e-9, UTC) if summary.begin_ns > 0 else None
+    lines = [
+        f"{summary.path}  {summary.bytes / 1e6:.1f} MB  {summary.duration_s:.2f} s  "
+        + f"{summary.messages} messages"
+        + ("" if summary.complete else "  UNFINISHED"),
+        f"begins {begin:%Y-%m-%d %H:%M:%S} UTC" if begin else "without date",
+        "",
+        f"{'topic':<40} {'count':>8} {'Hz':>8} {'missing':>8} {'max gap':>9} {'jitter':>9} "
+        f"{'latency p50/p99':>18}",
+    ]
+    lines += [_row(topic) for topic in summary.topics]
+    for name, values in summary.metadata.items():
+        lines.append(f"metadata {name}: " + ", ".join(f"{key}={value}" for key, value in values.items()))
+    for name, size in summary.attachments.items():
+        lines.append(f"attachment {name}: {size} bytes")
+    lines += [f"warning: {warning}" for warning in summary.warnings]
+    if problem:
+        lines.append(f"not fit for calibration: {problem}")
+    return "\n".join(lines)
+
+
+def _row(topic: TopicSummary) -> str:
+    latency = "" if topic.latency_ms is None else "{:.2f}/{:.2f} ms".format(*topic.latency_ms)
+    return (
+        f"{topic.topic:<40} {topic.count:>8} {topic.rate_hz:>8.2f} {topic.missing:>8} "
+        f"{topic.largest_gap_s:>7.3f} s {topic.jitter_us:>6.1f} us {latency:>18}"
+    )
