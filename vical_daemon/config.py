@@ -159,6 +159,8 @@ class BusConfig:
         user: User name for `connect`.
         password: Its password.
         readers: Users who may only read.
+        ros2: Publish also under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md.
+        ros2_domain: ROS_DOMAIN_ID of those who listen.
     """
 
     socket: str | None = None
@@ -172,6 +174,8 @@ class BusConfig:
     user: str | None = None
     password: str | None = None
     readers: tuple[str, ...] = ()
+    ros2: bool = False
+    ros2_domain: Annotated[int, Bound(low=0, high=232)] = 0
 
 
 @dataclass(frozen=True, slots=True)

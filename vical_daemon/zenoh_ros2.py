@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 import zenoh
 
 from vical_daemon import ros2_names
+from vical_daemon.bus import Handler, Sample
 from vical_daemon.ros2_names import Ros2Topic
+from vical_daemon.zenoh_bus import ZenohBus, ZenohSubscription
 
 
 class Ros2Outlet:
@@ -103,3 +106,54 @@ class _Publisher:
 
 
 _HEARTBEAT_S = 0.2
+
+
+class Ros2Bus:
+    """A `ZenohBus` that publishes everything under ROS 2's names as well.
+
+    Args:
+        bus: The bus.
+        node: Name of the node in the ROS graph.
+        domain: ROS_DOMAIN_ID.
+    """
+
+    def __init__(self, bus: ZenohBus, node: str, domain: int) -> None:
+        self._bus = bus
+        self._outlet = Ros2Outlet(bus.session, node, domain)
+
+    @property
+    def session(self) -> Any:
+        """See `ZenohBus.session`."""
+        return self._bus.session
+
+    @property
+    def connected(self) -> bool:
+        """See `ZenohBus.connected`."""
+        return self._bus.connected
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """See `Bus.publish`."""
+        self._bus.publish(key, payload)
+        with suppress(zenoh.ZError):  # closing, or no link at this moment
+            self._outlet.publish(key, payload)
+
+    def subscribe(
+        self,
+        key_expression: str,
+        handler: Handler | None = None,
+        *,
+        depth: int = 1024,
+        newest_wins: bool = False,
+    ) -> ZenohSubscription:
+        """See `Bus.subscribe`."""
+        return self._bus.subscribe(key_expression, handler, depth=depth, newest_wins=newest_wins)
+
+    def latest(self, key_expression: str, timeout_s: float = 1.0) -> list[Sample]:
+        """See `Bus.latest`."""
+        return self._bus.latest(key_expression, timeout_s)
+
+    def close(self) -> None:
+        """Leave; may be called twice."""
+        with suppress(zenoh.ZError):
+            self._outlet.close()
+        self._bus.close()

@@ -14,7 +14,7 @@ from vical_daemon import notify
 from vical_daemon.bus import Bus
 from vical_daemon.config import BusConfig, Config, load
 from vical_daemon.places import make_private, runtime_directory
-from vical_daemon.zenoh_bus import BusError, open_bus
+from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
 
 _log = logging.getLogger(__name__)
 SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
@@ -38,14 +38,20 @@ def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) 
         BusError: The bus cannot be hosted.
     """
     make_private(socket_path(config.bus).parent)
+    bus: ZenohBus | None = None
     if _HOSTS & set(roles):
         try:
-            return _host(config)
+            bus = _host(config)
         except BusError:
             if set(roles) >= _HOSTS:
                 raise
             _log.info("the bus is hosted by another process: joining it")
-    return _wait_for_router(config, stop)
+    bus = bus or _wait_for_router(config, stop)
+    if bus is not None and config.bus.ros2:
+        from vical_daemon.zenoh_ros2 import Ros2Bus
+
+        return Ros2Bus(bus, f"{config.rig}_{min(roles, default='vical')}", config.bus.ros2_domain)
+    return bus
 
 
 def open_client(config_path: str | None, endpoint: str | None) -> Bus:
@@ -69,7 +75,7 @@ def open_client(config_path: str | None, endpoint: str | None) -> Bus:
     return open_bus(mode="client", tcp_port=bus.tcp_port or BusConfig().tcp_port, **credentials)
 
 
-def _host(config: Config) -> Bus:
+def _host(config: Config) -> ZenohBus:
     bus = config.bus
     return open_bus(
         mode="router",
@@ -83,7 +89,7 @@ def _host(config: Config) -> Bus:
     )
 
 
-def _wait_for_router(config: Config, stop: threading.Event) -> Bus | None:
+def _wait_for_router(config: Config, stop: threading.Event) -> ZenohBus | None:
     path, begin_s, told = socket_path(config.bus), time.monotonic(), False
     while not stop.is_set():
         try:

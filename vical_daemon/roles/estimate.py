@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from vical_daemon import topics
-from vical_daemon.bus import Bus, Sample
+from vical_daemon.bus import Bus, Sample, Subscription
 from vical_daemon.config import Config
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate
@@ -21,6 +22,7 @@ from vical_daemon.messages import (
     MessageError,
     decode_imu,
     decode_points,
+    decode_string,
 )
 from vical_daemon.places import make_private, runtime_directory
 from vical_daemon.publications import (
@@ -90,6 +92,12 @@ class EstimateRole:
         self._next_s = self._next_companion_s = -float("inf")
         return self._publications(0.0)
 
+    def reset(self, estimator: Estimator) -> None:
+        """Forget everything and begin anew with a fresh estimator."""
+        self._order.pop_all()
+        self.estimator, self.latest = estimator, None
+        self._next_s = self._next_companion_s = -float("inf")
+
     def _feed(self, items: list[ImuMessage | PointsFrame]) -> None:
         for item in items:
             if isinstance(item, ImuMessage):
@@ -137,9 +145,12 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     clock = clock or shared_clock(make_private(runtime_directory()))
     role = EstimateRole(config, make_estimator(config))
     inbox = Inbox(bus, input_keys(config), INBOX)
+    commands = bus.subscribe(topics.command_key(config.rig, "estimate"), depth=8)
     status = StatusSender(config.rig, "estimate", bus, clock)
     while not stop.is_set():
         inbox.wait(PUBLISH_S / 2)
+        if _reset_wanted(commands):
+            role.reset(make_estimator(config))
         while True:  # a bounded number at a time, so that publications stay on time when data pile up
             for sample in inbox.take(256):
                 role.take(sample)
@@ -147,6 +158,16 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
             status.tick(lambda: role.statuses(inbox.dropped))
             if not len(inbox) or stop.is_set():
                 break
+    commands.close()
     inbox.close()
     publish(bus, role.finish())
     status.tick(lambda: role.statuses(inbox.dropped), force=True)
+
+
+def _reset_wanted(commands: Subscription) -> bool:
+    """Read the commands that have come; other words than ``reset`` are not for us."""
+    wanted = False
+    while (sample := commands.recv(0.0)) is not None:
+        with suppress(MessageError):
+            wanted |= decode_string(sample.payload).strip() == "reset"
+    return wanted

@@ -76,16 +76,46 @@ def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
         outlet.close()
 
 
+def test_the_bus_of_a_process_speaks_ros_when_told(tmp_path):
+    from vical_daemon.cli.bus_access import open_for_roles
+    from vical_daemon.config import BusConfig, Config
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    config = Config(bus=BusConfig(socket=str(tmp_path / "z.sock"), tcp_port=port, ros2=True, ros2_domain=4))
+    bus = open_for_roles(config, ("imu", "camera"), threading.Event())
+    own, ros = [], threading.Event()
+    bus.subscribe("vical/rig0/imu/*", own.append)
+    with zenoh.open(client_config(port)) as listener:
+        subscriber = listener.declare_subscriber("4/imu0/data/**", lambda _sample: ros.set())
+        payload = encode_imu(T0_NS, "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
+        end = time.monotonic() + 15
+        while not (ros.is_set() and own) and time.monotonic() < end:
+            bus.publish("vical/rig0/imu/imu0", payload)
+            time.sleep(0.02)
+        subscriber.undeclare()
+    assert ros.is_set()
+    assert own[0].payload == payload
+    assert bus.connected
+    bus.close()
+    bus.close()
+
+
+def client_config(port):
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
+    return config
+
+
 def test_attachments_count_up_and_static_messages_wait_for_late_joiners(router):
     session, port = router
     outlet = Ros2Outlet(session, domain=3)
     pose = PoseEstimate([0.1, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [[0.0] * 6] * 6)
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
     static = Transform(T0_NS, "imu", "cam0", (0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
     outlet.publish("vical/rig0/tf_static", encode_transforms([static]))
-    with zenoh.open(config) as late:
+    with zenoh.open(client_config(port)) as late:
         samples, statics = [], []
         plain = late.declare_subscriber("3/calibration/**", samples.append)
         advanced = zenoh.ext.declare_advanced_subscriber(
