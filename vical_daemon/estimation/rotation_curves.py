@@ -31,6 +31,9 @@ class RotationCurve(Protocol):
     def at(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return R_ref_imu (..., 3, 3), rate in the imu frame (..., 3), integral of R_ref_imu (..., 3, 3)."""
 
+    def matrix_effect(self, times_s: FloatArray) -> FloatArray:
+        """Return what an error of the gyro's 3x3 matrix does to the orientation, (..., 3, 9), row-major."""
+
     def quaternion(self, times_s: FloatArray) -> FloatArray:
         """Return the orientation alone, w x y z, shape (..., 4)."""
 
@@ -131,6 +134,24 @@ class GyroCurve:
         R_k = so3.matrix_from_quat(self.q_ref_imu[k])
         return R, rate, self.integral[k] + 0.5 * s[..., None, None] * (R_k + R)
 
+    def matrix_effect(self, times_s: FloatArray) -> FloatArray:
+        """Return the integral of R_ref_imu E_ij rate: the effect of an error of the gyro's scale matrix.
+
+        If the true rate is `(I + S) rate`, the orientation is off by `matrix_effect @ S.ravel()` (left, rad).
+
+        Returns:
+            shape (..., 3, 9), columns in the order of S row by row.
+        """
+        R = so3.matrix_from_quat(self.q_ref_imu)
+        flow = (R[:, :, :, None] * self.rate_rps[:, None, None, :]).reshape(-1, 27)
+        dt = np.diff(self.t_s)[:, None]
+        total = np.zeros_like(flow)
+        np.cumsum(0.5 * dt * (flow[:-1] + flow[1:]), axis=0, out=total[1:])
+        k, s, _ = self._segment(times_s)
+        share = (s / (self.t_s[k + 1] - self.t_s[k]))[..., None]
+        out: FloatArray = total[k] + share * (total[k + 1] - total[k])
+        return out.reshape(*times_s.shape, 3, 9)
+
     def variance(self, times_s: FloatArray, density: float) -> FloatArray:
         """Return the variance per axis gathered since the start: white gyro noise is a random walk in angle.
 
@@ -198,6 +219,10 @@ class OrientationCurve:
         R = so3.matrix_from_quat(so3.quat_multiply(self.q_ref_body[k], so3.quat_from_rotvec(turn)))
         rate = np.einsum("...ij,...j->...i", so3.right_jacobian(turn), derivative)
         return R, rate, np.zeros_like(R)
+
+    def matrix_effect(self, times_s: FloatArray) -> FloatArray:
+        """Return zeros: there is no gyro."""
+        return np.zeros((*times_s.shape, 3, 9))
 
     def variance(self, times_s: FloatArray, density: float) -> FloatArray:
         """Return a small drift: measured orientations do not walk; their noise is the caller's to add."""

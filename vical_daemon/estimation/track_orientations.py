@@ -21,7 +21,8 @@ FloatArray = npt.NDArray[np.float64]
 
 _MIN_FEATURES = 12
 _MAX_GAP_NS = 400_000_000
-_STEPS = 8
+_STEPS = 12
+_PLAIN_STEPS = 6  # before outliers are put aside
 
 
 def track_orientations(
@@ -91,36 +92,53 @@ def relative_rotation(rays_1: FloatArray, rays_2: FloatArray) -> tuple[FloatArra
         rays with unit noise, shape (3, 3); None where the points do not determine it.
     """
     U, _, Vt = np.linalg.svd(rays_1.T @ rays_2)
-    R = np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, dtype=np.float64)
-    t = _direction(rays_1, rays_2 @ R.T, np.ones(len(rays_1)))
-    J, weight = np.zeros((len(rays_1), 5)), np.ones(len(rays_1))
-    for _ in range(_STEPS):
-        turned = rays_2 @ R.T
-        # noise of either ray moves the error along t x ray: dividing by its length makes the noise one
-        a, b = np.cross(turned, t), np.cross(t, rays_1)
-        length = np.sqrt(np.einsum("ij,ij->i", a, a) + np.einsum("ij,ij->i", b, b)) + 1e-9
-        e = np.einsum("ij,ij->i", rays_1, np.cross(t, turned)) / length
-        basis = np.linalg.svd(t[None])[2][1:]
-        # d e / d (local rotation): ray_1 . (t x R (d x ray_2)) = d . (ray_2 x R' (ray_1 x t))
-        J[:, :3] = np.cross(rays_2, np.cross(rays_1, t) @ R) / length[:, None]
-        J[:, 3:] = (np.cross(turned, rays_1) @ basis.T) / length[:, None]
-        scale = 3.0 * float(np.median(np.abs(e))) / 0.6745 + 1e-12
-        weight = 1.0 / (1.0 + (e / scale) ** 2) ** 2
-        A = (J * weight[:, None]).T @ J
-        step = -np.linalg.solve(A + 1e-9 * np.trace(A) * np.eye(5), (J * weight[:, None]).T @ e)
-        R = R @ so3.exp(step[:3])
-        t = t + step[3:] @ basis
-        t = t / np.linalg.norm(t)
-        if np.abs(step[:3]).max() < 1e-9:
-            break
-    A = (J * weight[:, None]).T @ J + 1e-9 * np.eye(5)
-    covariance = np.linalg.inv(A)[:3, :3]
+    start = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    # a turn explains most of what a small translation does: its direction is tried along every axis
+    R, t = np.tile(start, (3, 1, 1)), np.eye(3)
+    weight = np.ones((3, len(rays_1)))
+    cost = np.full(3, np.inf)
+    for i in range(_STEPS):
+        e, J, basis = _linearise(R, t, rays_1, rays_2)
+        if i >= _PLAIN_STEPS:
+            scale = 3.0 * np.median(np.abs(e), axis=1, keepdims=True) / 0.6745 + 1e-9
+            weight = 1.0 / (1.0 + (e / scale) ** 2) ** 2
+        cost = np.median(np.abs(e), axis=1)
+        Jt = np.swapaxes(J * weight[..., None], 1, 2)
+        A = Jt @ J
+        A = A + np.eye(5) * (1e-7 * np.einsum("cii->c", A) / 5.0 + 1e-12)[:, None, None]
+        step = -np.linalg.solve(A, Jt @ e[..., None])[..., 0]
+        step *= np.minimum(1.0, 0.3 / np.maximum(np.abs(step).max(axis=1), 1e-12))[:, None]
+        R = R @ so3.exp(step[:, :3])
+        t = t + (step[:, None, 3:] @ basis)[:, 0]
+        t = t / np.linalg.norm(t, axis=1, keepdims=True)
+    best = int(np.argmin(cost))
+    Jw = J[best] * weight[best][:, None]
+    covariance = np.linalg.inv(Jw.T @ J[best] + 1e-9 * np.eye(5))[:3, :3]
     if not np.isfinite(covariance).all():
         return None
-    return R, np.asarray(covariance, dtype=np.float64)
+    return np.asarray(R[best], dtype=np.float64), np.asarray(covariance, dtype=np.float64)
 
 
-def _direction(rays_1: FloatArray, turned: FloatArray, weight: FloatArray) -> FloatArray:
-    """Direction of translation for a given rotation: the normal to all epipolar normals."""
-    n = np.cross(turned, rays_1)
-    return np.asarray(np.linalg.eigh((n * weight[:, None]).T @ n)[1][:, 0], dtype=np.float64)
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product over the last axis; numpy's own is slow on small arrays."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), axis=-1)
+
+
+def _linearise(
+    R: FloatArray, t: FloatArray, rays_1: FloatArray, rays_2: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return normalised epipolar errors (c, n), their derivatives (c, n, 5), tangents of t (c, 2, 3)."""
+    turned = rays_2 @ np.swapaxes(R, 1, 2)
+    across = t[:, None, :]
+    # noise of either ray moves the error along t x ray: dividing by its length makes the noise one
+    a, b = _cross(turned, across), _cross(across, rays_1[None])
+    length = np.sqrt(np.sum(a * a, axis=-1) + np.sum(b * b, axis=-1)) + 1e-9
+    e = np.sum(rays_1 * -a, axis=-1) / length
+    basis = np.linalg.svd(t[:, None, :])[2][:, 1:]
+    J = np.empty((*e.shape, 5))
+    # d e / d (local rotation): ray_1 . (t x R (d x ray_2)) = d . (ray_2 x R' (ray_1 x t))
+    J[..., :3] = _cross(rays_2[None], -b @ R)
+    J[..., 3:] = _cross(turned, rays_1[None]) @ np.swapaxes(basis, 1, 2)
+    return e, J / length[..., None], basis

@@ -1,0 +1,216 @@
+"""Known results of observability, from the model (Lie derivatives) and along motions (Gramian); guidance."""
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.missing_motion import Limits, axis_words, missing_motion
+from vical_daemon.estimation.observability import Motion, Setup, gramian, lost_in_block, pose_sensitivities
+from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
+
+G = np.array([0.0, 6.0, 7.7])
+R_IMU_CAM = so3.exp(np.array([0.3, -1.2, 0.5]))
+P_IMU_CAM = np.array([0.08, 0.02, -0.03])
+
+
+def _lost(result):
+    """Share of each block in the null space."""
+    names = np.array(result.names)
+    return {n for n in dict.fromkeys(result.names) if np.linalg.norm(result.null_space[:, names == n]) > 1e-6}
+
+
+@pytest.mark.parametrize(
+    "blocks",
+    [
+        ModelBlocks(),
+        ModelBlocks(intrinsics=True, imu_matrix=True, target_scale=True, gravity="magnitude"),
+    ],
+)
+def test_before_a_known_target_everything_is_observable(blocks):
+    result = model_rank(blocks)
+    assert result.rank == result.unknowns
+
+
+def test_without_a_target_only_position_and_the_turn_of_the_world_are_free():
+    level = model_rank(ModelBlocks(target_free=True, gravity="known"))
+    assert level.unknowns - level.rank == 4
+    assert _lost(level) == {"attitude", "position", "velocity", "landmark"}
+    tilted = model_rank(ModelBlocks(target_free=True, gravity="magnitude"))
+    assert tilted.unknowns - tilted.rank == 6
+    assert not _lost(tilted) & {"rotation", "lever_arm", "timeshift", "gyro_bias", "accel_bias"}
+
+
+def test_nor_do_lens_and_imu_errors_without_a_target_add_to_that():
+    full = model_rank(
+        ModelBlocks(target_free=True, gravity="known", intrinsics=True, imu_matrix=True, points=5), order=10
+    )
+    assert full.unknowns - full.rank == 4
+
+
+def test_rotation_about_one_axis_loses_the_lever_arm_along_it():
+    result = model_rank(ModelBlocks(gravity="magnitude"), "one_axis")
+    names = np.array(result.names)
+    arm = result.null_space[:, names == "lever_arm"]
+    assert result.unknowns - result.rank == 1
+    np.testing.assert_allclose(np.abs(arm[0] / np.linalg.norm(arm[0])), [0.36, 0.48, 0.8], atol=1e-6)
+    assert not _lost(result) & {"rotation", "timeshift"}
+
+
+def test_pure_translation_loses_the_lever_arm_and_keeps_the_delay():
+    result = model_rank(ModelBlocks(), "translation")
+    assert "lever_arm" in _lost(result) and "timeshift" not in _lost(result)
+
+
+def test_constant_rate_and_velocity_lose_the_delay():
+    assert "timeshift" in _lost(model_rank(ModelBlocks(), "constant"))
+
+
+def test_the_verdict_does_not_depend_on_the_draw():
+    assert {model_rank(ModelBlocks(points=4), seed=s, order=10).rank for s in range(2)} == {25}
+
+
+def test_an_unknown_motion_is_named():
+    with pytest.raises(ValueError, match="one_axis"):
+        model_rank(ModelBlocks(), "spiral")
+
+
+def _motion(kind, seconds=12.0, dt=0.005):
+    """Motion before a board at the origin, 0.8 m away, integrated finely enough to be exact for the test."""
+    t = np.arange(0, seconds, dt)
+    swing = np.stack([0.3 * np.sin(2.1 * t), 0.25 * np.sin(2.7 * t + 1), 0.4 * np.sin(1.6 * t + 2)], axis=1)
+    if kind == "one_axis":
+        swing *= np.array([0.0, 0.0, 1.0])
+    elif kind == "translation":
+        swing *= 0.0
+    elif kind == "constant":
+        swing = np.outer(0.7 * t, [0.0, 0.0, 1.0])
+    R_base = np.eye(3)  # of the camera in the world; the board lies at z = 0.8
+    R_world_cam = R_base @ so3.exp(swing)
+    moving = 0.0 if kind == "constant" else 0.08
+    sway = np.stack([np.sin(1.9 * t), np.sin(2.3 * t + 1), np.sin(1.3 * t + 2)], axis=1) * moving
+    R = R_world_cam @ R_IMU_CAM.T
+    p = np.array([0.0, 0.0, -0.8]) + sway - (R @ P_IMU_CAM)
+    v = np.gradient(p, dt, axis=0, edge_order=2)
+    a = np.gradient(v, dt, axis=0, edge_order=2)
+    turn = so3.log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / dt
+    w = np.vstack((turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]))
+    f = np.einsum("kji,kj->ki", R, a - G)
+    return Motion(t, R, p, v, w, f)
+
+
+def _setup(**changes):
+    x, y = np.meshgrid(np.linspace(-0.2, 0.2, 5), np.linspace(-0.15, 0.15, 4))
+    board = np.column_stack((x.ravel(), y.ravel(), np.zeros(20)))
+    lens = np.array([450.0, 450.0, 319.5, 239.5])
+    return Setup(R_IMU_CAM, P_IMU_CAM, lens, np.array([-0.2, 0.05, 0, 0]), board, **changes)
+
+
+FRAMES = np.arange(10, 2390, 20)
+
+
+def test_sensitivities_agree_with_integrating_a_disturbed_imu():
+    motion = _motion("general", 1.5)
+    layout = {n: slice(3 * i, 3 * i + 3) for i, n in enumerate(
+        ("attitude", "position", "velocity", "gyro_bias", "accel_bias", "gravity"))}  # fmt: skip
+    theta, velocity, position = pose_sensitivities(motion, layout, 18)
+    dt = motion.t_s[1] - motion.t_s[0]
+    h = 1e-5
+    # all 36 disturbed imus at once: +h and -h in every unknown
+    x = np.concatenate((h * np.eye(18), -h * np.eye(18)))
+    R = so3.exp(x[:, :3]) @ motion.R_world_imu[0]
+    v, p = motion.v_world_imu[0] + x[:, 6:9], motion.p_world_imu[0] + x[:, 3:6]
+    g = G + x[:, 15:18]
+    for k in range(len(motion.t_s) - 1):
+        w = 0.5 * (motion.rate_rps[k] + motion.rate_rps[k + 1]) - x[:, 9:12]
+        later = R @ so3.exp(dt * w)
+        a0 = np.einsum("cij,cj->ci", R, motion.specific_force_mps2[k] - x[:, 12:15]) + g
+        a1 = np.einsum("cij,cj->ci", later, motion.specific_force_mps2[k + 1] - x[:, 12:15]) + g
+        p = p + dt * v + dt * dt * (a0 / 3 + a1 / 6)
+        v = v + 0.5 * dt * (a0 + a1)
+        R = later
+    numeric = so3.log(R[:18] @ np.swapaxes(R[18:], 1, 2)) / (2 * h)
+    np.testing.assert_allclose(theta[-1], numeric.T, atol=1e-4)
+    np.testing.assert_allclose(velocity[-1], (v[:18] - v[18:]).T / (2 * h), rtol=2e-3, atol=1e-2)
+    np.testing.assert_allclose(position[-1], (p[:18] - p[18:]).T / (2 * h), rtol=2e-3, atol=1e-2)
+
+
+def test_general_motion_determines_everything_and_bounds_are_sensible():
+    result = gramian(_motion("general"), _setup(), FRAMES)
+    assert result.rank == result.unknowns == 25
+    assert np.all(result.sigma[result.blocks["lever_arm"]] < 2e-3)
+    assert result.sigma[result.blocks["timeshift"]][0] < 2e-4
+
+
+def test_one_axis_names_the_axis_along_a_motion_too():
+    result = gramian(_motion("one_axis"), _setup(), FRAMES)
+    assert result.rank < result.unknowns
+    axis = lost_in_block(result, "lever_arm")[0]
+    assert abs(axis @ R_IMU_CAM[:, 2]) > 0.99  # the optical axis, in the imu frame
+    assert np.all(np.isfinite(result.sigma[result.blocks["rotation"]]))
+    assert np.isfinite(result.sigma[result.blocks["timeshift"]][0])
+    assert "lever_arm" in [name for name, _ in result.lost[0].parts] or len(result.lost) > 1
+
+
+def test_translation_and_constant_rate_along_a_motion():
+    translation = gramian(_motion("translation"), _setup(), FRAMES)
+    assert len(lost_in_block(translation, "lever_arm")) == 3
+    assert np.isfinite(translation.sigma[translation.blocks["timeshift"]][0])
+    constant = gramian(_motion("constant", 8.0), _setup(), FRAMES[:70])
+    assert not constant.sigma[constant.blocks["timeshift"]][0] < 5e-3
+
+
+def test_optional_blocks_are_judged_too():
+    every = frozenset({"intrinsics", "imu_matrix", "target_scale", "readout"})
+    result = gramian(_motion("general"), _setup(estimate=every), FRAMES)
+    assert result.unknowns == 50
+    free = gramian(_motion("general", 6.0), _setup(target_free=True), FRAMES[:50])
+    # board-free: three of position, three of the world's turn (gravity's direction is an unknown), no others
+    assert free.unknowns - free.rank in (6, 7)
+    assert not np.isfinite(free.sigma[free.blocks["position"]]).any()
+    assert np.isfinite(free.sigma[free.blocks["rotation"]]).all()
+
+
+def _covariance(arm=(1e-3,) * 3, rotation=(1e-3,) * 3, shift=1e-4):
+    arm_cov = R_IMU_CAM @ np.diag(np.square(arm)) @ R_IMU_CAM.T
+    C = np.zeros((7, 7))
+    C[:3, :3], C[3:6, 3:6], C[6, 6] = arm_cov, np.diag(np.square(rotation)), shift**2
+    return C
+
+
+def _scatter(*rates_cam):
+    return sum(np.outer(R_IMU_CAM @ np.array(w), R_IMU_CAM @ np.array(w)) for w in rates_cam)
+
+
+def test_guidance_names_the_optical_axis_and_another_rotation():
+    found = missing_motion(_covariance(arm=(1e-3, 1e-3, 0.5)), R_IMU_CAM, _scatter((0, 0, 0.7)))
+    assert str(found[0]) == (
+        "lever arm along the optical axis: "
+        "so far it turned about the optical axis only; rotate about another axis"
+    )
+    assert len(found) == 1
+
+
+def test_guidance_says_nothing_when_all_is_known():
+    assert missing_motion(_covariance(), R_IMU_CAM, _scatter((0.5, 0, 0), (0, 0.5, 0))) == []
+
+
+def test_guidance_for_standing_still_slow_and_steady_motion():
+    still = missing_motion(_covariance((1, 1, 1), (1, 1, 1), 1.0), R_IMU_CAM, 1e-6 * np.eye(3))
+    assert len(still) == 7 and all("turn" in m.advice for m in still)
+    slow = missing_motion(_covariance(arm=(0.01, 1e-3, 1e-3)), R_IMU_CAM, 0.005 * np.eye(3))
+    assert "faster" in slow[0].advice and slow[0].direction == "the image's x axis"
+    steady = missing_motion(_covariance(shift=0.01), R_IMU_CAM, _scatter((0, 0.7, 0)), rate_change_rps2=0.01)
+    assert "to and fro" in str(steady[0]) and steady[0].block == "timeshift"
+    tilted = missing_motion(
+        _covariance(rotation=(1e-3, 0.2, 1e-3)),
+        R_IMU_CAM,
+        _scatter((0, 0.7, 0)),
+        limits=Limits(rotation_rad=0.01),
+    )
+    assert "image's y axis" in str(tilted[0])
+
+
+def test_axes_in_words():
+    assert axis_words(np.array([0, 0, -2.0])) == "the optical axis"
+    assert "between" in axis_words(np.array([1.0, 1.0, 0.0]))
+    assert "oblique" in axis_words(np.array([1.0, 1.0, 1.0]))
