@@ -201,7 +201,7 @@ class FakeCamera:
         memory[:4] = np.frombuffer(struct.pack("<I", number), dtype=np.uint8)
         return self.image_bytes
 
-    def metadata(self, truth: FrameTruth, *, payloads: int = 12) -> bytes:
+    def metadata(self, truth: FrameTruth, *, payloads: int = 6) -> bytes:
         """Return the UVCH metadata of a frame: one entry a payload, spread over the read-out."""
         if self.uvc is None:
             return b""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import shutil
-import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,7 +59,6 @@ class FakeKernel(Requests):
         super().__init__(clock or VirtualClock())
         self.mappings: set[int] = set()
         self.requests: deque[int] = deque(maxlen=10_000)
-        self.busy_s = 0.0
         self._open: dict[int, OpenNode] = {}
         self._next_fd = _FIRST_FD
         (self.dev / "v4l/by-id").mkdir(parents=True)
@@ -156,14 +154,7 @@ class FakeKernel(Requests):
         return mapping
 
     def poll(self, watched: Sequence[tuple[int, int]], timeout_s: float) -> dict[int, int]:
-        """Wait, in this kernel's time; `busy_s` counts the processor time that this kernel costs."""
-        started = time.thread_time()
-        try:
-            return self._poll(watched, timeout_s)
-        finally:
-            self.busy_s += time.thread_time() - started
-
-    def _poll(self, watched: Sequence[tuple[int, int]], timeout_s: float) -> dict[int, int]:
+        """Wait, in this kernel's time."""
         deadline = self.clock.now_ns + round(timeout_s * 1e9)
         while True:
             ready = {fd: found for fd, events in watched if (found := self._ready(fd, events))}
@@ -173,13 +164,6 @@ class FakeKernel(Requests):
 
     def ioctl(self, fd: int, request: int, argument: ctypes.Structure) -> None:
         """Decode and run one request."""
-        started = time.thread_time()
-        try:
-            self._ioctl(fd, request, argument)
-        finally:
-            self.busy_s += time.thread_time() - started
-
-    def _ioctl(self, fd: int, request: int, argument: ctypes.Structure) -> None:
         held = self._held(fd)
         number = request & 0xFF
         self.requests.append(number)
