@@ -276,4 +276,5 @@ def _why_not(last: Update | None, timeout_s: float | None) -> str:
         return f"no calibration heard within {timeout_s} s; is `vical run` (vical-calibrate) up?"
     estimate = last.estimate
     hint = estimate.guidance or estimate.reason
-    return f"{last.camera} has not converged within {timeout_s} s: {estimate.status}{': ' + hint if hint else ''}"
+    stands = f"{estimate.status}: {hint}" if hint else str(estimate.status)
+    return f"{last.camera} has not converged within {timeout_s} s: {stands}"

@@ -145,7 +145,7 @@ def read_stored(path: Path) -> StoredCalibration | None:
         return None
     try:
         stored = msgspec.json.decode(text, type=StoredCalibration)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         _log.warning("%s is no stored calibration and is not used: %s", path, error)
         return None
     problem = _problem(stored)

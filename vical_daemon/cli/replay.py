@@ -60,9 +60,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(result))
     else:
-        print(
-            f"{result['messages']} messages in {result['duration_s']:.1f} s, latest {result['late_ms']:.1f} ms late"
-        )
+        late = f"the latest {result['late_ms']:.1f} ms late"
+        print(f"{result['messages']} messages in {result['duration_s']:.1f} s, {late}")
     return 0
 
 

@@ -1,0 +1,110 @@
+"""vical info, recover and replay."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import pytest
+
+from vical_daemon import topics
+from vical_daemon.bus import LocalBus
+from vical_daemon.cli import main
+from vical_daemon.cli.replay import replay
+from vical_daemon.mcap_log import LogFolder, LogReader, LogWriter
+from vical_daemon.recording import open_recording
+from vical_daemon.recording.logs import stamp_of
+
+
+@pytest.fixture
+def log(asl_folder, tmp_path):
+    path = tmp_path / "a.mcap"
+    with LogWriter(path, {"vical": {"version": "1"}}) as writer:
+        for i, (key, payload) in enumerate(open_recording(asl_folder).messages()):
+            if not 400 <= i < 404:
+                writer.write(key, payload, stamp_of(payload) + 2_000_000)
+        writer.attach("config.yaml", "text/yaml", b"rig: rig0", 1)
+    return path
+
+
+def test_info_of_a_log(log, capsys):
+    assert main(["info", str(log), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    imu = next(t for t in found["topics"] if t["topic"] == "/vical/rig0/imu/imu0")
+    assert imu["type_name"] == "sensor_msgs/msg/Imu"
+    assert imu["rate_hz"] == pytest.approx(200)
+    assert imu["missing"] == 4
+    assert imu["gaps"] == 1
+    assert imu["latency_ms"] == pytest.approx([2.0, 2.0])
+    assert found["complete"]
+    assert found["problem"] == ""
+    assert found["metadata"] == {"vical": {"version": "1"}}
+    assert found["attachments"] == {"config.yaml": 9}
+    assert main(["info", str(log)]) == 0
+    text = capsys.readouterr().out
+    assert "/vical/rig0/imu/imu0" in text
+    assert "200.00" in text
+
+
+def test_info_of_a_folder_and_of_a_cut_log(asl_folder, log, capsys):
+    assert main(["info", str(asl_folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [t["count"] for t in found["topics"]] == [200, 2400]
+    log.write_bytes(log.read_bytes()[:100_000])
+    assert main(["info", str(log)]) == 0
+    text = capsys.readouterr().out
+    assert "UNFINISHED" in text
+    assert "end is missing" in text
+
+
+@pytest.mark.parametrize("command", ["info", "recover", "replay"])
+def test_bad_files_are_one_line(command, tmp_path, capsys):
+    path = tmp_path / "a.mcap"
+    assert main([command, str(path)]) == 1
+    path.write_text("text")
+    assert main([command, str(path)]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 2
+    assert all("a.mcap" in line for line in lines)
+
+
+def test_recover_file_and_folder(log, tmp_path, capsys):
+    raw = log.read_bytes()
+    log.write_bytes(raw[: len(raw) // 2])
+    assert main(["recover", str(log), "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["recovered"]
+    assert found["output"].endswith("a.recovered.mcap")
+    assert found["messages"] > 100
+    assert main(["recover", str(log)]) == 1  # exists already
+    assert "exists already" in capsys.readouterr().err
+    assert main(["recover", str(log), "-o", str(tmp_path / "b.mcap")]) == 0
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    (parts / "x.mcap.part").write_bytes(raw[:-20])
+    assert main(["recover", str(parts)]) == 0
+    reader = LogReader(parts / "x.mcap")
+    assert len(list(reader.messages())) == 2596
+    assert reader.complete
+    assert main(["recover", str(parts)]) == 0
+    assert "nothing to recover" in capsys.readouterr().out
+    assert main(["recover", str(parts), "-o", "x"]) == 2
+    folder = LogFolder(parts)
+    assert folder.lock()
+    assert main(["recover", str(parts)]) == 1
+    folder.unlock()
+
+
+def test_replay_publishes_in_time_and_order(asl_folder):
+    recording = open_recording(asl_folder)
+    bus, got = LocalBus(), []
+    bus.subscribe("**", got.append)
+    result = replay(recording, bus, threading.Event(), speed=0)
+    assert [(s.key, s.payload) for s in got] == list(recording.messages())
+    assert result["messages"] == 2600
+    got.clear()
+    result = replay(recording, bus, threading.Event(), speed=40, rig="robot7")
+    assert 0.29 < result["duration_s"] < 5
+    assert got[0].key == topics.imu_key("robot7", "imu0")
+    stop = threading.Event()
+    stop.set()
+    assert replay(recording, bus, stop)["messages"] == 0
