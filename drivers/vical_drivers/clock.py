@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 _NS = 1e9
 
@@ -220,6 +221,18 @@ def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
     return (b[1] - a[1]) / (b[0] - a[0])
 
 
+class DeviceTime(NamedTuple):
+    """When one sample was taken, on the device's clock.
+
+    Attributes:
+        ticks: Unwrapped ticks, as the device said.
+        fine: The same with the fraction of a tick that its rounding took away, as far as it is known.
+    """
+
+    ticks: int
+    fine: float
+
+
 @dataclass(frozen=True, slots=True)
 class Stamp:
     """What the clock says of one sample.
@@ -263,6 +276,7 @@ class DeviceClock:
         self.outliers = 0
         self.repeats = 0
         self.lost = 0
+        self._period = tick_hz / rate_hz if rate_hz > 0.0 else 0.0
         self._options = options
         self._unwrap = TickUnwrapper(tick_bits)
         self._suspect: tuple[int, int] | None = None
@@ -273,6 +287,7 @@ class DeviceClock:
         self.envelope = LowerEnvelope(self._options)
         self._first_ticks: int | None = None
         self._last_ticks = 0
+        self._fine = 0.0
         self._t0_ns = 0
         self._last_t_ns: int | None = None
         self._stamped_ticks = 0
@@ -282,8 +297,8 @@ class DeviceClock:
         """Device seconds since the mapping began; below about 1 s it is not worth much."""
         return 0.0 if self._first_ticks is None else (self._last_ticks - self._first_ticks) / self.tick_hz
 
-    def add(self, ticks: int, t_arrival_ns: int) -> int | None:
-        """Take one sample; return its unwrapped ticks, None where the value cannot be true or was seen.
+    def add(self, ticks: int, t_arrival_ns: int) -> DeviceTime | None:
+        """Take one sample; return its device time, None where the value cannot be true or was seen.
 
         A value from the future is either damage or a restarted (or newly set) device timer. One such
         value is dropped; a second one that fits the first is a restart, and the mapping begins anew.
@@ -303,10 +318,23 @@ class DeviceClock:
         unwrapped = self._unwrap.accept(ticks)
         if self._first_ticks is None:
             self._first_ticks, self._t0_ns = unwrapped, t_arrival_ns
-        x_s = (unwrapped - self._first_ticks) / self.tick_hz
+            self._fine, self._last_ticks = float(unwrapped), unwrapped
+        self._fine = self._refined(unwrapped)
+        x_s = (self._fine - self._first_ticks) / self.tick_hz
         self.envelope.add(x_s, (t_arrival_ns - self._t0_ns) / _NS - x_s)
         self._last_ticks = unwrapped
-        return unwrapped
+        return DeviceTime(unwrapped, self._fine)
+
+    def _refined(self, unwrapped: int) -> float:
+        """Ticks with the fraction that rounding took away.
+
+        Samples come every 62.5 ticks at 1000 Hz, so the counter alternates between steps of 62 and 63. The
+        instants themselves are evenly spaced by the same crystal: go on by whole periods, within the tick.
+        """
+        if self._period <= 0.0:
+            return float(unwrapped)
+        periods = round((unwrapped - self._last_ticks) / self._period)
+        return min(max(self._fine + periods * self._period, unwrapped), unwrapped + 1.0)
 
     def _possible(self, ticks: int, t_arrival_ns: int) -> bool:
         assert self._first_ticks is not None
@@ -326,24 +354,24 @@ class DeviceClock:
         host_s = (t_arrival_ns - self._suspect[1]) / _NS
         return 0.0 < step_s < host_s + 1.0
 
-    def stamp(self, unwrapped_ticks: int) -> Stamp:
-        """Map unwrapped ticks that were added before; call it once per sample and in order.
+    def stamp(self, device: DeviceTime) -> Stamp:
+        """Map a device time that `add` returned; call it once per sample and in order.
 
         Stamps never go back: where the envelope just moved, the step is spread over some samples.
         """
         assert self._first_ticks is not None
-        x_s = (unwrapped_ticks - self._first_ticks) / self.tick_hz
+        x_s = (device.fine - self._first_ticks) / self.tick_hz
         t_ns = self._t0_ns + round((x_s + self.envelope.line(x_s)) * _NS)
         lost = 0
         if self._last_t_ns is not None:
-            step_s = (unwrapped_ticks - self._stamped_ticks) / self.tick_hz
+            step_s = (device.ticks - self._stamped_ticks) / self.tick_hz
             t_ns = max(t_ns, self._last_t_ns + max(1, round(0.5 * step_s * _NS)))
             # Half a period of tolerance swallows the 62/63 tick alternation at 1000 Hz.
             lost = max(0, round(step_s * self.rate_hz) - 1)
         self.lost += lost
-        self._last_t_ns, self._stamped_ticks = t_ns, unwrapped_ticks
+        self._last_t_ns, self._stamped_ticks = t_ns, device.ticks
         sigma_s = math.hypot(self.envelope.sigma_s, 0.5 / self.tick_hz)
-        return Stamp(t_ns, round(min(sigma_s, 1.0) * _NS), unwrapped_ticks, lost)
+        return Stamp(t_ns, round(min(sigma_s, 1.0) * _NS), device.ticks, lost)
 
 
 class SampleCounter:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
-from vical_drivers.clock import DeviceClock, EnvelopeOptions, SampleCounter
+from vical_drivers.clock import DeviceClock, DeviceTime, EnvelopeOptions, SampleCounter
 from vical_drivers.errors import DeviceLostError, DeviceTimeoutError, DriverError
 from vical_drivers.microstrain.probe import PROTOCOLS, connect
 from vical_drivers.microstrain.session import ImuSettings, RawSample, Session
@@ -89,7 +89,7 @@ class MicrostrainImu:
         self._past_skipped_bytes = 0
         self._reconnects = 0
         self._attempts = 0
-        self._held: list[tuple[RawSample, int]] = []
+        self._held: list[tuple[RawSample, DeviceTime]] = []
         self._closed = False
         self._last_data_ns = 0
         self._next_attempt_ns = 0
@@ -161,18 +161,18 @@ class MicrostrainImu:
             raw_ticks = sample.ticks if self._counter is None else self._counter.count(sample.t_arrival_ns)
             assert raw_ticks is not None
             restarts, repeats = self.clock.restarts, self.clock.repeats
-            ticks = self.clock.add(raw_ticks, sample.t_arrival_ns)
+            device_time = self.clock.add(raw_ticks, sample.t_arrival_ns)
             if self.clock.restarts != restarts:
                 self._held.clear()
             self._stuck = self._stuck + 1 if self.clock.repeats != repeats else 0
             if self._stuck > _STUCK_SAMPLES:
                 self._switch_to_counting()
-            if ticks is not None:
-                self._held.append((sample, ticks))
+            if device_time is not None:
+                self._held.append((sample, device_time))
         if not self._held or self.clock.age_s < self._options.warm_up_s:
             return []
         held, self._held = self._held, []
-        out = [self._to_sample(sample, ticks) for sample, ticks in held]
+        out = [self._to_sample(sample, device_time) for sample, device_time in held]
         self._samples += len(out)
         first_ns, count, _ = self._span or (out[0].t_host_ns, 0, 0)
         self._span = (first_ns, count + len(out), out[-1].t_host_ns)
@@ -192,15 +192,15 @@ class MicrostrainImu:
         )
         self.clock.restarts = restarts
 
-    def _to_sample(self, raw: RawSample, ticks: int) -> ImuSample:
-        stamp = self.clock.stamp(ticks)
+    def _to_sample(self, raw: RawSample, device_time: DeviceTime) -> ImuSample:
+        stamp = self.clock.stamp(device_time)
         self._lost += stamp.lost_before
         # A new clock (restart, reconnect) may begin a little before the old one ended.
         self._last_stamp_ns = max(stamp.t_device_event_ns - self._delay_ns, self._last_stamp_ns + 1)
         return ImuSample(
             t_host_ns=self._last_stamp_ns,
             t_arrival_ns=raw.t_arrival_ns,
-            device_ticks=ticks,
+            device_ticks=device_time.ticks,
             gyro_rps=raw.gyro_rps,
             specific_force_mps2=raw.specific_force_mps2,
             t_sigma_ns=stamp.t_sigma_ns,

@@ -11,7 +11,7 @@ from vical_drivers.errors import DeviceRefusedError, DriverError
 from vical_drivers.microstrain import mip
 from vical_drivers.microstrain import mip_fields as fields
 from vical_drivers.microstrain.port import ArrivalLog, BytePort, timeout, wait_for_silence
-from vical_drivers.microstrain.session import Applied, ImuSettings, RawSample, group_delay_s
+from vical_drivers.microstrain.session import Applied, ImuSettings, RawSample, group_delay_s, raise_baud
 from vical_drivers.samples import DeviceInfo
 
 _REPLY_TIMEOUT_S = 0.5
@@ -34,12 +34,17 @@ class _Reply:
 
 
 class MipSession:
-    """See `session.Session`. The port stays the caller's."""
+    """See `session.Session`. The port stays the caller's.
+
+    Attributes:
+        reply_timeout_s: How long one try waits for a reply; more for a device that samples at 1 Hz.
+    """
 
     protocol = "mip"
 
     def __init__(self, port: BytePort) -> None:
         self._port = port
+        self.reply_timeout_s = _REPLY_TIMEOUT_S
         self._decoder = mip.Decoder()
         self._arrivals = ArrivalLog()
         self._baud_found = port.baud
@@ -114,7 +119,7 @@ class MipSession:
     def _base_rate_hz(self) -> float:
         """Base rate of the inertial data; newer devices want the data set named."""
         for command, reply, ask in ((0x06, 0x83, b""), (0x0E, 0x8E, bytes([mip.SET_SENSOR]))):
-            with contextlib.suppress(DeviceRefusedError):
+            with contextlib.suppress(DriverError):
                 data = self._ask(mip.SET_3DM, command, reply, ask)
                 rate = int.from_bytes(data[-2:], "big")
                 if rate:
@@ -128,7 +133,7 @@ class MipSession:
         wanted = struct.pack(">HHBBHHBH", 10, _FLAGS_INERTIAL_ONLY, taps, 17, 10, 10, 1, 0)
         try:
             self._command(mip.SET_3DM, 0x35, bytes([mip.APPLY]) + wanted)
-        except DeviceRefusedError:
+        except DriverError:
             return 0.0, None
         in_force = self._ask(mip.SET_3DM, 0x35, 0x86, bytes([mip.READ]))
         if len(in_force) >= 5 and in_force[4] != taps:
@@ -145,7 +150,7 @@ class MipSession:
             wanted = [*([time_field.descriptor] if time_field else []), fields.ACCEL, fields.GYRO]
             try:
                 self._write_format(wanted, decimation)
-            except DeviceRefusedError:
+            except DriverError:
                 if time_field is None:
                     raise
                 continue
@@ -164,7 +169,7 @@ class MipSession:
         except _UnknownCommandError:
             self._command(mip.SET_3DM, 0x0F, bytes([mip.APPLY, mip.SET_SENSOR]) + body)
             in_force = self._ask(mip.SET_3DM, 0x0F, 0x8F, bytes([mip.READ, mip.SET_SENSOR]))[1:]
-        if in_force != body:
+        if _items(in_force) != _items(body):
             raise DeviceRefusedError(
                 f"{self._port.name}: the device did not take its message format: "
                 f"{in_force.hex()}, not {body.hex()}"
@@ -175,7 +180,7 @@ class MipSession:
         if wanted is None and bytes_per_s * 10 > _BUSY_WIRE * self._port.baud:
             wanted = next((b for b in _BAUDS if bytes_per_s * 10 <= _BUSY_WIRE * b), _BAUDS[-1])
         if wanted is not None and wanted != self._port.baud:
-            self.change_baud(wanted)
+            raise_baud(self._port, wanted, self.change_baud, explicit=settings.baud is not None)
 
     def change_baud(self, baud: int) -> None:
         """Change both sides' baud until the device's next power-up."""
@@ -253,12 +258,12 @@ class MipSession:
 
     def _transact(
         self, descriptor_set: int, command: int, data: bytes, *,
-        reply: int | None = None, timeout_s: float = _REPLY_TIMEOUT_S, tries: int = _TRIES,
+        reply: int | None = None, timeout_s: float | None = None, tries: int = _TRIES,
     ) -> _Reply:  # fmt: skip
         """Send a command and return its reply; samples that stream in between are kept."""
         for _ in range(tries):
             self._port.write(mip.encode(descriptor_set, (command, data)))
-            deadline = time.monotonic() + timeout_s
+            deadline = time.monotonic() + (timeout_s or self.reply_timeout_s)
             while (left := deadline - time.monotonic()) > 0:
                 for packet in self._receive(left):
                     if (answer := _answer(packet, descriptor_set, command, reply)) is None:
@@ -331,6 +336,11 @@ class MipSession:
 
 class _UnknownCommandError(DeviceRefusedError):
     """NACK 1: this model has no such command; another spelling may exist."""
+
+
+def _items(message_format: bytes) -> list[bytes]:
+    """Descriptor and decimation of each field of a message format, in any order."""
+    return sorted(message_format[i : i + 3] for i in range(1, len(message_format), 3))
 
 
 _THREE = struct.Struct(">3f")

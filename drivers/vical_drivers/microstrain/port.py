@@ -11,6 +11,7 @@ import errno
 import logging
 import os
 import select
+import termios
 import time
 from collections import deque
 from pathlib import Path
@@ -50,6 +51,11 @@ class BytePort(Protocol):
     @property
     def wire_byte_ns(self) -> float:
         """Time one byte occupies the wire, ns; 0 where no UART is in between (USB)."""
+        ...
+
+    @property
+    def link(self) -> str:
+        """What lies in between: "usb", "ftdi", "uart" or "unknown"."""
         ...
 
     def read(self, timeout_s: float) -> tuple[bytes, int]:
@@ -107,12 +113,12 @@ class SerialPort:
 
     def __init__(self, path: str, baud: int = 115_200, *, link: str = "auto") -> None:
         self._name = path
-        self.link = link_of(path) if link == "auto" else link
+        self._link = link_of(path) if link == "auto" else link
         try:
             self._serial = serial.Serial(
                 path, baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, termios.error) as error:
             raise _explain(path, error) from None
         self._fd: int = self._serial.fileno()
         self._poll = select.poll()
@@ -131,6 +137,11 @@ class SerialPort:
     def name(self) -> str:
         """Path, for messages."""
         return self._name
+
+    @property
+    def link(self) -> str:
+        """What lies in between: "usb", "ftdi", "uart" or "unknown" (pseudo terminal)."""
+        return self._link
 
     @property
     def baud(self) -> int:
@@ -162,7 +173,7 @@ class SerialPort:
             self._serial.write(data)
         except serial.SerialTimeoutException:
             raise self._lost("it takes no more bytes") from None
-        except (OSError, serial.SerialException) as error:
+        except (OSError, termios.error) as error:
             raise self._lost(str(error)) from None
 
     def set_baud(self, baud: int) -> None:
@@ -171,7 +182,7 @@ class SerialPort:
             self._serial.flush()
             self._serial.baudrate = baud
             self._serial.reset_input_buffer()
-        except (OSError, serial.SerialException) as error:
+        except (OSError, termios.error) as error:
             raise self._lost(str(error)) from None
 
     def _lost(self, why: str) -> DeviceLostError:
@@ -179,7 +190,7 @@ class SerialPort:
 
     def close(self) -> None:
         """Free the port; may be called twice."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, termios.error):
             self._serial.close()
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from vical_drivers.errors import DriverError
+from vical_drivers.microstrain.port import BytePort
 from vical_drivers.samples import DeviceInfo
 
+_log = logging.getLogger(__name__)
 GYRO_ANALOG_DELAY_S = 0.57e-3
 """Analog filter of the GX3's gyro (2-pole RC, 358 Hz)."""
 _ADC_AVERAGE_DELAY_S = 29.0 / 60.0 * 1e-3
@@ -74,6 +79,27 @@ class RawSample(NamedTuple):
     gyro_rps: tuple[float, float, float]
     specific_force_mps2: tuple[float, float, float]
     t_arrival_ns: int
+
+
+def raise_baud(port: BytePort, wanted: int, change: Callable[[int], None], *, explicit: bool) -> None:
+    """Change the baud for a rate that needs it, where that means anything.
+
+    On USB the UART's setting has no effect. A pseudo terminal or network bridge may have no baud at all:
+    there a refusal is no error unless the user asked for this very baud.
+
+    Raises:
+        DriverError: The change failed on a real UART, or was asked for.
+    """
+    if port.link == "usb" and not explicit:
+        return
+    found = port.baud
+    try:
+        change(wanted)
+    except DriverError:
+        if explicit or port.link != "unknown":
+            raise
+        port.set_baud(found)
+        _log.warning("port=%s baud=%d stays, the device did not follow to %d", port.name, found, wanted)
 
 
 class Session(Protocol):

@@ -35,6 +35,8 @@ FLAGS_INERTIAL_ONLY = FLAG_NO_MAGNETOMETER | FLAG_NO_NORTH_COMPENSATION | FLAG_N
 
 READ, APPLY, STORE = 0, 1, 2
 """Function selectors of the sampling and communication settings; `STORE` writes the EEPROM."""
+FIRST_VOLATILE_FIRMWARE = 1127
+"""From 1.1.27 on, "apply" of the sampling settings does not write the EEPROM."""
 BAUD_RATES = (115_200, 230_400, 460_800, 921_600)
 BASE_RATE_HZ = 1000.0
 _SLOWEST_DECIMATION = {115_200: 4, 230_400: 3, 460_800: 2, 921_600: 1}
@@ -156,6 +158,17 @@ def realign(up_tenths_s: int = 255, north_tenths_s: int = 255) -> bytes:
 def read_eeprom(address: int) -> bytes:
     """Read one word of the EEPROM."""
     return struct.pack(">BBH", 0xE5, 0x00, address)
+
+
+def write_eeprom(address: int, word: int) -> bytes:
+    """Write one word of the EEPROM. The vendor warns against it: a wrong word disables the device.
+
+    Raises:
+        ValueError: The manual allows no such address.
+    """
+    if not (0x0000 <= address <= 0x00EF or 0x0400 <= address <= 0x042F):
+        raise ValueError(f"EEPROM address 0x{address:04X} is outside 0x0000 .. 0x00EF and 0x0400 .. 0x042F")
+    return struct.pack(">4BHH", 0xE4, 0xC1, 0x29, 0x00, address, word)
 
 
 def get_identity(index: int) -> bytes:

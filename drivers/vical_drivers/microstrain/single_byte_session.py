@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import time
 
@@ -10,9 +11,10 @@ from vical_drivers.errors import DeviceRefusedError, DriverError
 from vical_drivers.microstrain import single_byte as sb
 from vical_drivers.microstrain import single_byte_commands as cmd
 from vical_drivers.microstrain.port import ArrivalLog, BytePort, timeout, wait_for_silence
-from vical_drivers.microstrain.session import Applied, ImuSettings, RawSample, group_delay_s
+from vical_drivers.microstrain.session import Applied, ImuSettings, RawSample, group_delay_s, raise_baud
 from vical_drivers.samples import DeviceInfo
 
+_log = logging.getLogger(__name__)
 _REPLY_TIMEOUT_S = 0.5
 _TRIES = 3
 _STREAMED = 0xC2
@@ -34,16 +36,22 @@ _IDENTITY = ("model number", "serial number", "model name", "options", "lot")
 
 
 class SingleByteSession:
-    """See `session.Session`. The port stays the caller's."""
+    """See `session.Session`. The port stays the caller's.
+
+    Attributes:
+        reply_timeout_s: How long one try waits for a reply; more for a device that samples at 1 Hz.
+    """
 
     protocol = "single-byte"
 
     def __init__(self, port: BytePort) -> None:
         self._port = port
+        self.reply_timeout_s = _REPLY_TIMEOUT_S
         self._decoder = sb.Decoder()
         self._arrivals = ArrivalLog()
         self._baud_found = port.baud
         self._backlog: list[RawSample] = []
+        self._firmware = cmd.FIRST_VOLATILE_FIRMWARE
 
     @property
     def checksum_errors(self) -> int:
@@ -70,11 +78,12 @@ class SingleByteSession:
 
     def identify(self) -> DeviceInfo:
         """See `Session.identify`."""
-        number = int(self._transact(cmd.GET_FIRMWARE, 0xE9).values[0])
+        number = self._firmware = int(self._transact(cmd.GET_FIRMWARE, 0xE9).values[0])
         text = {}
         for index, name in enumerate(_IDENTITY):
             with contextlib.suppress(DriverError):
-                text[name] = str(self._transact(cmd.get_identity(index), 0xEA).fields()["text"])
+                # Not every firmware answers each index; the wait for those must stay short.
+                text[name] = str(self._transact(cmd.get_identity(index), 0xEA, tries=2).fields()["text"])
         serial = text.get("serial number", "")
         return DeviceInfo(
             kind="imu",
@@ -93,11 +102,23 @@ class SingleByteSession:
         wanted = cmd.Sampling(decimation, cmd.FLAGS_INERTIAL_ONLY, settings.filter_width)
         in_force = cmd.Sampling.from_record(self._transact(cmd.sampling(), 0xDB))
         if in_force.difference(wanted):
-            # Firmware before 1.1.27 writes its EEPROM on "apply": never do it when nothing changes.
+            # Firmware before 1.1.27 writes its EEPROM on "apply". It happens once: the next start finds the
+            # settings as they should be and sends nothing.
+            if self._firmware < cmd.FIRST_VOLATILE_FIRMWARE:
+                _log.warning(
+                    "port=%s eeprom=written once, this old firmware knows no other way", self._port.name
+                )
             self._transact(cmd.sampling(cmd.APPLY, wanted), 0xDB)
             in_force = cmd.Sampling.from_record(self._transact(cmd.sampling(), 0xDB))
         if difference := in_force.difference(wanted):
-            raise DeviceRefusedError(f"{self._port.name}: the device did not take its settings: {difference}")
+            little = (in_force.flags ^ wanted.flags) & cmd.FLAG_LITTLE_ENDIAN_FLOATS
+            vital = (in_force.decimation, in_force.filter_width) != (wanted.decimation, wanted.filter_width)
+            if vital or little:
+                raise DeviceRefusedError(
+                    f"{self._port.name}: the device did not take its settings: {difference}"
+                )
+            # Old firmware does not know every flag; the inertial data are the same.
+            _log.warning("port=%s settings_differ=%s", self._port.name, difference)
         return Applied(
             rate_hz=cmd.BASE_RATE_HZ / in_force.decimation,
             group_delay_s=group_delay_s(in_force.filter_width),
@@ -112,7 +133,7 @@ class SingleByteSession:
         if wanted is None and cmd.max_rate_hz(_STREAMED, self._port.baud) < rate_hz:
             wanted = next((b for b in cmd.BAUD_RATES if cmd.max_rate_hz(_STREAMED, b) >= rate_hz), None)
         if wanted is not None and wanted != self._port.baud:
-            self.change_baud(wanted)
+            raise_baud(self._port, wanted, self.change_baud, explicit=settings.baud is not None)
 
     def change_baud(self, baud: int) -> None:
         """Change both sides' baud until the device's next power-up."""
@@ -158,12 +179,12 @@ class SingleByteSession:
         return self._decoder.feed(data)
 
     def _transact(
-        self, command: bytes, kind: int, timeout_s: float = _REPLY_TIMEOUT_S, tries: int = _TRIES
+        self, command: bytes, kind: int, timeout_s: float | None = None, tries: int = _TRIES
     ) -> sb.Record:
         """Send a command and return its reply; samples that stream in between are kept."""
         for _ in range(tries):
             self._port.write(command)
-            deadline = time.monotonic() + timeout_s
+            deadline = time.monotonic() + (timeout_s or self.reply_timeout_s)
             found: sb.Record | None = None
             while found is None and (left := deadline - time.monotonic()) > 0:
                 for record in self._receive(left):
