@@ -50,7 +50,7 @@ def make_detector(config: Config) -> Detect:
 
 def _tracker() -> Detect:
     """Look the module up: a build without it says so in one line."""
-    name = "vical_daemon.vision.tracker"
+    name = "vical_daemon.vision.tracks"
     if find_spec(name) is None:
         raise ConfigError("calibration without a target is not in this build; give a target file (--target)")
     detect: Detect = import_module(name).FeatureTracker().detect

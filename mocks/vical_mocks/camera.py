@@ -78,7 +78,7 @@ class SimulatedCamera:
         self._art = draw_board(target)
         self._texture = BoardTexture(self._art)
         self._rng = np.random.default_rng(seed)
-        self._rays, self._blind = _pixel_rays(lens)
+        self._rays, self._blind = pixel_rays(lens)
         self._border = _border_rays(self._rays, lens.resolution)
         self._shade = _vignette(lens, self.settings.vignetting) * np.float32(self.settings.gain / FULL_SCALE)
 
@@ -202,7 +202,7 @@ def _rays_to_board(R_world_cam: FloatArray, p_world_cam: FloatArray) -> FloatArr
     return np.asarray(stacked * np.where(z > 0, -1.0, 1.0)[:, None])
 
 
-def _pixel_rays(lens: Lens) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+def pixel_rays(lens: Lens) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Ray (x/z, y/z) of each pixel, shape (height, width, 2), and the pixels that have none."""
     width, height = lens.resolution
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))

@@ -1,0 +1,149 @@
+"""Where features will be in the next frame: rotated by the gyro, or carried on by the last flow.
+
+Rotation moves a pixel whatever its distance, and it is what moves hand-held pictures most; translation is
+left to the search. Needs the camera's intrinsics and how it is turned on the IMU, both roughly (a degree).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vical_daemon.vision.detection import FloatArray
+
+HISTORY_SAMPLES = 4000
+
+
+@dataclass(frozen=True)
+class FlowCamera:
+    """What is known about the camera.
+
+    Attributes:
+        intrinsics: fx fy cx cy, px.
+        distortion: Four coefficients.
+        distortion_model: radtan or equidistant.
+        R_imu_cam: Rotation that maps camera vectors into the imu frame, shape (3, 3); None: unknown, the gyro
+            is not used.
+        timeshift_cam_imu_s: t_imu = t_cam + shift, s.
+    """
+
+    intrinsics: tuple[float, float, float, float]
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    distortion_model: str = "radtan"
+    R_imu_cam: FloatArray | None = None
+    timeshift_cam_imu_s: float = 0.0
+
+    def matrix(self) -> FloatArray:
+        """Camera matrix, shape (3, 3)."""
+        fx, fy, cx, cy = self.intrinsics
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def rays(self, uv_px: FloatArray) -> FloatArray:
+        """Undistorted normalised coordinates (x/z, y/z), shape (n, 2)."""
+        points = np.ascontiguousarray(uv_px[:, None, :], np.float64)
+        undistort = cv2.fisheye.undistortPoints if self._is_fisheye() else cv2.undistortPoints
+        return np.asarray(undistort(points, self.matrix(), np.array(self.distortion)), np.float64).reshape(
+            -1, 2
+        )
+
+    def pixels(self, rays: FloatArray) -> FloatArray:
+        """Pixels of rays (n, 3) in front of the camera, shape (n, 2)."""
+        xy = np.ascontiguousarray((rays[:, :2] / rays[:, 2:])[:, None, :])
+        if self._is_fisheye():
+            uv = cv2.fisheye.distortPoints(xy, self.matrix(), np.array(self.distortion))
+        else:
+            solid = np.concatenate([xy, np.ones((len(xy), 1, 1))], axis=2)
+            uv, _ = cv2.projectPoints(
+                solid, np.zeros(3), np.zeros(3), self.matrix(), np.array(self.distortion)
+            )
+        return np.asarray(uv, np.float64).reshape(-1, 2)
+
+    def _is_fisheye(self) -> bool:
+        return self.distortion_model == "equidistant"
+
+
+class FlowPredictor:
+    """Predicts feature positions.
+
+    Args:
+        camera: What is known about the camera; None: only the flow of the last frames is used.
+    """
+
+    def __init__(self, camera: FlowCamera | None = None) -> None:
+        self.camera = camera
+        self._gyro: deque[tuple[int, FloatArray]] = deque(maxlen=HISTORY_SAMPLES)
+        self._affine: FloatArray | None = None
+        self._step_s = 0.0
+
+    def add_imu(self, t_imu_ns: int, gyro_rps: tuple[float, float, float]) -> None:
+        """Take one gyro sample (rad/s, imu frame); samples that go back in time are ignored."""
+        if not self._gyro or t_imu_ns > self._gyro[-1][0]:
+            self._gyro.append((t_imu_ns, np.asarray(gyro_rps, np.float64)))
+
+    def predict(self, uv_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None) -> FloatArray:
+        """Where points of the last frame will be, shape (n, 2), px."""
+        rotation = self.rotation(t_before_ns, t_now_ns)
+        if rotation is not None and self.camera is not None:
+            rays = self.camera.rays(uv_px)
+            turned = np.column_stack([rays, np.ones(len(rays))]) @ rotation.T
+            if np.all(turned[:, 2] > 0.1):
+                return self.camera.pixels(turned)
+        if self._affine is None:
+            return uv_px.copy()
+        share = 1.0
+        if t_before_ns is not None and t_now_ns is not None and self._step_s > 0:
+            share = float(np.clip((t_now_ns - t_before_ns) * 1e-9 / self._step_s, 0.0, 3.0))
+        flow = uv_px @ self._affine[:, :2].T + self._affine[:, 2] - uv_px
+        return np.asarray(uv_px + share * flow)
+
+    def learn(
+        self, before_px: FloatArray, now_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None
+    ) -> None:
+        """Remember the mean (affine) flow of a frame for the next one."""
+        self._affine = None
+        if len(before_px) >= 8:
+            design = np.column_stack([before_px, np.ones(len(before_px))])
+            flow = now_px - before_px
+            usual = np.median(flow, axis=0)
+            near = np.linalg.norm(flow - usual, axis=1) < 25.0
+            if near.sum() >= 8:
+                self._affine = np.linalg.lstsq(design[near], now_px[near], rcond=None)[0].T
+        if t_before_ns is not None and t_now_ns is not None:
+            self._step_s = (t_now_ns - t_before_ns) * 1e-9
+
+    def linear_flow(self) -> FloatArray:
+        """Turn and scale of the last frame's mean flow, shape (2, 2)."""
+        return np.eye(2) if self._affine is None else self._affine[:, :2]
+
+    def rotation(self, t_before_ns: int | None, t_now_ns: int | None) -> FloatArray | None:
+        """R_now_before of the camera from the gyro; None where samples do not bracket the two instants."""
+        if self.camera is None or self.camera.R_imu_cam is None or t_before_ns is None or t_now_ns is None:
+            return None
+        shift = round(self.camera.timeshift_cam_imu_s * 1e9)
+        begin, end = t_before_ns + shift, t_now_ns + shift
+        if len(self._gyro) < 2 or end <= begin or self._gyro[0][0] > begin:
+            return None
+        # The newest sample may lag a little behind the picture: its rate is held.
+        if end - self._gyro[-1][0] > 20_000_000:
+            return None
+        times = np.array([t - begin for t, _ in self._gyro], np.float64) * 1e-9
+        rates = np.array([rate for _, rate in self._gyro])
+        span = (end - begin) * 1e-9
+        inner = times[(times > 0) & (times < span)]
+        grid = np.concatenate([[0.0], inner, [span]])
+        at = np.column_stack([np.interp(grid, times, rates[:, k]) for k in range(3)])
+        R_before_now = np.eye(3)
+        for step, rate in zip(np.diff(grid), (at[1:] + at[:-1]) / 2, strict=True):
+            R_before_now = R_before_now @ cv2.Rodrigues(rate * step)[0]
+        R_imu_cam = self.camera.R_imu_cam
+        return np.asarray(R_imu_cam.T @ R_before_now.T @ R_imu_cam)
+
+    def undistort(self, uv_px: FloatArray) -> FloatArray:
+        """Pixels of the ideal pinhole of the same focal length (for epipolar lines); as given without one."""
+        if self.camera is None:
+            return uv_px
+        fx, fy, cx, cy = self.camera.intrinsics
+        return np.asarray(self.camera.rays(uv_px) * np.array([fx, fy]) + np.array([cx, cy]))

@@ -1,0 +1,265 @@
+"""Feature tracks for calibration without a target: corners of the scene followed from frame to frame.
+
+Pyramidal Lucas-Kanade from the last frame, started where the gyro (or the last flow) says; a way back that
+must end where it began; a last alignment with how the feature looked when first seen, so that errors do not
+add up along a track; an epipolar check against a frame some time ago. New features fill empty grid cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.vision.detection import AnyImage, Detection, FloatArray, Gray, IntArray, as_gray
+from vical_daemon.vision.flow_prediction import FlowPredictor
+from vical_daemon.vision.patches import Float32, Templates, no_templates
+
+BoolArray = npt.NDArray[np.bool_]
+
+SMOOTHING_PX = 0.8
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """Settings of the tracker.
+
+    Attributes:
+        max_features: Upper bound on features alive.
+        cells: Columns and rows of the grid that spreads them.
+        window_px: Edge of the Lucas-Kanade window.
+        levels: Pyramid levels above the picture itself.
+        back_px: Largest distance of the way back from where it began.
+        align_px: Largest move of the alignment with a feature's first look before it is anchored anew.
+        unlike: Largest unlikeness (0 equal, 1 unrelated) before it is anchored anew.
+        epipolar_px: Largest distance from the epipolar line.
+        fast_threshold: Contrast of a new corner, grey levels.
+        border_px: Features nearer to the edge are given up.
+        sigma_floor_px: Error that noise and contrast do not explain: perspective, corners in depth.
+    """
+
+    max_features: int = 80
+    cells: tuple[int, int] = (10, 8)
+    window_px: int = 15
+    levels: int = 3
+    back_px: float = 0.5
+    align_px: float = 0.7
+    unlike: float = 0.45
+    epipolar_px: float = 1.5
+    fast_threshold: int = 18
+    border_px: int = 8
+    sigma_floor_px: float = 0.15
+
+
+@dataclass
+class TrackStats:
+    """Counters: frames, features begun, and why tracks ended."""
+
+    frames: int = 0
+    begun: int = 0
+    lost_flow: int = 0
+    lost_back: int = 0
+    lost_epipolar: int = 0
+    anchored: int = 0
+
+
+@dataclass
+class _Features:
+    """The features alive, as columns."""
+
+    ids: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    uv: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
+    drift: FloatArray = field(default_factory=lambda: np.zeros(0))
+    old_uv: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    warp: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    templates: Templates = field(default_factory=no_templates)
+
+    def keep(self, mask: BoolArray) -> None:
+        """Drop the others."""
+        self.ids, self.uv, self.sigma = self.ids[mask], self.uv[mask], self.sigma[mask]
+        self.drift, self.old_uv, self.warp = self.drift[mask], self.old_uv[mask], self.warp[mask]
+        self.templates = self.templates.take(mask)
+
+    def add(self, ids: IntArray, uv: FloatArray, templates: Templates, sigma_px: float) -> None:
+        """Append new features."""
+        count = len(ids)
+        self.ids, self.uv = np.append(self.ids, ids), np.vstack([self.uv, uv])
+        self.sigma = np.append(self.sigma, np.full(count, sigma_px))
+        self.drift = np.append(self.drift, np.zeros(count))
+        self.old_uv = np.vstack([self.old_uv, np.full(uv.shape, np.nan)])
+        self.warp = np.concatenate([self.warp, np.broadcast_to(np.eye(2), (count, 2, 2))])
+        self.templates = self.templates.joined(templates)
+
+
+EPIPOLAR_EVERY = 5
+"""Frames between the pictures that the epipolar check compares: enough parallax, little change."""
+MIN_EPIPOLAR = 15
+
+
+class FeatureTracker:
+    """Follows natural features through the pictures of one camera.
+
+    Args:
+        options: Settings.
+        predictor: Foretells flow from gyro rates; None: from the flow of the last frames only.
+    """
+
+    def __init__(self, options: TrackOptions | None = None, predictor: FlowPredictor | None = None) -> None:
+        self.options = options or TrackOptions()
+        self.predictor = predictor or FlowPredictor()
+        self.stats = TrackStats()
+        self._features = _Features()
+        self._last: tuple[Gray, int | None] | None = None
+        self._frame = 0
+        self._next_id = 0
+        self._fast = cv2.FastFeatureDetector.create(self.options.fast_threshold, True)
+
+    def detect(self, image: AnyImage, t_ns: int | None = None) -> Detection | None:
+        """Track into a new picture and return every feature alive, or None where there is none.
+
+        Args:
+            image: Shape (height, width) uint8/uint16 or (height, width, 3) uint8 (BGR).
+            t_ns: Stamp, ns, in the clock of the gyro samples given to the predictor.
+
+        Returns:
+            Ids (never used twice), pixels, and the stated sigma.
+
+        Raises:
+            ValueError: The picture has a shape or type that no camera of ours gives.
+        """
+        gray = as_gray(image)
+        smooth = cv2.GaussianBlur(gray, (5, 5), SMOOTHING_PX).astype(np.float32)
+        if self._last is not None and self._last[0].shape != gray.shape:
+            self._features, self._last = _Features(), None
+        self.stats.frames += 1
+        self._frame += 1
+        if self._last is not None and len(self._features.ids):
+            self._follow(self._last[0], gray, self._last[1], t_ns)
+            self._align(smooth)
+            self._check_epipolar()
+        self._refill(gray, smooth)
+        self._last = (gray, t_ns)
+        if not len(self._features.ids):
+            return None
+        features = self._features
+        sigma = np.sqrt(features.sigma**2 + features.drift**2 + self.options.sigma_floor_px**2)
+        return Detection(features.ids.copy(), features.uv.copy(), sigma)
+
+    def _follow(self, before: Gray, now: Gray, t_before: int | None, t_now: int | None) -> None:
+        features, options = self._features, self.options
+        height, width = now.shape
+        guess = self.predictor.predict(features.uv, t_before, t_now)
+        uv, good = self._flow(before, now, features.uv, guess, options.levels)
+        border = options.border_px
+        good &= ((uv > border) & (uv < np.array([width, height]) - 1 - border)).all(axis=1)
+        self.stats.lost_flow += int(np.sum(~good))
+        back, returned = self._flow(now, before, uv, features.uv, 1)
+        returned &= np.linalg.norm(back - features.uv, axis=1) < options.back_px
+        self.stats.lost_back += int(np.sum(good & ~returned))
+        good &= returned
+        self.predictor.learn(features.uv[good], uv[good], t_before, t_now)
+        features.uv = uv
+        features.keep(good)
+
+    def _flow(
+        self, source: Gray, goal: Gray, points: FloatArray, guess: FloatArray, levels: int
+    ) -> tuple[FloatArray, BoolArray]:
+        if not len(points):
+            return points.copy(), np.zeros(0, bool)
+        window = (self.options.window_px, self.options.window_px)
+        found, status, _ = cv2.calcOpticalFlowPyrLK(
+            source,
+            goal,
+            np.ascontiguousarray(points[:, None, :], np.float32),
+            np.ascontiguousarray(guess[:, None, :], np.float32),
+            winSize=window,
+            maxLevel=levels,
+            criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.02),
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            minEigThreshold=1e-3,
+        )
+        uv = found.reshape(-1, 2).astype(np.float64)
+        good = (status.ravel() > 0) & np.isfinite(uv).all(axis=1)
+        return np.where(good[:, None], uv, points), np.asarray(good)
+
+    def _align(self, smooth: Float32) -> None:
+        """Pull each feature to where its first look matches; anchor anew where that no longer fits."""
+        features = self._features
+        features.warp = self.predictor.linear_flow() @ features.warp
+        uv, unlike, sigma = features.templates.align(smooth, features.uv, features.warp)
+        fits = (np.linalg.norm(uv - features.uv, axis=1) < self.options.align_px) & (
+            unlike < self.options.unlike
+        )
+        features.uv = np.where(fits[:, None], uv, features.uv)
+        features.sigma = np.where(fits, sigma, features.sigma)
+        stale = np.flatnonzero(~fits)
+        if len(stale):
+            kept = features.templates.take(np.flatnonzero(fits))
+            order = np.argsort(np.concatenate([np.flatnonzero(fits), stale]), kind="stable")
+            fresh = Templates.cut(smooth, features.uv[stale])
+            features.templates = kept.joined(fresh).take(order)
+            features.warp[stale] = np.eye(2)
+            features.drift[stale] = np.hypot(features.drift[stale], self.options.sigma_floor_px)
+            self.stats.anchored += len(stale)
+
+    def _check_epipolar(self) -> None:
+        """Compare with the picture of `EPIPOLAR_EVERY` frames ago; drop what moved against the rest."""
+        features = self._features
+        if self._frame % EPIPOLAR_EVERY:
+            return
+        known = np.isfinite(features.old_uv[:, 0])
+        if known.sum() >= MIN_EPIPOLAR:
+            a = self.predictor.undistort(features.old_uv[known])
+            b = self.predictor.undistort(features.uv[known])
+            cv2.setRNGSeed(self._frame)
+            _, inlier = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, self.options.epipolar_px, 0.99, 200)
+            if inlier is not None and inlier.sum() >= 0.5 * len(inlier):
+                keep = np.ones(len(known), bool)
+                keep[known] = inlier.ravel() > 0
+                self.stats.lost_epipolar += int(np.sum(~keep))
+                features.keep(keep)
+        features.old_uv = features.uv.copy()
+
+    def _refill(self, gray: Gray, smooth: Float32) -> None:
+        """Begin features in empty cells, best corner of each."""
+        options, features = self.options, self._features
+        columns, rows = options.cells
+        room = options.max_features - len(features.ids)
+        height, width = gray.shape
+        scale = np.array([columns / width, rows / height])
+        taken = np.zeros((rows, columns), bool)
+        cell = np.floor(features.uv * scale).astype(int)
+        taken[np.clip(cell[:, 1], 0, rows - 1), np.clip(cell[:, 0], 0, columns - 1)] = True
+        wanted = min(room, int(np.sum(~taken)))
+        if wanted < 1 or (wanted < 0.2 * taken.size and self._frame % 3):
+            return
+        found = self._fast.detect(gray)
+        if not found:
+            return
+        uv = np.asarray(cv2.KeyPoint.convert(found), np.float64)
+        response = np.array([k.response for k in found])
+        border = options.border_px
+        inside = ((uv > border) & (uv < np.array([width, height]) - 1 - border)).all(axis=1)
+        uv, response = uv[inside], response[inside]
+        chosen = _best_of_empty_cells(uv, response, scale, taken)[:wanted]
+        if len(chosen):
+            ids = np.arange(self._next_id, self._next_id + len(chosen), dtype=np.int64)
+            self._next_id += len(chosen)
+            features.add(ids, uv[chosen], Templates.cut(smooth, uv[chosen]), options.sigma_floor_px)
+            self.stats.begun += len(chosen)
+
+
+def _best_of_empty_cells(
+    uv: FloatArray, response: FloatArray, scale: FloatArray, taken: BoolArray
+) -> npt.NDArray[np.intp]:
+    """Index of the strongest corner of each cell that is not taken, strongest first."""
+    rows, columns = taken.shape
+    cell = np.floor(uv * scale).astype(int)
+    flat = np.clip(cell[:, 1], 0, rows - 1) * columns + np.clip(cell[:, 0], 0, columns - 1)
+    order = np.argsort(-response, kind="stable")
+    order = order[~taken.ravel()[flat[order]]]
+    _, first = np.unique(flat[order], return_index=True)
+    return np.asarray(order[np.sort(first)])
