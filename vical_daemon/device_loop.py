@@ -13,6 +13,8 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 from vical_drivers.errors import DriverError
 from vical_drivers.samples import DeviceInfo, Frame, FrameSource, SourceStats
 
+from vical_daemon import notify
+
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -191,6 +193,7 @@ class DeviceLoop(Generic[T]):
     def _streams(self, source: Source[T]) -> None:
         if self._health.state == "lost":
             _log.info("%s: back", self.name)
+            notify.event("device_back", f"{self.name} is back", device=self.name)
         if self._health.state != "streaming":
             self._health = replace(self._health, state="streaming", problem="", info=source.info)
 
@@ -198,4 +201,6 @@ class DeviceLoop(Generic[T]):
         problem = " ".join(str(error).split())
         if problem != self._health.problem:  # said once, not at each attempt
             _log.warning("%s: %s", self.name, problem)
+        if self._health.state in ("streaming", "silent"):
+            notify.event("device_lost", f"{self.name}: {problem}", level="warning", device=self.name)
         self._health = replace(self._health, state="lost", problem=problem)

@@ -14,13 +14,13 @@ from vical_daemon import topics
 from vical_daemon.bus import LocalBus, Sample
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.config import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
+from vical_daemon.estimate_role import EstimateRole
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.estimators import make_estimator
 from vical_daemon.priors import Initial
 from vical_daemon.publications import publish
 from vical_daemon.recording import Recording, Stream
-from vical_daemon.roles.estimate import EstimateRole
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.calibration_filter import FrameReport
@@ -119,7 +119,8 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     frames: list[FrameReport] = []
     bus = LocalBus()
     estimator = make_estimator(job.config, job.priors)
-    role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, frames.extend if keep_frames else None)
+    keep = frames.extend if keep_frames else None
+    role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, keep=keep)
     for key in (job.imu.key, *(_points_key(job, name) for name in job.cameras)):
         bus.subscribe(key, role.take)
     _attach_detectors(bus, job)

@@ -70,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
         raise CliError("--seconds: 5 to 3600 are of use", 2)
     out = _folder(args.out)
     before = set(out.rglob("*.mcap"))
+    for stored in (out / "store").glob("*.json"):  # of an earlier demo: this one is to start from nothing
+        stored.unlink()
     from vical_mocks.live_rig import LiveRig, LiveRigSettings
 
     from vical_daemon.cli import demo_truth

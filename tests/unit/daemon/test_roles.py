@@ -14,6 +14,7 @@ from vical_drivers.samples import DeviceInfo, Frame, ImuSample, SourceStats
 from vical_daemon import topics
 from vical_daemon.bus import LocalBus, Sample
 from vical_daemon.config import Config, loads
+from vical_daemon.estimate_role import EstimateRole
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
@@ -41,7 +42,6 @@ from vical_daemon.roles import camera as camera_module
 from vical_daemon.roles import imu as imu_module
 from vical_daemon.roles.camera import CameraRole
 from vical_daemon.roles.detect import DetectRole
-from vical_daemon.roles.estimate import EstimateRole
 from vical_daemon.vision.detection import Detection
 from vical_daemon.wall_clock import WallClock
 

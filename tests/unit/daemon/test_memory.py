@@ -1,0 +1,130 @@
+"""A calibration survives a restart, belongs to its devices, and a changed mounting is announced once."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vical_daemon import topics
+from vical_daemon.bus import LocalBus
+from vical_daemon.config import Config, loads
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
+from vical_daemon.memory import Memory, difference
+from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics
+from vical_daemon.wall_clock import private_clock
+
+
+def _camera(p_m=(0.08, 0.02, -0.03), turn_deg=0.0, shift_s=0.01, sigma=1e-4) -> CameraEstimate:
+    x, y, z, w = Rotation.from_euler("y", turn_deg, degrees=True).as_quat()
+    covariance = (np.eye(6) * sigma**2).tolist()
+    pose = PoseEstimate(list(p_m), [float(v) for v in (w, x, y, z)], covariance)
+    lens = ([500.0, 500.0, 320.0, 240.0], [1.0] * 4, "radtan", [0.1, 0.0, 0.0, 0.0], [0.01] * 4)
+    return CameraEstimate(pose, shift_s, 1e-5, *lens, 0.2)
+
+
+def _estimate(camera: CameraEstimate, status: Status = Status.CONVERGED) -> CalibrationEstimate:
+    return CalibrationEstimate(
+        1, status, "", 1.0, "", 60.0, 600, 6000, {"cam0": camera}, None, [0.0, 0.0, -9.8], 1.0, 0.0
+    )
+
+
+def _announce(bus: LocalBus, camera_serial: str = "C1") -> None:
+    for role, name, serial in (("imu", "imu/imu0", "I1"), ("camera", "camera/cam0", camera_serial)):
+        payload = encode_diagnostics(1, role, [DiagnosticStatus(Level.OK, name, "", serial)])
+        bus.publish(topics.status_key("rig0", role), payload)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    return loads(
+        "imus: {imu0: {port: /dev/x, rate_hz: 100}}\ncameras: {cam0: {uri: 'v4l2:/dev/video0'}}\n"
+        f"target: t.yaml\nstore: {{directory: {tmp_path / 'store'}}}\n"
+    )
+
+
+def _remember(config: Config, camera: CameraEstimate, camera_serial: str = "C1") -> None:
+    bus = LocalBus()
+    memory = Memory(config, bus, private_clock())
+    _announce(bus, camera_serial)
+    memory.watch(_estimate(camera))
+    memory.close(None)
+
+
+def _later(config: Config, camera_serial: str = "C1") -> Memory:
+    bus = LocalBus()
+    memory = Memory(config, bus, private_clock())
+    _announce(bus, camera_serial)
+    return memory
+
+
+def test_nothing_known_gives_what_the_config_says(config: Config) -> None:
+    prior = _later(config).priors()["cam0"]
+    assert prior.T_imu_cam is None and prior.resolution == (640, 480)
+
+
+def test_a_converged_calibration_is_the_prior_after_a_restart(config: Config) -> None:
+    _remember(config, _camera())
+    prior = _later(config).priors()["cam0"]
+    assert prior.T_imu_cam is not None and prior.timeshift_cam_imu_s == 0.01
+    np.testing.assert_array_equal(prior.T_imu_cam[1], [0.08, 0.02, -0.03])
+    assert prior.intrinsics == (500, 500, 320, 240)
+
+
+def test_it_is_not_used_for_another_camera(config: Config) -> None:
+    _remember(config, _camera())
+    assert _later(config, camera_serial="C2").priors()["cam0"].T_imu_cam is None
+
+
+def test_what_the_config_holds_fixed_wins(config: Config) -> None:
+    _remember(config, _camera())
+    lens = replace(config.cameras["cam0"].lens, intrinsics=(460.0, 460.0, 300.0, 200.0))
+    fixed = replace(
+        config,
+        cameras={"cam0": replace(config.cameras["cam0"], lens=lens)},
+        calibration=replace(config.calibration, fix=("intrinsics",)),
+    )
+    prior = _later(fixed).priors()["cam0"]
+    assert prior.intrinsics == (460, 460, 300, 200) and prior.distortion is None
+    assert prior.T_imu_cam is not None
+
+
+def test_nothing_is_stored_before_convergence(config: Config) -> None:
+    bus = LocalBus()
+    memory = Memory(config, bus, private_clock())
+    _announce(bus)
+    memory.watch(_estimate(_camera(), Status.CONVERGING))
+    memory.close(_estimate(_camera(), Status.DEGENERATE))
+    assert _later(config).priors()["cam0"].T_imu_cam is None
+
+
+def test_serials_may_come_late_but_not_never(config: Config) -> None:
+    _remember(config, _camera())
+    bus = LocalBus()
+    memory = Memory(config, bus, private_clock())
+    threading.Timer(0.2, _announce, [bus]).start()
+    assert memory.priors()["cam0"].T_imu_cam is not None
+
+
+def test_a_changed_mounting_is_announced_once(config: Config) -> None:
+    _remember(config, _camera())
+    memory = _later(config)
+    memory.priors()
+    first = memory.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03), turn_deg=1.0)))
+    assert first.events == [
+        "changed: cam0 since the stored calibration: moved by 10.0 mm, turned by 1.00 deg"
+    ]
+    assert memory.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03)))).events == []
+
+
+def test_what_lies_within_the_sigmas_or_does_not_matter_is_no_change() -> None:
+    assert difference(_camera(), _camera()) == ""
+    assert difference(_camera(), _camera(p_m=(0.081, 0.02, -0.03))) == ""  # 7 sigma, but 1 mm
+    assert difference(_camera(sigma=5e-3), _camera(p_m=(0.09, 0.02, -0.03), sigma=5e-3)) == ""  # 1.4 sigma
+    assert difference(_camera(), _camera(shift_s=0.0105)) == "time shift by +0.50 ms"
+    assert difference(_camera(turn_deg=0.05), _camera()) == ""
+    assert difference(_camera(turn_deg=0.5), _camera()) == "turned by 0.50 deg"

@@ -1,0 +1,121 @@
+"""What the role estimate does, without I/O: messages in, by stamp behind a short lag; messages out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from vical_daemon import topics
+from vical_daemon.bus import Sample
+from vical_daemon.config import Config
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate
+from vical_daemon.estimators import Estimator
+from vical_daemon.messages import DiagnosticStatus, ImuMessage, MessageError, decode_imu, decode_points
+from vical_daemon.publications import Message, calibration_messages, calibration_status, companion_messages
+from vical_daemon.stamp_order import StampOrder
+
+Keep = Callable[[Sequence[Any]], None]
+Inspect = Callable[[CalibrationEstimate], CalibrationEstimate]
+PUBLISH_S = 0.2
+COMPANION_S = 1.0
+
+
+class EstimateRole:
+    """Feeds an estimator with decoded messages in the order of their stamps. No I/O, no clock.
+
+    Args:
+        config: The rig.
+        estimator: What does the arithmetic.
+        period_s: Between two publications; a change shows as soon as the next one.
+        keep: Takes the verdict on every frame (for reports); None: they are dropped.
+        inspect: Sees every estimate before it is published and may add to it.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        estimator: Estimator,
+        period_s: float = PUBLISH_S,
+        *,
+        keep: Keep | None = None,
+        inspect: Inspect | None = None,
+    ) -> None:
+        self.config, self.estimator = config, estimator
+        self._period_s, self._keep, self._inspect = period_s, keep, inspect
+        self._imu_key = topics.imu_key(config.rig, config.calibration_imu)
+        self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
+        self._next_s = self._next_companion_s = -float("inf")
+        self._malformed = 0
+        self.latest: CalibrationEstimate | None = None
+
+    def take(self, sample: Sample) -> None:
+        """Take one message from the bus; what cannot be read is counted."""
+        try:
+            if sample.key == self._imu_key:
+                imu = decode_imu(sample.payload)
+                self._order.push(imu.stamp_ns, imu)
+            else:
+                frame = decode_points(sample.payload).to_frame()
+                self._order.push(frame.t_cam_ns, frame)
+        except MessageError:
+            self._malformed += 1
+
+    def step(self, now_s: float | None = None) -> list[Message]:
+        """Do what can be done with what was taken and return what is to be published.
+
+        Args:
+            now_s: Any steady clock, for the 5 Hz; None: the time of the data (offline, repeatable).
+        """
+        self._feed(self._order.pop_due())
+        if now_s is None:
+            now_s = (self._order.newest_ns or 0) * 1e-9
+        return self._publications(now_s)
+
+    def finish(self) -> list[Message]:
+        """End of the data: use everything and return the last word."""
+        self._feed(self._order.pop_all())
+        self._report(self.estimator.finish())
+        self._next_s = self._next_companion_s = -float("inf")
+        return self._publications(0.0)
+
+    def reset(self, estimator: Estimator) -> None:
+        """Forget everything and begin anew with a fresh estimator."""
+        self._order.pop_all()
+        self.estimator, self.latest = estimator, None
+        self._next_s = self._next_companion_s = -float("inf")
+
+    def _feed(self, items: list[ImuMessage | PointsFrame]) -> None:
+        for item in items:
+            if isinstance(item, ImuMessage):
+                self.estimator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+            else:
+                self.estimator.add_points(item)
+                self._report(self.estimator.process())
+
+    def _report(self, frames: Sequence[Any]) -> None:
+        if self._keep is not None:
+            self._keep(frames)
+
+    def _publications(self, now_s: float) -> list[Message]:
+        if now_s < self._next_s:
+            return []
+        self._next_s = now_s + self._period_s
+        estimate = self.estimator.estimate()
+        self.latest = estimate = self._inspect(estimate) if self._inspect else estimate
+        messages = calibration_messages(self.config, estimate)
+        if now_s >= self._next_companion_s:
+            self._next_companion_s = now_s + COMPANION_S
+            messages += companion_messages(self.config, estimate)
+        return messages
+
+    def statuses(self, dropped: int = 0) -> list[DiagnosticStatus]:
+        """Return the health of the estimator; `dropped`: samples that never came here."""
+        counters = {
+            "queue_depth": str(len(self._order)),
+            "dropped": str(dropped),
+            "late": str(self._order.late),
+            "refused": str(self._order.refused),
+            "malformed": str(self._malformed),
+        }
+        return [calibration_status(self.latest, counters)]
