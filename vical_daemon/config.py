@@ -203,11 +203,19 @@ class RecordConfig:
 
 @dataclass(frozen=True, slots=True)
 class WebConfig:
-    """The page with the live calibration."""
+    """The page with the live calibration.
+
+    Attributes:
+        enabled: Serve it.
+        host: Address to listen on; 127.0.0.1: this machine only.
+        port: Of the page; 0: any free one.
+        foxglove_port: WebSocket for Foxglove (its usual port is 8765); 0: none.
+    """
 
     enabled: bool = False
     host: str = "127.0.0.1"
     port: Annotated[int, Bound(low=0, high=65535)] = 8080
+    foxglove_port: Annotated[int, Bound(low=0, high=65535)] = 0
 
 
 @dataclass(frozen=True, slots=True)

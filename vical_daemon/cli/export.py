@@ -21,6 +21,7 @@ _EPILOG = """\
   vical calibrate log.mcap --target target.yaml -o result.json
   vical export result.json --format kalibr -o camchain-imucam.yaml
   vical export log.mcap --format openvins -o openvins/         a folder: every file of the format
+  vical export store --format urdf                             the last calibration that was stored
   vical export camchain-imucam.yaml --format basalt            Kalibr's result for other software
 
 Further files of a format (imu.yaml, one file per camera) are written beside the main one.
@@ -30,7 +31,7 @@ Further files of a format (imu.yaml, one file per camera) are written beside the
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add SOURCE, the format and what the source may lack."""
     parser.add_argument(
-        "source", metavar="SOURCE", help="result JSON, log (.mcap) or Kalibr's camchain (.yaml)"
+        "source", metavar="SOURCE", help="result JSON, log (.mcap), Kalibr's camchain (.yaml), or: store"
     )
     parser.add_argument("--format", required=True, choices=FORMATS, metavar="F", help=", ".join(FORMATS))
     parser.add_argument(
@@ -100,6 +101,8 @@ def read_source(source: str) -> Rig:
     from vical_daemon.export.kalibr import read_camchain
 
     path = Path(source)
+    if source == "store" and not path.exists():
+        return _from_store()
     if not path.exists():
         raise CliError(f"{source}: no such file")
     if path.suffix in (".yaml", ".yml"):
@@ -154,6 +157,23 @@ def _from_log(path: Path) -> Rig:
         )
     estimate = merge_calibrations(decode_calibration(data) for data in last.values())
     return rig_from_estimate(estimate, sizes, note=f"vical, from {path.name}, status {estimate.status}")
+
+
+def _from_store() -> Rig:
+    """Read the newest stored calibration of every camera."""
+    from dataclasses import replace as with_changes
+
+    from vical_daemon.export import rig_from_estimate
+    from vical_daemon.places import state_directory
+    from vical_daemon.store import CalibrationStore
+
+    folder = state_directory() / "calibration"
+    stored = sorted(CalibrationStore(folder).all(), key=lambda entry: entry.saved_ns)
+    if not stored:
+        raise CliError(f"no calibration is stored in {folder}: nothing has converged on this machine yet")
+    cameras = {entry.camera: entry.known for entry in stored}
+    estimate = with_changes(stored[-1].estimate, cameras=cameras)
+    return rig_from_estimate(estimate, note=f"vical, stored for imu {stored[-1].imu_serial}")
 
 
 def _complete(rig: Rig, args: argparse.Namespace) -> Rig:

@@ -11,6 +11,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from aiohttp import web
 
@@ -24,6 +25,9 @@ from vical_daemon.wall_clock import WallClock, shared_clock
 from vical_daemon.web.images import CameraView
 from vical_daemon.web.server import PageServer
 from vical_daemon.web.state import WebState
+
+if TYPE_CHECKING:
+    from vical_daemon.foxglove_live import FoxgloveServer
 
 TOKEN_VARIABLE = "VICAL_WEB_TOKEN"  # noqa: S105  (the name of the variable, not a secret)
 TOKEN_FILE = "web-token"  # noqa: S105
@@ -122,6 +126,7 @@ async def _serve(
     if ready is not None:
         ready(address)
     status = StatusSender(config.rig, "web", bus, clock)
+    viewer = _foxglove(config, bus)
 
     def statuses() -> list[DiagnosticStatus]:
         values = {"malformed": str(state.malformed), "address": address}
@@ -134,7 +139,24 @@ async def _serve(
     try:
         await server.run(stopped)
     finally:
+        if viewer is not None:
+            viewer.close()
         await runner.cleanup()
+
+
+def _foxglove(config: Config, bus: Bus) -> FoxgloveServer | None:
+    """Serve Foxglove too where the config asks for it; a taken port must not end the page."""
+    if not config.web.foxglove_port:
+        return None
+    from vical_daemon.foxglove_live import FoxgloveError, FoxgloveServer
+
+    try:
+        viewer = FoxgloveServer(bus, config, config.web.host, config.web.foxglove_port)
+    except FoxgloveError as error:
+        _log.warning("%s; set web.foxglove_port", error)
+        return None
+    _log.info("Foxglove at ws://%s:%d", config.web.host, viewer.port)
+    return viewer
 
 
 def read_token() -> str:

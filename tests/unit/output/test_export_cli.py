@@ -109,6 +109,21 @@ def test_log_gives_its_last_calibration(tmp_path, capsys):
     assert chain["cam0"]["resolution"] == [640, 480]
 
 
+def test_store_gives_the_newest_calibration(tmp_path, capsys, monkeypatch):
+    from vical_daemon.store import CalibrationStore
+
+    monkeypatch.setenv("VICAL_STATE_DIR", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "store", "--format", "json"]) == 1
+    assert "nothing has converged" in capsys.readouterr().err
+    store = CalibrationStore(tmp_path / "calibration")
+    for k, shift in enumerate((0.001, 0.003)):
+        store.save("imu-1", f"cam-{k}", "cam0", estimate(10**18 + k, "cam0", shift), 10**18 + k)
+    assert main(["export", "store", "--format", "json"]) == 0
+    exported = json.loads(capsys.readouterr().out)
+    assert exported["cameras"]["cam0"]["timeshift_cam_imu_s"] == pytest.approx(0.003)
+
+
 @pytest.mark.parametrize(
     ("content", "says"),
     [("nonsense", "not JSON"), ("[1]", "not a result"), ("{}", "cameras"), ("", "not a result")],

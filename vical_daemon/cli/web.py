@@ -1,0 +1,102 @@
+"""`vical web`: the page of a rig that is running, from any machine that reaches its bus."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.options import add_config, add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.bus import Bus
+    from vical_daemon.config import Config
+
+HELP = "a page with the live calibration, on loopback"
+_EPILOG = """\
+  vical web -c vical.yaml                 page at http://127.0.0.1:8080/
+  vical web --port 0 --foxglove 8765      no settings needed: asks the bus what there is; Foxglove as well
+
+On a robot set `web: {enabled: true}` instead; then `vical run` serves the page.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add where to listen and which bus to ask."""
+    add_config(parser, required=False)
+    parser.add_argument("--connect", metavar="ENDPOINT", help="a router, e.g. tcp/127.0.0.1:7447")
+    parser.add_argument("--host", help="address to listen on (default: as in the config, 127.0.0.1)")
+    parser.add_argument("--port", type=int, help="port (default: as in the config, 8080; 0: any free one)")
+    parser.add_argument("--foxglove", type=int, metavar="PORT", help="WebSocket for Foxglove as well")
+    parser.epilog = _EPILOG
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until interrupted."""
+    for name in ("port", "foxglove"):
+        value = getattr(args, name)
+        if value is not None and not 0 <= value <= 65535:
+            raise CliError(f"--{name} {value}: a port lies between 0 and 65535", EXIT_USAGE)
+    from vical_daemon.cli.bus_access import open_client
+    from vical_daemon.config import load
+    from vical_daemon.roles import web
+    from vical_daemon.wall_clock import private_clock
+
+    bus = open_client(args.config, args.connect)
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    try:
+        config = load(args.config) if args.config else _discover(bus)
+        settings = config.web
+        for name, value in (("host", args.host), ("port", args.port), ("foxglove_port", args.foxglove)):
+            if value is not None:
+                settings = replace(settings, **{name: value})
+        web.run(replace(config, web=settings), bus, stop, clock=private_clock(), ready=_tell(args))
+    finally:
+        bus.close()
+    return 0
+
+
+def _tell(args: argparse.Namespace) -> Callable[[str], None]:
+    """Return what prints the address once it is served."""
+
+    def ready(address: str) -> None:
+        print(json.dumps({"address": address}) if args.json else address, flush=True)
+        if sys.stderr.isatty() and not args.quiet:
+            print("Ctrl-C ends it", file=sys.stderr)
+
+    return ready
+
+
+def _discover(bus: Bus) -> Config:
+    """Make up the part of a config that the page needs from what is on the bus.
+
+    Raises:
+        CliError: Nothing there, or several rigs.
+    """
+    from vical_daemon import topics
+    from vical_daemon.config import CameraConfig, Config, ImuConfig
+
+    found = [topics.parse_key(sample.key) for sample in bus.latest(f"{topics.ROOT}/**", 2.0)]
+    parsed = [entry for entry in found if entry is not None]
+    rigs = sorted({entry.rig for entry in parsed})
+    if not rigs:
+        raise CliError("nothing is on the bus yet; is `vical run` (vical.target) up?")
+    if len(rigs) > 1:
+        raise CliError(f"there are the rigs {', '.join(rigs)}: say which with -c FILE", EXIT_USAGE)
+    about_cameras = (topics.CALIBRATION, topics.CAMERA_INFO, topics.POSE)
+    cameras = sorted({entry.name for entry in parsed if entry.topic in about_cameras})
+    logging.getLogger(__name__).info("rig %s, cameras %s", rigs[0], ", ".join(cameras) or "none")
+    return Config(
+        rig=rigs[0],
+        imus={"imu0": ImuConfig(port="elsewhere")},
+        cameras={name: CameraConfig(uri="elsewhere") for name in cameras},
+    )
