@@ -38,6 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     decode = leaf("decode", "a raw byte capture as JSON lines, then a summary", _decode)
     decode.add_argument("file", metavar="FILE", help="raw bytes as they came over the wire")
     _add_protocol(decode)
+    decode.add_argument(
+        "--little-endian-floats", action="store_true", help="the GX3's sampling flag bit 4 was set"
+    )
     bias = leaf("capture-gyro-bias", "let the device average its gyro at rest (volatile)", _capture_bias)
     _add_port(bias)
     bias.add_argument("--seconds", type=float, default=10.0, metavar="S", help="1 .. 30, 10 is good")
@@ -127,7 +130,7 @@ def _decode(args: argparse.Namespace) -> int:
     from vical_drivers.microstrain.capture import Capture
 
     data = Path(args.file).read_bytes()
-    capture = Capture(data, args.protocol)
+    capture = Capture(data, args.protocol, little_endian_floats=args.little_endian_floats)
     for record in capture:
         print(json.dumps({key: _finite(value) for key, value in record.items()}))
     s = capture.summary

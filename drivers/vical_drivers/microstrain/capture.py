@@ -41,17 +41,19 @@ class Capture:
     Args:
         data: The bytes.
         protocol: "single-byte", "mip", or "auto": whichever explains more of the bytes.
+        little_endian_floats: The single-byte device was set to send floats so (sampling flag bit 4).
 
     Raises:
         DriverError: Unknown protocol.
     """
 
-    def __init__(self, data: bytes, protocol: str = "auto") -> None:
+    def __init__(self, data: bytes, protocol: str = "auto", *, little_endian_floats: bool = False) -> None:
         if protocol == "auto":
             protocol = detect_protocol(data)
         if protocol not in ("single-byte", "mip"):
             raise DriverError(f"unknown protocol {protocol!r}; known are auto, single-byte, mip")
         self._data = data
+        self._little_endian_floats = little_endian_floats
         self.summary = CaptureSummary(protocol)
 
     def __iter__(self) -> Iterator[dict[str, object]]:
@@ -62,7 +64,7 @@ class Capture:
             yield from self._single_byte()
 
     def _single_byte(self) -> Iterator[dict[str, object]]:
-        decoder = sb.Decoder()
+        decoder = sb.Decoder(little_endian_floats=self._little_endian_floats)
         for chunk in _chunks(self._data):
             for record in decoder.feed(chunk) if chunk else decoder.finish():
                 kind = self._count(record.kind)

@@ -110,7 +110,8 @@ class Decoder:
         self._tail = b""
         self._consumed = 0
         self._packet_bytes = 0
-        self._in_step = True
+        # A capture may begin inside a packet: that is no damage.
+        self._in_step = False
 
     @property
     def pending(self) -> bytes:

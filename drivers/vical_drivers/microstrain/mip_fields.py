@@ -9,14 +9,17 @@ import math
 import struct
 from dataclasses import dataclass
 
+from vical_drivers.microstrain import single_byte as sb
 from vical_drivers.microstrain.mip import ACK, NACK_REASONS, SET_3DM, SET_BASE, SET_SENSOR, Field, Packet
 
-STANDARD_GRAVITY_MPS2 = 9.80665
+STANDARD_GRAVITY_MPS2 = sb.STANDARD_GRAVITY_MPS2
 GAUSS = 1e-4
 GX3_TICK_HZ = 62_500
 WEEK_S = 604_800
 
 ACCEL, GYRO, TICKS, PPS_TIME, GPS_CORRELATION = 0x04, 0x05, 0x0E, 0x0F, 0x12
+_WRAPPED = 0x82
+"""Single-byte records inside a MIP field (GX3-35 in its wrapped raw format)."""
 GPS_TIME, REFERENCE_TIME = 0xD3, 0xD5
 _IDENTITY = ("model_name", "model_number", "serial_number", "lot", "options")
 
@@ -104,6 +107,10 @@ def _describe_field(descriptor_set: int, field: Field) -> dict[str, object]:
         if (descriptor_set, descriptor) == (SET_BASE, 0x81) and len(data) == 82:
             return {"device": identity(data)}
         layout = _REPLIES.get((descriptor_set, descriptor))
+    elif (descriptor_set, descriptor) == (SET_SENSOR, _WRAPPED):
+        decoder = sb.Decoder()
+        records = decoder.feed(data) + decoder.finish()
+        return {"wrapped": [{"kind": f"0x{r.kind:02X}", **r.fields()} for r in records]}
     else:
         layout = _SENSOR.get(descriptor) if descriptor_set == SET_SENSOR else None
         layout = layout or _SHARED.get(descriptor)

@@ -207,7 +207,8 @@ class Decoder:
         self._tail = b""
         self._consumed = 0
         self._record_bytes = 0
-        self._in_step = True
+        # A capture may begin inside a record: that is no damage.
+        self._in_step = False
 
     @property
     def pending(self) -> bytes:

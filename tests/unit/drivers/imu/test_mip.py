@@ -164,3 +164,16 @@ def test_unknown_fields_and_several_acks_are_shown():
         "ack_2": {"command": "0x11", "result": "invalid parameter"},
         "field_0xEE": "01",
     }
+
+
+def test_single_byte_records_wrapped_in_mip_are_unwrapped():
+    record = bytes.fromhex("C23C23D70ABCA3D70ABF7F9DB23A83126FBB03126F3A03126F000989680B04")
+    (packet,) = mip.Decoder().feed(mip.encode(0x80, (0x82, record)))
+    (wrapped,) = mip_fields.describe(packet)["wrapped"]
+    assert (wrapped["kind"], wrapped["device_ticks"]) == ("0xC2", 625000)
+
+
+def test_a_capture_that_begins_inside_a_packet_is_not_damaged():
+    decoder = mip.Decoder()
+    assert ticks_of(decoder.feed(data_packet(0)[7:] + data_packet(1))) == [1]
+    assert decoder.checksum_errors == 0
