@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from vical_daemon.estimation.measurements import CameraPrior
     from vical_daemon.estimation.td_icp import TdIcpOptions, TdIcpResult
     from vical_daemon.estimation.td_icp_joint import JointResult, OrientationStream
     from vical_daemon.estimation.td_icp_monitor import DelayReport
@@ -91,9 +92,14 @@ def _open(path: str) -> Recording:
     return recording
 
 
-def _gyro(
+def choose_gyro(
     recording: Recording, name: str | None
 ) -> tuple[str, npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Return name, stamps (ns) and rates (rad/s) of the imu that is meant.
+
+    Raises:
+        CliError: None, or several and no name.
+    """
     imus = recording.imus
     if not imus:
         raise CliError(f"{recording.path} holds no imu data")
@@ -126,10 +132,10 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     camera = args.camera or next(iter(cameras))
     if camera not in cameras:
         raise CliError(f"{recording.path} holds no camera {camera!r}, only {', '.join(cameras)}", EXIT_USAGE)
-    imu, t_ns, gyro = _gyro(recording, args.imu)
+    imu, t_ns, gyro = choose_gyro(recording, args.imu)
     base = int(t_ns[0])
     options = _options(args, initial)
-    stream = camera_stream(recording, cameras[camera], _prior(initial, camera), args.target, base)
+    stream = camera_stream(recording, cameras[camera], prior_of(initial, camera), args.target, base)
     t_imu = seconds(t_ns, base)
     result = td_icp(t_imu, gyro, stream.t_s, stream.R_world_sensor, stream.rotation_sigma, options)
     document: dict[str, Any] = {**result.to_json(), "imu": imu, "camera": camera}
@@ -146,7 +152,8 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     return 0
 
 
-def _prior(initial: Initial, camera: str) -> Any:
+def prior_of(initial: Initial, camera: str) -> CameraPrior | None:
+    """Return what a file says about a camera; a single camera of another name is meant for it."""
     prior = initial.cameras.get(camera)
     if prior is None and len(initial.cameras) == 1:
         prior = next(iter(initial.cameras.values()))
@@ -254,7 +261,9 @@ def _register(args: argparse.Namespace, initial: Initial, names: list[str]) -> J
             continue
         if name in recording.cameras:
             camera = recording.cameras[name]
-            streams.append(sources.camera_stream(recording, camera, _prior(initial, name), args.target, base))
+            streams.append(
+                sources.camera_stream(recording, camera, prior_of(initial, name), args.target, base)
+            )
         elif Path(name).is_file():
             streams.append(sources.trajectory_file(Path(name), base)[0])
         elif name.startswith("/"):
@@ -266,7 +275,7 @@ def _register(args: argparse.Namespace, initial: Initial, names: list[str]) -> J
                 EXIT_USAGE,
             )
     if gyros:
-        imu, t_ns, gyro = _gyro(recording, gyros[0])
+        imu, t_ns, gyro = choose_gyro(recording, gyros[0])
         return joint_with_gyro(imu, sources.seconds(t_ns, base), gyro, streams, _options(args, initial))
     return joint_of_orientations(streams, _options(args, initial))
 

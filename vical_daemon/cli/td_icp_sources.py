@@ -13,7 +13,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_orientations import Orientations, target_orientations
 from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.lens_refinement import refine_lens
+from vical_daemon.estimation.lens_refinement import LensFit, refine_lens
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.start import Lens
 from vical_daemon.estimation.td_icp_joint import OrientationStream
@@ -55,7 +55,7 @@ def camera_stream(
     Raises:
         CliError: Something needed is not there.
     """
-    lens = _lens(stream, prior)
+    lens = lens_of(stream, prior)
     if stream.kind == "tracks":
         if prior is None or prior.intrinsics is None:
             raise CliError(
@@ -68,6 +68,25 @@ def camera_stream(
             raise CliError(f"{stream.name}: too few features carry over from frame to frame")
         found = max(chains, key=lambda chain: len(chain.t_cam_ns))
         return _stream(stream.name, found, base_ns)
+    found, _ = board_poses(recording, stream, lens, prior is None or prior.intrinsics is None, target)
+    return _stream(stream.name, found, base_ns)
+
+
+def board_poses(
+    recording: Recording, stream: Stream, lens: Lens, guess: bool, target: str | None
+) -> tuple[Orientations, LensFit]:
+    """Find the board in a camera's frames, improve the lens by them, and return the camera's poses.
+
+    Args:
+        recording: The data.
+        stream: The camera, images or points.
+        lens: Start.
+        guess: The lens is only guessed from the image size.
+        target: Target file.
+
+    Raises:
+        CliError: No target, or it does not fit the data.
+    """
     if target is None:
         raise CliError(f"{stream.name}: give the board with --target", EXIT_USAGE)
     from vical_daemon.vision.target import load_target
@@ -80,14 +99,18 @@ def camera_stream(
         raise CliError(
             f"{stream.name}: point ids go beyond the target's {len(points_m)} points; wrong target file?"
         )
-    if prior is None or prior.intrinsics is None:
+    if guess:
         estimate_intrinsics(lens, frames, points_m)
     fit = refine_lens(frames, points_m, lens.intrinsics, lens.distortion, lens.model)
-    found = target_orientations(frames, points_m, fit.intrinsics, fit.distortion, lens.model)
-    return _stream(stream.name, found, base_ns)
+    return target_orientations(frames, points_m, fit.intrinsics, fit.distortion, lens.model), fit
 
 
-def _lens(stream: Stream, prior: CameraPrior | None) -> Lens:
+def lens_of(stream: Stream, prior: CameraPrior | None) -> Lens:
+    """Return what is known about a camera's lens, or a guess from the image size.
+
+    Raises:
+        CliError: Not even the image size is known.
+    """
     if prior is None:
         if stream.resolution is None:
             raise CliError(

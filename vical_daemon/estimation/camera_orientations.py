@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -29,12 +29,14 @@ class Orientations:
         R_world_cam: The world is the target (or the first camera frame), shape (n, 3, 3).
         covariance: Of the local (right) error, rad^2, shape (n, 3, 3).
         skipped: Frames without a usable pose.
+        p_world_cam: Position of the camera in the world, m, shape (n, 3); empty where it is not known.
     """
 
     t_cam_ns: IntArray
     R_world_cam: FloatArray
     covariance: FloatArray
     skipped: int = 0
+    p_world_cam: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def target_orientations(
@@ -87,7 +89,8 @@ def target_orientations(
     rms = np.array([pose.rms for pose in poses])
     covariance *= np.maximum(1.0, rms / np.median(rms))[:, None, None] ** 2
     R_world_cam = np.swapaxes(R, 1, 2)
-    return Orientations(np.array(stamps), R_world_cam, R @ covariance @ R_world_cam, skipped)
+    p = -(R_world_cam @ np.stack([pose.p_cam_target for pose in poses])[..., None])[..., 0]
+    return Orientations(np.array(stamps), R_world_cam, R @ covariance @ R_world_cam, skipped, p)
 
 
 def _choose(found: PlanarPoses | None, previous: PlanarPose | None) -> PlanarPose | None:

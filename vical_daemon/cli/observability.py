@@ -1,0 +1,148 @@
+"""`vical observability INPUT`: what the motion of a recording can determine, and what motion is missing."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.options import add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.missing_motion import Missing
+    from vical_daemon.estimation.observability import Motion, Observability, Setup
+    from vical_daemon.estimation.observability_model import ModelRank
+
+HELP = "which parameters the motion made observable, and what motion is missing"
+BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of COMMANDS."""
+    parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
+    parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format")
+    parser.add_argument("--initial", metavar="FILE", help="what is known before: Kalibr's files")
+    parser.add_argument("--camera", metavar="NAME", help="which camera, where there are several")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
+    parser.add_argument(
+        "--estimate",
+        metavar="WHAT",
+        default="",
+        help=f"comma-separated, further unknowns: {', '.join(BLOCKS)}",
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Judge and print."""
+    blocks = [word.strip() for word in args.estimate.split(",") if word.strip()]
+    for word in blocks:
+        if word not in BLOCKS:
+            raise CliError(f"--estimate: {word!r} is not known (known: {', '.join(BLOCKS)})", EXIT_USAGE)
+    if not Path(args.input).exists():
+        raise CliError(f"{args.input} does not exist")
+    from vical_daemon.cli.observability_motion import motion_of
+    from vical_daemon.estimation.observability import gramian
+    from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
+
+    motion, setup, frames = motion_of(args, frozenset(blocks))
+    result = gramian(motion, setup, frames)
+    model = model_rank(
+        ModelBlocks(
+            intrinsics="intrinsics" in blocks,
+            imu_matrix="imu_matrix" in blocks,
+            target_scale="target_scale" in blocks,
+        )
+    )
+    missing = _missing(result, motion, setup)
+    document = _document(result, motion, missing, model, len(frames))
+    if args.json:
+        print(json.dumps(document))
+    else:
+        _print(document, missing)
+    if missing:
+        print(f"vical: warning: {'; '.join(str(m) for m in missing)}", file=sys.stderr)
+    return 0
+
+
+def _missing(result: Observability, motion: Motion, setup: Setup) -> list[Missing]:
+    """What is missing, in words, from the bound with next to no prior."""
+    import numpy as np
+
+    from vical_daemon.estimation.missing_motion import missing_motion
+
+    prior = np.diag(1.0 / (1e3 * result.units) ** 2)
+    covariance = np.linalg.inv(result.information + prior)
+    order = [result.blocks[name] for name in ("lever_arm", "rotation", "timeshift")]
+    index = np.concatenate([np.arange(s.start, s.stop) for s in order])
+    scatter = np.einsum("ki,kj->ij", motion.rate_rps, motion.rate_rps) / len(motion.t_s)
+    change = np.gradient(motion.rate_rps, motion.t_s, axis=0)
+    rms = float(np.sqrt(np.median(np.sum(change**2, axis=1))))
+    return missing_motion(covariance[np.ix_(index, index)], setup.R_imu_cam, scatter, rms)
+
+
+def _document(
+    result: Observability, motion: Motion, missing: list[Missing], model: ModelRank, frames: int
+) -> dict[str, Any]:
+    import numpy as np
+
+    def sigma(block: str) -> list[float | None]:
+        return [float(v) if np.isfinite(v) else None for v in result.sigma[result.blocks[block]]]
+
+    rates = np.sqrt(np.mean(motion.rate_rps**2, axis=0))
+    return {
+        "rank": result.rank,
+        "unknowns": result.unknowns,
+        "observable": result.rank == result.unknowns,
+        "sigma": {
+            name: sigma(name)
+            for name in result.blocks
+            if name not in ("attitude", "position", "velocity", "landmark")
+        },
+        "lost": [{"parts": dict(d.parts), "strength": d.strength} for d in result.lost],
+        "missing": [
+            {
+                "block": m.block,
+                "direction": m.direction,
+                "axis_cam": m.axis_cam.tolist(),
+                "sigma": m.sigma,
+                "advice": m.advice,
+            }
+            for m in missing
+        ],
+        "rate_rms_rps": rates.tolist(),
+        "seconds": float(motion.t_s[-1] - motion.t_s[0]),
+        "frames": frames,
+        "model": {"rank": model.rank, "unknowns": model.unknowns},
+    }
+
+
+def _print(document: dict[str, Any], missing: list[Missing]) -> None:
+    print(
+        f"{document['rank']} of {document['unknowns']} unknowns determined by {document['seconds']:.0f} s, "
+        f"{document['frames']} frames (the model allows {document['model']['rank']} "
+        f"of {document['model']['unknowns']})"
+    )
+    units = {
+        "lever_arm": (1e3, "mm"),
+        "rotation": (57.29578, "deg"),
+        "timeshift": (1e3, "ms"),
+        "gyro_bias": (57.29578, "deg/s"),
+        "accel_bias": (1.0, "m/s^2"),
+        "gravity": (1.0, "m/s^2"),
+        "intrinsics": (1.0, "px"),
+        "readout": (1e3, "ms"),
+    }
+    print("bound on sigma for a perfect imu:")
+    for name, values in document["sigma"].items():
+        factor, unit = units.get(name, (1.0, ""))
+        words = "  ".join("lost" if v is None else f"{factor * v:.4f}" for v in values)
+        print(f"  {name:13s} {words} {unit}")
+    for lost in document["lost"]:
+        parts = ", ".join(f"{name} {share:.2f}" for name, share in lost["parts"].items())
+        print(f"  lost direction: {parts}")
+    for item in missing:
+        print(f"missing: {item}")

@@ -1,0 +1,159 @@
+"""The motion of a recording for `vical observability`: attitude from the gyro, position from the board."""
+
+from __future__ import annotations
+
+import argparse
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.td_icp import choose_gyro, prior_of
+from vical_daemon.cli.td_icp_sources import board_poses, lens_of, seconds
+from vical_daemon.estimation.camera_orientations import Orientations
+from vical_daemon.estimation.lens_refinement import LensFit
+from vical_daemon.estimation.observability import Motion, Setup
+from vical_daemon.estimation.rotation_curves import GyroCurve
+from vical_daemon.estimation.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
+from vical_daemon.priors import Initial, read_initial
+from vical_daemon.recording import open_recording
+
+FloatArray = npt.NDArray[np.float64]
+
+_MAX_SECONDS = 30.0
+_MAX_FRAMES = 150
+_HOLE_S = 0.35
+
+
+def motion_of(args: argparse.Namespace, blocks: frozenset[str]) -> tuple[Motion, Setup, npt.NDArray[np.intp]]:
+    """Rebuild the motion of the longest stretch (at most 30 s) in which the board stays in view.
+
+    Raises:
+        CliError: No board, no imu, or no motion to work with.
+    """
+    recording = open_recording(args.input, check=False)
+    initial = read_initial(args.initial) if args.initial else Initial()
+    cameras = recording.cameras
+    name = args.camera or next(iter(cameras), None)
+    if name is None or name not in cameras or (args.camera is None and len(cameras) > 1):
+        raise CliError(
+            f"choose one camera of {recording.path} with --camera: {', '.join(cameras) or 'there is none'}",
+            EXIT_USAGE,
+        )
+    stream, prior = cameras[name], prior_of(initial, name)
+    if stream.kind == "tracks":
+        raise CliError(f"{name}: tracks of unknown points do not give the motion; a board is needed")
+    lens = lens_of(stream, prior)
+    poses, fit = board_poses(recording, stream, lens, prior is None or prior.intrinsics is None, args.target)
+    imu, t_ns, gyro = choose_gyro(recording, args.imu)
+    force = recording.imu_arrays(imu).specific_force_mps2
+    base = int(t_ns[0])
+    t_imu, t_cam = seconds(t_ns, base), seconds(poses.t_cam_ns, base)
+    fresh = np.concatenate(([True], np.diff(t_imu) > 1e-6))
+    t_imu, gyro, force = t_imu[fresh], gyro[fresh], force[fresh]
+    result = td_icp(t_imu, gyro, t_cam, poses.R_world_cam, poses.covariance, TdIcpOptions())
+    if result.status == REFUSED:
+        result = _without_motion(poses, result)
+    p_imu_cam = np.zeros(3)
+    if prior is not None and prior.T_imu_cam is not None:
+        p_imu_cam = prior.T_imu_cam[1]
+    motion, frames = _rebuild(
+        t_imu, gyro, force, t_cam + result.timeshift_cam_imu_s, poses, result, p_imu_cam
+    )
+    return motion, _setup(fit, lens.model, lens.resolution, result, p_imu_cam, blocks, args.target), frames
+
+
+def _without_motion(poses: Orientations, result: TdIcpResult) -> TdIcpResult:
+    """A rig that stands still has an observability too (a poor one); anything else is an error."""
+    if "no motion" not in result.reason or len(poses.t_cam_ns) < 12:
+        raise CliError(f"the recording cannot be judged: {result.reason}")
+    used = np.ones(len(poses.t_cam_ns), dtype=np.bool_)
+    return TdIcpResult(
+        "degenerate",
+        result.reason,
+        0.0,
+        0.0,
+        np.eye(3),
+        gyro_bias_rps=np.zeros(3),
+        pairs=len(used),
+        used=used,
+    )
+
+
+def _rebuild(
+    t_imu: FloatArray,
+    gyro: FloatArray,
+    force: FloatArray,
+    t_frame: FloatArray,
+    poses: Orientations,
+    result: TdIcpResult,
+    p_imu_cam: FloatArray,
+) -> tuple[Motion, npt.NDArray[np.intp]]:
+    inside = np.flatnonzero(result.used & (t_frame > t_imu[0]) & (t_frame < t_imu[-1]))
+    stretch = _longest(t_frame[inside])
+    index = inside[stretch]
+    if len(index) < 12:
+        raise CliError("the board is never in view for long enough")
+    t = t_frame[index]
+    use = (t_imu >= t[0]) & (t_imu <= t[-1])
+    curve = GyroCurve.integrate(t_imu, gyro, result.gyro_bias_rps)
+    middle = len(index) // 2
+    R_ref_imu = curve.at(t)[0]
+    R_world_ref = poses.R_world_cam[index[middle]] @ (R_ref_imu[middle] @ result.R_imu_cam).T
+    p_world_imu = poses.p_world_cam[index] - (R_world_ref @ R_ref_imu) @ p_imu_cam
+    path = CubicSpline(t, p_world_imu)
+    times = t_imu[use]
+    motion = Motion(
+        times,
+        np.asarray(R_world_ref @ curve.at(times)[0], dtype=np.float64),
+        np.asarray(path(times), dtype=np.float64),
+        np.asarray(path(times, 1), dtype=np.float64),
+        gyro[use] - result.gyro_bias_rps,
+        force[use],
+    )
+    frames = np.unique(np.clip(np.searchsorted(times, t), 1, len(times) - 2))
+    if len(frames) > _MAX_FRAMES:
+        frames = frames[np.linspace(0, len(frames) - 1, _MAX_FRAMES).round().astype(int)]
+    return motion, frames
+
+
+def _longest(t: FloatArray) -> slice:
+    """The longest run without a hole, cut to 30 s around its middle."""
+    breaks = np.flatnonzero(np.diff(t) > _HOLE_S) + 1
+    edges = np.concatenate(([0], breaks, [len(t)]))
+    if not len(t):
+        return slice(0, 0)
+    longest = int(np.argmax([t[b - 1] - t[a] for a, b in pairwise(edges)]))
+    a, b = int(edges[longest]), int(edges[longest + 1])
+    centre = 0.5 * (t[a] + t[b - 1])
+    inside = np.flatnonzero(np.abs(t[a:b] - centre) <= _MAX_SECONDS / 2)
+    return slice(a + int(inside[0]), a + int(inside[-1]) + 1)
+
+
+def _setup(
+    fit: LensFit,
+    model: str,
+    resolution: tuple[int, int],
+    result: TdIcpResult,
+    p_imu_cam: FloatArray,
+    blocks: frozenset[str],
+    target: str,
+) -> Setup:
+    from pathlib import Path
+
+    from vical_daemon.vision.target import load_target
+
+    corner = fit.corner_sigma_px if np.isfinite(fit.corner_sigma_px) else 0.5
+    return Setup(
+        result.R_imu_cam,
+        p_imu_cam,
+        fit.intrinsics,
+        fit.distortion,
+        load_target(Path(target)).points_m,
+        model=model,
+        resolution=resolution,
+        estimate=blocks,
+        corner_sigma_px=max(corner, 0.05),
+    )
