@@ -90,7 +90,7 @@ def _acquire(folder: str, stop: Any, ready: Any, answers: Any, size: tuple[int, 
     (Path(folder) / "kernel").mkdir()
     kernel = FakeKernel(Path(folder) / "kernel", RealClock())
     path = kernel.plug(camera)
-    settings = CameraSettings(exposure_s=EXPOSURE_S, readout_s=READOUT_S, borrow=True, buffers=8)
+    settings = CameraSettings(exposure_s=EXPOSURE_S, readout_s=READOUT_S, borrow=True)
     bus: Bus = open_bus(mode="router", socket=Path(folder) / "bus")
     role, outbox = CameraRole("bench", "cam0", WallClock(0)), Outbox(bus, QUEUE_DEPTH, "out")
     ready.wait(60)

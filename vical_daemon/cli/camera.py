@@ -70,7 +70,7 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="what the driver's stamp marks, where its own word is not to be believed",
     )
-    parser.add_argument("--buffers", type=int, default=6, metavar="N", help="kernel buffers")
+    parser.add_argument("--buffers", type=int, default=None, metavar="N", help="kernel buffers")
 
 
 def run(args: argparse.Namespace) -> int:

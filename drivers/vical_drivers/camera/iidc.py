@@ -78,7 +78,7 @@ class IidcCamera:
             self._mode: IidcMode = device.set_mode(self._settings)
             self._frame_info = device.embed()
             self._apply(device)
-            self._fd = device.start(self._settings.buffers)
+            self._fd = device.start(self._settings.ring_size(self._mode.rate_hz))
         except BaseException:
             self._drop()
             raise

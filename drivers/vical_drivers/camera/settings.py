@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -9,6 +10,8 @@ from vical_drivers.camera.formats import ENCODINGS, ImageDecoder
 from vical_drivers.camera.stamps import Anchor, Shutter
 from vical_drivers.errors import DeviceRefusedError
 
+HELD_UP_S = 0.25
+MIN_BUFFERS, MAX_BUFFERS = 6, 32
 STAMP_CHOICES = ("auto", "raw", *(a.value for a in Anchor if a is not Anchor.ARRIVAL))
 
 
@@ -32,7 +35,7 @@ class CameraSettings:
         readout_s: First to last row, s; 0: unknown or nothing to correct.
         stamp: "auto", "raw" (publish the driver's stamp as it is) or the anchor that the driver's stamp
             really marks: "soe", "eof", "first-packet", "shutter-closed".
-        buffers: Kernel buffers asked for.
+        buffers: Kernel buffers asked for; None: enough for a quarter of a second.
         borrow: Frames show the kernel's memory and are valid only until the next `read`: one copy less.
         decoder: Decompressor for MJPG, PNG and JPEG.
     """
@@ -49,7 +52,7 @@ class CameraSettings:
     rolling_shutter: bool = False
     readout_s: float = 0.0
     stamp: str = "auto"
-    buffers: int = 6
+    buffers: int | None = None
     borrow: bool = False
     decoder: ImageDecoder | None = None
 
@@ -64,8 +67,14 @@ class CameraSettings:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise DeviceRefusedError(f"camera: {name} = {value} must be above 0")
-        if self.readout_s < 0 or self.buffers < 2:
+        if self.readout_s < 0 or (self.buffers is not None and self.buffers < 2):
             raise DeviceRefusedError("camera: readout_s must be at least 0 and buffers at least 2")
+
+    def ring_size(self, rate_hz: float) -> int:
+        """Return how many buffers to ask for at a frame rate: a process may be held up for so long."""
+        if self.buffers is not None:
+            return self.buffers
+        return min(max(MIN_BUFFERS, math.ceil(HELD_UP_S * rate_hz)), MAX_BUFFERS)
 
     @property
     def shutter(self) -> Shutter:

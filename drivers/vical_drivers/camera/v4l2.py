@@ -64,7 +64,7 @@ class _Session:
             if self.identity.driver == _UVC_DRIVER and settings.stamp == "auto":
                 self.uvc_hwtimestamps = hwtimestamps(kernel)
                 self.metadata = UvcMetadata.open(kernel, entry)
-            self.buffers = self.node.start(settings.buffers)
+            self.buffers = self.node.start(settings.ring_size(self.rate_hz))
         except BaseException:
             self.close()
             raise

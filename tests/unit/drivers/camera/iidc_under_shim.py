@@ -139,7 +139,7 @@ def test_without_embedding_the_first_packet_dates_the_frame(open_iidc: OpenIidc,
 
 
 def test_losses_are_found_by_the_embedded_counter(open_iidc: OpenIidc, rig: FireWireRig) -> None:
-    source = open_iidc()
+    source = open_iidc(buffers=6)
     source.read(1.0)
     rig.shared.lose_frames = 4
     assert sum(source.read(1.0).dropped_before for _ in range(8)) == 4
