@@ -92,6 +92,7 @@ def driver_options(config: CameraConfig) -> dict[str, Any]:
         "rolling_shutter": config.lens.readout_s > 0,
         "readout_s": config.lens.readout_s,
         "stamp": config.stamp,
+        "borrow": True,  # the message is built before the next read: the only copy on this way
     }
 
 
