@@ -7,6 +7,7 @@ import json
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", help="config, target, recording and result (default: a new folder)"
     )
+    parser.add_argument(
+        "--web", type=int, metavar="PORT", help="serve the live page too (http://127.0.0.1:PORT/, 0: any)"
+    )
     add_json(parser)
 
 
@@ -80,6 +84,8 @@ def run(args: argparse.Namespace) -> int:
     settings = LiveRigSettings(board=BOARD, seed=args.seed, camera_rate_hz=RATE_HZ)
     with LiveRig(settings) as rig:
         config = _write_config(out, rig.port)
+        if args.web is not None:
+            config = replace(config, web=replace(config.web, enabled=True, port=args.web))
         stamps = demo_truth.StampWitness(rig.imu_instant_ns, config.imus[IMU].filter_samples)
         estimate, trace = _run_roles(config, rig, stamps, args)
     truth = demo_truth.truth_of_stamps(rig.rig.truth(0.0, CAMERA), stamps.error_s, CAMERA)
@@ -116,8 +122,11 @@ def _run_roles(
     watch = Watch(bus, config.rig, CAMERA)
     started: list[str] = []
     try:
-        for role in ("record", "estimate", "detect", "camera", "imu"):
+        page = ("web",) if config.web.enabled else ()
+        for role in (*page, "record", "estimate", "detect", "camera", "imu"):
             options: dict[str, Any] = {"clock": clock}
+            if role == "web":
+                options["ready"] = lambda address: _say(f"live page at {address}")
             if role == "camera":
                 options["open_source"] = lambda _camera: rig.camera()
             if role == "imu":

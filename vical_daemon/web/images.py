@@ -20,7 +20,9 @@ from vical_daemon.messages import (
 )
 
 WIDTH_LIMIT = 800  # wider images are thinned: the page is for looking, not for measuring
-PATIENCE_NS = 700_000_000  # an image without points is shown when nothing better came for so long
+PATIENCE_NS = 1_200_000_000  # an image without points is shown when nothing better came for so long
+RESTART_NS = 5_000_000_000
+KEPT_BYTES = 24 * 2**20  # images that wait for their points: about a second of them
 _RING = np.array([(x, y) for x in range(-5, 6) for y in range(-5, 6) if 10 <= x * x + y * y <= 26])
 _PALETTE = np.array(
     [(0, 94, 213), (115, 158, 0), (178, 114, 0), (66, 228, 240), (167, 121, 204), (0, 159, 230)],
@@ -38,8 +40,8 @@ class CameraView:
     def __init__(self, camera: str) -> None:
         self.camera = camera
         self._lock = threading.Lock()
-        self._images: deque[Sample] = deque(maxlen=6)
-        self._points: deque[Sample] = deque(maxlen=24)
+        self._images: deque[Sample] = deque(maxlen=40)
+        self._points: deque[Sample] = deque(maxlen=60)
         self._shown_ns = 0
 
     def take(self, sample: Sample) -> None:
@@ -49,7 +51,12 @@ class CameraView:
             return
         is_image = parsed.topic in (topics.IMAGE, topics.COMPRESSED)
         with self._lock:
-            (self._images if is_image else self._points).append(sample)
+            if not is_image:
+                self._points.append(sample)
+                return
+            self._images.append(sample)
+            while len(self._images) > 2 and sum(len(s.payload) for s in self._images) > KEPT_BYTES:
+                self._images.popleft()
 
     def jpeg(self) -> bytes | None:
         """Return the next picture as JPEG; None while there is nothing newer than the last one."""
@@ -62,6 +69,8 @@ class CameraView:
                 stamp_ns, load = _open_image(sample)
             except MessageError:
                 continue
+            if stamp_ns < self._shown_ns - RESTART_NS:
+                self._shown_ns = 0  # the clock went back: a replay that began anew
             if stamp_ns <= self._shown_ns:
                 break
             if stamp_ns in known:

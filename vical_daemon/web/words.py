@@ -10,7 +10,7 @@ from vical_daemon.estimation.result import CalibrationEstimate, Status
 
 _SENTENCES = {
     Status.WAITING: "Waiting for data.",
-    Status.INITIALISING: "Looking for a first solution: move the rig before the board.",
+    Status.INITIALISING: "Looking for a first solution.",
     Status.CONVERGING: "Getting sharper.",
     Status.CONVERGED: "Converged: the stated sigmas are small enough.",
     Status.DEGENERATE: "The motion so far does not reveal everything.",

@@ -175,8 +175,17 @@ def test_picture_waits_for_its_points_but_not_for_ever(web_feed):
     bare = fill(view, web_feed, with_points=False)
     bare(2)
     assert view.jpeg() is None
-    bare(20)
+    bare(30)
     assert view.jpeg() is not None
+
+
+def test_a_clock_that_goes_back_does_not_stop_the_picture(web_feed):
+    view = CameraView("cam0")
+    feed = fill(view, web_feed)
+    feed(500)
+    assert view.jpeg()
+    feed(1)
+    assert view.jpeg()
 
 
 def test_wide_images_are_thinned(web_feed):

@@ -1,0 +1,127 @@
+"""Processor time of the page with 0 and 4 viewers, fed like a rig: 5 Hz estimates, 10 Hz images."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import importlib.util
+import multiprocessing
+import resource
+import threading
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+
+
+def serve(pipe: Connection, seconds: float) -> None:
+    """Child: role web over a LocalBus; sends its address, then the CPU seconds it used while fed."""
+    from vical_daemon.bus import LocalBus
+    from vical_daemon.config import CameraConfig, Config, ImuConfig, WebConfig
+    from vical_daemon.roles import web
+    from vical_daemon.wall_clock import private_clock
+
+    feed = _feed_module()
+    recorded = LocalBus()
+    messages: list[tuple[str, bytes]] = []
+    recorded.subscribe("vical/**", lambda sample: messages.append((sample.key, sample.payload)))
+    rng, steps = np.random.default_rng(0), []
+    for k in range(int(10 * seconds)):  # made before the measurement: it is the page that is measured
+        messages.clear()
+        feed.publish_image(recorded, k)
+        if k % 2:
+            feed.publish_estimate(recorded, feed.estimate(0.1 * k, rng))
+        if k % 10 == 0:
+            feed.publish_status(recorded)
+        steps.append(list(messages))
+    bus, stop = LocalBus(), threading.Event()
+    config = Config(
+        imus={"imu0": ImuConfig(port="none")},
+        cameras={"cam0": CameraConfig(uri="none")},
+        web=WebConfig(enabled=True, port=0),
+    )
+    options = {"clock": private_clock(), "ready": pipe.send}
+    thread = threading.Thread(target=web.run, args=(config, bus, stop), kwargs=options)
+    thread.start()
+    pipe.recv()  # viewers are there
+    begin = _cpu_s()
+    for step in steps:
+        for key, payload in step:
+            bus.publish(key, payload)
+        time.sleep(0.1)
+    pipe.send(_cpu_s() - begin)
+    stop.set()
+    thread.join()
+
+
+def _cpu_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def _feed_module() -> Any:
+    path = Path(__file__).parents[1] / "tests" / "system" / "output" / "web_feed.py"
+    spec = importlib.util.spec_from_file_location("web_feed", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+async def watch(address: str, events: int, pictures: int, done: threading.Event) -> int:
+    """Read events and pictures like so many browsers; returns the bytes received."""
+    received = 0
+
+    async def read(url: str) -> None:
+        nonlocal received
+        async with session.get(url) as answer:
+            async for chunk in answer.content.iter_any():
+                received += len(chunk)
+
+    async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(None)) as session:
+        urls = [address + "events"] * events + [address + "camera/cam0.mjpg"] * pictures
+        tasks = [asyncio.create_task(read(url)) for url in urls]
+        while not done.is_set():
+            await asyncio.sleep(0.1)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    return received
+
+
+def measure(events: int, pictures: int, seconds: float) -> tuple[float, float]:
+    """Return CPU share of the child and kB/s received by the viewers."""
+    ours, theirs = multiprocessing.get_context("spawn").Pipe()
+    child = multiprocessing.get_context("spawn").Process(target=serve, args=(theirs, seconds))
+    child.start()
+    address = ours.recv()
+    done, result = threading.Event(), []
+    thread = threading.Thread(
+        target=lambda: result.append(asyncio.run(watch(address, events, pictures, done)))
+    )
+    thread.start()
+    time.sleep(1.0)
+    begin = time.monotonic()
+    ours.send("go")
+    cpu_s = ours.recv()
+    elapsed = time.monotonic() - begin
+    done.set()
+    thread.join()
+    child.join()
+    return cpu_s / elapsed, result[0] / elapsed / 1e3
+
+
+def main(argv: list[str]) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks web_viewers", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    args = parser.parse_args(argv)
+    print("| viewers of values | of pictures | CPU, % of a core | sent, kB/s |")
+    print("|---:|---:|---:|---:|")
+    for events, pictures in ((0, 0), (1, 0), (4, 0), (1, 1), (4, 4)):
+        share, rate = measure(events, pictures, args.seconds)
+        print(f"| {events} | {pictures} | {100 * share:.2f} | {rate:.0f} |")
+    return 0
