@@ -233,8 +233,7 @@ class DeviceTime(NamedTuple):
     fine: float
 
 
-@dataclass(frozen=True, slots=True)
-class Stamp:
+class Stamp(NamedTuple):
     """What the clock says of one sample.
 
     Attributes:
@@ -276,6 +275,7 @@ class DeviceClock:
         self.outliers = 0
         self.repeats = 0
         self.lost = 0
+        self._tick_sigma_s = 0.5 / tick_hz
         self._period = tick_hz / rate_hz if rate_hz > 0.0 else 0.0
         self._options = options
         self._unwrap = TickUnwrapper(tick_bits)
@@ -303,7 +303,8 @@ class DeviceClock:
         A value from the future is either damage or a restarted (or newly set) device timer. One such
         value is dropped; a second one that fits the first is a restart, and the mapping begins anew.
         """
-        if self._first_ticks is not None and not self._possible(ticks, t_arrival_ns):
+        step = self._unwrap.step(ticks)
+        if self._first_ticks is not None and not self._possible(step, t_arrival_ns):
             if not self._continues_suspect(ticks, t_arrival_ns):
                 self._suspect = (ticks, t_arrival_ns)
                 self.outliers += 1
@@ -312,7 +313,7 @@ class DeviceClock:
             self.outliers -= 1
             self._begin()
         self._suspect = None
-        if self._first_ticks is not None and self._unwrap.step(ticks) == 0:
+        if self._first_ticks is not None and step == 0:
             self.repeats += 1
             return None
         unwrapped = self._unwrap.accept(ticks)
@@ -334,17 +335,18 @@ class DeviceClock:
         if self._period <= 0.0:
             return float(unwrapped)
         periods = round((unwrapped - self._last_ticks) / self._period)
-        return min(max(self._fine + periods * self._period, unwrapped), unwrapped + 1.0)
+        fine = self._fine + periods * self._period
+        return float(unwrapped) if fine < unwrapped else min(fine, unwrapped + 1.0)
 
-    def _possible(self, ticks: int, t_arrival_ns: int) -> bool:
+    def _possible(self, step: int, t_arrival_ns: int) -> bool:
+        """Tell whether an arrival may be that of a sample `step` ticks after the last one."""
         assert self._first_ticks is not None
-        step = self._unwrap.step(ticks)
         if step < 0:
             return False
         x_s = (self._last_ticks + step - self._first_ticks) / self.tick_hz
         earliness_s = x_s + self.envelope.line(x_s) - (t_arrival_ns - self._t0_ns) / _NS
         # Before the envelope has settled an arrival may lie well below the first guess.
-        allowed_s = 0.02 + 1e-3 * step / self.tick_hz + (1.0 if self.age_s < 5.0 else 0.0)
+        allowed_s = 0.02 + 1e-3 * step / self.tick_hz + (1.0 if x_s < 5.0 else 0.0)
         return earliness_s < allowed_s
 
     def _continues_suspect(self, ticks: int, t_arrival_ns: int) -> bool:
@@ -365,13 +367,15 @@ class DeviceClock:
         lost = 0
         if self._last_t_ns is not None:
             step_s = (device.ticks - self._stamped_ticks) / self.tick_hz
-            t_ns = max(t_ns, self._last_t_ns + max(1, round(0.5 * step_s * _NS)))
+            earliest_ns = self._last_t_ns + int(0.5e9 * step_s) + 1
+            if t_ns < earliest_ns:
+                t_ns = earliest_ns
             # Half a period of tolerance swallows the 62/63 tick alternation at 1000 Hz.
             lost = max(0, round(step_s * self.rate_hz) - 1)
-        self.lost += lost
+            self.lost += lost
         self._last_t_ns, self._stamped_ticks = t_ns, device.ticks
-        sigma_s = math.hypot(self.envelope.sigma_s, 0.5 / self.tick_hz)
-        return Stamp(t_ns, round(min(sigma_s, 1.0) * _NS), device.ticks, lost)
+        sigma_s = math.hypot(self.envelope.sigma_s, self._tick_sigma_s)
+        return Stamp(t_ns, int(sigma_s * _NS) if sigma_s < 1.0 else int(_NS), device.ticks, lost)
 
 
 class SampleCounter:
