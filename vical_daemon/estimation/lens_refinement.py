@@ -106,7 +106,7 @@ def refine_lens(
     sigma: float | None = None
     for i in range(_STEPS):
         # far from the minimum large residuals are news, not outliers: the gate closes step by step
-        width = max(_WIDTH, 10.0 * _WIDTH * 0.6**i)
+        width = max(_WIDTH, 10.0 * _WIDTH * 0.4**i)
         system = _System.build(views, points_m, lens, model, sigma, width)
         sigma = system.sigma
         cost = system.cost + float((((lens - start) / scale) ** 2).sum())

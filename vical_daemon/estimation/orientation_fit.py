@@ -26,7 +26,8 @@ _MEDIAN_CHI2_3 = 2.366
 _MIN_INTERVAL_S = 2e-5  # two sensors may see the same instant; their drift may not be told apart to infinity
 _ROUNDS = 12
 _SHIFT_DONE_S = 2e-8
-_SWEEPS = {3: (0.5, 0.25), 5: (0.2,)}  # in which rounds the noises are estimated, and with what steps
+# in which rounds the noises are estimated and with what steps, for one sensor and for several
+_SWEEPS = ({3: (0.5, 0.25), 5: (0.2,)}, {3: (0.5,), 5: (0.3,)})
 _SLOW_START = -1.5  # where the search for log(slow error after a second / noise of one orientation) starts
 _SLOW_LIMITS = (-4.0, 4.0)
 _TURN_UNKNOWN = 1.0 / 5.0**2  # information about a world that may be turned by any angle
@@ -155,8 +156,9 @@ def polish(
     while rounds < _ROUNDS and not done:
         rounds += 1
         linear = _linearise(curve, sensors, bias, noise)
-        if noise.estimate and rounds in _SWEEPS:
-            sensors, log_gyro = _estimate_scales(linear, sensors, log_gyro, noise, _SWEEPS[rounds])
+        sweeps = _SWEEPS[min(len(sensors) - 1, 1)].get(rounds, ())
+        if noise.estimate and sweeps:
+            sensors, log_gyro = _estimate_scales(linear, sensors, log_gyro, noise, sweeps)
         solution = solve(_scaled(linear, _scales(sensors, log_gyro)))
         new_sensors, step = _update(linear, sensors, solution, noise.estimate and rounds <= 2, noise.estimate)
         same_gate = all(np.array_equal(a.used, b.used) for a, b in zip(sensors, new_sensors, strict=True))

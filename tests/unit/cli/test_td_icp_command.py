@@ -1,0 +1,131 @@
+"""`vical td-icp` and `vical observability` on small recordings: figures, refusals, sensors, trajectories."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from vical_mocks.points import simulate
+from vical_mocks.rig import reference_rig
+from vical_mocks.trajectory import one_axis
+
+from vical_daemon.cli import main
+
+TARGET = """target_type: checkerboard
+targetCols: 8
+targetRows: 6
+rowSpacingMeters: 0.05
+colSpacingMeters: 0.05
+"""
+
+
+def _write(folder, run, *, gyro_factor=1.0, late_s=0.0):
+    """The recording as an ASL folder; the gyro's unit and the camera's stamps may be spoiled."""
+    (folder / "mav0/imu0").mkdir(parents=True)
+    (folder / "mav0/cam0").mkdir(parents=True)
+    rows = ["#timestamp [ns],wx,wy,wz,ax,ay,az"]
+    for t, w, f in zip(run.t_imu_ns, run.gyro_rps * gyro_factor, run.specific_force_mps2, strict=True):
+        rows.append(",".join(map(str, [t, *w, *f])))
+    (folder / "mav0/imu0/data.csv").write_text("\n".join(rows))
+    rows = ["#timestamp [ns],point_id,u [px],v [px]"]
+    for frame in run.frames:
+        stamp = frame.t_cam_ns + round(late_s * 1e9)
+        rows += [f"{stamp},{i},{u},{v}" for i, (u, v) in zip(frame.ids, frame.uv_px, strict=True)]
+    (folder / "mav0/cam0/corners.csv").write_text("\n".join(rows))
+    (folder / "mav0/cam0/sensor.yaml").write_text("resolution: [640, 480]\n")
+    (folder / "target.yaml").write_text(TARGET)
+    lens = run.rig.lens
+    (folder / "initial.yaml").write_text(
+        f"cam0:\n  resolution: [640, 480]\n  intrinsics: {list(map(float, lens.intrinsics))}\n"
+        f"  distortion_model: {lens.model}\n  distortion_coeffs: {list(map(float, lens.distortion))}\n"
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate(3, 8.0, timeshift_cam_imu_s=0.012, camera_rate_hz=10.0, corner_sigma_px=0.3)
+
+
+def _vical(capsys, command, folder, *more):
+    code = main([command, str(folder), "--target", str(folder / "target.yaml"), "--json", *more])
+    captured = capsys.readouterr()
+    return code, json.loads(captured.out) if captured.out.strip() else {}, captured.err
+
+
+@pytest.mark.parametrize("late_s", [0.75, -0.75])
+def test_the_delay_is_found_with_a_camera_three_quarters_of_a_second_off(tmp_path, capsys, run, late_s):
+    folder = _write(tmp_path, run, late_s=late_s)
+    code, result, _ = _vical(capsys, "td-icp", folder, "--initial", str(folder / "initial.yaml"))
+    assert code == 0 and result["status"] == "ok"
+    assert abs(result["timeshift_cam_imu_s"] - (0.012 - late_s)) < 4 * result["timeshift_sigma_s"]
+    assert result["timeshift_sigma_s"] < 0.4e-3
+    assert len(result["R_imu_cam_q_wxyz"]) == 4 and len(result["gyro_bias_rps"]) == 3
+    assert result["pairs"] > 55 and result["iterations"] > 0
+
+
+def test_a_gyro_in_degrees_is_refused_with_the_reason(tmp_path, capsys, run):
+    folder = _write(tmp_path, run, gyro_factor=180 / np.pi)
+    code, result, err = _vical(capsys, "td-icp", folder, "--initial", str(folder / "initial.yaml"))
+    assert code == 1 and result["status"] == "refused"
+    assert "degrees per second" in err and len(err.strip().splitlines()) == 1
+
+
+def test_a_trajectory_file_joins_as_a_sensor(tmp_path, capsys, run):
+    folder = _write(tmp_path, run)
+    t_s = np.arange(0.2, 7.8, 0.05)
+    q = Rotation.from_matrix(run.rig.trajectory.R_world_imu(t_s)).as_quat()
+    noise = Rotation.from_rotvec(np.random.default_rng(0).normal(0, 1e-3, (len(t_s), 3)))
+    q = (Rotation.from_quat(q) * noise).as_quat()
+    base = run.t_imu_ns[0] * 1e-9
+    lines = [f"{base + t - 0.3:.9f} 0 0 0 {' '.join(map(str, row))}" for t, row in zip(t_s, q, strict=True)]
+    tum = folder / "mocap.txt"
+    tum.write_text("# TUM\n" + "\n".join(lines))
+    code, result, _ = _vical(
+        capsys, "td-icp", folder, "--initial", str(folder / "initial.yaml"), "--sensors", f"imu0,cam0,{tum}"
+    )
+    assert code == 0 and result["reference"] == "imu0"
+    assert set(result["sensors"]) == {"cam0", "mocap.txt"}
+    found = result["sensors"]["mocap.txt"]
+    assert abs(found["timeshift_s"] - 0.3) < 5 * found["timeshift_sigma_s"] + 1e-6
+    assert len(result["pairs"]) == 3
+
+
+def test_what_cannot_work_is_said_in_one_line(tmp_path, capsys, run):
+    folder = _write(tmp_path, run)
+    assert main(["td-icp", str(folder)]) == 2
+    assert "--target" in capsys.readouterr().err
+    assert main(["td-icp", str(folder / "nothing")]) == 1
+    assert main(["td-icp", str(folder), "--search", "-1"]) == 2
+    assert main(["td-icp", str(folder), "--sensors", "imu0,radar"]) == 2
+    assert "radar" in capsys.readouterr().err
+    assert main(["observability", str(folder), "--estimate", "colour"]) == 2
+
+
+def test_watching_follows_the_delay(tmp_path, capsys, run):
+    folder = _write(tmp_path, run)
+    initial = str(folder / "initial.yaml")
+    code, result, _ = _vical(
+        capsys, "td-icp", folder, "--initial", initial, "--watch", "4", "--search", "0.5"
+    )
+    assert code == 0 and len(result["watch"]) >= 2
+    assert all(abs(w["timeshift_s"] - 0.012) < 5 * w["timeshift_sigma_s"] for w in result["watch"])
+    assert not any(w["jumped"] for w in result["watch"])
+
+
+def test_observability_of_general_motion_and_of_one_axis(tmp_path, capsys, run):
+    folder = _write(tmp_path / "general", run)
+    code, result, _ = _vical(capsys, "observability", folder, "--initial", str(folder / "initial.yaml"))
+    assert code == 0 and result["observable"] and result["missing"] == []
+    assert result["model"] == {"rank": 25, "unknowns": 25}
+    rig = reference_rig(4)
+    turning = one_axis(4, [0, 0, 1], T_imu_cam=(rig.R_imu_cam, rig.p_imu_cam))
+    single = simulate(4, 6.0, rig=replace(rig, trajectory=turning), camera_rate_hz=8.0, corner_sigma_px=0.3)
+    folder = _write(tmp_path / "single", single)
+    code, result, err = _vical(capsys, "observability", folder, "--initial", str(folder / "initial.yaml"))
+    assert code == 0
+    advice = {m["block"]: m for m in result["missing"]}
+    assert advice["lever_arm"]["direction"] == "the optical axis"
+    assert "rotate about another axis" in advice["lever_arm"]["advice"]
+    assert "optical axis" in err
