@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -158,7 +159,7 @@ class SimulatedCamera:
         else:
             texels = np.concatenate(
                 [
-                    cv2.perspectiveTransform(ray, homography)
+                    cv2.perspectiveTransform(ray[None], homography)
                     for ray, homography in zip(self._rays, homographies, strict=True)
                 ]
             ).reshape(height, width, 2)
@@ -202,6 +203,7 @@ def _rays_to_board(R_world_cam: FloatArray, p_world_cam: FloatArray) -> FloatArr
     return np.asarray(stacked * np.where(z > 0, -1.0, 1.0)[:, None])
 
 
+@lru_cache(maxsize=4)
 def pixel_rays(lens: Lens) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Ray (x/z, y/z) of each pixel, shape (height, width, 2), and the pixels that have none."""
     width, height = lens.resolution
@@ -212,7 +214,10 @@ def pixel_rays(lens: Lens) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool
         back, _ = lens.project(rays)
         wrong = ~(np.linalg.norm(back - uv, axis=-1) < 1e-6)
     rays[wrong] = (0.0, 0.0, 1.0)
-    return rays[..., :2].astype(np.float32), wrong
+    table = np.ascontiguousarray(rays[..., :2], np.float32)
+    table.setflags(write=False)
+    wrong.setflags(write=False)
+    return table, wrong
 
 
 def _border_rays(rays: npt.NDArray[np.float32], resolution: tuple[int, int]) -> FloatArray:

@@ -15,7 +15,7 @@ Texture = tuple[npt.NDArray[np.uint16], FloatArray]
 
 TEXELS_PER_SIGMA = 2.0
 LEVELS_PER_OCTAVE = 2
-MAX_TEXELS = 5000
+MAX_TEXELS = 3600
 FULL_SCALE = 65535.0
 
 

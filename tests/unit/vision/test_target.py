@@ -6,7 +6,10 @@ import pytest
 from vical_daemon.vision.target import AprilGrid, Checkerboard, TargetError, load_target
 
 APRIL = "target_type: aprilgrid\ntagCols: 6\ntagRows: 5\ntagSize: 0.088\ntagSpacing: 0.3\n"
-CHECKER = "target_type: 'checkerboard'\ntargetCols: 8\ntargetRows: 6\nrowSpacingMeters: 5e-2\ncolSpacingMeters: 0.04\n"
+CHECKER = (
+    "target_type: 'checkerboard'\ntargetCols: 8\ntargetRows: 6\nrowSpacingMeters: 5e-2\n"
+    "colSpacingMeters: 0.04\n"
+)
 
 
 def write(folder: Path, text: str) -> Path:
