@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
-import pkgutil
 import sys
-
-import benchmarks
+from pathlib import Path
 
 
 def studies() -> dict[str, str]:
-    """Names of the modules that have a `main(argv)`, with the first line of their docstrings."""
+    """Names of the modules that have a `main`, with the first line of their docstrings (read, not imported)."""
     found: dict[str, str] = {}
-    for module in pkgutil.iter_modules(benchmarks.__path__):
-        if module.name.startswith("_"):
-            continue
-        loaded = importlib.import_module(f"benchmarks.{module.name}")
-        if hasattr(loaded, "main"):
-            found[module.name] = (loaded.__doc__ or "").strip().splitlines()[0]
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        if not path.stem.startswith("_") and "main" in functions:
+            found[path.stem] = (ast.get_docstring(tree) or "").splitlines()[0]
     return found
 
 

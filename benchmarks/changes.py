@@ -65,8 +65,14 @@ def judge(record: Record) -> runner.Result:
     after = [s for s in record.snapshots if s.t_s >= AT_S]
     worst = [(s.t_s, _worst(s.error, s.covariance)) for s in after]
     outside = [t for t, w in worst if w > 3.0]
+    # Until it is announced (at most 3 s) nobody can know of a step.
+    blind_until_s = min([t for t in bumps if t >= AT_S] + [AT_S + 3.0])
     lies = [
-        s.t_s for s in record.snapshots if s.status == "converged" and _worst(s.error, s.covariance) > 5.0
+        s.t_s
+        for s in record.snapshots
+        if s.status == "converged"
+        and not AT_S <= s.t_s < blind_until_s
+        and _worst(s.error, s.covariance) > 5.0
     ]
     last = record.snapshots[-1] if record.snapshots else None
     return {
