@@ -96,7 +96,7 @@ def _document(
     return {
         "rank": result.rank,
         "unknowns": result.unknowns,
-        "observable": result.rank == result.unknowns,
+        "observable": result.rank == result.unknowns and not missing,
         "sigma": {
             name: sigma(name)
             for name in result.blocks

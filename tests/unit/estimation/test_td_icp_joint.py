@@ -26,7 +26,7 @@ def _rate(t, h=1e-5):
     )
 
 
-def _stream(name, hz, shift, sigma, seed, seconds=12.0):
+def _stream(name, hz, shift, sigma, seed, seconds=8.0):
     rng = np.random.default_rng(seed)
     t = np.arange(0.4, seconds, 1 / hz)
     mounting, world = Rotation.random(2, random_state=seed)
@@ -37,12 +37,12 @@ def _stream(name, hz, shift, sigma, seed, seconds=12.0):
 
 def test_two_cameras_and_a_tracker_against_a_gyro():
     rng = np.random.default_rng(4)
-    t_imu = np.arange(0.0, 14.0, 0.01)
+    t_imu = np.arange(0.0, 9.0, 0.01)
     gyro = _rate(t_imu) + rng.normal(0, 5.2e-3, (len(t_imu), 3)) + 0.01
     shifts = {"cam0": 0.012, "cam1": -0.031, "tracker": 0.4}
     made = {n: _stream(n, hz, s, sigma, i) for i, (n, s, hz, sigma) in enumerate(
-        [("cam0", shifts["cam0"], 15, 0.1 * DEG), ("cam1", shifts["cam1"], 20, 0.1 * DEG),
-         ("tracker", shifts["tracker"], 30, 0.2 * DEG)])}  # fmt: skip
+        [("cam0", shifts["cam0"], 10, 0.1 * DEG), ("cam1", shifts["cam1"], 12, 0.1 * DEG),
+         ("tracker", shifts["tracker"], 15, 0.2 * DEG)])}  # fmt: skip
     result = joint_with_gyro("imu0", t_imu, gyro, [m[0] for m in made.values()])
     assert result.status == "ok", result.reason
     assert len(result.pairs) == 6 and result.covariance.shape == (12, 12)
@@ -50,7 +50,7 @@ def test_two_cameras_and_a_tracker_against_a_gyro():
     for pair in result.pairs:
         error = pair.timeshift_s - (truth[pair.a] - truth[pair.b])
         assert abs(error) < 4.5 * pair.timeshift_sigma_s, pair
-        assert pair.timeshift_sigma_s < 0.4e-3
+        assert pair.timeshift_sigma_s < 1e-3
     for name, (_, mounting) in made.items():
         found = Rotation.from_matrix(result.sensors[name].R_ref_sensor)
         assert (found.inv() * mounting).magnitude() < 0.3 * DEG
