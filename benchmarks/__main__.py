@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def studies() -> dict[str, str]:
-    """Names of the modules that have a `main`, with the first line of their docstrings (read, not imported)."""
+    """Modules that have a `main`, with the first line of their docstrings (read, not imported)."""
     found: dict[str, str] = {}
     for path in sorted(Path(__file__).parent.glob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
