@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from vical_daemon.cli.options import add_json
 
 HELP = "install systemd units, udev rules and the user, or remove them"
 _UNITS = Path("etc/systemd/system")
+_HOMES = ("/home", "/root", "/run/user")
 _CONFIG = Path("etc/vical/vical.yaml")
 _PLACES = {
     "vical.target": _UNITS / "vical.target",
@@ -55,7 +57,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Install or remove; doing it twice changes nothing."""
     root = Path(args.root)
-    steps = removal(root) if args.remove else installation(root, _program(args.program), now=args.now)
+    if args.remove:
+        steps = removal(root)
+    else:
+        program = _program(args.program)
+        for path in (program, Path(sys.executable).resolve()):
+            if (folder := closed_folder(path)) is not None:
+                text = f"{path}: user vical may not enter {folder}; install vical below /opt"
+                print(f"vical: warning: {text}", file=sys.stderr)
+        steps = installation(root, program, now=args.now)
     if not args.dry_run:
         _require_rights(root)
     done = []
@@ -88,11 +98,26 @@ def templates() -> Path:
     raise CliError(f"the unit files are not in this installation (looked beside {package})")
 
 
-def render(name: str, program: Path) -> str:
-    """Return a template with the program's path; home folders stay readable only if it runs from one."""
+def render(name: str, program: Path, interpreter: Path | None = None) -> str:
+    """Return a template with the program's path; home folders stay readable only if it runs from one.
+
+    Args:
+        name: Of the template.
+        program: What the units start.
+        interpreter: The Python behind it; None: the one that runs now.
+    """
     text = (templates() / name).read_text(encoding="utf-8")
-    in_home = any(program.is_relative_to(home) for home in ("/home", "/root", "/run/user"))
+    needed = (program, (interpreter or Path(sys.executable)).resolve())
+    in_home = any(path.is_relative_to(home) for path in needed for home in _HOMES)
     return text.replace("@VICAL@", str(program)).replace("@PROTECT_HOME@", "read-only" if in_home else "yes")
+
+
+def closed_folder(path: Path) -> Path | None:
+    """Return the first folder above `path` that other users may not enter; None if all are open."""
+    for folder in reversed(path.parents):
+        if folder.is_dir() and not folder.stat().st_mode & stat.S_IXOTH:
+            return folder
+    return None
 
 
 def installation(root: Path, program: Path, *, now: bool = False) -> list[Step]:

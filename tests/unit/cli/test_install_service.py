@@ -74,10 +74,19 @@ def test_every_process_has_a_unit_that_runs_it(root: Path) -> None:
 
 
 def test_a_program_in_a_home_folder_stays_readable(tmp_path: Path) -> None:
-    text = install_service.render("vical-.service.d/10-common.conf", Path("/home/robot/vical/bin/vical"))
-    assert "ProtectHome=read-only" in text
-    text = install_service.render("vical-.service.d/10-common.conf", Path("/opt/vical/bin/vical"))
-    assert "ProtectHome=yes" in text
+    common, python = "vical-.service.d/10-common.conf", Path("/usr/bin/python3")
+    assert "ProtectHome=read-only" in install_service.render(common, Path("/home/robot/bin/vical"), python)
+    assert "ProtectHome=yes" in install_service.render(common, Path("/opt/vical/bin/vical"), python)
+    at_home = Path("/root/.pyenv/bin/python3")
+    assert "ProtectHome=read-only" in install_service.render(common, Path("/opt/vical/bin/vical"), at_home)
+
+
+def test_a_folder_that_the_service_user_may_not_enter_is_named(tmp_path: Path) -> None:
+    (tmp_path / "private" / "bin").mkdir(parents=True)
+    assert install_service.closed_folder(Path("/usr/bin/env")) is None
+    (tmp_path / "private").chmod(0o700)
+    closed = install_service.closed_folder(tmp_path / "private" / "bin" / "vical")
+    assert closed is not None and closed in (tmp_path / "private", *tmp_path.parents)
 
 
 def test_only_acquire_is_real_time(root: Path) -> None:

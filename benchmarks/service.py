@@ -1,0 +1,186 @@
+"""The service under a real systemd: install, kill -9 each process, hang one, stop, start; what is lost."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.machine import Machine, MachineError
+from vical_daemon.mcap_log import recover
+from vical_daemon.recording import open_recording
+from vical_daemon.vision.target import Checkerboard
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PROCESSES = ("acquire", "record", "calibrate")
+FEED = "/run/vical-feed"
+CONFIG = f"""\
+imus: {{imu0: {{port: {FEED}/imu, rate_hz: 100}}}}
+cameras: {{cam0: {{uri: 'v4l2:/dev/video77', lens: {{intrinsics: [515, 515, 320, 240]}}}}}}
+target: target.yaml
+"""
+FEED_UNIT = f"""\
+[Service]
+RuntimeDirectory=vical-feed
+Environment=TMPDIR={FEED} OMP_NUM_THREADS=1
+WorkingDirectory={REPOSITORY}
+ExecStart={sys.executable} -m benchmarks.service_feed --runtime /run/vical --port {FEED}/imu
+"""
+# The emulated IMU is a pseudo terminal; the rest of the sandbox stays as it is.
+DROP_IN = "[Service]\nDeviceAllow=char-pts rw\n"
+
+
+def main(argv: list[str]) -> int:
+    """Run the study and print its table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks service", description=__doc__)
+    parser.add_argument("--kills", type=int, default=20, help="of each process")
+    parser.add_argument("--keep-log", metavar="FILE", help="write the journal there")
+    args = parser.parse_args(argv)
+    try:
+        with Machine() as machine:
+            _install(machine)
+            rows = _study(machine, args.kills)
+            if args.keep_log:
+                Path(args.keep_log).write_text(machine.run("journalctl", "--no-pager", "-o", "short-precise"))
+    except MachineError as error:
+        print(f"skipped: {error}", file=sys.stderr)
+        return 0
+    print("| what | result |\n|---|---|")
+    for what, result in rows:
+        print(f"| {what} | {result} |")
+    return 0
+
+
+def _install(machine: Machine) -> None:
+    """Put the service into the machine by its own command, and the feed beside it."""
+    from vical_daemon.cli import main as vical
+
+    root = machine.root
+    (root / "root").chmod(0o711)  # where this Python may live
+    (root / "etc/vical").mkdir(parents=True)
+    (root / "etc/vical/vical.yaml").write_text(CONFIG)
+    (root / "etc/vical/target.yaml").write_text(Checkerboard(8, 6, 0.05, 0.05).to_yaml())
+    program = Path(sys.executable).with_name("vical")
+    if vical(["install-service", "--root", str(root), "--program", str(program), "--json"]):
+        raise MachineError("install-service failed")
+    units = root / "etc/systemd/system"
+    (units / "rig-feed.service").write_text(FEED_UNIT)
+    (units / "vical-acquire.service.d").mkdir()
+    (units / "vical-acquire.service.d/bench.conf").write_text(DROP_IN)
+
+
+def _study(machine: Machine, kills: int) -> list[tuple[str, str]]:
+    rows = [("boot to basic.target", f"{machine.boot():.1f} s")]
+    machine.run("systemctl", "start", "rig-feed")
+    begin_s = time.monotonic()
+    machine.run("systemctl", "start", "vical.target")
+    for name in PROCESSES:
+        _wait(lambda name=name: machine.show(f"vical-{name}", "ActiveState") == ["active"], f"{name} active")
+    rows.append(("vical.target started, every process ready", f"{time.monotonic() - begin_s:.1f} s"))
+    _wait(lambda: "converged" in _status(machine, "calibrate"), "converged", 180)
+    rows.append(("calibration converged", _status(machine, "calibrate")[:70]))
+    deeds: list[tuple[float, str]] = []
+    rows += [(f"kill -9 {name}, {kills} times", _kill(machine, name, kills, deeds)) for name in PROCESSES]
+    rows.append(("calibrate hung (SIGSTOP)", _hang(machine, "calibrate", deeds)))
+    rows.append(("record hung (SIGSTOP)", _hang(machine, "record", deeds)))
+    deeds.append((time.time(), "stop"))
+    begin_s = time.monotonic()
+    machine.run("systemctl", "stop", "vical.target", *[f"vical-{name}" for name in PROCESSES])
+    results = {name: machine.show(f"vical-{name}", "Result")[0] for name in PROCESSES}
+    rows.append(("systemctl stop vical.target", f"{time.monotonic() - begin_s:.1f} s, {_join(results)}"))
+    rows += _judge_logs(machine.root, deeds)
+    stored = list((machine.root / "var/lib/vical/calibration").glob("*.json"))
+    rows.append(("stored calibrations", f"{len(stored)}: {', '.join(p.name for p in stored)}"))
+    machine.run("systemctl", "start", "vical.target")
+    _wait(lambda: "starting from the calibration stored" in _journal(machine), "prior taken", 60)
+    rows.append(("started again", "takes the stored calibration as its prior"))
+    machine.run("systemctl", "stop", "vical.target", "rig-feed")
+    return rows
+
+
+def _kill(machine: Machine, name: str, kills: int, deeds: list[tuple[float, str]]) -> str:
+    """Kill one process again and again; return how long systemd and the process took to be ready again."""
+    outages = []
+    for _ in range(kills):
+        (pid,) = machine.show(f"vical-{name}", "MainPID")
+        begin_s = time.monotonic()
+        machine.run("kill", "-9", pid)
+        deeds.append((time.time(), f"kill {name}"))
+        _wait(lambda pid=pid: _ready_again(machine, name, pid), f"{name} again", 90)
+        outages.append(time.monotonic() - begin_s)
+        time.sleep(2.0)
+    (restarts,) = machine.show(f"vical-{name}", "NRestarts")
+    return f"ready again after {np.median(outages):.1f} s (longest {max(outages):.1f} s), {restarts} restarts"
+
+
+def _ready_again(machine: Machine, name: str, old_pid: str) -> bool:
+    pid, state = machine.show(f"vical-{name}", "MainPID", "ActiveState")
+    return state == "active" and pid not in (old_pid, "0")
+
+
+def _hang(machine: Machine, name: str, deeds: list[tuple[float, str]]) -> str:
+    """Stop a process without killing it: only the watchdog can notice."""
+    (pid,) = machine.show(f"vical-{name}", "MainPID")
+    begin_s = time.monotonic()
+    machine.run("kill", "-STOP", pid)
+    deeds.append((time.time(), f"hang {name}"))
+    _wait(lambda: _ready_again(machine, name, pid), f"{name} after a hang", 120)
+    return f"watchdog: ready again after {time.monotonic() - begin_s:.1f} s"
+
+
+def _judge_logs(root: Path, deeds: list[tuple[float, str]]) -> list[tuple[str, str]]:
+    """Open every log (after recovery where it was not closed), and lay holes of the IMU beside the deeds."""
+    folder = root / "var/lib/vical/log"
+    for part in sorted(folder.glob("*.part")):
+        recover(part)
+    logs = sorted(folder.glob("*.mcap"))
+    arrays = [open_recording(log, check=False).imu_arrays("imu0").t_ns * 1e-9 for log in logs]
+    stamps_s = np.unique(np.concatenate(arrays))
+    rows = [("logs that open", f"{len(arrays)} of {len(logs)}")]
+    ends_s = stamps_s[:-1][np.diff(stamps_s) > 0.025]
+    begins_s = stamps_s[1:][np.diff(stamps_s) > 0.025]
+    for deed in dict.fromkeys(name for _, name in deeds[:-1]):
+        holes, losses = [], []
+        for at_s, until_s in _spans(deeds, deed):
+            inside = (begins_s > at_s) & (ends_s < until_s)
+            holes += list((begins_s - ends_s)[inside])
+            losses += list(at_s - ends_s[inside])
+        text = f"{len(holes)}"
+        if holes:
+            text += f", longest {max(holes):.2f} s, last sample {max(losses):.2f} s before at the most"
+        rows.append((f"holes in the recorded IMU stamps after {deed}", text))
+    return rows
+
+
+def _spans(deeds: list[tuple[float, str]], name: str) -> list[tuple[float, float]]:
+    """Return from when to when each deed of this name was the last one."""
+    following = [at_s for at_s, _ in deeds[1:]]
+    return [(at_s, end_s) for (at_s, deed), end_s in zip(deeds, following, strict=False) if deed == name]
+
+
+def _status(machine: Machine, name: str) -> str:
+    return machine.show(f"vical-{name}", "StatusText")[0]
+
+
+def _journal(machine: Machine) -> str:
+    return machine.run("journalctl", "--no-pager", "-u", "vical-calibrate", "-n", "60", "-o", "cat")
+
+
+def _join(values: dict[str, str]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in values.items())
+
+
+def _wait(condition: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > end_s:
+            raise MachineError(f"timed out: {what}")
+        time.sleep(0.2)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
