@@ -24,6 +24,7 @@ from vical_daemon.mcap_log.files import LogError, describe
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_LIMIT = 256 * 2**20
+_PIECE = 2**20
 # What the parsers of the mcap package and of lz4 raise on damaged input.
 _DAMAGE = (ValueError, RuntimeError, KeyError, OverflowError, EOFError, struct.error, McapError)
 _OP_MESSAGE = int(Opcode.MESSAGE)
@@ -268,13 +269,26 @@ def _decompress(compression: bytes, packed: memoryview, limit: int) -> bytes:
     if not compression:
         return bytes(packed[:limit])
     if compression == b"lz4":
-        import lz4.frame
-
-        data: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=limit)
-        return data
+        return _decompress_lz4(packed, limit)
     if compression == b"zstd":
         return _decompress_zstd(packed, limit)
     raise ValueError(f"chunk compression {compression!r} is not known")
+
+
+def _decompress_lz4(packed: memoryview, limit: int) -> bytes:
+    """Unpack piece by piece: lz4 would reserve the whole limit at once."""
+    import lz4.frame
+
+    unpacker = lz4.frame.LZ4FrameDecompressor()
+    pieces = [unpacker.decompress(packed, max_length=min(_PIECE, limit))]
+    total = len(pieces[0])
+    while total < limit and not unpacker.eof and not unpacker.needs_input:
+        piece = unpacker.decompress(b"", max_length=min(_PIECE, limit - total))
+        if not piece:
+            break
+        pieces.append(piece)
+        total += len(piece)
+    return b"".join(pieces)
 
 
 def _decompress_zstd(packed: memoryview, limit: int) -> bytes:
@@ -286,7 +300,7 @@ def _decompress_zstd(packed: memoryview, limit: int) -> bytes:
     with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed) as reader:
         while total < limit:
             try:
-                piece = reader.read(min(2**20, limit - total))
+                piece = reader.read(min(_PIECE, limit - total))
             except zstandard.ZstdError:
                 if pieces:
                     break  # a chunk without its end: keep what came out; the caller compares sizes
