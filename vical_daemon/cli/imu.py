@@ -47,6 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     bias.add_argument(
         "--store-in-eeprom", action="store_true", help="keep it over power-off (the EEPROM wears out)"
     )
+    poll = leaf("poll", "one record of any kind, in SI units", _poll)
+    _add_port(poll)
+    poll.add_argument(
+        "kind", metavar="KIND", help="data command (0xCC: everything) or MIP inertial field (0x04), as hex"
+    )
     _add_port(leaf("selftest", "the device's built-in test; exit 1 where a part fails", _selftest))
 
 
@@ -185,6 +190,20 @@ def _capture_bias(args: argparse.Namespace) -> int:
         else:
             kept = "stored in the EEPROM" if args.store_in_eeprom else "kept until power-off"
             print(f"gyro bias {bias[0]:+.6f} {bias[1]:+.6f} {bias[2]:+.6f} rad/s, {kept}")
+        return 0
+
+    return _with_session(args, work)
+
+
+def _poll(args: argparse.Namespace) -> int:
+    try:
+        kind = int(args.kind, 16)
+    except ValueError:
+        raise CliError(f"{args.kind!r} is no hexadecimal number such as 0xCC", 2) from None
+
+    def work(session: Session, _baud: int) -> int:
+        session.identify()
+        print(json.dumps({key: _finite(value) for key, value in session.poll(kind & 0xFF).items()}))
         return 0
 
     return _with_session(args, work)

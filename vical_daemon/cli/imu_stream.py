@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
             link=args.link,
         ) as imu:
             stamps = _print_samples(imu, args, stop)
-            summary = _summary(imu)
+            summary = _summary(imu) | {"samples": len(stamps)}
     finally:
         for number, handler in previous:
             signal.signal(number, handler)

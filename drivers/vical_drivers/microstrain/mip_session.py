@@ -258,19 +258,33 @@ class MipSession:
 
     def _transact(
         self, descriptor_set: int, command: int, data: bytes, *,
-        reply: int | None = None, timeout_s: float | None = None, tries: int = _TRIES,
+        reply: int | None = None, also: tuple[int, int] | None = None,
+        timeout_s: float | None = None, tries: int = _TRIES,
     ) -> _Reply:  # fmt: skip
-        """Send a command and return its reply; samples that stream in between are kept."""
+        """Send a command and return its reply; samples that stream in between are kept.
+
+        Args:
+            descriptor_set: Set of command and reply.
+            command: Descriptor of the command.
+            data: Its data.
+            reply: Descriptor of the field that carries the answer; None: the ACK is all.
+            also: Set and descriptor of data that come in a packet of their own.
+            timeout_s: For one try.
+            tries: How often to send it.
+        """
         for _ in range(tries):
             self._port.write(mip.encode(descriptor_set, (command, data)))
             deadline = time.monotonic() + (timeout_s or self.reply_timeout_s)
             while (left := deadline - time.monotonic()) > 0:
                 for packet in self._receive(left):
+                    if also and packet.descriptor_set == also[0] and packet.field(also[1]) is not None:
+                        return _Reply(0, packet.field(also[1]))
                     if (answer := _answer(packet, descriptor_set, command, reply)) is None:
                         self._keep(packet)
                         continue
                     self._raise_refusal(answer.code, descriptor_set, command)
-                    return answer
+                    if not also:
+                        return answer
         raise timeout(self._port, f"MIP command 0x{descriptor_set:02X},0x{command:02X}")
 
     def _keep(self, packet: mip.Packet) -> None:
@@ -312,6 +326,13 @@ class MipSession:
             raise DeviceRefusedError(f"{self._port.name}: the device returned no gyro bias")
         x, y, z = _THREE.unpack(answer.data)
         return x, y, z
+
+    def poll(self, kind: int) -> dict[str, object]:
+        """See `Session.poll`. The data follow the ACK in a packet of their own."""
+        wanted = bytes([0, 1, kind, 0, 0])
+        answer = self._transact(mip.SET_3DM, 0x01, wanted, also=(mip.SET_SENSOR, kind))
+        field = mip.Field(kind, answer.data or b"")
+        return {"kind": "0x80", **fields.describe(mip.Packet(mip.SET_SENSOR, (field,)))}
 
     def store_gyro_bias(self) -> None:
         """See `Session.store_gyro_bias`."""

@@ -148,6 +148,14 @@ class Session(Protocol):
         """Let the device average its gyro at rest; sets its volatile bias. Returns it, rad/s."""
         ...
 
+    def poll(self, kind: int) -> dict[str, object]:
+        """Ask for one record (single-byte data command, or MIP inertial field); its fields in SI units.
+
+        Raises:
+            DeviceRefusedError: The device has no such record.
+        """
+        ...
+
     def store_gyro_bias(self) -> None:
         """Write the volatile gyro bias to the EEPROM: only ever on a user's explicit wish."""
         ...

@@ -220,6 +220,14 @@ class SingleByteSession:
         x, y, z = (float(v) for v in reply.values[:3])
         return x, y, z
 
+    def poll(self, kind: int) -> dict[str, object]:
+        """See `Session.poll`."""
+        if kind not in sb.DATA_COMMANDS:
+            known = ", ".join(f"0x{k:02X}" for k in sorted(sb.DATA_COMMANDS))
+            raise DeviceRefusedError(f"{self._port.name}: 0x{kind:02X} is no data command; they are {known}")
+        record = self._transact(bytes([kind]), kind)
+        return {"kind": f"0x{kind:02X}", "name": sb.LAYOUTS[kind].name, **record.fields()}
+
     def store_gyro_bias(self) -> None:
         """See `Session.store_gyro_bias`."""
         reply = self._transact(cmd.store_bias_in_eeprom(2), 0xD0, 2.0, tries=1)

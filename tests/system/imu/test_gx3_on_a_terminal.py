@@ -1,22 +1,19 @@
-"""Driver against the emulated device over a real pseudo terminal: protocols, bauds, faults, unplugging."""
+"""Driver against the emulated device over a real pseudo terminal: protocols, rates, bauds, stamps."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceNotFoundError, DriverError
 from vical_drivers.microstrain.device import open_imu
 from vical_drivers.samples import ImuSource
 from vical_mocks.faults import ByteFaults
 from vical_mocks.gx3_state import Settings
+
+from vical_daemon.cli import main
 
 pytestmark = pytest.mark.system
 FAST = {"warm_up_s": 0.1}
@@ -82,81 +79,22 @@ def test_a_device_left_at_another_baud_and_streaming_is_found(emulate):
     assert emulator.device.baud == baud
 
 
-@pytest.mark.parametrize("protocol", ["single-byte", "mip"])
-def test_damage_costs_samples_but_nothing_else(emulate, protocol):
-    emulator = emulate(protocol=protocol)
-    with open_imu(emulator.port_name, protocol=protocol, rate_hz=500.0, **FAST) as imu:
-        emulator.damage(ByteFaults(lose=5e-4, flip=5e-4, double=5e-4, insert=5e-4, seed=3))
-        samples = collect(imu, 500)
-        stats = imu.stats()
-        emulator.damage(None)
-    assert stats.checksum_errors > 2
-    assert stats.resync_bytes > 50
-    assert 2 < stats.lost < 100
-    forces = np.array([s.specific_force_mps2 for s in samples])
-    np.testing.assert_allclose(forces, np.tile([0.0, 0.0, -9.80665], (len(forces), 1)), atol=1e-6)
+def test_the_commands_of_the_device_by_hand(emulate, capsys):
+    def vical(*words):
+        assert main(list(words)) == 0
+        return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
-
-def test_unplug_and_replug_many_times(emulate):
-    emulator = emulate()
-    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    with open_imu(emulator.port_name, rate_hz=500.0, warm_up_s=0.02) as imu:
-        collect(imu, 5)
-        for _ in range(3):
-            emulator.unplug()
-            with pytest.raises(DeviceLostError):
-                collect(imu, 10_000)
-            emulator.plug()
-            collect(imu, 5)
-        assert imu.stats().reconnects == 3
-    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208
-
-
-def test_a_silent_device_is_noticed(emulate):
-    emulator = emulate()
-    with open_imu(emulator.port_name, **FAST, silence_s=0.3) as imu:
-        collect(imu, 10)
-        emulator.device.face.power_up()
-        start_s = time.monotonic()
-        with pytest.raises(DriverError, match="silent"):
-            collect(imu, 10_000)
-        assert time.monotonic() - start_s < 2.0
-        collect(imu, 5)  # and it comes back by itself
-
-
-def test_a_restarted_device_clock_is_noticed(emulate):
-    emulator = emulate()
-    with open_imu(emulator.port_name, rate_hz=200.0, **FAST) as imu:
-        collect(imu, 50)
-        emulator.device.state.ticks_offset += 3_000_000_000
-        samples = collect(imu, 50)
-        assert imu.stats().extra["clock_restarts"] == 1
-    assert (np.diff([s.t_host_ns for s in samples]) > 0).all()
-
-
-def test_a_port_without_a_device_and_a_port_in_use(emulate):
-    emulator = emulate()
-    with open_imu(emulator.port_name, **FAST), pytest.raises(DeviceBusyError):
-        open_imu(emulator.port_name)
-    emulator.device.face.receive = lambda data: None
-    with pytest.raises(DeviceNotFoundError, match="no MicroStrain sensor that speaks mip answers"):
-        open_imu(emulator.port_name, protocol="mip")
-
-
-VICAL = (sys.executable, "-c", "import sys; from vical_daemon.cli import main; sys.exit(main())")
-
-
-def test_sigterm_stops_the_stream(emulate):
-    emulator = emulate()
-    command = [*VICAL, "imu", "stream", emulator.port_name, "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            first = json.loads(process.stdout.readline())
-            process.send_signal(signal.SIGTERM)
-            rest = process.stdout.read().splitlines()
-            assert process.wait(10) == 0
-        finally:
-            process.kill()
-    assert set(first) >= {"t_host_ns", "device_ticks", "gyro_rps", "accel_mps2"}
-    assert json.loads(rest[-1])["summary"]["lost"] == 0
-    assert not emulator.device.face.streaming
+    old, new = emulate(), emulate(protocol="mip")
+    (info,) = vical("imu", "info", old.port_name, "--json")
+    assert info["firmware"] == "1.1.30"
+    assert info["settings"]["filter_width"] == 15
+    (record,) = vical("imu", "poll", old.port_name, "0xCC", "--json")
+    assert record["accel_mps2"][2] == pytest.approx(-9.80665)
+    assert len(record["matrix"]) == 9
+    (record,) = vical("imu", "poll", new.port_name, "0x04", "--json")
+    assert record["accel_mps2"][2] == pytest.approx(-9.80665)
+    (test,) = vical("imu", "selftest", new.port_name, "--json")
+    assert test["passed"]
+    (bias,) = vical("imu", "capture-gyro-bias", old.port_name, "--seconds", "1", "--json")
+    assert bias["gyro_bias_rps"] == pytest.approx([0.0, 0.0, 0.0])
+    assert old.device.state.eeprom_writes == new.device.state.eeprom_writes == 0
