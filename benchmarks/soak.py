@@ -1,0 +1,142 @@
+"""Bus and recorder for a long time at full rate: memory, descriptors, threads, lost samples.
+
+    python -m benchmarks soak --minutes 20
+
+This process hosts the bus and publishes 1000 Hz inertial data and 30 Hz images of 360 kB; the recorder
+runs in a process of its own with a quota, so that rotation and deletion take part.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing as mp
+import os
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vical_daemon import messages as m
+from vical_daemon import topics
+from vical_daemon.mcap_log import LogReader
+
+_CONTEXT = mp.get_context("spawn")
+_IMU, _IMAGE = topics.imu_key("rig0", "imu0"), topics.image_key("rig0", "cam0")
+_SETTLE_S = 60.0
+
+
+def main(argv: list[str]) -> int:
+    """Publish, watch, print."""
+    parser = argparse.ArgumentParser(prog="soak")
+    parser.add_argument("--minutes", type=float, default=20.0)
+    args = parser.parse_args(argv)
+    from vical_daemon.zenoh_bus import open_bus
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        bus = open_bus(mode="router", socket=folder / "z.sock")
+        done = _CONTEXT.Event()
+        recorder = _CONTEXT.Process(target=record, args=(str(folder), done))
+        recorder.start()
+        status: dict[str, str] = {}
+        bus.subscribe(topics.status_key("rig0", "record"), lambda sample: status.update(_values(sample)))
+        while not status:
+            time.sleep(0.1)
+        seen, sent = publish_and_watch(bus, recorder.pid or 0, args.minutes * 60)
+        time.sleep(2.0)
+        done.set()
+        recorder.join()
+        bus.close()
+        holes, kept, segments = check_segments(folder / "log")
+    report(seen, sent, status, holes, kept, segments)
+    return int(holes > 0 or status["lost_on_bus"] != "0" or status["dropped"] != "0")
+
+
+def publish_and_watch(bus: Any, pid: int, seconds: float) -> tuple[list[tuple[Any, ...]], int]:
+    """Publish on one clock; every 10 s note (memory, descriptors, threads) of both processes."""
+    image = m.encode_image(
+        1, "cam0", np.random.default_rng(1).integers(0, 2, (480, 752), dtype=np.uint8), "mono8"
+    )
+    begin_s, sent, images, seen = time.monotonic(), 0, 0, []
+    while (elapsed_s := time.monotonic() - begin_s) < seconds:
+        while sent < elapsed_s * 1000:
+            bus.publish(_IMU, m.encode_imu(sent, "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8)))
+            sent += 1
+        if images < elapsed_s * 30:
+            bus.publish(_IMAGE, image)
+            images += 1
+        if elapsed_s > len(seen) * 10:
+            seen.append((elapsed_s, _usage(os.getpid()), _usage(pid)))
+        time.sleep(0.0007)
+    return seen, sent
+
+
+def record(folder: str, done: Any) -> None:
+    """The role as it runs in `vical-record.service`."""
+    from vical_daemon.config import loads
+    from vical_daemon.roles import record as role
+    from vical_daemon.wall_clock import private_clock
+    from vical_daemon.zenoh_bus import open_bus
+
+    record = f"{{directory: {folder}/log, rotate_s: 20, quota_bytes: 400000000, reserve_bytes: 0}}"
+    config = loads(f"rig: rig0
+record: {record}
+")
+    bus = open_bus(mode="client", socket=Path(folder) / "z.sock")
+    stop = threading.Event()
+    thread = threading.Thread(target=role.run, args=(config, bus, stop), kwargs={"clock": private_clock()})
+    thread.start()
+    done.wait()
+    stop.set()
+    thread.join()
+    bus.close()
+
+
+def check_segments(log: Path) -> tuple[int, int, int]:
+    """Return (holes in the numbers, messages, files) of what the quota has left."""
+    numbers: list[int] = []
+    paths = sorted(log.glob("*.mcap"))
+    for path in paths:
+        messages = (x for x in LogReader(path).messages() if x.channel.topic == "/" + _IMU)
+        numbers.extend(m.decode_imu(message.payload).stamp_ns for message in messages)
+    return int((np.diff(numbers) != 1).sum()), len(numbers), len(paths)
+
+
+def report(
+    seen: list[tuple[Any, ...]], sent: int, status: dict[str, str], holes: int, kept: int, segments: int
+) -> None:
+    """Print the table."""
+    settled = [row for row in seen if row[0] > min(_SETTLE_S, seen[-1][0] / 4)]
+    print("| figure | host of the bus | recorder |\n|---|---|---|")
+    for i, what in enumerate(("memory, MB", "descriptors", "threads")):
+        cells = []
+        for process in (1, 2):
+            values = [row[process][i] for row in settled]
+            tenth = max(1, len(values) // 10)
+            first, last = np.mean(values[:tenth]), np.mean(values[-tenth:])
+            cells.append(
+                f"{first:.1f} -> {last:.1f} ({100 * (last / first - 1):+.1f} %), most {max(values):.1f}"
+            )
+        print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
+    print(
+        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {status['lost_on_bus']} messages lost on "
+        f"the bus, {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted by the "
+        f"quota; {holes} holes in the {kept} samples of the {segments} files left."
+    )
+
+
+def _values(sample: Any) -> dict[str, str]:
+    return m.decode_diagnostics(sample.payload).statuses[0].values
+
+
+def _usage(pid: int) -> tuple[float, int, int]:
+    process = Path(f"/proc/{pid}")
+    pages = int((process / "statm").read_text().split()[1])
+    return (
+        pages * os.sysconf("SC_PAGE_SIZE") / 2**20,
+        len(list((process / "fd").iterdir())),
+        len(list((process / "task").iterdir())),
+    )
