@@ -82,9 +82,7 @@ def record(folder: str, done: Any) -> None:
     from vical_daemon.zenoh_bus import open_bus
 
     record = f"{{directory: {folder}/log, rotate_s: 20, quota_bytes: 400000000, reserve_bytes: 0}}"
-    config = loads(f"rig: rig0
-record: {record}
-")
+    config = loads(f"rig: rig0\nrecord: {record}\n")
     bus = open_bus(mode="client", socket=Path(folder) / "z.sock")
     stop = threading.Event()
     thread = threading.Thread(target=role.run, args=(config, bus, stop), kwargs={"clock": private_clock()})
@@ -122,9 +120,9 @@ def report(
             )
         print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
     print(
-        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {status['lost_on_bus']} messages lost on "
-        f"the bus, {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted by the "
-        f"quota; {holes} holes in the {kept} samples of the {segments} files left."
+        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {status['lost_on_bus']} messages lost "
+        f"on the bus, {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted by "
+        f"the quota; {holes} holes in the {kept} samples of the {segments} files left."
     )
 
 
