@@ -56,11 +56,13 @@ class BoardArt:
 
 
 def draw_board(target: object) -> BoardArt:
-    """Draw `target`, anything with the attributes of `GridOfTags` or `GridOfSquares`.
+    """Draw `target`: anything with the attributes of `GridOfTags` or `GridOfSquares`, or art itself.
 
     Raises:
         ValueError: The kind is neither aprilgrid nor checkerboard.
     """
+    if isinstance(target, BoardArt):
+        return target
     kind = getattr(target, "kind", None)
     if kind == "aprilgrid":
         return _draw_tags(cast(GridOfTags, target))

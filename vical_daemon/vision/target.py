@@ -141,7 +141,19 @@ def load_target(path: str | Path) -> Target:
         TargetError: The file is missing, no YAML, has unknown, missing or doubled keys, or a value out of
             bounds; one line naming file, line, key, bound and what to try.
     """
-    file = TargetFile.read(Path(path))
+    return _build(TargetFile.read(Path(path)))
+
+
+def parse_target(text: str, path: str | Path) -> Target:
+    """Read a target from the text of a file; `path` is only named in errors.
+
+    Raises:
+        TargetError: As `load_target`.
+    """
+    return _build(TargetFile.parse(text, Path(path)))
+
+
+def _build(file: TargetFile) -> Target:
     kind = file.text("target_type")
     if kind == "aprilgrid":
         return _aprilgrid(file)
@@ -189,4 +201,4 @@ def _frozen(array: FloatArray) -> FloatArray:
     return array
 
 
-__all__ = ["AprilGrid", "Checkerboard", "Target", "TargetError", "load_target"]
+__all__ = ["AprilGrid", "Checkerboard", "Target", "TargetError", "load_target", "parse_target"]

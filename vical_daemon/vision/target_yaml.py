@@ -37,7 +37,16 @@ class TargetFile:
         Raises:
             TargetError: Missing, unreadable, not YAML, not one flat mapping, or a doubled key.
         """
-        node = _compose(path, _read_text(path))
+        return cls.parse(_read_text(path), path)
+
+    @classmethod
+    def parse(cls, text: str, path: Path) -> TargetFile:
+        """Read the text of a file; `path` is only named in errors.
+
+        Raises:
+            TargetError: As `read`.
+        """
+        node = _compose(path, text)
         if not isinstance(node, yaml.MappingNode):
             raise TargetError(
                 f"{path}: no target file: expected lines like 'tagCols: 6'; `vical target` writes one"

@@ -1,0 +1,134 @@
+"""`vical target`: a board to print, to scale, and its target YAML."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.errors import CliError
+from vical_daemon.cli.options import add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.vision.target import Target
+
+HELP = "a board to print, to scale, and its target YAML"
+
+EPILOG = """examples:
+  vical target --type aprilgrid -o board.pdf                      6 x 6 tags, as large as A4 takes
+  vical target --type aprilgrid --paper a0 --tag-size 88mm -o board.pdf
+  vical target --type checkerboard --cols 8 --rows 7 --square 30mm -o board.svg
+  vical target --from board.yaml -o board.pdf                     print an existing target file
+Print at 100 %, measure the ruler, and put what you measured into the YAML."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.epilog = EPILOG
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--type", choices=("aprilgrid", "checkerboard"), help="kind of board")
+    what.add_argument("--from", dest="source", type=Path, metavar="FILE", help="an existing target YAML")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="F.pdf or F.svg")
+    parser.add_argument("--yaml", type=Path, metavar="FILE", help="target YAML (default: beside the board)")
+    parser.add_argument("--paper", default="a4", help="a5 ... a0, letter, legal, tabloid or WxH in mm (a4)")
+    grid = parser.add_argument_group("aprilgrid")
+    grid.add_argument("--tag-cols", type=int, default=6, help="tags along x (6)")
+    grid.add_argument("--tag-rows", type=int, default=6, help="tags along y (6)")
+    grid.add_argument("--tag-size", metavar="LENGTH", help="edge of a tag, m or e.g. 30mm (as large as fits)")
+    grid.add_argument("--tag-spacing", type=float, default=0.3, help="gap between tags / tag size (0.3)")
+    squares = parser.add_argument_group("checkerboard")
+    squares.add_argument("--cols", type=int, default=8, help="inner corners along x (8)")
+    squares.add_argument("--rows", type=int, default=7, help="inner corners along y (7)")
+    squares.add_argument(
+        "--square", metavar="LENGTH", help="edge of a square, m, or e.g. 30mm (as large as fits)"
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the board and its YAML."""
+    from vical_daemon.vision.board_sheet import SheetError, describe, lay_out
+    from vical_daemon.vision.sheet_files import to_pdf, to_svg
+    from vical_daemon.vision.target import TargetError
+
+    kind = args.out.suffix.lower()
+    if kind not in (".pdf", ".svg"):
+        raise CliError(f"-o {args.out}: the name must end in .pdf or .svg", exit_code=2)
+    yaml_path = args.yaml or args.out.with_suffix(".yaml")
+    try:
+        target = _target(args)
+        sheet = lay_out(target, args.paper)
+    except (SheetError, TargetError) as error:
+        raise CliError(str(error), exit_code=2) from None
+    try:
+        if kind == ".pdf":
+            args.out.write_bytes(to_pdf(sheet, describe(target)))
+        else:
+            args.out.write_text(to_svg(sheet), encoding="utf-8")
+        if args.source is None or yaml_path.resolve() != args.source.resolve():
+            yaml_path.write_text(target.to_yaml(), encoding="utf-8")
+    except OSError as error:
+        raise CliError(f"{error.filename or args.out}: cannot be written ({error.strerror})") from None
+    _report(args, target, sheet.size_mm, yaml_path)
+    return 0
+
+
+def _target(args: argparse.Namespace) -> Target:
+    from vical_daemon.vision.board_sheet import largest_on
+    from vical_daemon.vision.target import AprilGrid, Checkerboard, load_target
+
+    if args.source is not None:
+        return load_target(args.source)
+    wanted = args.tag_size if args.type == "aprilgrid" else args.square
+    size = parse_length_m(wanted) if wanted is not None else 0.02
+    board: Target
+    if args.type == "aprilgrid":
+        board = AprilGrid(args.tag_cols, args.tag_rows, size, args.tag_spacing)
+    else:
+        board = Checkerboard(args.cols, args.rows, size, size)
+    _check(board, args.out)
+    return board if wanted is not None else largest_on(board, args.paper)
+
+
+def _check(board: Target, out: Path) -> None:
+    """Refuse what the target file's reader would refuse, with the same words."""
+    from vical_daemon.vision.target import parse_target
+
+    parse_target(board.to_yaml(), out.with_suffix(".yaml"))
+
+
+def parse_length_m(text: str) -> float:
+    """Read "0.03", "30mm" or "3cm" as metres.
+
+    >>> parse_length_m("30mm")
+    0.03
+    """
+    number, scale = text.strip().lower(), 1.0
+    for unit, factor in (("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)):
+        if number.endswith(unit):
+            number, scale = number.removesuffix(unit), factor
+            break
+    try:
+        return round(float(number) * scale, 9)
+    except ValueError:
+        raise CliError(f"length {text!r}: give metres, or a number with mm or cm", exit_code=2) from None
+
+
+def _report(args: argparse.Namespace, target: Target, size_mm: tuple[float, float], yaml_path: Path) -> None:
+    from vical_daemon.vision.board_sheet import describe
+
+    if args.json:
+        row = {
+            "board": str(args.out),
+            "yaml": str(yaml_path),
+            "kind": target.kind,
+            "points": len(target.points_m),
+            "page_mm": list(size_mm),
+        }
+        print(json.dumps(row))
+        return
+    print(f"{args.out}: {describe(target).removeprefix('vical ')}, page {size_mm[0]:g} x {size_mm[1]:g} mm")
+    print(f"{yaml_path}: target file for --target")
+    print("Print at 100 %, glue it to something flat, measure the ruler; correct the YAML if it is off.")
