@@ -11,6 +11,7 @@ line is the stamp. Pure arithmetic: nothing here reads a clock or a device.
 from __future__ import annotations
 
 import struct
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -29,7 +30,10 @@ COMMON_CLOCKS_HZ = (1e6, 6e6, 10e6, 12e6, 15e6, 24e6, 25e6, 27e6, 30e6, 48e6, 50
 
 MIN_AGE_S = 1.0
 MAX_SIGMA_S = 0.5e-3
-MAX_JITTER_S = 8e-3
+ARRIVALS = 600
+LOOK_EVERY = 32
+SCATTER_S = 0.5e-3
+LOW_SHARE = 0.45
 MAX_DELAY_S = 1.0
 MAX_SUSPECTS = 20
 MAX_CAPTURE_TO_PACKET_NS = 500_000_000
@@ -123,6 +127,7 @@ class UvcClock:
     def __init__(self, frequency_hz: float | None = None) -> None:
         self._frequency_hz = frequency_hz
         self._waiting: list[tuple[int, int]] = []
+        self._arrivals: deque[tuple[float, float]] = deque(maxlen=ARRIVALS)
         self._restart()
         self.restarts = 0
 
@@ -134,6 +139,9 @@ class UvcClock:
         self._x_s = 0.0
         self._ticks = 0
         self._suspects = 0
+        self._arrivals.clear()
+        self._scatters = False
+        self._looked = 0
 
     def add(self, header: PayloadHeader) -> None:
         """Take the clock reading of one payload; headers without SCR are ignored."""
@@ -180,7 +188,14 @@ class UvcClock:
         if self._first is None:
             self._first = (self._ticks, t_host_ns)
         self._x_s = (self._ticks - self._first[0]) / self._frequency_hz
-        self._envelope.add(self._x_s, (t_host_ns - self._first[1]) * 1e-9 - self._x_s)
+        delay_s = (t_host_ns - self._first[1]) * 1e-9 - self._x_s
+        self._envelope.add(self._x_s, delay_s)
+        self._arrivals.append((self._x_s, delay_s))
+        self._looked += 1
+        if self._looked % LOOK_EVERY == 0:
+            x_s, d_s = np.array(self._arrivals).T
+            line_s = self._envelope.line(0.0) + self._envelope.skew * x_s
+            self._scatters = scatters_both_ways(d_s - line_s)
 
     def _possible(self, stc: int, t_host_ns: int) -> bool:
         if self._first is None or self._frequency_hz is None:
@@ -205,13 +220,26 @@ class UvcClock:
         reason = ""
         if self._first is None or self._x_s < MIN_AGE_S:
             reason = "too few clock readings yet"
-        elif e.jitter_s > MAX_JITTER_S:
-            reason = f"clock readings scatter by {e.jitter_s * 1e3:.1f} ms"
+        elif self._scatters:
+            reason = "clock readings scatter both ways"
         elif e.sigma_s > MAX_SIGMA_S:
-            reason = f"the fitted line is uncertain by {e.sigma_s * 1e3:.2f} ms"
+            reason = "the fitted line is too uncertain"
         sigma_ns = e.sigma_s * 1e9 if np.isfinite(e.sigma_s) else 1e9
         # the envelope's skew is host per device; a fast camera clock has a negative one
         return ClockHealth(not reason, reason, -e.skew * 1e6, sigma_ns, e.jitter_s * 1e9)
+
+
+def scatters_both_ways(residuals_s: npt.NDArray[np.float64]) -> bool:
+    """Tell readings that are wrong either way from arrivals that are merely late.
+
+    Lateness alone piles the residuals up at the line (a tenth of them lies below 0.15 medians, were it
+    exponential), however long its tail; errors of both signs leave the low end thin (0.6 for a bell).
+
+    Args:
+        residuals_s: Arrival minus line, s, shape (n,).
+    """
+    tenth, median = np.percentile(residuals_s, [10, 50])
+    return bool(median > SCATTER_S and tenth > LOW_SHARE * median)
 
 
 def plausible_capture(t_capture_ns: int, t_first_packet_ns: int) -> bool:

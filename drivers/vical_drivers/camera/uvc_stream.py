@@ -47,7 +47,8 @@ class UvcMetadata:
         self._node = node
         self._clock = UvcClock(frequency_hz)
         self._pts: OrderedDict[int, int] = OrderedDict()
-        self._said = ""
+        self._said: set[str] = set()
+        self._in_use = False
         self._driver_stamps_capture = hwtimestamps(kernel)
 
     @classmethod
@@ -118,10 +119,14 @@ class UvcMetadata:
             self._clock.add(header if t_ns == header.t_host_ns else replace(header, t_host_ns=t_ns))
 
     def _say(self, reason: str) -> None:
-        if reason != self._said:
-            self._said = reason
-            state = f"fallback to first packet: {reason}" if reason else "uvc-pts in use"
-            _log.info("uvc stamps path=%s %s", self._node.path, state)
+        """Log each reason once until the fit is used again."""
+        if not reason and not self._in_use:
+            self._said.clear()
+            _log.info("uvc stamps path=%s uvc-pts in use", self._node.path)
+        elif reason and reason not in self._said:
+            self._said.add(reason)
+            _log.info("uvc stamps path=%s fallback to first packet: %s", self._node.path, reason)
+        self._in_use = not reason
 
     def close(self) -> None:
         """Stop and free the node; may be called twice."""

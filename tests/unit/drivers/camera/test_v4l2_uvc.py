@@ -57,14 +57,25 @@ def test_first_frames_fall_back_to_the_first_packet(open_fake) -> None:
     assert np.abs(errors).max() < 5_000  # the fallback is late by the USB delay, never by an exposure
 
 
-def test_scattered_clock_readings_are_noticed_and_not_used(open_fake, caplog) -> None:
+@pytest.mark.parametrize("scatter_ns", [2e6, 60e6])  # the second is what a wrong frame counter does
+def test_scattered_clock_readings_are_noticed_and_not_used(open_fake, caplog, scatter_ns: float) -> None:
     caplog.set_level("INFO")
-    camera = usb_camera(scatter_ns=60_000_000.0)  # what a wrong frame counter does
+    camera = usb_camera(scatter_ns=scatter_ns)
     source = open_fake(camera, exposure_s=0.012)
     _, rules = errors_us(camera, source, 400)
-    assert set(rules) == {"first-packet-exposure/2"}
-    assert "clock readings scatter" in caplog.text
+    assert set(rules[40:]) == {"first-packet-exposure/2"}
+    assert "scatter both ways" in caplog.text or "too uncertain" in caplog.text
+    assert len(caplog.records) < 8  # said once, not with each frame
     assert source.stats().extra["uvc_fit_used"] == 0.0
+
+
+def test_a_long_tail_of_lateness_does_no_harm(open_fake) -> None:
+    camera = usb_camera(delay_mean_ns=12_000_000)  # a machine under heavy load
+    source = open_fake(camera, exposure_s=0.012)
+    errors, rules = errors_us(camera, source, 900)
+    assert rules.count("uvc-pts+exposure/2") > 600
+    fitted = [e for e, rule in zip(errors, rules, strict=True) if rule == "uvc-pts+exposure/2"]
+    assert np.percentile(np.abs(fitted), 90) < 400.0
 
 
 def test_without_metadata_node_the_grabber_says_so(open_fake, caplog) -> None:
