@@ -121,8 +121,8 @@ def report(
         print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
     print(
         f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {status['lost_on_bus']} messages lost "
-        f"on the bus, {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted by "
-        f"the quota; {holes} holes in the {kept} samples of the {segments} files left."
+        f"on the bus, {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted "
+        f"by the quota; {holes} holes in the {kept} samples of the {segments} files left."
     )
 
 

@@ -261,3 +261,31 @@ def test_key_expressions():
     assert not key_matches("vical/*/status/*", "vical/rig1/status")
     assert key_matches("a/**/z", "a/z")
     assert not key_matches("a/b", "a/b/c")
+
+
+def test_robot_works_without_its_site_and_joins_it_later(tmp_path):
+    """A rig's router and a site's router: started in any order, each rig under its own key."""
+    import socket as sockets
+
+    with sockets.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    begin = time.monotonic()
+    robots = [
+        open_bus(mode="router", socket=tmp_path / f"{name}.sock", connect=[f"tcp/127.0.0.1:{port}"])
+        for name in ("robot1", "robot2")
+    ]
+    assert time.monotonic() - begin < 5  # does not wait for the site
+    role = open_bus(mode="client", socket=tmp_path / "robot1.sock")
+    role.publish(topics.calibration_key("robot1", "cam0"), b"1")
+    robots[1].publish(topics.calibration_key("robot2", "cam0"), b"2")
+    assert until(lambda: len(robots[0].latest(topics.calibration_key("robot1", "*"))) == 1)
+    site = open_bus(mode="router", tcp_port=port)
+    assert until(lambda: {s.payload for s in site.latest("vical/*/calibration/*")} == {b"1", b"2"}, 10)
+    got: list[str] = []
+    subscription = site.subscribe("vical/**", lambda sample: got.append(sample.key))
+    key = topics.imu_key("robot1", "imu0")
+    assert until(lambda: role.publish(key, b"x") or key in got)
+    subscription.close()
+    for bus in (role, *robots, site):
+        bus.close()

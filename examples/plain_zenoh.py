@@ -1,0 +1,46 @@
+"""Without vical: eclipse-zenoh and rosbags are enough to follow where a camera sits.
+
+    python examples/plain_zenoh.py [ENDPOINT]
+
+Payloads are ROS 2 messages in CDR; the pose comes as geometry_msgs/PoseWithCovarianceStamped beside our
+own, richer message.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+def main(endpoint: str = "tcp/127.0.0.1:7447") -> None:
+    """Ask for the last pose of every camera, then print each new one."""
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+
+    def show(sample: zenoh.Sample) -> None:
+        message = typestore.deserialize_cdr(sample.payload.to_bytes(), POSE)
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        print(
+            f"{sample.key_expr}: p {p.x:.4f} {p.y:.4f} {p.z:.4f} m, q {q.w:.4f} {q.x:.4f} {q.y:.4f} {q.z:.4f}"
+        )
+
+    with zenoh.open(config) as session:
+        for reply in session.get("vical/*/calibration/*/pose"):
+            if reply.ok is not None:
+                show(reply.ok)
+        session.declare_subscriber("vical/*/calibration/*/pose", show)
+        while True:
+            time.sleep(1)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2])

@@ -1,0 +1,42 @@
+"""One router for a site: every robot joins it, whoever watches the site needs one connection.
+
+    python examples/site_router.py CA.pem SITE.pem SITE.key USERS.txt
+
+USERS.txt holds `user:password` lines; `viewer` may only look. A robot's side: `examples/site_robot.yaml`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from vical_daemon import client
+from vical_daemon.zenoh_bus import open_bus
+
+
+def main(ca: str, certificate: str, key: str, users: str) -> None:
+    """Host the router and print a line when a robot's calibration changes its status."""
+    site = open_bus(
+        mode="router",
+        listen=["tls/0.0.0.0:7447"],
+        tls_ca=ca,
+        tls_certificate=certificate,
+        tls_key=key,
+        password_file=users,
+        readers=["viewer"],
+    )
+    status: dict[tuple[str, str], str] = {}
+
+    def show(update: client.Update) -> None:
+        name = update.rig, update.camera
+        if status.get(name) != update.estimate.status:
+            status[name] = update.estimate.status
+            print("/".join(name), update.estimate.status, flush=True)
+
+    client.Client(site).subscribe(show)
+    while True:
+        time.sleep(3600)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:5])
