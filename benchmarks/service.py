@@ -141,25 +141,18 @@ def _judge_logs(root: Path, deeds: list[tuple[float, str]]) -> list[tuple[str, s
     arrays = [open_recording(log, check=False).imu_arrays("imu0").t_ns * 1e-9 for log in logs]
     stamps_s = np.unique(np.concatenate(arrays))
     rows = [("logs that open", f"{len(arrays)} of {len(logs)}")]
-    ends_s = stamps_s[:-1][np.diff(stamps_s) > 0.025]
-    begins_s = stamps_s[1:][np.diff(stamps_s) > 0.025]
-    for deed in dict.fromkeys(name for _, name in deeds[:-1]):
-        holes, losses = [], []
-        for at_s, until_s in _spans(deeds, deed):
-            inside = (begins_s > at_s) & (ends_s < until_s)
-            holes += list((begins_s - ends_s)[inside])
-            losses += list(at_s - ends_s[inside])
-        text = f"{len(holes)}"
-        if holes:
-            text += f", longest {max(holes):.2f} s, last sample {max(losses):.2f} s before at the most"
-        rows.append((f"holes in the recorded IMU stamps after {deed}", text))
+    holes: dict[str, list[tuple[float, float]]] = {name: [] for _, name in deeds[:-1]}
+    for i in np.nonzero(np.diff(stamps_s) > 0.025)[0]:
+        before = [(at_s, name) for at_s, name in deeds if at_s < stamps_s[i + 1]]
+        if before:  # a hole belongs to the last deed before its end
+            at_s, name = before[-1]
+            holes[name].append((stamps_s[i + 1] - stamps_s[i], at_s - stamps_s[i]))
+    for name, found in holes.items():
+        text = ", ".join(f"{length:.2f}" for length, _ in sorted(found, reverse=True)[:12])
+        if found:
+            text += f"; last sample before the deed {max(lost for _, lost in found):.2f} s at the most"
+        rows.append((f"holes in the recorded IMU after {name}, s", text or "none"))
     return rows
-
-
-def _spans(deeds: list[tuple[float, str]], name: str) -> list[tuple[float, float]]:
-    """Return from when to when each deed of this name was the last one."""
-    following = [at_s for at_s, _ in deeds[1:]]
-    return [(at_s, end_s) for (at_s, deed), end_s in zip(deeds, following, strict=False) if deed == name]
 
 
 def _status(machine: Machine, name: str) -> str:

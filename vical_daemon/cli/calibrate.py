@@ -90,7 +90,7 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome) -> int:
         Path(args.output).write_text(text + "\n", encoding="utf-8")
     if args.json:
         print(text)
-    else:
+    elif result["cameras"]:
         from vical_daemon.cli.calibration_text import describe
 
         print(describe(result))
