@@ -59,7 +59,7 @@ class EnvelopeOptions:
         block_s: Only the luckiest sample of each block of this length is kept.
     """
 
-    max_skew: float = 500e-6
+    max_skew: float = 2000e-6
     skew_prior: float = 100e-6
     skew_wander_per_s: float = 4e-8
     min_window_s: float = 20.0

@@ -32,6 +32,7 @@ _SELF_TEST_PARTS = {
     11: "accelerometer z",
     20: "system tick",
 }
+_NEEDED_STRINGS = 3
 _IDENTITY = ("model number", "serial number", "model name", "options", "lot")
 
 
@@ -83,7 +84,8 @@ class SingleByteSession:
         for index, name in enumerate(_IDENTITY):
             with contextlib.suppress(DriverError):
                 # Not every firmware answers each index; the wait for those must stay short.
-                text[name] = str(self._transact(cmd.get_identity(index), 0xEA, tries=2).fields()["text"])
+                tries = 2 if index < _NEEDED_STRINGS else 1
+                text[name] = str(self._transact(cmd.get_identity(index), 0xEA, tries=tries).fields()["text"])
         serial = text.get("serial number", "")
         return DeviceInfo(
             kind="imu",

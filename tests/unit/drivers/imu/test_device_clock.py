@@ -78,6 +78,15 @@ def test_the_counter_wraps_at_two_to_the_32():
     assert abs(error_s) < 100e-6
 
 
+def test_a_crystal_far_out_of_tolerance_is_still_followed():
+    ticks, true_s, arrival_ns = arrivals(4000, 100.0, 1500.0, usb)
+    clock = DeviceClock(TICK_HZ, rate_hz=100.0)
+    stamps = run(clock, ticks, arrival_ns)
+    error_s = np.array([s.t_device_event_ns for s in stamps[2000:]]) * 1e-9 - true_s[2000:]
+    assert np.abs(error_s).max() < 1e-3
+    assert clock.restarts == clock.outliers == 0
+
+
 @pytest.mark.parametrize("jump", [-500_000, 5_000_000, 3_000_000_000])
 def test_a_restarted_timer_begins_a_new_mapping(jump):
     ticks, true_s, arrival_ns = arrivals(6000, 100.0, 50.0, usb, first_tick=1_000_000)
