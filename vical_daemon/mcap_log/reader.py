@@ -280,7 +280,8 @@ def _decompress_lz4(packed: memoryview, limit: int) -> bytes:
     import lz4.frame
 
     unpacker = lz4.frame.LZ4FrameDecompressor()
-    pieces = [unpacker.decompress(packed, max_length=min(_PIECE, limit))]
+    first = min(_PIECE, max(65536, 2 * len(packed)), limit)
+    pieces = [unpacker.decompress(packed, max_length=first)]
     total = len(pieces[0])
     while total < limit and not unpacker.eof and not unpacker.needs_input:
         piece = unpacker.decompress(b"", max_length=min(_PIECE, limit - total))
