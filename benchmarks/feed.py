@@ -197,13 +197,14 @@ class CalibratorSubject:
             camera.distortion,
         )
         covariance = self._published_covariance(camera)
-        gravity = np.asarray(estimate.gravity_world_mps2) - run.rig.gravity_world_mps2
         extra = {
             "nis_per_dof": estimate.nis_per_dof,
             "rejected": estimate.rejected_fraction,
             "corner_sigma_px": camera.corner_sigma_px,
-            "gravity_error": float(np.linalg.norm(gravity)),
         }
+        if not self.calibrator.options.target_free:  # there the world is a frame of its own
+            gravity = np.asarray(estimate.gravity_world_mps2) - run.rig.gravity_world_mps2
+            extra["gravity_error"] = float(np.linalg.norm(gravity))
         return Snapshot(t_s, status, error, covariance, extra)
 
     def _published_covariance(self, camera: CameraEstimate) -> FloatArray:
