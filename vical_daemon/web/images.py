@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections import deque
 from typing import Any
@@ -13,7 +14,6 @@ from vical_daemon import topics
 from vical_daemon.bus import Sample
 from vical_daemon.messages import (
     MessageError,
-    PointsMessage,
     decode_compressed_image,
     decode_image,
     decode_points,
@@ -23,6 +23,7 @@ WIDTH_LIMIT = 800  # wider images are thinned: the page is for looking, not for 
 PATIENCE_NS = 1_200_000_000  # an image without points is shown when nothing better came for so long
 RESTART_NS = 5_000_000_000
 KEPT_BYTES = 24 * 2**20  # images that wait for their points: about a second of them
+_STAMP = struct.Struct("<4xiI")  # behind the four bytes that begin every CDR message
 _RING = np.array([(x, y) for x in range(-5, 6) for y in range(-5, 6) if 10 <= x * x + y * y <= 26])
 _PALETTE = np.array(
     [(0, 94, 213), (115, 158, 0), (178, 114, 0), (66, 228, 240), (167, 121, 204), (0, 159, 230)],
@@ -62,28 +63,30 @@ class CameraView:
         """Return the next picture as JPEG; None while there is nothing newer than the last one."""
         with self._lock:
             images, points = list(self._images), list(self._points)
-        known = dict(_stamped(points))
-        newest: tuple[int, Any] | None = None
+        known = {_stamp_ns(sample): sample for sample in points}
+        newest: tuple[int, Sample] | None = None
         for sample in reversed(images):
-            try:
-                stamp_ns, load = _open_image(sample)
-            except MessageError:
-                continue
+            stamp_ns = _stamp_ns(sample)
             if stamp_ns < self._shown_ns - RESTART_NS:
                 self._shown_ns = 0  # the clock went back: a replay that began anew
             if stamp_ns <= self._shown_ns:
                 break
             if stamp_ns in known:
-                return self._encode(stamp_ns, load(), known[stamp_ns])
-            newest = newest or (stamp_ns, load)
+                return self._encode(stamp_ns, sample, known[stamp_ns])
+            newest = newest or (stamp_ns, sample)
         if newest is None or newest[0] - self._shown_ns < PATIENCE_NS:
             return None
-        return self._encode(newest[0], newest[1](), None)
+        return self._encode(*newest, None)
 
-    def _encode(self, stamp_ns: int, pixels: npt.NDArray[Any], points: PointsMessage | None) -> bytes:
+    def _encode(self, stamp_ns: int, image: Sample, points_sample: Sample | None) -> bytes | None:
         from vical_daemon.vision.image_codec import encode_image
 
         self._shown_ns = stamp_ns
+        try:
+            pixels = _pixels(image)
+            points = None if points_sample is None else decode_points(points_sample.payload)
+        except MessageError:
+            return None
         factor = -(-pixels.shape[1] // WIDTH_LIMIT)
         picture = colour(pixels[::factor, ::factor])
         if points is not None:
@@ -91,31 +94,21 @@ class CameraView:
         return encode_image(picture, "jpeg", quality=80)
 
 
-def _stamped(samples: list[Sample]) -> list[tuple[int, PointsMessage]]:
-    found = []
-    for sample in samples:
-        try:
-            message = decode_points(sample.payload)
-        except MessageError:
-            continue
-        found.append((message.stamp_ns, message))
-    return found
+def _stamp_ns(sample: Sample) -> int:
+    """Read the stamp of a message that begins with a std_msgs/Header; 0 where it is too short for one."""
+    if len(sample.payload) < _STAMP.size:
+        return 0
+    seconds, nanoseconds = _STAMP.unpack_from(sample.payload)
+    return int(seconds) * 10**9 + int(nanoseconds)
 
 
-def _open_image(sample: Sample) -> tuple[int, Any]:
-    """Return the stamp and a function that gives the pixels (decoding is for the one that is shown)."""
+def _pixels(sample: Sample) -> npt.NDArray[Any]:
     parsed = topics.parse_key(sample.key)
     if parsed is not None and parsed.topic is topics.COMPRESSED:
-        compressed = decode_compressed_image(sample.payload)
+        from vical_daemon.vision.image_codec import decode_image as decode_file
 
-        def unpack() -> npt.NDArray[Any]:
-            from vical_daemon.vision.image_codec import decode_image as decode_file
-
-            return decode_file(np.frombuffer(compressed.data, dtype=np.uint8))
-
-        return compressed.stamp_ns, unpack
-    raw = decode_image(sample.payload)
-    return raw.stamp_ns, raw.pixels
+        return decode_file(np.frombuffer(decode_compressed_image(sample.payload).data, dtype=np.uint8))
+    return decode_image(sample.payload).pixels()
 
 
 def colour(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
@@ -123,7 +116,10 @@ def colour(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     if pixels.dtype == np.uint16:
         pixels = (pixels >> 8).astype(np.uint8)
     if pixels.ndim == 2:
-        pixels = np.repeat(pixels[:, :, None], 3, axis=2)
+        picture = np.empty((*pixels.shape, 3), dtype=np.uint8)
+        for channel in range(3):  # three times as fast as np.repeat along the last axis
+            picture[:, :, channel] = pixels
+        return picture
     return np.array(pixels[:, :, :3], dtype=np.uint8, order="C")
 
 
