@@ -20,11 +20,18 @@ if TYPE_CHECKING:
 HELP = "the online filter over a recording: extrinsics and time shift"
 FIX = ("intrinsics", "timeshift", "extrinsics")
 ESTIMATE = ("imu_intrinsics", "readout", "target_scale")
+_EXAMPLES = """\
+examples:
+  vical calibrate log.mcap --target target.yaml --initial lens.yaml --fix intrinsics
+  vical calibrate euroc_folder --target april.yaml --json -o result.json --report result.html
+  vical export result.json --format kalibr -o camchain.yaml
+"""
 _UNUSABLE = ("waiting", "initialising", "inconsistent")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = _EXAMPLES
     parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
     parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format; without: target-free")
     parser.add_argument("--camera", metavar="NAME", help="only this camera")

@@ -52,6 +52,7 @@ store: {{directory: {store}}}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = "afterwards: vical info DIR/*.mcap; vical calibrate DIR/*.mcap --target DIR/target.yaml"
     parser.add_argument(
         "--seconds",
         type=float,

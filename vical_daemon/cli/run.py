@@ -32,6 +32,9 @@ _CHILD_STOP_S = 15.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = (
+        "as a service: vical install-service; on a laptop: vical run -c vical.yaml, then vical watch"
+    )
     parser.add_argument(
         "roles",
         metavar="ROLE",

@@ -22,6 +22,7 @@ _REFRESH_S = 0.25
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
+    parser.epilog = "in a script: vical watch --until-converged --timeout 120 && echo done"
     add_config(parser, required=False)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="a router, e.g. tcp/127.0.0.1:7447 (default: ours)"
