@@ -21,7 +21,13 @@ from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_model import ImuBuffer
 from vical_daemon.estimation.judge import Judge
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import (
+    BoolArray,
+    CalibrationOptions,
+    CameraPrior,
+    FloatArray,
+    PointsFrame,
+)
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.state import (
     ACCEL_BIAS,
@@ -92,7 +98,7 @@ class Calibrator:
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image; those of unknown cameras or off the board are only counted."""
-        ok = np.isfinite(frame.uv_px).all(axis=1) & (frame.ids >= 0) & (frame.ids < len(self.target))
+        ok = self._known(frame)
         if frame.camera not in self.priors or self._buffer is None:
             self.judge.frames_ignored += 1
             return
@@ -102,6 +108,12 @@ class Calibrator:
         t_cam_s = (frame.t_cam_ns - self._base_ns) * 1e-9
         self.judge.saw_points(t_cam_s, len(frame.ids))
         self._pending.push(t_cam_s, frame)
+
+    def _known(self, frame: PointsFrame) -> BoolArray:
+        """Which points of a frame can be used at all."""
+        return np.asarray(
+            np.isfinite(frame.uv_px).all(axis=1) & (frame.ids >= 0) & (frame.ids < len(self.target))
+        )
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
@@ -246,12 +258,18 @@ class Calibrator:
             self.judge.frames_ignored += 1
             return None
         self._buffer.trim(f.state.t_s - _KEEP_S)
-        ratio = self._held_back.follow(f, frame, t_cam_s, self.target, self._buffer)
+        ratio = self._held_back_ratio(frame, t_cam_s)
         if ratio is not None:
             self.judge.held_back(ratio)
         self.judge.saw_frame(report, f)
         self._act(self.watch.look(report, f), frame, t_cam_s)
         return report
+
+    def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
+        """How well an image was predicted that the held-back copy of the filter has not used."""
+        assert self.filter is not None
+        assert self._buffer is not None
+        return self._held_back.follow(self.filter, frame, t_cam_s, self.target, self._buffer)
 
     def _act(self, action: Action, frame: PointsFrame, t_cam_s: float) -> None:
         """Do what the watch over changes asks for."""

@@ -60,12 +60,8 @@ class Layout:
     target_scale: int | None
 
 
-def make_layout(
-    cameras: list[str], *, fix: frozenset[str], estimate: frozenset[str], landmarks: int = 0
-) -> Layout:
+def make_layout(cameras: list[str], *, fix: frozenset[str], estimate: frozenset[str]) -> Layout:
     """Lay the error state out for a set of switches (names as in `CalibrationOptions`)."""
-    if landmarks:
-        raise ValueError("landmarks live behind this layout")
     at = _CORE
     gyro_matrix = accel_matrix = None
     if "imu_intrinsics" in estimate:
