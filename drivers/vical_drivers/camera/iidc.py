@@ -26,7 +26,7 @@ from vical_drivers.camera.iidc_device import IidcDevice, IidcMode, frame_bytes, 
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, SequenceCounter
 from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp
+from vical_drivers.camera.v4l2_stamp import SIGMA_NS, ExposureStamper, RawStamp
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
@@ -36,6 +36,8 @@ list_iidc_cameras = list_devices
 
 MIN_SILENCE_S = 1.0
 SILENT_PERIODS = 5.0
+OLDEST_NS = 2_000_000_000
+"""No frame waits longer in the ring."""
 PACKET_STAMP_SIGMA_NS = 36_000
 """The first packet is dated by its bus cycle of 125 us: a uniform error of 125 us / sqrt(12)."""
 
@@ -259,7 +261,7 @@ class IidcCamera:
         t_packet_ns: int,
         t_arrival_ns: int,
     ) -> Frame | None:
-        raw = self._raw_stamp(info, t_packet_ns)
+        raw = self._raw_stamp(info, t_packet_ns, t_arrival_ns)
         self._update_exposure(device, info)
         self._pending_loss += self._missing(info, raw.t_raw_ns)
         image = self._image(data, depth_bits)
@@ -282,11 +284,15 @@ class IidcCamera:
             dropped_before=dropped,
         )
 
-    def _raw_stamp(self, info: EmbeddedInfo, t_packet_ns: int) -> RawStamp:
+    def _raw_stamp(self, info: EmbeddedInfo, t_packet_ns: int, t_arrival_ns: int) -> RawStamp:
         forced = self._settings.stamp
         anchor = None if forced in ("auto", "raw") else Anchor(forced)
         if info.cycle_time is not None:
             t_ns = self._clock.to_host_ns(image_cycle_time_ns(info.cycle_time))
+            if not 0 <= t_arrival_ns - t_ns < OLDEST_NS:
+                # exposed before a bus reset gave the bus another time, and read after it
+                self._statistics.count("implausible_stamps")
+                return RawStamp(t_arrival_ns, Anchor.ARRIVAL, None, SIGMA_NS[Anchor.ARRIVAL])
             sigma_ns = round(self._clock.sigma_ns) + 200  # and the masked bits
             return RawStamp(t_ns, anchor or Anchor.SHUTTER_CLOSED, "embedded-cycle-timer", sigma_ns)
         return RawStamp(t_packet_ns, anchor or Anchor.FIRST_PACKET, None, PACKET_STAMP_SIGMA_NS)
