@@ -28,7 +28,7 @@ from vical_mocks.faults import ByteFaults, FaultyLink
 from vical_mocks.gx3_device import Gx3Device
 from vical_mocks.gx3_mip import MODELS
 from vical_mocks.gx3_state import Identity, Settings
-from vical_mocks.imu import GX3_25_ERRORS, ImuErrors, Motion
+from vical_mocks.imu import GX3_25_ERRORS, FloatArray, ImuErrors, Motion, at_rest
 
 _IDLE_S = 0.05
 _BAUD_OF = {getattr(termios, f"B{b}"): b for b in (9600, 19200, 115200, 230400, 460800, 921600)}
@@ -126,6 +126,12 @@ class Gx3Emulator:
             os.close(self._master)
             self._master = self._slave = -1
 
+    def toggle_cable(self) -> None:
+        """Unplug where it is plugged in, plug in where it is not."""
+        # A thread of its own: a signal may come while the lock is held.
+        act = self.unplug if self._master >= 0 else self.plug
+        threading.Thread(target=act, name="gx3-cable", daemon=True).start()
+
     def damage(self, faults: ByteFaults | None) -> None:
         """Begin (None: end) to damage the bytes towards the host."""
         with self._lock:
@@ -219,13 +225,25 @@ class Gx3Emulator:
         self.stop()
 
 
+def sway(t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A level unit turning to and fro about its vertical axis: 1 rad/s, every two seconds."""
+    gyro, force = at_rest(t_s)
+    gyro[:, 2] = np.sin(np.pi * t_s)
+    return gyro, force
+
+
+MOTIONS: dict[str, Motion] = {"rest": at_rest, "sway": sway}
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m vical_mocks.gx3_emulator",
-        description="Emulate a MicroStrain 3DM-GX3-25 on a pseudo terminal; prints the terminal's name.",
+        description="Emulate a MicroStrain 3DM-GX3-25 on a pseudo terminal; prints the terminal's name. "
+        "SIGUSR1 pulls the cable, or plugs it in again.",
     )
     parser.add_argument("--protocol", choices=("single-byte", "mip"), default="single-byte")
     parser.add_argument("--model", choices=tuple(MODELS), default="gx3", help="what a MIP unit knows")
+    parser.add_argument("--motion", choices=tuple(MOTIONS), default="rest", help="how the unit moves")
     parser.add_argument("--link", choices=LINKS, default="usb", help="how bytes are delayed and bunched")
     parser.add_argument("--skew-ppm", type=float, default=35.0, help="rate error of the device clock")
     parser.add_argument("--wander-ppm", type=float, default=0.0, help="slow change of the rate error")
@@ -255,6 +273,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.streaming:
         eeprom.power_up_mode, eeprom.preset_command = 2, 0xC2
     with Gx3Emulator(
+        MOTIONS[args.motion],
         protocol=args.protocol,
         model=args.model,
         link=args.link,
@@ -267,6 +286,7 @@ def main(argv: list[str] | None = None) -> int:
         faults=ByteFaults(lose=args.lose, flip=args.flip, at_start=args.garbage, seed=args.seed),
         stall_every_s=args.stall,
     ) as emulator:
+        signal.signal(signal.SIGUSR1, lambda _signal, _frame: emulator.toggle_cable())
         sys.stdout.write(emulator.port_name + "\n")
         sys.stdout.flush()
         done.wait(args.seconds)
