@@ -27,6 +27,7 @@ from vical_daemon.wall_clock import WallClock
 _log = logging.getLogger(__name__)
 QUEUE_BYTES = 128 * 2**20
 _RETRY_NS = 5_000_000_000
+_MENDING_S = 5.0
 
 
 class Arrival(NamedTuple):
@@ -85,6 +86,7 @@ class Recorder:
         self._serials: dict[str, str] = {}
         self._calibrations: dict[str, bytes] = {}
         self._latched: dict[str, bytes] = {}
+        self._mending: threading.Thread | None = None
         self.messages = 0
 
     @property
@@ -164,8 +166,7 @@ class Recorder:
         if not self._folder.lock():
             self._problem = f"standing by: another recorder writes into {self._folder.path}"
             return
-        for recovery in self._folder.recover():
-            _log.info("recovered %s: %d messages", recovery.output.name, recovery.messages)
+        self._mend()
         self._folder.enforce_quota(0)
         if not self._folder.has_room(resuming=bool(self._problem)):
             self._problem = "the disk has reached record.reserve_bytes; waiting for space"
@@ -180,6 +181,19 @@ class Recorder:
         for key, payload in self._latched.items():
             self._session.write(key, payload, now_ns, latched=True)
         _log.info("recording into %s", self._session.path)
+
+    def _mend(self) -> None:
+        """Recover what a crash left, beside the recording: a part of 1 GB takes longer than data may wait."""
+        if self._mending is None or not self._mending.is_alive():
+            self._mending = threading.Thread(target=self._recover, name="log recovery", daemon=True)
+            self._mending.start()
+
+    def _recover(self) -> None:
+        try:
+            for recovery in self._folder.recover():
+                _log.info("recovered %s: %d messages", recovery.output.name, recovery.messages)
+        except OSError as error:
+            _log.warning("recovery in %s: %s", self._folder.path, error)
 
     def _end(self, problem: str) -> None:
         session, self._session = self._session, None
@@ -205,7 +219,12 @@ class Recorder:
         except LogError as error:
             self._problem = str(error)
             _log.error("%s", error)
-        self._folder.unlock()
+        if self._mending is not None:
+            self._mending.join(_MENDING_S)
+        if (
+            self._mending is None or not self._mending.is_alive()
+        ):  # else another one would mend the same parts
+            self._folder.unlock()
 
     def _metadata(self) -> dict[str, dict[str, str]]:
         try:
