@@ -121,7 +121,7 @@ _SOURCES = {"v4l2": _open_v4l2, "iidc": _open_iidc, "aravis": _open_aravis, "fol
 def list_cameras(*, kernel: Kernel | None = None, schemes: tuple[str, ...] = SCHEMES) -> list[DeviceInfo]:
     """Return the cameras that are there; `details["uri"]` is what `open_camera` takes.
 
-    A kind whose library is missing is skipped: most machines have no FireWire.
+    A kind whose library is missing is skipped; where there is a FireWire bus, the log says what to install.
     """
     from vical_drivers.camera.discovery import list_v4l2_cameras
 
@@ -131,7 +131,8 @@ def list_cameras(*, kernel: Kernel | None = None, schemes: tuple[str, ...] = SCH
             try:
                 found += _list_by_library(scheme)
             except MissingLibraryError as error:
-                _log.debug("%s", error)
+                # Aravis is looked for everywhere, libdc1394 only where there is a FireWire bus
+                _log.log(logging.WARNING if scheme == "iidc" else logging.DEBUG, "%s", error)
             except DriverError as error:
                 _log.warning("%s", error)
     return found
