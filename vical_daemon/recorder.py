@@ -221,9 +221,7 @@ class Recorder:
             _log.error("%s", error)
         if self._mending is not None:
             self._mending.join(_MENDING_S)
-        if (
-            self._mending is None or not self._mending.is_alive()
-        ):  # else another one would mend the same parts
+        if self._mending is None or not self._mending.is_alive():  # or two mend one part
             self._folder.unlock()
 
     def _metadata(self) -> dict[str, dict[str, str]]:

@@ -333,7 +333,7 @@ def test_every_cut_is_refused(decode):
 
 
 @pytest.mark.parametrize("decode", GOOD, ids=lambda f: f.__name__)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_hostile_bytes_raise_only_message_error(decode, data):
     raw = bytearray(GOOD[decode])

@@ -112,13 +112,13 @@ def test_role_records_what_travels(tmp_path, asl_folder):
 def test_rotation_loses_nothing(make, tmp_path):
     recorder = make("  rotate_bytes: 1000000\n")
     recorder.tick()
-    for i in range(0, 12000, 1000):
-        feed(recorder, 1000, i)
-        command(recorder, "split") if i % 3000 == 2000 else recorder.tick()
+    for i in range(0, 6000, 500):
+        feed(recorder, 500, i)
+        command(recorder, "split") if i % 1500 == 1000 else recorder.tick()
     recorder.close()
     segments = LogFolder(tmp_path / "log").segments()
     assert len(segments) >= 4
-    assert [n for path in segments for n in numbers(path)] == list(range(12000))
+    assert [n for path in segments for n in numbers(path)] == list(range(6000))
     runs = set()
     for i, path in enumerate(segments):
         reader = LogReader(path)

@@ -69,7 +69,7 @@ def test_folder_and_its_mcap_are_the_same(asl_folder, tmp_path):
     ]
 
 
-@pytest.mark.parametrize("name", ["euroc_imu_april", "openvins_sim_tum"])
+@pytest.mark.parametrize("name", ["euroc_imu_april"])
 def test_shared_data_and_its_mcap_are_the_same(name, tmp_path):
     if not (SHARED / name).is_dir():
         pytest.skip(f"no {SHARED / name}")
