@@ -14,7 +14,7 @@ from vical_daemon.vision.grid_model import GridModel, fit_grid
 from vical_daemon.vision.guided import (
     BoardFix,
     BoolArray,
-    check_codes,
+    check_identity,
     complete_board,
     predict_with_residuals,
     refine_missing,
@@ -145,7 +145,7 @@ class BoardDetector:
         model, predicted = start
         fix = refine_predicted(picture, self._layout, model, predicted, search_px=5.0)
         if fix is not None:
-            fix = check_codes(picture, self._layout, refine_missing(picture, self._layout, fix))
+            fix = check_identity(picture, self._layout, refine_missing(picture, self._layout, fix))
         if fix is None or not self._holds(fix, picture.shape):
             self.stats.losses += 1
             return None

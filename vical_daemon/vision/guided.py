@@ -28,6 +28,9 @@ MAX_SIGMA_PX = 2.0
 GROW_ROUNDS = 3
 MIN_AGREEMENT = 0.3
 MIN_BOARD_AGREEMENT = 0.35
+MIN_RIM_CORNERS = 3
+MAX_RIM_SHARE = 0.2
+"""Of the places just beyond a checkerboard: this many that look like its corners, and it is shifted."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def grow_board(
         fix = refine_missing(image, layout, fix)
         if int(fix.found.sum()) <= before:
             break
-    return check_codes(image, layout, fix)
+    return check_identity(image, layout, fix)
 
 
 def predict_with_residuals(fix: BoardFix, layout: BoardLayout) -> FloatArray:
@@ -199,16 +202,47 @@ def corner_contrast(
     return np.asarray(np.minimum(mean * polarity, weakest + 0.5 * np.abs(mean)))
 
 
+def check_identity(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> BoardFix | None:
+    """Make sure that the corners carry their own ids: by the tags' codes, or by where a checkerboard ends.
+
+    Returns:
+        The fix, perhaps without hidden tags; None if the board is shifted against its ids.
+    """
+    if isinstance(layout.target, AprilGrid):
+        return check_codes(image, layout, fix)
+    return None if is_shifted(image, layout, fix) else fix
+
+
+def is_shifted(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> bool:
+    """Tell whether a checkerboard goes on beyond its outermost corners, where it must have ended."""
+    rim = layout.rim
+    if rim is None:
+        return False
+    uv = fix.model.predict(rim.xy_m)
+    axes = fix.model.axes_px(rim.xy_m)
+    radius = rim.radius_px(axes)
+    height, width = image.shape
+    with np.errstate(invalid="ignore"):
+        inside = ((uv > radius[:, None]) & (uv < np.array([width, height]) - 1 - radius[:, None])).all(axis=1)
+    index = np.flatnonzero(inside & (radius >= MIN_RADIUS_PX))
+    if len(index) < MIN_RIM_CORNERS:
+        return False
+    found = np.flatnonzero(fix.found)
+    own = corner_contrast(image, layout, fix.uv_px[found], fix.model.axes_px(layout.xy_m[found]), found)
+    saddles = image.refine(uv[index], radius[index], np.minimum(5.0, 0.5 * radius[index] + 1.5))
+    contrast = corner_contrast(image, rim, saddles.uv_px, axes[index], index)
+    goes_on = saddles.ok & (contrast > 0.5 * float(np.median(own)))
+    return bool(goes_on.sum() >= MIN_RIM_CORNERS and goes_on.mean() > MAX_RIM_SHARE)
+
+
 def check_codes(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> BoardFix | None:
     """Compare the tags' bits with what the ids promise; a board shifted by a tag does not pass.
 
     Returns:
-        The fix without the corners of hidden tags; None if the board as a whole is not where it seems. A
-        checkerboard has no codes and passes.
+        The fix without the corners of hidden tags; None if the board as a whole is not where it seems.
     """
-    if not isinstance(layout.target, AprilGrid):
-        return fix
     target = layout.target
+    assert isinstance(target, AprilGrid)
     origin = layout.xy_m[::4]
     spots = origin[:, None, :] + bit_centres()[None] * target.tag_size_m
     uv = fix.model.predict(spots.reshape(-1, 2)).reshape(len(origin), BITS * BITS, 2)

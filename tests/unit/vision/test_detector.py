@@ -145,6 +145,17 @@ def test_a_prediction_off_by_one_tag_is_noticed(film, aprilgrid, columns):
     assert np.abs(errors(camera, found, aprilgrid, 0.0)[0]).max() < 0.1
 
 
+@pytest.mark.parametrize("shift", [(1, 1), (-1, 1), (2, 0), (0, -2), (1, 0)])
+def test_a_checkerboard_shifted_by_squares_is_noticed(film, checkerboard, shift):
+    camera = film(checkerboard, 1.0)
+    shifted = checkerboard.points_m + np.array([*shift, 0]) * 0.05
+    uv, seen = camera.project(shifted, 0.0)
+    detector = BoardDetector(checkerboard)
+    found = detector.detect(camera.render(0.0), 0, np.where(seen[:, None], uv, np.nan))
+    assert detector.stats.guided == 0
+    assert np.abs(errors(camera, found, checkerboard, 0.0)[0]).max() < 0.1
+
+
 def test_nothing_there():
     noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
     for board in (AprilGrid(6, 6, 0.088, 0.3), Checkerboard(8, 6, 0.05, 0.05)):
