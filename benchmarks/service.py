@@ -138,9 +138,10 @@ def _judge_logs(root: Path, deeds: list[tuple[float, str]]) -> list[tuple[str, s
     for part in sorted(folder.glob("*.part")):
         recover(part)
     logs = sorted(folder.glob("*.mcap"))
-    arrays = [open_recording(log, check=False).imu_arrays("imu0").t_ns * 1e-9 for log in logs]
+    recordings = [open_recording(log, check=False) for log in logs]
+    arrays = [r.imu_arrays("imu0").t_ns * 1e-9 for r in recordings if "imu0" in r.imus]
     stamps_s = np.unique(np.concatenate(arrays))
-    rows = [("logs that open", f"{len(arrays)} of {len(logs)}")]
+    rows = [("logs that open", f"{len(recordings)} of {len(logs)}")]
     holes: dict[str, list[tuple[float, float]]] = {name: [] for _, name in deeds[:-1]}
     for i in np.nonzero(np.diff(stamps_s) > 0.025)[0]:
         before = [(at_s, name) for at_s, name in deeds if at_s < stamps_s[i + 1]]

@@ -15,6 +15,7 @@ from vical_daemon.estimation import so3
 from vical_daemon.roles.imu import open_imu
 
 SIGMAS_ALLOWED = 4.0
+_RESTARTED_NS = 20_000_000  # larger: the device's timer was set anew, its ticks no longer tell when
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,9 @@ class StampWitness:
             samples = read(timeout_s)
             for sample in samples:
                 true_ns = self._instant_ns(sample.device_ticks, self._filter_samples)
-                self._errors_ns.append(sample.t_host_ns - true_ns)
+                error_ns = sample.t_host_ns - true_ns
+                if abs(error_ns) < _RESTARTED_NS:
+                    self._errors_ns.append(error_ns)
             return samples
 
         source.read = heard  # type: ignore[method-assign]
