@@ -28,6 +28,7 @@ _log = logging.getLogger(__name__)
 QUEUE_BYTES = 128 * 2**20
 _RETRY_NS = 5_000_000_000
 _MENDING_S = 5.0
+_KEYS = 512
 
 
 class Arrival(NamedTuple):
@@ -87,7 +88,9 @@ class Recorder:
         self._calibrations: dict[str, bytes] = {}
         self._latched: dict[str, bytes] = {}
         self._mending: threading.Thread | None = None
+        self._keys: set[str] = set()
         self.messages = 0
+        self.refused = 0
 
     @property
     def recording(self) -> bool:
@@ -100,6 +103,8 @@ class Recorder:
 
     def write(self, item: Arrival) -> None:
         """Take one arrival: learn from it, obey it, record it."""
+        if not self._admit(item.key):
+            return
         self._learn(item)
         if self._session is None:
             return
@@ -108,6 +113,16 @@ class Recorder:
             self.messages += 1
         except LogError as error:
             self._fail(str(error))
+
+    def _admit(self, key: str) -> bool:
+        """Refuse keys beyond any sane number: whoever invents names must not fill memory and log."""
+        if key in self._keys:
+            return True
+        if len(self._keys) >= _KEYS:
+            self.refused += 1
+            return False
+        self._keys.add(key)
+        return True
 
     def _learn(self, item: Arrival) -> None:
         if item.key == self._command_key:
@@ -259,6 +274,7 @@ class Recorder:
             "queue_depth": str(len(queue)),
             "dropped": str(sum(queue.dropped.values())),
             "lost_on_bus": str(lost),
+            "refused": str(self.refused),
             "files_deleted": str(self._folder.deleted),
         }
         try:

@@ -47,7 +47,7 @@ _KIND_OF_TYPE: dict[str, Kind] = {
 _STAMP = struct.Struct("<iI")
 # Where rates and forces stand, counted from the end of a sensor_msgs/Imu.
 _GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
-_IMU_BYTES = 4 + 8 + 8 + 37 * 8
+_IMU_NUMBERS = 37 * 8
 _PLAIN_WORDS = {"image_raw", "image_mono", "image", "data", "data_raw", "raw", "compressed", "camera", "imu"}
 _RIG = "rig0"
 
@@ -110,7 +110,7 @@ class LogRecording(Recording):
             if channel is None:
                 continue
             stamp_ns = stamp_of(raw.payload)
-            if channel.kind == "imu" and len(raw.payload) < _IMU_BYTES:
+            if channel.kind == "imu" and not _has_imu_size(raw.payload):
                 stamp_ns = None
             if stamp_ns is None or (not channel.stamps and not _readable(channel, raw.payload)):
                 channel.unreadable += 1
@@ -196,6 +196,14 @@ def stamp_of(payload: bytes) -> int | None:
         return None
     stamp_ns: int = seconds * 1_000_000_000 + nanoseconds
     return stamp_ns
+
+
+def _has_imu_size(payload: bytes) -> bool:
+    """Whether these bytes are as long as a sensor_msgs/Imu with this frame id is."""
+    if len(payload) < 16 + _IMU_NUMBERS:
+        return False
+    behind_name = 12 + int.from_bytes(payload[12:16], "little")  # counted from behind the encapsulation
+    return len(payload) == 4 + behind_name + (-behind_name) % 8 + _IMU_NUMBERS
 
 
 def _readable(channel: _Channel, payload: bytes) -> bool:

@@ -349,3 +349,12 @@ def test_images_can_be_left_out(make):
 def test_arrival_of_an_unknown_key_is_nothing():
     assert arrival(Sample("vical/rig0/unknown", b"", 0), private_clock()) is None
     assert np.sign(arrival(Sample(IMU, b"", 0), private_clock()).log_time_ns) == 1
+
+
+def test_invented_keys_fill_neither_memory_nor_log(make, tmp_path):
+    recorder = make()
+    recorder.tick()
+    for i in range(600):
+        feed(recorder, 1, i, key=topics.imu_key("rig0", f"junk{i}"))
+    assert recorder.messages == 512
+    assert recorder.status(RecordQueue(), 0).values["refused"] == "88"

@@ -369,3 +369,16 @@ def test_untidy_tables_are_used_with_a_warning(tmp_path, write_asl):
 def test_empty_folder_says_what_is_expected(tmp_path):
     with pytest.raises(RecordingError, match="is no ASL folder"):
         open_recording(tmp_path)
+
+
+def test_junk_on_the_imu_topic_of_a_log_is_left_out(asl_folder, tmp_path):
+    folder = open_recording(asl_folder)
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for i, (key, payload) in enumerate(folder.messages()):
+            writer.write(key, payload, stamp_of(payload))
+            if i % 100 == 0 and "/imu/" in key:
+                writer.write(key, b"junk", stamp_of(payload))
+                writer.write(key, payload[:12] + bytes(400), stamp_of(payload))
+    recording = open_recording(tmp_path / "a.mcap")
+    assert recording.imu_samples == folder.imu_samples
+    assert any("unreadable messages left out" in warning for warning in recording.warnings)
