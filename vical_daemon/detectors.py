@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, Protocol
 
-from vical_daemon.config import Config, ConfigError
+from vical_daemon.config import Config
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 
 Detect = Callable[[Any, int], "Found | None"]
@@ -40,18 +38,11 @@ def make_detector(config: Config) -> Detect:
         ConfigError: The target file is missing or wrong.
     """
     if config.calibration.mode == "target_free":
-        return _tracker()
+        from vical_daemon.vision.tracks import FeatureTracker
+
+        return FeatureTracker().detect
     from vical_daemon.vision.detector import BoardDetector
     from vical_daemon.vision.target import load_target
 
     assert config.target_path is not None  # `config.load` has seen to it
     return BoardDetector(load_target(config.target_path)).detect
-
-
-def _tracker() -> Detect:
-    """Look the module up: a build without it says so in one line."""
-    name = "vical_daemon.vision.tracks"
-    if find_spec(name) is None:
-        raise ConfigError("calibration without a target is not in this build; give a target file (--target)")
-    detect: Detect = import_module(name).FeatureTracker().detect
-    return detect
