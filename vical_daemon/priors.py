@@ -6,6 +6,7 @@ level or under `imu0`; every key is optional.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,7 +15,13 @@ import numpy as np
 
 from vical_daemon import schema
 from vical_daemon.config import Config, Focal, LensConfig, Matrix4, rigid_error
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, ImuNoise
+from vical_daemon.estimation.measurements import (
+    CalibrationOptions,
+    CameraPrior,
+    ConvergenceTargets,
+    FloatArray,
+    ImuNoise,
+)
 from vical_daemon.schema import Bound
 from vical_daemon.strict_yaml import ConfigError, Document, Value, read
 
@@ -117,6 +124,7 @@ def camera_prior(config: Config, name: str) -> CameraPrior:
 def calibration_options(config: Config) -> CalibrationOptions:
     """Return the estimator's switches of a config."""
     calibration = config.calibration
+    wanted = calibration.convergence
     imu = config.imus[config.calibration_imu] if config.imus else None
     noise = ImuNoise()
     if imu is not None:
@@ -129,6 +137,9 @@ def calibration_options(config: Config) -> CalibrationOptions:
         gravity_mps2=calibration.gravity_mps2,
         corner_sigma_px=calibration.corner_sigma_px,
         imu_noise=noise,
+        targets=ConvergenceTargets(
+            wanted.position_sigma_m, math.radians(wanted.rotation_sigma_deg), wanted.timeshift_sigma_s
+        ),
     )
 
 

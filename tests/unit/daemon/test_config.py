@@ -169,7 +169,8 @@ def test_estimator_settings_from_the_config() -> None:
     pose = "[[0,0,1,0.5],[-1,0,0,0.25],[0,-1,0,0],[0,0,0,1]]"
     config = loads(
         RIG.replace("lens:\n", f"lens:\n      T_cam_imu: {pose}\n      timeshift_cam_imu: 1e-2\n")
-        + "calibration: {fix: [intrinsics], estimate: [readout], corner_sigma_px: 0.3}\n"
+        + "calibration: {fix: [intrinsics], estimate: [readout], corner_sigma_px: 0.3,\n"
+        "  convergence: {position_sigma_m: 2e-3, rotation_sigma_deg: 0.05}}\n"
     )
     prior = camera_prior(config, "cam0")
     assert prior.T_imu_cam is not None
@@ -184,6 +185,8 @@ def test_estimator_settings_from_the_config() -> None:
     assert (
         options.fix == {"intrinsics"} and options.estimate == {"readout"} and options.corner_sigma_px == 0.3
     )
+    assert (options.targets.position_m, options.targets.timeshift_s) == (0.002, 5e-4)
+    assert options.targets.rotation_rad == pytest.approx(np.deg2rad(0.05))
     assert options.imu_noise.rate_hz == 100 and not options.target_free
 
 
