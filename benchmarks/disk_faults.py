@@ -21,7 +21,8 @@ from vical_daemon import topics
 from vical_daemon.bus import Sample
 from vical_daemon.config import loads
 from vical_daemon.mcap_log import LogFolder, LogReader
-from vical_daemon.recorder import Recorder, RecordQueue, arrival
+from vical_daemon.record_queue import RecordQueue, arrival
+from vical_daemon.recorder import Recorder
 from vical_daemon.wall_clock import WallClock, private_clock
 
 _IMU = topics.imu_key("rig0", "imu0")

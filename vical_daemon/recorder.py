@@ -1,15 +1,12 @@
-"""The recorder without its thread: a queue that favours the small messages, and the state of a recording."""
+"""The recorder without its thread: what it keeps, when it begins and ends, and what it says of itself."""
 
 from __future__ import annotations
 
 import json
 import logging
 import threading
-from collections import deque
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple
 
-from vical_daemon.bus import Sample
 from vical_daemon.config import Config
 from vical_daemon.mcap_log import Attachment, LogError, LogFolder, LogSession
 from vical_daemon.messages import (
@@ -21,57 +18,14 @@ from vical_daemon.messages import (
     decode_string,
     merge_calibrations,
 )
-from vical_daemon.topics import CALIBRATION, STATUS, Topic, command_key, parse_key
+from vical_daemon.record_queue import Arrival, RecordQueue
+from vical_daemon.topics import CALIBRATION, STATUS, Topic, command_key
 from vical_daemon.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
-QUEUE_BYTES = 128 * 2**20
 _RETRY_NS = 5_000_000_000
 _MENDING_S = 5.0
 _KEYS = 512
-
-
-class Arrival(NamedTuple):
-    """A message with the time at which it arrived (UNIX, ns)."""
-
-    topic: Topic
-    key: str
-    payload: bytes
-    log_time_ns: int
-
-
-class RecordQueue:
-    """What waits for the disk. When it piles up images go first, and inertial data last."""
-
-    def __init__(self, limit_bytes: int = QUEUE_BYTES) -> None:
-        self._limit_bytes = limit_bytes
-        self._queue: deque[Arrival] = deque()
-        self._ready = threading.Condition()
-        self._bytes = 0
-        self.dropped: dict[str, int] = {}
-
-    def __len__(self) -> int:
-        return len(self._queue)
-
-    def put(self, item: Arrival) -> None:
-        """Append; beyond half of the limit no images, beyond the limit nothing."""
-        image = item.topic.kind in ("image", "compressed")
-        with self._ready:
-            if self._bytes + len(item.payload) > self._limit_bytes / (2 if image else 1):
-                self.dropped[item.topic.kind] = self.dropped.get(item.topic.kind, 0) + 1
-                return
-            self._queue.append(item)
-            self._bytes += len(item.payload)
-            self._ready.notify()
-
-    def take(self, timeout_s: float) -> list[Arrival]:
-        """Return all that waits; [] after the timeout."""
-        with self._ready:
-            self._ready.wait_for(lambda: bool(self._queue), timeout_s)
-            items = list(self._queue)
-            self._queue.clear()
-            self._bytes = 0
-            return items
 
 
 class Recorder:
@@ -289,12 +243,6 @@ class Recorder:
             )
         message = f"recording, {self.messages} messages" if session else "stopped by command"
         return DiagnosticStatus(Level.OK, "record", message, values=values)
-
-
-def arrival(sample: Sample, clock: WallClock) -> Arrival | None:
-    """Return a sample as it is recorded; None for keys that are not in the topics table."""
-    parsed = parse_key(sample.key)
-    return Arrival(parsed.topic, sample.key, sample.payload, clock.now_ns()) if parsed else None
 
 
 def _latches(topic: Topic) -> bool:

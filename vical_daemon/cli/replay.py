@@ -33,6 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="a router, e.g. tcp/127.0.0.1:7447 (default: ours)"
     )
+    parser.add_argument(
+        "--wait", type=float, default=2.0, metavar="S", help="time for others to come, where we host the bus"
+    )
     add_config(parser, required=False)
     add_json(parser)
 
@@ -41,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
     """Publish with the time between stamps that there was; without a router, host the bus meanwhile."""
     from vical_daemon.recording import open_recording
 
-    if args.speed < 0:
-        raise CliError("--speed must not be negative", EXIT_USAGE)
+    if args.speed < 0 or args.wait < 0:
+        raise CliError("--speed and --wait must not be negative", EXIT_USAGE)
     recording = open_recording(args.log, topics=args.streams, check=False)
     bus = _open_bus(args)
     try:

@@ -14,6 +14,7 @@ from vical_daemon.recording.logs import stamp_of
 from vical_daemon.recording.model import Recording
 
 _PERIODIC_HZ = 0.5
+_SAME_CLOCK_MS = 3_600_000.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,8 @@ class TopicSummary:
         missing: Messages that these holes would have held.
         largest_gap_s: The longest interval.
         jitter_us: Spread (1.4826 times the median deviation) of the intervals.
-        latency_ms: Median and 99th percentile of arrival minus stamp; None where arrival is not known.
+        latency_ms: Median and 99th percentile of arrival minus stamp; None where arrival is not
+            known, or by another clock.
         bytes: Of the payloads.
         disordered: Messages whose stamp lies before that of an earlier one.
     """
@@ -119,8 +121,9 @@ def _summary(
     attachments: dict[str, int],
 ) -> Summary:
     topics = [_topic(name, tally) for name, tally in sorted(tallies.items())]
-    begins = [min(tally.stamps) for tally in tallies.values() if tally.stamps]
-    ends = [max(tally.stamps) for tally in tallies.values() if tally.stamps]
+    # a replayed log holds stamps of another day beside today's: how long it took, the arrivals know
+    times = [tally.arrivals or tally.stamps for tally in tallies.values() if tally.stamps]
+    begins, ends = [min(values) for values in times], [max(values) for values in times]
     duration_s = (max(ends) - min(begins)) * 1e-9 if begins else 0.0
     size = sum(file.stat().st_size for file in _files(path))
     count = sum(topic.count for topic in topics)
@@ -149,7 +152,8 @@ def _topic(name: str, tally: _Tally) -> TopicSummary:
     latency = None
     if len(tally.arrivals):
         delays_ms = (np.array(tally.arrivals, dtype=np.int64) - raw) * 1e-6
-        latency = (float(np.median(delays_ms)), float(np.percentile(delays_ms, 99)))
+        if abs(float(np.median(delays_ms))) < _SAME_CLOCK_MS:
+            latency = (float(np.median(delays_ms)), float(np.percentile(delays_ms, 99)))
     largest_s = float(steps_s.max()) if len(steps_s) else 0.0
     disordered = int((raw < np.maximum.accumulate(raw)).sum()) if len(raw) else 0
     return TopicSummary(

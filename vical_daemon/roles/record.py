@@ -10,7 +10,8 @@ from vical_daemon.config import Config
 from vical_daemon.health import StatusSender
 from vical_daemon.mcap_log import LogFolder
 from vical_daemon.places import make_private, runtime_directory, state_directory
-from vical_daemon.recorder import Recorder, RecordQueue, arrival
+from vical_daemon.record_queue import RecordQueue, arrival
+from vical_daemon.recorder import Recorder
 from vical_daemon.topics import TOPICS, rig_expression
 from vical_daemon.wall_clock import WallClock, shared_clock
 

@@ -15,7 +15,8 @@ from vical_daemon import topics
 from vical_daemon.bus import LocalBus, Sample
 from vical_daemon.config import loads
 from vical_daemon.mcap_log import LogFolder, LogReader
-from vical_daemon.recorder import Arrival, Recorder, RecordQueue, arrival
+from vical_daemon.record_queue import Arrival, RecordQueue, arrival
+from vical_daemon.recorder import Recorder
 from vical_daemon.recording import open_recording
 from vical_daemon.roles import record
 from vical_daemon.wall_clock import private_clock
