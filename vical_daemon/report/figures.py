@@ -63,16 +63,17 @@ def _band(axes: Axes, t: FloatArray, value: FloatArray, sigma: FloatArray, colou
     axes.plot(t, value, color=colour, linewidth=1.4, label=label)
 
 
-def _zoom(axes: Axes, t: FloatArray, values: FloatArray, sigmas: FloatArray) -> None:
-    """Limit the right-hand panel to the last half of the recording and to its bands there."""
-    late = t >= t[0] + 0.5 * (t[-1] - t[0])
+def _limit(axes: Axes, t: FloatArray, values: FloatArray, sigmas: FloatArray, share: float) -> None:
+    """Set the vertical limits to the bands after the first `share` of the recording.
+
+    The first seconds are known to metres; shown whole, they would flatten everything after them.
+    """
+    late = t >= t[0] + share * (t[-1] - t[0])
     low, high = values[late] - 3 * sigmas[late], values[late] + 3 * sigmas[late]
     finite = np.isfinite(low) & np.isfinite(high)
     if finite.any():
         margin = 0.08 * (high[finite].max() - low[finite].min()) + 1e-12
         axes.set_ylim(low[finite].min() - margin, high[finite].max() + margin)
-    if late.sum() > 1:
-        axes.set_xlim(t[late][0], t[-1])
 
 
 def convergence(trace: Sequence[dict[str, Any]]) -> Figure:
@@ -101,9 +102,12 @@ def convergence(trace: Sequence[dict[str, Any]]) -> Figure:
     _style(panels[2, 0], "Time shift", "time, s", "ms")
     for row, title in enumerate(("second half", "second half", "second half")):
         _style(panels[row, 1], title, "time, s" if row == 2 else "")
-    _zoom(panels[0, 1], t, p_mm - p_mm[-1], p_sigma)
-    _zoom(panels[1, 1], t, rotation, r_sigma)
-    _zoom(panels[2, 1], t, shift[:, None], shift_sigma[:, None])
+    for column, share in ((0, 0.06), (1, 0.5)):
+        _limit(panels[0, column], t, p_mm - p_mm[-1], p_sigma, share)
+        _limit(panels[1, column], t, rotation, r_sigma, share)
+        _limit(panels[2, column], t, shift[:, None], shift_sigma[:, None], share)
+        for panel in panels[:, column]:
+            panel.set_xlim(t[0] if column == 0 else 0.5 * (t[0] + t[-1]), t[-1])
     for panel in panels[:2, 0]:
         panel.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")
     return figure
