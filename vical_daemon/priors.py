@@ -14,7 +14,8 @@ from typing import Annotated, Literal
 import numpy as np
 
 from vical_daemon import schema
-from vical_daemon.config import Config, Focal, LensConfig, Matrix4, rigid_error
+from vical_daemon.config import Config, Focal, LensConfig, Matrix4
+from vical_daemon.config_rules import rigid_error
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,

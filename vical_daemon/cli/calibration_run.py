@@ -86,18 +86,9 @@ def make_job(
     if not chosen:
         raise CliError(f"{recording.path} holds no camera: neither images nor points")
     priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
-    noise = initial.imu_noise or ImuNoise()
-    rate_hz = min(max(imu_stream.rate_hz, 1.0), 1000.0)
-    config = Config(
-        rig=recording.rig,
-        imus={
-            imu_stream.name: ImuConfig(
-                port="recording",
-                rate_hz=rate_hz,
-                noise=NoiseConfig(noise.gyro_density, noise.gyro_walk, noise.accel_density, noise.accel_walk),
-            )
-        },
-        cameras={n: CameraConfig(uri="recording", size=p.resolution) for n, p in priors.items()},
+    config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
+    config = replace(
+        config,
         target=target,
         calibration=CalibrationConfig(
             mode="target" if target else "target_free",
@@ -106,6 +97,17 @@ def make_job(
         ),
     )
     return Job(recording, imu_stream, chosen, config, priors)
+
+
+def _config(rig: str, imu: Stream, priors: dict[str, CameraPrior], noise: ImuNoise) -> Config:
+    """Describe the devices of a recording as a config does."""
+    densities = NoiseConfig(noise.gyro_density, noise.gyro_walk, noise.accel_density, noise.accel_walk)
+    rate_hz = min(max(imu.rate_hz, 1.0), 1000.0)
+    return Config(
+        rig=rig,
+        imus={imu.name: ImuConfig(port="recording", rate_hz=rate_hz, noise=densities)},
+        cameras={name: CameraConfig(uri="recording", size=p.resolution) for name, p in priors.items()},
+    )
 
 
 def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outcome:
