@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +33,13 @@ IMU_HZ = 100.0
 REACH_S = 2.0
 
 
-def trajectories(seed: int) -> dict[str, Trajectory]:
-    """The four motions; every trial has its own phases and frequencies."""
-    return {
-        "hand, 40 deg/s": hand_motion(seed, 40.0),
-        "hand, 60 deg/s": hand_motion(seed, 60.0),
-        "random knots, 60 deg/s": hand_motion(seed, 60.0, style="spline"),
-        "brisk, 100 deg/s": hand_motion(seed, 100.0),
-    }
+# The four motions; every trial has its own phases and frequencies.
+TRAJECTORIES: dict[str, Callable[[int], Trajectory]] = {
+    "hand, 40 deg/s": lambda seed: hand_motion(seed, 40.0),
+    "hand, 60 deg/s": lambda seed: hand_motion(seed, 60.0),
+    "random knots, 60 deg/s": lambda seed: hand_motion(seed, 60.0, style="spline"),
+    "brisk, 100 deg/s": lambda seed: hand_motion(seed, 100.0),
+}
 
 
 def simulate_gyro(
@@ -144,8 +143,8 @@ def study_main(trials: int) -> None:
     print(f"\n### {trials} trials, 10 s, 15 Hz, 0.1 deg, GX3 gyro, true delay within 2 s, any mounting\n")
     print(HEADER)
     everything = []
-    for name in trajectories(0):
-        rows = [trial(trajectories(s)[name], s) for s in range(trials)]
+    for name, make in TRAJECTORIES.items():
+        rows = [trial(make(s), s) for s in range(trials)]
         everything += rows
         print(_row(name, rows), flush=True)
     print(_row("all", everything))
@@ -274,12 +273,51 @@ def study_real(folder: Path) -> None:
         )
 
 
+def figure_start(path: Path) -> None:
+    """Draw what the coarse start sees: disagreement of turn angles over the delay, true delay +1.3 s."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from vical_daemon.estimation.rotation_curves import GyroCurve
+    from vical_daemon.estimation.rotation_registration import camera_turns, shift_costs
+    from vical_daemon.estimation.so3 import quat_from_matrix
+
+    shift, rng, motion = 1.3, np.random.default_rng(1), hand_motion(1, 60.0)
+    t_imu = np.arange(0.0, 16.0, 1.0 / IMU_HZ)
+    curve = GyroCurve.integrate(t_imu, simulate_gyro(motion, t_imu, rng)[0], np.zeros(3))
+    t = np.arange(3.0, 13.0, 1.0 / 15.0)
+    figure, axes = plt.subplots(figsize=(7.0, 3.2))
+    for outliers, label in ((0.0, "no outliers"), (0.3, "30 % of the orientations wrong")):
+        R = motion.R_world_imu(t) @ exp_so3(rng.normal(0.0, 0.1 * DEG, (len(t), 3)))
+        bad = rng.random(len(t)) < outliers
+        R[bad] = R[bad] @ exp_so3(rng.normal(0.0, 0.7, (int(bad.sum()), 3)))
+        turns = camera_turns(t - shift, quat_from_matrix(R))
+        delays = np.arange(-4.0, 4.0, 0.01)
+        cost = shift_costs(curve, t - shift, turns, delays, 0.25 * float(np.quantile(turns.angle, 0.4)))
+        axes.plot(delays, cost, label=label, linewidth=1.0)
+    axes.axvline(shift, color="grey", linewidth=0.6)
+    axes.set_xlabel("delay tried, s")
+    axes.set_ylabel("mean robust disagreement")
+    axes.legend()
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    print(f"wrote {path}")
+
+
 def main(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks td_icp", description=__doc__)
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--study", default="main,robust,handheld,joint,real")
     parser.add_argument("--data", type=Path, default=Path("../shared/data/euroc_imu_april"))
+    parser.add_argument("--figure", type=Path, help="only draw the figure of the coarse start there")
     args = parser.parse_args(list(argv))
+    if args.figure is not None:
+        figure_start(args.figure)
+        return 0
     studies = {
         "main": lambda: study_main(args.trials),
         "robust": lambda: study_robust(args.trials),

@@ -73,9 +73,9 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[Missin
     import numpy as np
 
     from vical_daemon.estimation.missing_motion import missing_motion
+    from vical_daemon.estimation.observability import covariance_of
 
-    prior = np.diag(1.0 / (1e3 * result.units) ** 2)
-    covariance = np.linalg.inv(result.information + prior)
+    covariance = covariance_of(result)
     order = [result.blocks[name] for name in ("lever_arm", "rotation", "timeshift")]
     index = np.concatenate([np.arange(s.start, s.stop) for s in order])
     scatter = np.einsum("ki,kj->ij", motion.rate_rps, motion.rate_rps) / len(motion.t_s)

@@ -102,13 +102,15 @@ def refine_lens(
     if views is None:
         return LensFit(lens[:4], lens[4:], np.full(8, np.nan), float("nan"), 0)
     scale = np.concatenate((np.full(4, lens[0]), np.ones(4))) * _PRIOR
-    start, damping = lens.copy(), 1e-4
-    sigma: float | None = None
+    start, damping = lens.copy(), 1e-8
+    measured: float | None = None
+    sigma = 1.0
     for i in range(_STEPS):
         # far from the minimum large residuals are news, not outliers: the gate closes step by step
         width = max(_WIDTH, 10.0 * _WIDTH * 0.4**i)
-        system = _System.build(views, points_m, lens, model, sigma, width)
-        sigma = system.sigma
+        system = _System.build(views, points_m, lens, model, measured, width)
+        # one corner noise for both costs that are compared; the measured one is for the next round
+        sigma, measured = measured or system.sigma, system.sigma
         cost = system.cost + float((((lens - start) / scale) ** 2).sum())
         moved = False
         while damping < 1e6 and not moved:

@@ -284,6 +284,23 @@ def _parts(vector: FloatArray, layout: dict[str, slice]) -> list[tuple[str, floa
     return sorted(((n, s) for n, s in shares if s > 0.05), key=lambda part: -part[1])
 
 
+def covariance_of(result: Observability, prior: float = 1e3) -> FloatArray:
+    """Return the covariance of all unknowns with next to no prior, so that lost directions stay finite.
+
+    Args:
+        result: The verdict.
+        prior: Sigma of the prior in the units that make unknowns comparable (1e3: a radian, ten metres, a
+            second).
+
+    Returns:
+        In the unknowns' own units, shape (p, p).
+    """
+    u = result.units
+    values, vectors = np.linalg.eigh(result.information * np.outer(u, u))
+    half = vectors / np.sqrt(np.maximum(values, 0.0) + prior**-2)
+    return np.asarray((half @ half.T) * np.outer(u, u), dtype=np.float64)
+
+
 def lost_in_block(result: Observability, block: str) -> FloatArray:
     """Return an orthonormal basis of what is lost within one block, shape (k, size), strongest first.
 
