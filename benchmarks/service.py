@@ -85,8 +85,7 @@ def _study(machine: Machine, kills: int) -> list[tuple[str, str]]:
     rows.append(("calibration converged", _status(machine, "calibrate")[:70]))
     deeds: list[tuple[float, str]] = []
     rows += [(f"kill -9 {name}, {kills} times", _kill(machine, name, kills, deeds)) for name in PROCESSES]
-    rows.append(("calibrate hung (SIGSTOP)", _hang(machine, "calibrate", deeds)))
-    rows.append(("record hung (SIGSTOP)", _hang(machine, "record", deeds)))
+    rows += [(f"{name} hung (SIGSTOP)", _hang(machine, name, deeds)) for name in ("record", "acquire")]
     deeds.append((time.time(), "stop"))
     begin_s = time.monotonic()
     machine.run("systemctl", "stop", "vical.target", *[f"vical-{name}" for name in PROCESSES])

@@ -104,7 +104,7 @@ def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, st
     bus.subscribe(key, lambda sample: liveness.take(sample, time.monotonic()))
     gc.collect()
     gc.freeze()  # what was loaded stays: the collector need not walk through it in the middle of a read
-    ready, said = False, ""
+    ready, said = False, False
     while not stop.is_set() and not threads.failed.is_set():
         stop.wait(_TICK_S)
         if not ready and liveness.ready():
@@ -113,9 +113,13 @@ def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, st
         problem = liveness.problem(time.monotonic())
         if not problem:
             notify.watchdog()
-        elif ready and problem != said:
-            _log.error("not alive: %s", problem)
-        said = problem
+        if ready and bool(problem) != said:  # said once, not each second
+            said = bool(problem)
+            _log.log(
+                logging.ERROR if said else logging.INFO,
+                "%s",
+                f"not alive: {problem}" if said else "alive again",
+            )
         notify.status(problem or liveness.summary())
     notify.stopping()
 
