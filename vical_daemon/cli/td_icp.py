@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
     from vical_daemon.priors import Initial
     from vical_daemon.recording import Recording
 
+_TRACKS = (
+    "from tracks of unknown points the delay is coarse and the mounting may be off by 2 deg, whatever the "
+    "sigmas; `vical calibrate` without --target does better"
+)
 HELP = "the delay between imu, cameras and other sensors, from their rotations alone"
 
 
@@ -117,7 +122,7 @@ def choose_gyro(
 def _single(args: argparse.Namespace, initial: Initial) -> int:
     """One imu and one camera."""
     from vical_daemon.cli.td_icp_sources import camera_stream, seconds
-    from vical_daemon.estimation.td_icp import REFUSED, td_icp
+    from vical_daemon.estimation.td_icp import DEGENERATE, REFUSED, td_icp
 
     recording = _open(args.input)
     cameras = recording.cameras
@@ -138,6 +143,9 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     stream = camera_stream(recording, cameras[camera], prior_of(initial, camera), args.target, base)
     t_imu = seconds(t_ns, base)
     result = td_icp(t_imu, gyro, stream.t_s, stream.R_world_sensor, stream.rotation_sigma, options)
+    if cameras[camera].kind == "tracks" and result.status != REFUSED:
+        reason = "; ".join(filter(None, [_TRACKS, result.reason]))
+        result = replace(result, status=DEGENERATE, reason=reason)
     document: dict[str, Any] = {**result.to_json(), "imu": imu, "camera": camera}
     if args.watch is not None and result.status != REFUSED:
         document["watch"] = [_report_json(r) for r in _watch(t_imu, gyro, stream, options, args.watch)]
