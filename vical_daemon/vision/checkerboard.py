@@ -16,14 +16,41 @@ from vical_daemon.vision.saddle import SaddleImage
 from vical_daemon.vision.tag_code import sample
 from vical_daemon.vision.target import Checkerboard
 
-SMALL_IMAGE_PX = 700
+LEAST_WIDTH_PX = 320
 
 
-def search_checkerboard(gray: Gray, target: Checkerboard) -> FloatArray | None:
-    """Find the inner corners, shape (rows * cols, 2), px, in the finder's own order; None without a board."""
-    size = (target.cols, target.rows)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, corners = cv2.findChessboardCornersSB(gray, size, flags=flags)
+def search_checkerboard(gray: Gray, target: Checkerboard, thorough: bool = True) -> FloatArray | None:
+    """Find the inner corners, shape (rows * cols, 2), px, in the finder's own order; None without a board.
+
+    Reduced pictures come first: they show most boards at a fraction of the time, and the corners are refined
+    afterwards in the full picture anyway.
+
+    Args:
+        gray: The picture.
+        target: The board.
+        thorough: Look at the full picture too where the reduced ones show no board.
+    """
+    width = gray.shape[1]
+    reductions = [r for r in (4, 2) if width / r >= LEAST_WIDTH_PX]
+    if thorough or not reductions:
+        reductions.append(1)
+    for reduction in reductions:
+        small = gray
+        if reduction > 1:
+            share = 1.0 / reduction
+            small = np.asarray(
+                cv2.resize(gray, None, fx=share, fy=share, interpolation=cv2.INTER_AREA), np.uint8
+            )
+        uv = _find(small, target)
+        if uv is not None:
+            return (uv + 0.5) * reduction - 0.5
+    return None
+
+
+def _find(gray: Gray, target: Checkerboard) -> FloatArray | None:
+    found, corners = cv2.findChessboardCornersSB(
+        gray, (target.cols, target.rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
     if not found:
         return None
     uv = np.asarray(corners, np.float64).reshape(-1, 2)
