@@ -50,9 +50,10 @@ def main(argv: list[str]) -> int:
         done.set()
         recorder.join()
         bus.close()
+        status["lost_inertial"] = (folder / "lost_inertial").read_text()
         holes, kept, segments = check_segments(folder / "log")
     report(seen, sent, status, holes, kept, segments)
-    return int(holes > 0 or status["lost_on_bus"] != "0" or status["dropped"] != "0")
+    return int(holes > 0 or status["lost_inertial"] != "0" or status["dropped"] != "0")
 
 
 def publish_and_watch(bus: Any, pid: int, seconds: float) -> tuple[list[tuple[Any, ...]], int]:
@@ -84,10 +85,12 @@ def record(folder: str, done: Any) -> None:
     record = f"{{directory: {folder}/log, rotate_s: 20, quota_bytes: 400000000, reserve_bytes: 0}}"
     config = loads(f"rig: rig0\nrecord: {record}\n")
     bus = open_bus(mode="client", socket=Path(folder) / "z.sock")
+    inertial = bus.subscribe(_IMU, lambda _: None)  # to tell apart what was lost: images may be dropped
     stop = threading.Event()
     thread = threading.Thread(target=role.run, args=(config, bus, stop), kwargs={"clock": private_clock()})
     thread.start()
     done.wait()
+    (Path(folder) / "lost_inertial").write_text(str(inertial.dropped))
     stop.set()
     thread.join()
     bus.close()
@@ -121,7 +124,7 @@ def report(
         print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
     print(
         f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {status['lost_on_bus']} messages lost "
-        f"on the bus, {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted "
+        f"on the bus ({status['lost_inertial']} of them inertial), {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted "
         f"by the quota; {holes} holes in the {kept} samples of the {segments} files left."
     )
 
