@@ -101,20 +101,40 @@ def test_a_second_process_is_kept_off_the_camera(tmp_path: Path) -> None:
 
 
 @pytest.mark.system
+@pytest.mark.timeout(400)
 def test_the_grabber_over_the_real_libdc1394(tmp_path: Path) -> None:
-    """Runs `iidc_under_shim.py`, and the contract of frame sources, in a process on the fake bus."""
+    """Runs `iidc_under_shim.py`, and the contract of frame sources, in a process on the fake bus.
+
+    The bus runs in real time, and a machine under full load may starve it: what failed is run once more,
+    alone, and has to pass then.
+    """
     missing = firewire_rig.missing_tools()
     if missing:
         pytest.skip(missing)
     environment = firewire_rig.build(HERE / "fake_firewire.c", tmp_path)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:randomly", "-p", "no:cacheprovider"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:randomly",
+        "-o",
+        f"cache_dir={tmp_path / 'cache'}",
+    ]
     files = [str(HERE / "iidc_under_shim.py"), f"{HERE / 'test_frame_source_contract.py'}::TestFrameSource"]
-    done = subprocess.run(
-        [*command, *files, "-k", "iidc"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    output = ""
+    for extra in ([], ["--last-failed"]):
+        done = subprocess.run(
+            [*command, *extra, *files, "-k", "iidc"],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=180,
+            check=False,
+        )
+        output += done.stdout
+        if done.returncode == 0:
+            return
+    pytest.fail(output)
