@@ -122,10 +122,11 @@ def report(
                 f"{first:.1f} -> {last:.1f} ({100 * (last / first - 1):+.1f} %), most {max(values):.1f}"
             )
         print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
+    lost = f"{status['lost_on_bus']} messages lost on the bus ({status['lost_inertial']} of them inertial)"
     print(
-        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {status['lost_on_bus']} messages lost "
-        f"on the bus ({status['lost_inertial']} of them inertial), {status['dropped']} dropped by the recorder, {status['files_deleted']} files deleted "
-        f"by the quota; {holes} holes in the {kept} samples of the {segments} files left."
+        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {lost}, {status['dropped']} dropped by the "
+        f"recorder, {status['files_deleted']} files deleted by the quota; {holes} holes in the {kept} samples "
+        f"of the {segments} files left."
     )
 
 
