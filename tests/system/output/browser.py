@@ -58,7 +58,7 @@ class Page:
         )
         return result.get("result", {}).get("value")
 
-    async def wait(self, expression, timeout_s=20.0):
+    async def wait(self, expression, timeout_s=45.0):
         """Wait until a JavaScript expression is true and return it."""
         end = asyncio.get_running_loop().time() + timeout_s
         while not (value := await self.evaluate(expression)):

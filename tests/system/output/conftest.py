@@ -60,12 +60,12 @@ def served(web_feed, monkeypatch):
     options = {"clock": private_clock(), "ready": lambda address: (addresses.append(address), ready.set())}
     thread = threading.Thread(target=web.run, args=(config, bus, stop), kwargs=options)
     thread.start()
-    assert ready.wait(20)
+    assert ready.wait(60)
     page = Served(bus, addresses[0])
     bus.subscribe("vical/*/command/*", lambda sample: page.commands.append(sample))
     yield page
     stop.set()
-    thread.join(20)
+    thread.join(60)
     assert not thread.is_alive()
 
 

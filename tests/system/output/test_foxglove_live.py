@@ -57,7 +57,7 @@ def server(bus):
 async def advertised(channel_socket):
     channels = {}
     while len(channels) < len(rig_keys(CONFIG)) + 2:
-        message = await channel_socket.receive(timeout=10)
+        message = await channel_socket.receive(timeout=30)
         if message.type is aiohttp.WSMsgType.TEXT:
             document = json.loads(message.data)
             for channel in document.get("channels", []):
@@ -87,7 +87,7 @@ def test_a_viewer_gets_the_bytes_of_the_bus_and_only_while_it_looks(bus, server)
             bus.publish(points, corners)
             got = {}
             while len(got) < 2:
-                message = await viewer.receive(timeout=10)
+                message = await viewer.receive(timeout=30)
                 if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 1:
                     got[struct.unpack_from("<I", message.data, 1)[0]] = message.data[13:]
             await viewer.send_json({"op": "unsubscribe", "subscriptionIds": [7, 8]})
@@ -95,7 +95,7 @@ def test_a_viewer_gets_the_bytes_of_the_bus_and_only_while_it_looks(bus, server)
                 await asyncio.sleep(0.02)
             return channels, got
 
-    channels, got = asyncio.run(asyncio.wait_for(talk(), 30))
+    channels, got = asyncio.run(asyncio.wait_for(talk(), 60))
     assert got[7] == payload
     assert len(got[8]) > 30
     channel = channels[f"/{imu}"]
@@ -139,7 +139,7 @@ def test_vical_web_finds_the_rig_by_itself(tmp_path, web_feed):
                 cameras = json.load(answer)["cameras"]
         assert cameras["cam0"]["status"] in ("converging", "converged")
         process.send_signal(signal.SIGTERM)
-        assert process.wait(20) == 0
+        assert process.wait(60) == 0
         process.stdout.close()
     finally:
         stop.set()

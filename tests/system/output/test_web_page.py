@@ -22,7 +22,7 @@ pytestmark = pytest.mark.system
 def request(method, url, **options):
     async def go():
         async with (
-            aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(20)) as session,
+            aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(60)) as session,
             session.request(method, url, **options) as answer,
         ):
             return answer.status, dict(answer.headers), await answer.text()
