@@ -124,9 +124,9 @@ def report(
         print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
     lost = f"{status['lost_on_bus']} messages lost on the bus ({status['lost_inertial']} of them inertial)"
     print(
-        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {lost}, {status['dropped']} dropped by the "
-        f"recorder, {status['files_deleted']} files deleted by the quota; {holes} holes in the {kept} samples "
-        f"of the {segments} files left."
+        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {lost}, {status['dropped']} dropped "
+        f"by the recorder, {status['files_deleted']} files deleted by the quota; {holes} holes in the {kept} "
+        f"samples of the {segments} files left."
     )
 
 
