@@ -42,7 +42,11 @@ class StampOrder(Generic[T]):
         return self._newest_ns
 
     def push(self, stamp_ns: int, item: T) -> None:
-        """Take an item; one that comes later than the lag allows is dropped and counted in `late`."""
+        """Take an item; one that comes later than the lag allows is counted in `late` and goes out next.
+
+        It is not dropped: a stream that is delayed as a whole (a busy machine) is still in order by itself,
+        and the estimator waits with an image until inertial data bracket it.
+        """
         if self._newest_ns is None:
             self._newest_ns = stamp_ns
         elif stamp_ns - self._newest_ns > self._max_lead_ns:
@@ -52,7 +56,6 @@ class StampOrder(Generic[T]):
             self._newest_ns = stamp_ns
         if self._released_ns is not None and stamp_ns < self._released_ns:
             self.late += 1
-            return
         heapq.heappush(self._heap, (stamp_ns, self._arrivals, item))
         self._arrivals += 1
 

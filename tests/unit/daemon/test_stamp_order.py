@@ -22,13 +22,13 @@ def test_waits_for_the_lag_and_sorts() -> None:
     assert order.pop_all() == ["imu 1200"]
 
 
-def test_what_comes_after_its_successors_is_dropped_and_counted() -> None:
+def test_what_comes_after_its_successors_goes_out_next_and_is_counted() -> None:
     order: StampOrder[str] = StampOrder(lag_s=0.1)
     order.push(1000 * MS, "a")
     order.push(1200 * MS, "b")
     assert order.pop_due() == ["a"]
-    order.push(900 * MS, "too late")
-    assert order.pop_all() == ["b"]
+    order.push(900 * MS, "late")
+    assert order.pop_due() == ["late"] and order.pop_all() == ["b"]
     assert order.late == 1
 
 
