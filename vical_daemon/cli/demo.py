@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
             config = replace(config, web=replace(config.web, enabled=True, port=args.web))
         stamps = demo_truth.StampWitness(rig.imu_instant_ns, config.imus[IMU].filter_samples)
         estimate, trace = _run_roles(config, rig, stamps, args)
-    truth = demo_truth.truth_of_stamps(rig.rig.truth(0.0, CAMERA), stamps.error_s, CAMERA)
+    truth = demo_truth.truth_of_stamps(rig.rig.truth(0.0, CAMERA), stamps.error_s, stamps.wander_s, CAMERA)
     result = estimate.to_json() | {"status": str(estimate.status), "trace": trace}
     result |= {"cpu_s": time.process_time(), "truth": truth}
     result["recordings"] = sorted(str(path) for path in set(out.rglob("*.mcap")) - before)

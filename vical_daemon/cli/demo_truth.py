@@ -20,7 +20,11 @@ _RESTARTED_NS = 20_000_000  # larger: the device's timer was set anew, its ticks
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One number beside its truth; `sigmas` is the error over its standard deviation."""
+    """One number beside its truth.
+
+    `truth_sigma` is how well the truth itself is one number: how late a busy host stamps changes during
+    the run.
+    """
 
     name: str
     unit: str
@@ -28,12 +32,13 @@ class Comparison:
     sigma: float
     truth: float
     error: float
+    truth_sigma: float = 0.0
 
     @property
     def sigmas(self) -> float:
         """Error in standard deviations; infinite where a wrong number claims to be exact."""
         if self.sigma > 0:
-            return abs(self.error) / self.sigma
+            return abs(self.error) / math.hypot(self.sigma, self.truth_sigma)
         return 0.0 if abs(self.error) < 1e-12 else math.inf
 
 
@@ -58,6 +63,14 @@ class StampWitness:
         """Median of stamp minus truth, s."""
         return float(np.median(self._errors_ns)) * 1e-9 if self._errors_ns else 0.0
 
+    @property
+    def wander_s(self) -> float:
+        """How much that changed during the run, one sigma, s."""
+        if not self._errors_ns:
+            return 0.0
+        low, high = np.percentile(self._errors_ns, [16, 84])
+        return float(high - low) / 2 * 1e-9
+
     def open(self, config: ImuConfig) -> ImuSource:
         """Open the real driver and listen to what it gives."""
         source = open_imu(config)
@@ -76,12 +89,18 @@ class StampWitness:
         return source
 
 
-def truth_of_stamps(simulated: dict[str, Any], imu_stamp_error_s: float, camera: str) -> dict[str, Any]:
+def truth_of_stamps(
+    simulated: dict[str, Any], imu_stamp_error_s: float, wander_s: float, camera: str
+) -> dict[str, Any]:
     """Return the truth in the form of a result; the time shift is that between the stamps (see above)."""
     entry = simulated["cameras"][camera]
     simulated_s = entry["timeshift_cam_imu_s"]
     entry = entry | {"timeshift_cam_imu_s": simulated_s + imu_stamp_error_s}
-    extra = {"simulated_timeshift_s": simulated_s, "imu_stamp_error_s": imu_stamp_error_s}
+    extra = {
+        "simulated_timeshift_s": simulated_s,
+        "imu_stamp_error_s": imu_stamp_error_s,
+        "imu_stamp_wander_s": wander_s,
+    }
     return simulated | {"cameras": {camera: entry}} | extra
 
 
@@ -113,7 +132,7 @@ def compare(result: dict[str, Any], truth: dict[str, Any], camera: str) -> list[
     table.append(
         Comparison(
             "time shift", "ms", 1e3 * shift, 1e3 * estimate["timeshift_sigma_s"], 1e3 * true_shift,
-            1e3 * (shift - true_shift),
+            1e3 * (shift - true_shift), 1e3 * truth.get("imu_stamp_wander_s", 0.0),
         )
     )  # fmt: skip
     return table

@@ -126,6 +126,6 @@ def test_more_than_four_sigma_or_no_convergence_is_a_failure() -> None:
 
 def test_the_truth_of_the_stamps_contains_what_the_host_adds() -> None:
     simulated = {"cameras": {"cam0": {"timeshift_cam_imu_s": -0.0125}}}
-    truth = demo_truth.truth_of_stamps(simulated, 2e-4, "cam0")
+    truth = demo_truth.truth_of_stamps(simulated, 2e-4, 1e-5, "cam0")
     assert truth["cameras"]["cam0"]["timeshift_cam_imu_s"] == pytest.approx(-0.0123)
     assert truth["simulated_timeshift_s"] == -0.0125 and truth["imu_stamp_error_s"] == 2e-4
