@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from vical_mocks.points import simulate
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.consistency import Consistency
@@ -10,7 +11,6 @@ from vical_daemon.estimation.imu_model import ImuBuffer
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
 from vical_daemon.estimation.retract import retract
 from vical_daemon.estimation.state import CameraState, State, make_layout
-from vical_mocks.points import simulate
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def one_frame(run, f, buffer, base, index=5):
     frame = next(x for x in run.frames if (x.t_cam_ns - base) * 1e-9 > f.state.t_s + 0.05 * index)
     t_cam_s = (frame.t_cam_ns - base) * 1e-9
     f.predict(buffer.segment(f.state.t_s, t_cam_s + f.state.cameras["cam0"].timeshift_s))
-    measured = PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px)
+    measured = PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px.copy())
     return f.image(measured, t_cam_s, run.points_m[frame.ids])
 
 

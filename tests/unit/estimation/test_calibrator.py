@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vical_mocks.points import simulate
+from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import Status
-from vical_mocks.points import simulate
-from vical_mocks.rig import Bump, reference_rig
 
 
 def prior(run):

@@ -37,9 +37,9 @@ def segment(T, rate):
     return im.ImuSegment(t, rates(t), forces(t), 1 / rate)
 
 
-def integrate(seg, gyro_bias=np.zeros(3), accel_bias=np.zeros(3)):
-    relative = im.strapdown(seg, np.atleast_2d(gyro_bias), np.atleast_2d(accel_bias))
+def integrate(seg):
     zero = np.zeros((1, 3))
+    relative = im.strapdown(seg, zero, zero)
     return im.compose(im.Motion(np.eye(3)[None], zero, zero), relative, G[None])
 
 

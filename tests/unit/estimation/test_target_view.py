@@ -76,7 +76,7 @@ def test_rolling_shutter_is_a_global_one_at_each_rows_own_time():
 
 def test_batch_equals_loop():
     m = motion()
-    two = Motion(np.repeat(m.R, 2, 0), m.p + [[0, 0, 0], [0.01, 0.02, 0.03]], np.repeat(m.v, 2, 0))
+    two = Motion(np.repeat(m.R, 2, 0), m.p + np.array([[0, 0, 0], [0.01, 0.02, 0.03]]), np.repeat(m.v, 2, 0))
     both = view(X, two, camera(), RATES, 0.004, "radtan")
     for k in range(2):
         one = view(
