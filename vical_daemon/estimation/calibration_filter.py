@@ -26,6 +26,7 @@ _CURVED = 0.1  # iterate while the second-order part exceeds this share of the c
 _CORNER_GATE = float(chi2.isf(1e-4, 2))
 _RESIDUAL_GATE = float(chi2.isf(2e-5, 2))
 _FRAME_GATE_P = 1e-9
+_MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
 
 @lru_cache(maxsize=256)
@@ -374,6 +375,18 @@ class CalibrationFilter:
                 self.S[s] = J @ self.S[s]
             self.S = unscented.lower_root(self.S)
         self.state = retract(self.state, self.layout, dx)
+
+    def plausible(self) -> bool:
+        """Whether the state is one that a rig can have: finite, arm below 3 m, speed below 30 m/s."""
+        state = self.state
+        if not (np.isfinite(self.S).all() and float(np.abs(state.v_world_imu).max()) < _MAX_SPEED_MPS):
+            return False
+        return all(
+            float(np.abs(c.p_imu_cam).max()) < _MAX_ARM_M
+            and 0.2 < float(c.intrinsics[0]) / c.resolution[0] < 10.0
+            and abs(c.timeshift_s) < _MAX_SHIFT_S
+            for c in state.cameras.values()
+        )
 
     def reopen(self, index: int, sigma: float) -> None:
         """Add independent uncertainty to one error: what was known about it is in doubt."""

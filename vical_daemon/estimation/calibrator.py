@@ -40,7 +40,7 @@ from vical_daemon.estimation.state import (
     make_layout,
 )
 
-_ATTEMPT_EVERY_S = 0.5
+_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must cost little
 _MAX_GAP_S = 0.5
 _KEEP_S = 5.0
 _LATE_S = 2e-3  # an image this little before the state is used by moving the pose back
@@ -75,7 +75,8 @@ class Calibrator:
         self._base_ns = 0
         self._waiting: dict[str, list[tuple[float, PointsFrame]]] = {name: [] for name in cameras}
         self._pending = FrameQueue(list(cameras))
-        self._next_attempt_s = -np.inf
+        self._next_attempt_s, self._attempt_every_s = -np.inf, _ATTEMPT_FIRST_S
+        self._caches: dict[str, start.PoseCache] = {}
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
@@ -123,7 +124,8 @@ class Calibrator:
         if self.filter is None:
             self._collect()
             if self._buffer.newest_s >= self._next_attempt_s:
-                self._next_attempt_s = self._buffer.newest_s + _ATTEMPT_EVERY_S
+                self._next_attempt_s = self._buffer.newest_s + self._attempt_every_s
+                self._attempt_every_s = min(1.25 * self._attempt_every_s, _ATTEMPT_MOST_S)
                 self._attempt()
         return self._follow(flush=False)
 
@@ -154,7 +156,7 @@ class Calibrator:
             self.judge.waiting("collecting the first seconds: move the rig, keep the target in view")
             return
         result = start.attempt(
-            self._buffer, self._waiting, self.priors, self.options, self.layout, self.target
+            self._buffer, self._waiting, self.priors, self.options, self.layout, self.target, self._caches
         )
         if result.state is None:
             self.judge.waiting(result.reason, result.motion_missing)
@@ -166,6 +168,10 @@ class Calibrator:
         ]
         frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
         self.filter = self._rehearsed(result.state, frames)
+        if self.filter is None:
+            self.judge.waiting("the first seconds do not fit together yet: keep the board in view and moving")
+            return
+        self._caches.clear()
         self.judge.started(begin)
         self.watch.started(begin)
         self._stale = None
@@ -174,19 +180,26 @@ class Calibrator:
         for waiting in self._waiting.values():
             waiting.clear()
 
-    def _rehearsed(self, state: State, frames: list[tuple[float, PointsFrame]]) -> CalibrationFilter:
+    def _rehearsed(self, state: State, frames: list[tuple[float, PointsFrame]]) -> CalibrationFilter | None:
         """Run over the start once to learn its noise, then start again from the same place.
 
         The second start takes the better calibration as its mean, with the same wide sigmas.
         """
         trial = self._new_filter(deepcopy(state))
+        used = refused = 0
         for t_cam_s, frame in frames:
-            self._step(trial, frame, t_cam_s)
+            report = self._step(trial, frame, t_cam_s)
+            used += report is not None and report.used
+            refused += report is not None and not report.used
+            if not trial.plausible():
+                return None
+        if refused > used:
+            return None
         fresh = self._new_filter(state)
         for name, noise in trial.corner_noise.items():
             fresh.corner_noise[name].sigma_px = noise.sigma_px
             fresh.consistency[name] = trial.consistency[name]
-            fresh.consistency[name].alarm = 0.0
+            fresh.consistency[name].settle()
         return fresh
 
     def _new_filter(self, state: State) -> CalibrationFilter:
@@ -261,6 +274,10 @@ class Calibrator:
         ratio = self._held_back_ratio(frame, t_cam_s)
         if ratio is not None:
             self.judge.held_back(ratio)
+        if not f.plausible():
+            self.watch.why = "the estimate left the range of what a rig can be"
+            self._restart(f)
+            return report
         self.judge.saw_frame(report, f)
         self._act(self.watch.look(report, f), frame, t_cam_s)
         return report
@@ -300,19 +317,20 @@ class Calibrator:
 
     def _restart(self, f: CalibrationFilter) -> None:
         """The rig has changed: forget mounting and delay, keep the lens, and start from the data to come."""
-        for name, camera in f.state.cameras.items():
+        for name, camera in f.state.cameras.items() if f.plausible() else ():
             self.priors[name] = replace(
                 self.priors[name],
                 intrinsics=tuple(camera.intrinsics.tolist()),
                 distortion=tuple(camera.distortion.tolist()),
             )
         self.judge.changed(self.watch.why)
-        self._stale, self.filter = f, None
-        self._next_attempt_s = -np.inf
+        self._stale, self.filter = (f if f.plausible() else None), None
+        self._next_attempt_s, self._attempt_every_s = -np.inf, _ATTEMPT_FIRST_S
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
+        self.judge.clocks_in_doubt = self.watch.doubtful
         return self.judge.estimate(self.filter, self._stale)
 
     def trace(self, camera: str) -> list[TracePoint]:

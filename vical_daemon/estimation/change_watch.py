@@ -18,6 +18,7 @@ _REFUSED_CHANGED = 8  # images in a row, soon after that, before the calibration
 _SOON_S = 4.0
 _SETTLE_S = 3.0  # after a start the innovations still move
 _DRIFT_FLOOR_S = 30e-6
+_DRIFT_AFTER_S = 4.0
 
 
 class Action(Enum):
@@ -51,6 +52,11 @@ class ChangeWatch:
         self._drift.clear()
         self._skewed.clear()
 
+    @property
+    def doubtful(self) -> bool:
+        """A time shift may be drifting: too early to say so, too likely to ignore."""
+        return any(w.doubtful for name, w in self._drift.items() if name not in self._skewed)
+
     def look(self, report: FrameReport, f: CalibrationFilter) -> Action:
         """Say what is to be done after this image."""
         t = f.state.t_s
@@ -75,7 +81,7 @@ class ChangeWatch:
 
     def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
         index = f.layout.cameras[camera].timeshift
-        if index is None or camera in self._skewed or f.state.t_s < self._started_s + 1.0:
+        if index is None or camera in self._skewed or f.state.t_s < self._started_s + _DRIFT_AFTER_S:
             return Action.NONE
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
         variance = float(f.S[index] @ f.S[index])

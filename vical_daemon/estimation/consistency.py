@@ -31,6 +31,7 @@ _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 16.0
 _CLIP = 6.0
 _DEAD_BAND = 1.3
+_SETTLE = 10  # images: the first updates of a wide prior are not yet linear
 _CUSUM_DRIFT = 1.8
 _CUSUM_LIMIT = 8.0
 
@@ -95,9 +96,15 @@ class Consistency:
     images: int = 0
     alarm: float = 0.0
     _level: float = 1.0
+    _skip: int = _SETTLE
     _weight: float = 0.0
     _lagged: FloatArray = field(default_factory=lambda: np.zeros(_LAGS + 1))
     _recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_LAGS))
+
+    def settle(self) -> None:
+        """A filter starts anew with what was learnt: let its first images pass."""
+        self._skip, self.alarm = _SETTLE, 0.0
+        self._recent.clear()
 
     @property
     def alarmed(self) -> bool:
@@ -115,6 +122,9 @@ class Consistency:
         """
         normal = normalised(uv, innovation, linear, sigma)
         if normal is None:
+            return
+        if self._skip > 0:
+            self._skip -= 1
             return
         self.images += 1
         ratio = float(normal @ normal) / MODES
@@ -142,7 +152,7 @@ class Consistency:
         for lag, old in enumerate(reversed(self._recent), start=1):
             self._lagged[lag] += normal @ old
         self._recent.append(normal)
-        if self._weight < 40.0:
+        if self._weight < 100.0:
             return
         rho = self._lagged[1:] / self._lagged[0]
         taper = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)

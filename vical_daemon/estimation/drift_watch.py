@@ -15,6 +15,7 @@ import numpy as np
 _EVERY_S = 1.0
 _SPAN = 20
 _LIMIT = 6.0
+_DOUBT = 3.0
 
 
 @dataclass(slots=True)
@@ -23,9 +24,11 @@ class DriftWatch:
 
     Attributes:
         floor: Smallest standard deviation of a difference that is taken seriously, in the parameter's unit.
+        doubtful: The last estimate lies further off than chance would have it, though not yet surely.
     """
 
     floor: float
+    doubtful: bool = False
     _past: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=_SPAN))
 
     def drifts(self, t_s: float, value: float, variance: float, factor: float) -> bool:
@@ -39,12 +42,16 @@ class DriftWatch:
         """
         if self._past and t_s < self._past[-1][0] + _EVERY_S:
             return False
-        found = any(
-            abs(value - old) > _LIMIT * np.sqrt(factor * max(old_variance - variance, 0.0) + self.floor**2)
-            for _, old, old_variance in self._past
+        far = max(
+            (
+                abs(value - old) / np.sqrt(factor * max(old_variance - variance, 0.0) + self.floor**2)
+                for _, old, old_variance in self._past
+            ),
+            default=0.0,
         )
         self._past.append((t_s, value, variance))
-        return found
+        self.doubtful = bool(far > _DOUBT)
+        return bool(far > _LIMIT)
 
     def forget(self) -> None:
         """Start anew (after the parameter was reopened)."""

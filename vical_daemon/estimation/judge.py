@@ -16,7 +16,7 @@ from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.state import Layout
 
 _ENOUGH_FRAMES = 60
-_ENOUGH_S = 5.0
+_ENOUGH_S = 6.0
 _PATIENCE_S = 15.0
 _LOST = 3.0  # a direction this far above its target after the patience is called unobservable
 _NIS_BAD = 4.0
@@ -46,6 +46,8 @@ class Judge:
         self.events: list[str] = []
         self.status = Status.WAITING
         self.bumped = ""
+        self.clocks_in_doubt = False
+        self._ever_converged = False
         self._start_reason = ""
         self._motion_missing = False
         self._first_ns = self._newest_ns = 0
@@ -97,7 +99,7 @@ class Judge:
     def changed(self, why: str) -> None:
         """The rig is not what it was: the calibration is being taken anew."""
         self.bumped = why
-        self.events.append(f"bumped: {why}")
+        self.events.append(f"bumped: {why}" if self._ever_converged else f"started over: {why}")
         self._started_s = None
         self.status = Status.INCONSISTENT
 
@@ -160,6 +162,7 @@ class Judge:
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._gaps(e, name) for name, e in cameras.items()}
         self.status, reason, guidance = self._decide(f, missing)
+        self._ever_converged |= self.status == Status.CONVERGED
         if f is not None and self.status == Status.DEGENERATE:
             cameras = {name: _withheld(e, missing[name]) for name, e in cameras.items()}
         events, self.events = self.events, []
@@ -206,6 +209,12 @@ class Judge:
         if not all_gaps:
             if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
                 return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
+            if self.clocks_in_doubt:
+                return (
+                    Status.CONVERGING,
+                    "the time shift still moves: waiting to see whether the clocks drift",
+                    "",
+                )
             if not self._held_back_fine():
                 return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
             return Status.CONVERGED, "", ""

@@ -93,13 +93,28 @@ def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) 
     return SeenPose(t_cam_s, found.candidates[0], frame)
 
 
-def camera_poses(
-    frames: list[tuple[float, PointsFrame]], lens: Lens, target: FloatArray, most: int = 400
-) -> list[SeenPose]:
-    """Poses of at most `most` frames, evenly thinned, in order of time."""
-    step = max(1, -(-len(frames) // most))
-    poses = (pose_of(frame, t, lens, target) for t, frame in frames[::step])
-    return [p for p in poses if p is not None]
+class PoseCache:
+    """Poses already found, so that repeated attempts cost little; a new lens empties it."""
+
+    def __init__(self) -> None:
+        self._lens: tuple[float, ...] = ()
+        self._poses: dict[int, SeenPose | None] = {}
+
+    def poses(
+        self, frames: list[tuple[float, PointsFrame]], lens: Lens, target: FloatArray, most: int = 160
+    ) -> list[SeenPose]:
+        """Poses of at most `most` of the frames, evenly thinned, in order of time."""
+        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist())
+        step = max(1, -(-len(frames) // most))
+        chosen = frames[len(frames) - 1 :: -step][::-1]
+        if key != self._lens:
+            self._lens, self._poses = key, {}
+        known = {f.t_cam_ns: self._poses[f.t_cam_ns] for _, f in chosen if f.t_cam_ns in self._poses}
+        for t, f in chosen:
+            if f.t_cam_ns not in known:
+                known[f.t_cam_ns] = pose_of(f, t, lens, target)
+        self._poses = known
+        return [p for _, f in chosen if (p := known[f.t_cam_ns]) is not None]
 
 
 def attempt(
@@ -109,6 +124,7 @@ def attempt(
     options: CalibrationOptions,
     layout: Layout,
     target: FloatArray,
+    caches: dict[str, PoseCache],
 ) -> StartResult:
     """Try to start from what has been seen so far.
 
@@ -119,6 +135,7 @@ def attempt(
         options: Switches.
         layout: Which blocks are estimated.
         target: Points of the target, m, shape (n, 3).
+        caches: Poses found in earlier attempts, by camera.
 
     Returns:
         A state at the first usable frame, or the reason why not.
@@ -130,8 +147,9 @@ def attempt(
         lens = Lens.from_prior(prior)
         if layout.cameras[name].intrinsics is not None:
             estimate_intrinsics(lens, [f for _, f in frames[name]], target)
-        poses = camera_poses(frames[name], lens, target)
-        if len(poses) < 20:
+        poses = caches.setdefault(name, PoseCache()).poses(frames[name], lens, target)
+        needed = 20 if layout.cameras[name].intrinsics is None else 30
+        if len(poses) < needed:
             return StartResult(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )
