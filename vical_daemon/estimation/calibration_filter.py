@@ -17,8 +17,17 @@ from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.imu_model import ImuSegment, Motion, compose, process_noise, strapdown
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
-from vical_daemon.estimation.retract import camera_points, motion_points, pose_points, retract
-from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State, grp_from_rotation
+from vical_daemon.estimation.retract import camera_points, motion_points, orthonormal, pose_points, retract
+from vical_daemon.estimation.state import (
+    ATTITUDE,
+    MOTION,
+    POSITION,
+    VELOCITY,
+    Layout,
+    State,
+    grp_from_rotation,
+    rotation_from_grp,
+)
 from vical_daemon.estimation.target_view import Rates, view
 
 _ITERATIONS = 5
@@ -102,7 +111,7 @@ class _Linear:
 
 @dataclass(slots=True)
 class _Fit:
-    """Outcome of the correction: new root and state step, NIS, who took part, what nothing explains."""
+    """Outcome: new root and state step, NIS, who took part, what nothing explains, whitened residuals."""
 
     S: FloatArray
     dx: FloatArray
@@ -111,6 +120,7 @@ class _Fit:
     keep: BoolArray
     rest: float
     dof_rest: int
+    left: FloatArray
 
 
 @dataclass(slots=True)
@@ -167,11 +177,10 @@ class CalibrationFilter:
         noise = process_noise(self.state.R_world_imu, relative, self.imu_noise)
         self._grow(m, noise.covariance, noise.gyro_bias_var, noise.accel_bias_var, relative.t_s[-1])
         state = self.state
-        shift = np.zeros(self.layout.size)
-        shift[MOTION] = m.shift
-        state.R_world_imu, state.p_world_imu, state.v_world_imu = end.R[0], end.p[0], end.v[0]
+        state.R_world_imu = orthonormal(end.R[0] @ rotation_from_grp(m.shift[ATTITUDE]))
+        state.p_world_imu = end.p[0] + m.shift[POSITION]
+        state.v_world_imu = end.v[0] + m.shift[VELOCITY]
         state.t_s = float(segment.t_s[-1])
-        self.state = retract(state, self.layout, shift)
         self._set_rates(segment)
 
     def _grow(
@@ -222,7 +231,7 @@ class CalibrationFilter:
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
-        residual = image.uv - self.predict_pixels(image.camera, image.t_cam_s, image.points)
+        residual = fit.left * image.sigma_px[:, None]
         rows = np.repeat(keep, 2)
         self.consistency[image.camera].learn(
             first.z[keep], innovation[keep], first.linear[rows], image.sigma_px[keep]
@@ -360,7 +369,7 @@ class CalibrationFilter:
             if not bad.any() or (keep & ~bad).sum() < 4:
                 break
             keep = keep & ~bad
-        return _Fit(c.S, c.dx, c.nis, len(r_small), keep, rest, dof_rest)
+        return _Fit(c.S, c.dx, c.nis, len(r_small), keep, rest, dof_rest, left)
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""

@@ -102,7 +102,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     for name, camera in state.cameras.items():
         c = camera_points(camera, layout, name, dx[None])
         cameras[name] = CameraState(
-            _orthonormal(c.R_imu_cam[0]),
+            orthonormal(c.R_imu_cam[0]),
             c.p_imu_cam[0],
             float(c.timeshift_s[0]),
             c.intrinsics[0],
@@ -117,7 +117,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         scale += float(dx[layout.target_scale])
     return State(
         state.t_s,
-        _orthonormal(motion.R[0]),
+        orthonormal(motion.R[0]),
         motion.p[0],
         motion.v[0],
         motion.gyro_bias[0],
@@ -130,7 +130,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     )
 
 
-def _orthonormal(R: FloatArray) -> FloatArray:
+def orthonormal(R: FloatArray) -> FloatArray:
     """One Newton step towards the nearest rotation: rounding never accumulates, however long it runs."""
     out: FloatArray = 1.5 * R - 0.5 * R @ (R.T @ R)
     return out
