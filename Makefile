@@ -1,5 +1,6 @@
 # Two commands on a fresh machine: make demo, make test. Each makes .venv on first use.
 PYTHON ?= python3
+BENCH ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -12,7 +13,7 @@ demo: $(STAMP)
 	$(BIN)/vical demo --out demo_out
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q tests
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -40,7 +40,7 @@ def ends(request):
     return pair(request)
 
 
-def until(condition, timeout_s: float = 5.0) -> bool:
+def until(condition, timeout_s: float = 30.0) -> bool:
     end = time.monotonic() + timeout_s
     while not condition() and time.monotonic() < end:
         time.sleep(0.005)

@@ -61,9 +61,12 @@ def test_killed_recorder_loses_a_second_and_its_successor_goes_on(tmp_path):
             sent += 1
             time.sleep(0.002)
 
-    def recording(after: int) -> bool:
+    def said(after: int) -> list[dict]:
         words = [m.decode_diagnostics(s.payload) for s in bus.latest(status)]
-        return any(w.stamp_ns > after and w.statuses[0].values["state"] == "recording" for w in words)
+        return [w.statuses[0].values for w in words if w.stamp_ns > after]
+
+    def recording(after: int) -> bool:
+        return any(values["state"] == "recording" for values in said(after))
 
     first = start_recorder(tmp_path)
     assert until(lambda: recording(0))
@@ -75,9 +78,10 @@ def test_killed_recorder_loses_a_second_and_its_successor_goes_on(tmp_path):
     assert until(lambda: recording(before_ns))
     resumed_at = sent
     send(1.0)
-    time.sleep(0.5)
+    assert until(lambda: any(int(values["messages"]) >= sent - resumed_at for values in said(before_ns)))
+    time.sleep(0.3)  # its own status counts among the messages: a few may still be on their way
     second.terminate()
-    assert second.wait(20) == 0
+    assert second.wait(60) == 0
     kept = numbers(tmp_path)
     assert len(kept) == len(set(kept))
     early = [n for n in kept if n < killed_at]

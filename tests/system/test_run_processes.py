@@ -22,7 +22,8 @@ from vical_daemon.recording import open_recording
 from vical_daemon.vision.target import Checkerboard
 from vical_daemon.zenoh_bus import open_bus
 
-pytestmark = pytest.mark.system
+# Five Python processes start: on a machine under load that alone may take a minute.
+pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 
 
 class Daemon:
@@ -72,7 +73,7 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
                 process.communicate()
 
 
-def _wait_for(condition: Callable[[], Any], timeout_s: float = 30.0) -> None:
+def _wait_for(condition: Callable[[], Any], timeout_s: float = 60.0) -> None:
     end_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end_s, "it does not happen"
@@ -90,11 +91,11 @@ def test_all_processes_run_record_and_stop_cleanly(daemon: Daemon) -> None:
     _wait_for(lambda: sum("/imu/imu0" in s.key for s in list(got)) > 50)
     _wait_for(lambda: any("/calibration/cam0" in s.key for s in list(got)))
     watch = daemon.vical("watch", "--once", "--json")
-    out, _ = watch.communicate(timeout=30)
+    out, _ = watch.communicate(timeout=60)
     assert json.loads(out)["rig"] == "rover" and json.loads(out)["status"] == "waiting"
     bus.close()
     parent.send_signal(signal.SIGTERM)
-    _, err = parent.communicate(timeout=30)
+    _, err = parent.communicate(timeout=60)
     assert parent.returncode == 0, err
     assert "Traceback" not in err
     offsets = {
@@ -117,7 +118,7 @@ def test_systemd_is_told_ready_alive_and_stopping(daemon: Daemon) -> None:
     path = daemon.folder / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(path))
-        systemd.settimeout(30)
+        systemd.settimeout(60)
         process = daemon.vical("run", "acquire", NOTIFY_SOCKET=str(path))
         said: list[str] = []
         # A camera that is missing is said, and is no reason to die.
@@ -127,14 +128,14 @@ def test_systemd_is_told_ready_alive_and_stopping(daemon: Daemon) -> None:
         process.send_signal(signal.SIGTERM)
         while "STOPPING=1" not in said[-1]:
             said.append(systemd.recv(4096).decode())
-    assert process.wait(15) == 0
+    assert process.wait(60) == 0
 
 
 def test_a_second_host_of_the_bus_is_one_line(daemon: Daemon) -> None:
     first = daemon.vical("run", "acquire")
     _wait_for(daemon.socket.exists)
     second = daemon.vical("run", "acquire")
-    _, err = second.communicate(timeout=30)
+    _, err = second.communicate(timeout=60)
     assert second.returncode == 1 and "already hosts the bus" in err.splitlines()[-1]
     assert first.poll() is None
 
@@ -148,5 +149,5 @@ def test_a_second_host_of_the_bus_is_one_line(daemon: Daemon) -> None:
 )
 def test_mistakes_are_one_line(daemon: Daemon, words: list[str], code: int, text: str) -> None:
     process = daemon.vical(*words)
-    _, err = process.communicate(timeout=30)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == code and text in err.splitlines()[-1] and "Traceback" not in err

@@ -99,7 +99,7 @@ def test_sigterm_stops_the_stream(emulate):
             first = json.loads(process.stdout.readline())
             process.send_signal(signal.SIGTERM)
             rest = process.stdout.read().splitlines()
-            assert process.wait(10) == 0
+            assert process.wait(60) == 0
         finally:
             process.kill()
     assert set(first) >= {"t_host_ns", "device_ticks", "gyro_rps", "accel_mps2"}

@@ -1,0 +1,27 @@
+"""The order of the whole run: `pytest -n 2` gives files to whoever is free, so the long ones go first."""
+
+from __future__ import annotations
+
+import pytest
+
+LONGEST_FIRST = (
+    "test_calibrator.py",
+    "test_calibration_statistics.py",
+    "test_camera_iidc.py",
+    "test_calibrate.py",
+    "test_demo_command.py",
+    "test_run_processes.py",
+    "test_td_icp_command.py",
+    "test_gx3_on_a_terminal.py",
+    "test_simulated_camera.py",
+    "test_record_over_zenoh.py",
+    "test_calibration_filter.py",
+    "test_tracks.py",
+)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first (a stable sort: within a file, and after them, the order stays random)."""
+    rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
