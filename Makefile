@@ -1,6 +1,6 @@
 # Two commands on a fresh machine: make demo, make test. Each makes .venv on first use.
 PYTHON ?= python3
-BENCH ?=
+BENCH ?= montecarlo
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
