@@ -17,6 +17,7 @@ from vical_daemon.estimation.td_icp import TdIcpResult, td_icp
 
 MIN_SPAN_S = 3.0
 MAX_FRAMES = 500
+_STRETCH_S = 10.0
 _MIN_POINTS = 8
 _SHIFT_SIGMA_S = 1.0e-3
 _ROTATION_SIGMA_RAD = np.deg2rad(1.0)
@@ -219,7 +220,9 @@ def _motion_start(
     state: State | None = None
     for name, poses in seen.items():
         camera = cameras[name]
-        inside = [p for p in poses if buffer.oldest_s < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
+        # Only the latest stretch: the double integral drifts, and what was long ago costs more than it gives.
+        since = max(buffer.oldest_s, poses[-1].t_cam_s + camera.timeshift_s - _STRETCH_S)
+        inside = [p for p in poses if since < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far", timing)
         linear = _linear(buffer, inside, camera, timing[name])
