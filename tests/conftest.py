@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 LONGEST_FIRST = (
+    "test_euroc.py",
     "test_calibrator.py",
     "test_calibration_statistics.py",
     "test_camera_iidc.py",
