@@ -150,7 +150,7 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 
 
 def test_missing_binary_and_huge_files(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="(?i)no such file"):
+    with pytest.raises(ConfigError, match=r"(?i)no such file"):
         load(tmp_path / "none.yaml")
     (tmp_path / "b.yaml").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(ConfigError, match="not a text file"):
