@@ -104,8 +104,10 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome) -> int:
     if args.report and result["cameras"]:
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
-    if status in _UNUSABLE:
-        raise CliError(f"no calibration: {status}: {why or 'too little data'}")
+    if status in _UNUSABLE or not result["cameras"]:
+        from vical_daemon.cli.calibration_run import suspects
+
+        raise CliError(f"no calibration: {status}: {why or 'too little data'} ({suspects(job)})")
     if status != "converged":
         print(f"vical: warning: {status}: {why}", file=sys.stderr)
     return 0

@@ -84,7 +84,9 @@ def make_job(
     imu_stream = _choose("imu", recording.imus, imu)
     chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
     if not chosen:
-        raise CliError(f"{recording.path} holds no camera: neither images nor points")
+        raise CliError(
+            f"{recording.path} holds no camera, neither images nor points; `vical info` shows what is in it"
+        )
     priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
     config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
     config = replace(
@@ -157,6 +159,15 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
         result["traces"] = outcome.traces
     result["cpu_s"] = time.process_time()
     return result
+
+
+def suspects(job: Job) -> str:
+    """Name what to check when the motion is not to blame: wrong input looks like poor motion."""
+    spans = ", ".join(f"{name} {stream.duration_s:.1f} s" for name, stream in job.cameras.items())
+    things = ["the lens in --initial", f"the stamps (imu {job.imu.duration_s:.1f} s, {spans})"]
+    if job.config.target:
+        things.insert(0, f"the sizes in {job.config.target}")
+    return f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}"
 
 
 def _attach_detectors(bus: LocalBus, job: Job) -> None:

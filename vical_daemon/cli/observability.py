@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         if word not in BLOCKS:
             raise CliError(f"--estimate: {word!r} is not known (known: {', '.join(BLOCKS)})", EXIT_USAGE)
     if not Path(args.input).exists():
-        raise CliError(f"{args.input} does not exist")
+        raise CliError(f"{args.input} does not exist; check the path")
     from vical_daemon.cli.observability_motion import motion_of
     from vical_daemon.estimation.observability import gramian
     from vical_daemon.estimation.observability_model import ModelBlocks, model_rank

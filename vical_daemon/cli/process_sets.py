@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from vical_daemon.bus import Bus
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.errors import EXIT_USAGE, CliError, describe_known
 from vical_daemon.cli.options import suggest
 from vical_daemon.config import Config
 
@@ -87,7 +87,7 @@ class RoleThreads:
             except Exception as error:
                 self.errors[role] = error
                 self.failed.set()
-                if not hasattr(type(error), "exit_code"):
+                if describe_known(error) is None:  # a bug; what was foreseen is told in one line
                     _log.exception("role %s failed", role)
 
         thread = self._threads[role] = threading.Thread(target=guarded, name=f"role {role}", daemon=True)

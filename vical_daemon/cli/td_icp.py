@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
     initial = read_initial(args.initial) if args.initial else Initial()
     if not Path(args.input).exists():
-        raise CliError(f"{args.input} does not exist")
+        raise CliError(f"{args.input} does not exist; check the path")
     names = [name.strip() for name in (args.sensors or "").split(",") if name.strip()]
     if names or _is_trajectory(Path(args.input)):
         return _joint(args, initial, names)

@@ -93,9 +93,12 @@ class LogReader:
         except OSError as error:
             raise LogError(f"cannot read {self.path}: {describe(error)}") from None
         if not head:
-            raise LogError(f"{self.path} is empty")
+            raise LogError(f"{self.path} is empty; was it copied in full?")
         if head != MAGIC:
-            raise LogError(f"{self.path} is no MCAP file (its first bytes are {head!r})")
+            raise LogError(
+                f"{self.path} is no MCAP file (its first bytes are {head!r}); give one of `vical run`, "
+                "or for other kinds of recording the name they have: .bag, or the folder"
+            )
 
     @property
     def channels(self) -> list[LogChannel]:

@@ -33,7 +33,7 @@ def open_recording(
     """
     path = Path(path)
     if not path.exists():
-        raise RecordingError(f"{path} does not exist")
+        raise RecordingError(f"{path} does not exist; check the path")
     recording = _open(path, topics)
     if topics is not None and isinstance(recording, AslRecording):
         recording.streams = tuple(s for s in recording.streams if s.name in topics)
@@ -49,7 +49,7 @@ def check_recording(recording: Recording) -> None:
         RecordingError: Something cannot be right, or imu or camera are missing.
     """
     if not recording.imus:
-        raise RecordingError(f"{recording.path} holds no imu data")
+        raise RecordingError(f"{recording.path} holds no imu data; `vical info` shows what is in it")
     for name in recording.imus:
         recording.warnings.extend(check_imu(name, recording.imu_arrays(name)))
     for stream in recording.cameras.values():

@@ -205,6 +205,17 @@ def _spoil_size(folder: Path) -> list[str]:
     return _arguments(folder)
 
 
+def _spoil_target_size(folder: Path) -> list[str]:
+    """A decimal point slipped: nothing in the images shows it, only the accelerometer."""
+    path = folder / "target.yaml"
+    path.write_text(path.read_text().replace("tagSize: 0.088", "tagSize: 0.88"))
+    return _arguments(folder)
+
+
+def _spoil_no_initial(folder: Path) -> list[str]:
+    return _arguments(folder, "--initial", str(folder / "nowhere.yaml"))
+
+
 def _spoil_report(folder: Path) -> list[str]:
     return _arguments(folder, "--report", str(folder / "nowhere" / "r.html"))
 
@@ -218,6 +229,8 @@ def _spoil_report(folder: Path) -> list[str]:
         (_spoil_g, 1, "looks like g"),
         (_spoil_camera_rate, 1, "cam0"),
         (_spoil_target_key, 1, "tagSize"),
+        (_spoil_target_size, 1, "check the sizes in "),
+        (_spoil_no_initial, 2, "no such file"),
         (_spoil_initial, 2, "did you mean intrinsics"),
         (_spoil_nothing_fixed, 2, "does not give it"),
         (_spoil_fix, 2, "did you mean intrinsics"),
