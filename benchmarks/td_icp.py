@@ -281,7 +281,7 @@ def figure_start(path: Path) -> None:
     import matplotlib.pyplot as plt
 
     from vical_daemon.estimation.rotation_curves import GyroCurve
-    from vical_daemon.estimation.rotation_registration import camera_turns, shift_costs
+    from vical_daemon.estimation.rotation_start import camera_turns, shift_costs
     from vical_daemon.estimation.so3 import quat_from_matrix
 
     shift, rng, motion = 1.3, np.random.default_rng(1), hand_motion(1, 60.0)

@@ -8,7 +8,7 @@ delays between any two sensors come with their covariance.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -16,17 +16,22 @@ import numpy.typing as npt
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
 from vical_daemon.estimation.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
-from vical_daemon.estimation.rotation_registration import closest_point_registration, coarse_start
-from vical_daemon.estimation.td_icp import (
-    OK,
-    REFUSED,
-    TdIcpOptions,
-    TdIcpResult,
-    clean_gyro,
-    clean_orientations,
-    refuse_start,
-    td_icp,
-)
+from vical_daemon.estimation.rotation_registration import closest_point_registration
+from vical_daemon.estimation.rotation_start import coarse_start
+from vical_daemon.estimation.td_icp import td_icp
+from vical_daemon.estimation.td_icp_input import clean_gyro, clean_orientations
+from vical_daemon.estimation.td_icp_joint_result import JointResult, PairDelay, SensorDelay
+from vical_daemon.estimation.td_icp_refusals import refuse_start
+from vical_daemon.estimation.td_icp_result import OK, REFUSED, TdIcpOptions, TdIcpResult
+
+__all__ = [
+    "JointResult",
+    "OrientationStream",
+    "PairDelay",
+    "SensorDelay",
+    "joint_of_orientations",
+    "joint_with_gyro",
+]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -48,96 +53,6 @@ class OrientationStream:
     t_s: FloatArray
     R_world_sensor: FloatArray
     rotation_sigma: float | FloatArray = 1.7e-3
-
-
-@dataclass(frozen=True)
-class SensorDelay:
-    """One sensor against the reference.
-
-    Attributes:
-        timeshift_s: t_reference = t_sensor + timeshift_s, s.
-        timeshift_sigma_s: Its standard deviation, s.
-        R_ref_sensor: Rotation of the sensor in the reference sensor's frame, shape (3, 3).
-        rotation_sigma_rad: Standard deviations of its local error, rad, shape (3,).
-        noise_rad: Measured noise of one orientation, rms per axis, rad.
-        pairs: Orientations that took part.
-        rejected: Orientations that did not.
-    """
-
-    timeshift_s: float
-    timeshift_sigma_s: float
-    R_ref_sensor: FloatArray
-    rotation_sigma_rad: FloatArray
-    noise_rad: float
-    pairs: int
-    rejected: int
-
-
-@dataclass(frozen=True)
-class PairDelay:
-    """The delay between two sensors: t_b = t_a + timeshift_s."""
-
-    a: str
-    b: str
-    timeshift_s: float
-    timeshift_sigma_s: float
-
-
-@dataclass(frozen=True)
-class JointResult:
-    """All sensors together.
-
-    Attributes:
-        status: "ok" if every sensor took part, "degenerate" if some did not, "refused" if none did.
-        reason: Which did not take part and why, in words.
-        reference: Name of the reference.
-        sensors: By name.
-        pairs: Every pair of sensors, the reference among them.
-        names: Order of `covariance`.
-        covariance: Of [R_ref_sensor (3, local, rad), timeshift (s)] for each of `names`; (4 S, 4 S).
-        gyro_bias_rps: Bias of the reference gyro, shape (3,); zeros without one.
-    """
-
-    status: str
-    reason: str
-    reference: str
-    sensors: dict[str, SensorDelay] = field(default_factory=dict)
-    pairs: list[PairDelay] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    gyro_bias_rps: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    def to_json(self) -> dict[str, object]:
-        """Return what `vical td-icp --sensors ... --json` prints."""
-        return {
-            "status": self.status,
-            "reason": self.reason,
-            "reference": self.reference,
-            "sensors": {
-                name: {
-                    "timeshift_s": s.timeshift_s,
-                    "timeshift_sigma_s": s.timeshift_sigma_s,
-                    "R_ref_sensor_q_wxyz": so3.quat_from_matrix(s.R_ref_sensor).tolist(),
-                    "rotation_sigma_rad": s.rotation_sigma_rad.tolist(),
-                    "noise_rad": s.noise_rad,
-                    "pairs": s.pairs,
-                    "rejected": s.rejected,
-                }
-                for name, s in self.sensors.items()
-            },
-            "pairs": [
-                {
-                    "a": p.a,
-                    "b": p.b,
-                    "timeshift_s": p.timeshift_s,
-                    "timeshift_sigma_s": p.timeshift_sigma_s,
-                }
-                for p in self.pairs
-            ],
-            "order": self.names,
-            "covariance": self.covariance.tolist(),
-            "gyro_bias_rps": self.gyro_bias_rps.tolist(),
-        }
 
 
 def joint_with_gyro(

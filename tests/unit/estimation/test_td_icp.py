@@ -186,3 +186,26 @@ def test_stamp_jitter_that_is_known_widens_the_sigma():
     for result in (blind, aware):
         assert result.status == "ok"
         assert abs(result.timeshift_cam_imu_s) < 4 * result.timeshift_sigma_s
+
+
+@pytest.mark.parametrize("factor", [1.05, 0.95, 1.01])
+def test_stretched_stamps_are_blamed_and_not_the_rotations(factor):
+    t_imu, gyro, t_cam, R, *_ = record(20, 0.3)
+    result = td_icp(t_imu, gyro, t_cam[0] + factor * (t_cam - t_cam[0]), R)
+    assert result.status == "refused" and "the stamps of camera and imu" in result.reason
+    said = float(re.search(r"are ([0-9.]+) % too", result.reason)[1])
+    assert said == pytest.approx(100 * abs(factor - 1), abs=0.4)
+    assert ("fast" if factor > 1 else "slow") in result.reason
+    assert "direction" not in result.reason
+
+
+def test_the_rate_of_the_stamps_is_measured_where_it_is_small():
+    t_imu, gyro, t_cam, R, *_ = record(21, 0.1)
+    sound = td_icp(t_imu, gyro, t_cam, R)
+    assert abs(sound.stamp_rate) < 4 * sound.stamp_rate_sigma < 4e-4
+    middle = t_cam.mean()
+    drifting = td_icp(t_imu, gyro, middle + (t_cam - middle) / (1 + 5e-4), R)
+    assert abs(drifting.stamp_rate - 5e-4) < 4 * drifting.stamp_rate_sigma
+    assert drifting.status == "ok"
+    uneven = td_icp(t_imu, gyro, middle + (t_cam - middle) / 1.003, R)
+    assert uneven.status == "degenerate" and "stamps" in uneven.reason

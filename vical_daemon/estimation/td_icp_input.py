@@ -1,0 +1,66 @@
+"""Gyro samples and orientations brought into a form that can be registered, or the reason why not."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+MIN_ORIENTATIONS = 12
+
+
+def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArray] | str:
+    """Sort, drop what is not a number or stamped twice; a string says why nothing is left."""
+    t_s, gyro = np.asarray(t_s, dtype=np.float64), np.asarray(gyro, dtype=np.float64)
+    good = np.isfinite(t_s) & np.isfinite(gyro).all(axis=-1) if len(t_s) else np.zeros(0, dtype=bool)
+    t_s, gyro = t_s[good], gyro[good]
+    if len(t_s) < 2 * MIN_ORIENTATIONS:
+        return f"{len(t_s)} gyro samples: too few"
+    order = np.argsort(t_s, kind="stable")
+    t_s, gyro = t_s[order], gyro[order]
+    keep = np.concatenate(([True], np.diff(t_s) > 1e-6))  # a sample stamped twice adds nothing
+    return t_s[keep], gyro[keep]
+
+
+def clean_orientations(
+    t_s: FloatArray, R: FloatArray, rotation_sigma: float | FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.intp]] | str:
+    """Sort, drop what is not a number, and bring the noise into the form of covariances.
+
+    Returns:
+        Stamps, orientations, covariances, and the index of each in the input; or why nothing is left.
+    """
+    t_s, R = np.asarray(t_s, dtype=np.float64), np.asarray(R, dtype=np.float64)
+    n = len(t_s)
+    if n < MIN_ORIENTATIONS:
+        return f"{n} camera orientations: at least {MIN_ORIENTATIONS} are needed (is the target in view?)"
+    sigma = np.asarray(rotation_sigma, dtype=np.float64)
+    if sigma.ndim < 3:
+        sigma = (np.broadcast_to(sigma, (n,)) ** 2)[:, None, None] * np.eye(3)
+    good = np.flatnonzero(
+        np.isfinite(t_s) & np.isfinite(R).all(axis=(1, 2)) & np.isfinite(sigma).all(axis=(1, 2))
+    )
+    index = good[np.argsort(t_s[good], kind="stable")]
+    index = index[np.concatenate(([True], np.diff(t_s[index]) > 1e-6))] if len(index) else index
+    if len(index) < MIN_ORIENTATIONS:
+        return f"{len(index)} usable camera orientations: at least {MIN_ORIENTATIONS} are needed"
+    return t_s[index], R[index], sigma[index] + 1e-14 * np.eye(3), index
+
+
+def world_cam_from_cam_target(
+    R_cam_target: FloatArray, covariance: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray | None]:
+    """Turn target poses as seen by the camera into camera orientations in the world (= target).
+
+    Args:
+        R_cam_target: Rotations, shape (n, 3, 3).
+        covariance: Of their local (right) errors, rad^2, shape (n, 3, 3), or None.
+
+    Returns:
+        R_world_cam (n, 3, 3), and the covariance of its local error (n, 3, 3) or None.
+    """
+    R_world_cam = np.swapaxes(R_cam_target, 1, 2)
+    if covariance is None:
+        return R_world_cam, None
+    return R_world_cam, R_cam_target @ covariance @ R_world_cam

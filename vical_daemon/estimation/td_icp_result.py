@@ -1,0 +1,112 @@
+"""What temporal calibration is asked and what it answers: options and result of `td_icp`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation import so3
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+OK = "ok"
+DEGENERATE = "degenerate"
+REFUSED = "refused"
+
+
+@dataclass(frozen=True, slots=True)
+class TdIcpOptions:
+    """Settings; the defaults suit a 3DM-GX3-25 or better.
+
+    Attributes:
+        search_s: The shift is looked for within +- this of the guess, s.
+        timeshift_guess_s: Middle of the search, s.
+        gyro_density: Gyro noise density, rad/s/sqrt(Hz).
+        gyro_walk: Gyro bias walk, rad/s^2/sqrt(Hz).
+        gyro_log_sigma: How well the density is known (sigma of its logarithm).
+        bias_sigma_rps: The bias is expected to lie around zero with this sigma, rad/s.
+        stamp_jitter_s: Standard deviation of camera stamps, independent from frame to frame, s.
+        estimate_noise: Measure the noises' scales; False: take rotation_sigma and gyro_density as they are.
+        gyro_matrix_sigma: Expected size of each scale and misalignment error of the gyro (0.003: 0.3 %); they
+            are estimated along with the rest. 0: a perfect gyro.
+    """
+
+    search_s: float = 5.0
+    timeshift_guess_s: float = 0.0
+    gyro_density: float = 5.2e-4
+    gyro_walk: float = 2.0e-5
+    gyro_log_sigma: float = 0.2
+    bias_sigma_rps: float = 0.1
+    stamp_jitter_s: float = 0.0
+    estimate_noise: bool = True
+    gyro_matrix_sigma: float = 0.003
+
+
+@dataclass(frozen=True)
+class TdIcpResult:
+    """What registration found.
+
+    Attributes:
+        status: "ok"; "degenerate": part of the answer is not determined, `reason` says which; "refused":
+            there is no answer, and all numbers are not-a-number.
+        reason: Why, in words; empty when ok.
+        timeshift_cam_imu_s: t_imu = t_cam + shift, s.
+        timeshift_sigma_s: Its standard deviation, s.
+        R_imu_cam: Rotation of the camera in the imu frame, shape (3, 3).
+        rotation_sigma_rad: Standard deviations of its local (right) error, rad, shape (3,).
+        covariance: Of [R_imu_cam (3, local, rad), gyro bias (3, rad/s), shift (s)], shape (7, 7).
+        gyro_bias_rps: Bias in the middle of the data, rad/s, shape (3,).
+        pairs: Orientations that took part.
+        rejected: Orientations refused as outliers or without imu data at their time.
+        iterations: Rounds of both iterative phases.
+        camera_noise_rad: Measured noise of one orientation, rms per axis, rad.
+        gyro_noise_ratio: Measured drift of the gyro over the stated one.
+        used: Which of the given orientations took part, shape (n,).
+        stamp_rate: By how much the delay grows with time in these data, s/s (1e-6: one microsecond a second);
+            near zero where both clocks are sound. The shift above is that in the middle of the data.
+        stamp_rate_sigma: Its standard deviation, s/s.
+    """
+
+    status: str
+    reason: str
+    timeshift_cam_imu_s: float = float("nan")
+    timeshift_sigma_s: float = float("nan")
+    R_imu_cam: FloatArray = field(default_factory=lambda: np.full((3, 3), np.nan))
+    rotation_sigma_rad: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    covariance: FloatArray = field(default_factory=lambda: np.full((7, 7), np.nan))
+    gyro_bias_rps: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    pairs: int = 0
+    rejected: int = 0
+    iterations: int = 0
+    camera_noise_rad: float = float("nan")
+    gyro_noise_ratio: float = float("nan")
+    used: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    stamp_rate: float = float("nan")
+    stamp_rate_sigma: float = float("nan")
+
+    def to_json(self) -> dict[str, object]:
+        """Return what `vical td-icp --json` prints."""
+        q = so3.quat_from_matrix(self.R_imu_cam) if self.status != REFUSED else np.full(4, np.nan)
+        return {
+            "status": self.status,
+            "reason": self.reason,
+            "timeshift_cam_imu_s": _number(self.timeshift_cam_imu_s),
+            "timeshift_sigma_s": _number(self.timeshift_sigma_s),
+            "R_imu_cam_q_wxyz": [_number(v) for v in q],
+            "rotation_sigma_rad": [_number(v) for v in self.rotation_sigma_rad],
+            "gyro_bias_rps": [_number(v) for v in self.gyro_bias_rps],
+            "pairs": self.pairs,
+            "rejected": self.rejected,
+            "iterations": self.iterations,
+            "camera_noise_rad": _number(self.camera_noise_rad),
+            "stamp_rate_ppm": _number(1e6 * self.stamp_rate),
+            "stamp_rate_sigma_ppm": _number(1e6 * self.stamp_rate_sigma),
+        }
+
+
+def _number(value: float) -> float | None:
+    """JSON knows no not-a-number."""
+    return float(value) if np.isfinite(value) else None
