@@ -22,11 +22,13 @@ MODELS = {
     "known target, lens": ModelBlocks(intrinsics=True),
     "known target, IMU matrices": ModelBlocks(imu_matrix=True),
     "known target of unknown size": ModelBlocks(target_scale=True),
+    "known target, readout of rows": ModelBlocks(readout=True),
     "no target, gravity known": ModelBlocks(target_free=True, gravity="known"),
     "no target, direction of gravity unknown": ModelBlocks(target_free=True, gravity="magnitude"),
     "no target, lens, IMU matrices": ModelBlocks(
         target_free=True, gravity="known", intrinsics=True, imu_matrix=True
     ),
+    "no target, readout of rows": ModelBlocks(target_free=True, gravity="known", readout=True),
 }
 
 

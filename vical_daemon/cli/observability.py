@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
             intrinsics="intrinsics" in blocks,
             imu_matrix="imu_matrix" in blocks,
             target_scale="target_scale" in blocks,
+            readout="readout" in blocks,
         )
     )
     missing = _missing(result, motion, setup)

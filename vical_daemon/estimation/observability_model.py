@@ -15,7 +15,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-ComplexArray = npt.NDArray[np.complex128]
+from vical_daemon.estimation.power_series import ComplexArray, div, exp, matmul, mul, shift, trajectory
+
 FloatArray = npt.NDArray[np.float64]
 
 _STEP = 1e-30
@@ -33,6 +34,7 @@ class ModelBlocks:
         intrinsics: fx fy cx cy k1 k2 p1 p2 are unknown.
         imu_matrix: Gyro matrix (9) and lower-triangular accelerometer matrix (6) are unknown.
         target_scale: The board's size is unknown.
+        readout: Rows are taken one after the other; how long an image takes is unknown.
         gravity: free (3 unknowns), magnitude (known: 2) or known (0: the world is level).
         points: How many points are seen.
     """
@@ -42,6 +44,7 @@ class ModelBlocks:
     intrinsics: bool = False
     imu_matrix: bool = False
     target_scale: bool = False
+    readout: bool = False
     gravity: Literal["free", "magnitude", "known"] = "free"
     points: int = 6
 
@@ -65,79 +68,13 @@ class ModelRank:
     names: list[str]
 
 
-# --- power series in time: arrays whose first axis is the order ---
-
-
-def _mul(a: ComplexArray, b: ComplexArray) -> ComplexArray:
-    """Product of two series; further axes broadcast."""
-    out = np.zeros((len(a), *np.broadcast_shapes(a.shape[1:], b.shape[1:])), dtype=np.complex128)
-    for i in range(len(a)):
-        out[i:] += a[i] * b[: len(a) - i]
-    return out
-
-
-def _div(a: ComplexArray, b: ComplexArray) -> ComplexArray:
-    """Quotient of two series."""
-    out = np.zeros((len(a), *np.broadcast_shapes(a.shape[1:], b.shape[1:])), dtype=np.complex128)
-    for k in range(len(a)):
-        rest = a[k] - sum((out[i] * b[k - i] for i in range(k)), start=np.zeros_like(out[0]))
-        out[k] = rest / b[0]
-    return out
-
-
-def _matmul(A: ComplexArray, b: ComplexArray) -> ComplexArray:
-    """Matrix series (K, 3, 3) times vector series (K, ..., 3)."""
-    out = np.zeros_like(b)
-    for i in range(len(A)):
-        out[i:] += np.einsum("ij,k...j->k...i", A[i], b[: len(A) - i])
-    return out
-
-
-def _trajectory(
-    R0: ComplexArray, v0: ComplexArray, p0: ComplexArray, g: ComplexArray, w: ComplexArray, f: ComplexArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Series of attitude and position: R' = R hat(w), v' = R f + g, p' = v."""
-    K = len(w)
-    R = np.zeros((K, 3, 3), dtype=np.complex128)
-    v, p = np.zeros((K, 3), dtype=np.complex128), np.zeros((K, 3), dtype=np.complex128)
-    R[0], v[0], p[0] = R0, v0, p0
-    S = np.zeros((K, 3, 3), dtype=np.complex128)
-    S[:, 2, 1], S[:, 0, 2], S[:, 1, 0] = w[:, 0], w[:, 1], w[:, 2]
-    S -= np.swapaxes(S, 1, 2)
-    for k in range(K - 1):
-        R[k + 1] = sum(R[i] @ S[k - i] for i in range(k + 1)) / (k + 1)
-    a = _matmul(R, f)
-    a[0] += g
-    for k in range(K - 1):
-        v[k + 1] = a[k] / (k + 1)
-        p[k + 1] = v[k] / (k + 1)
-    return R, p
-
-
-def _shift(series: ComplexArray, delay: complex) -> ComplexArray:
-    """Series of y(t + delay) about t, to first order in the delay (its nominal value is zero)."""
-    out = series.copy()
-    out[:-1] += delay * series[1:] * np.arange(1, len(series)).reshape(-1, *([1] * (series.ndim - 1)))
-    return out
-
-
-def _exp(v: ComplexArray) -> ComplexArray:
-    """Rotation matrix of a vector that is real of any size or imaginary and tiny."""
-    S = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    angle2 = complex(v @ v)
-    if abs(angle2) < 1e-40:
-        return np.asarray(np.eye(3) + S, dtype=np.complex128)
-    angle = np.sqrt(angle2)
-    return np.asarray(np.eye(3) + np.sin(angle) / angle * S + (1 - np.cos(angle)) / angle2 * S @ S)
-
-
 class _World:
     """A generic state and generic inputs; `outputs` maps small changes of the unknowns to Taylor series."""
 
     def __init__(self, blocks: ModelBlocks, seed: int, rate: FloatArray, force: FloatArray) -> None:
         rng = np.random.default_rng(seed)
         self.blocks = blocks
-        self.R0, self.R_imu_cam = (_exp(rng.normal(0, 0.6, 3).astype(np.complex128)) for _ in range(2))
+        self.R0, self.R_imu_cam = (exp(rng.normal(0, 0.6, 3).astype(np.complex128)) for _ in range(2))
         self.p0 = rng.normal(0, 0.3, 3)
         self.v0 = rng.normal(0, 0.5, 3)
         self.g = rng.normal(0, 1, 3)
@@ -164,6 +101,7 @@ class _World:
         sizes += [("lens", 8)] if b.intrinsics else []
         sizes += [("gyro_matrix", 9), ("accel_matrix", 6)] if b.imu_matrix else []
         sizes += [("target_scale", 1)] if b.target_scale else []
+        sizes += [("readout", 1)] if b.readout else []
         sizes += [("landmark", 3 * b.points)] if b.target_free else []
         return [name for name, size in sizes for _ in range(size)]
 
@@ -185,8 +123,8 @@ class _World:
             g = g + part["gravity"] @ np.linalg.svd(self.g[None])[2][1:]
         elif self.blocks.gravity == "free":
             g = g + part["gravity"]
-        R, p = _trajectory(
-            self.R0 @ _exp(part["attitude"]), self.v0 + part["velocity"], self.p0 + part["position"], g, w, f
+        R, p = trajectory(
+            self.R0 @ exp(part["attitude"]), self.v0 + part["velocity"], self.p0 + part["position"], g, w, f
         )
         points = self.points.astype(np.complex128)
         if self.blocks.target_free:
@@ -201,28 +139,33 @@ class _World:
         K = len(R)
         arm = -np.repeat(p[:, None], len(points), axis=1)
         arm[0] += points
-        q = _matmul(np.swapaxes(R, 1, 2), arm)
+        q = matmul(np.swapaxes(R, 1, 2), arm)
         q[0] -= self.p_imu_cam + part["lever_arm"]
-        R_imu_cam = self.R_imu_cam @ _exp(part["rotation"])
+        R_imu_cam = self.R_imu_cam @ exp(part["rotation"])
         X = q @ R_imu_cam
-        xy = _div(X[..., :2], X[..., 2:])
+        xy = div(X[..., :2], X[..., 2:])
         if self.blocks.intrinsics:
             xy = self._lens(xy, part["lens"])
+        late = np.zeros((K, len(points), 1), dtype=np.complex128)
         if self.blocks.timeshift:
-            xy = _shift(xy, complex(part["timeshift"][0]))
+            late[0] += part["timeshift"]
+        if self.blocks.readout:
+            late += part["readout"] * xy[..., 1:]  # a row is taken the later the lower it lies in the image
+        if self.blocks.timeshift or self.blocks.readout:
+            xy = shift(xy, late)
         return xy[: K - 1]
 
     @staticmethod
     def _lens(xy: ComplexArray, lens: ComplexArray) -> ComplexArray:
         """Pinhole with radtan around f = 1, c = 0, k = (-0.2, 0.1), p = 0."""
         x, y = xy[..., 0], xy[..., 1]
-        r2 = _mul(x, x) + _mul(y, y)
+        r2 = mul(x, x) + mul(y, y)
         k1, k2, p1, p2 = -0.2 + lens[4], 0.1 + lens[5], 0.001 + lens[6], -0.002 + lens[7]
-        radial = k1 * r2 + k2 * _mul(r2, r2)
+        radial = k1 * r2 + k2 * mul(r2, r2)
         radial[0] += 1.0
-        xyy = _mul(x, y)
-        u = _mul(x, radial) + 2 * p1 * xyy + p2 * (r2 + 2 * _mul(x, x))
-        v = _mul(y, radial) + p1 * (r2 + 2 * _mul(y, y)) + 2 * p2 * xyy
+        xyy = mul(x, y)
+        u = mul(x, radial) + 2 * p1 * xyy + p2 * (r2 + 2 * mul(x, x))
+        v = mul(y, radial) + p1 * (r2 + 2 * mul(y, y)) + 2 * p2 * xyy
         out = np.stack((u * (1 + lens[0]), v * (1 + lens[1])), axis=-1)
         out[0] += lens[2:4]
         return out
@@ -281,10 +224,10 @@ def _constant(world: _World, K: int) -> _World:
     body_v = world.R0.real.T @ world.v0
     rate = world.rate.astype(np.complex128)
     zero = np.zeros(3, dtype=np.complex128)
-    R, _ = _trajectory(world.R0, zero, zero, zero, rate, np.zeros((K, 3), dtype=np.complex128))
+    R, _ = trajectory(world.R0, zero, zero, zero, rate, np.zeros((K, 3), dtype=np.complex128))
     gravity = np.zeros((K, 3), dtype=np.complex128)
     gravity[0] = world.g
-    force = -_matmul(np.swapaxes(R, 1, 2), gravity)
+    force = -matmul(np.swapaxes(R, 1, 2), gravity)
     force[0] += np.cross(w, body_v)
     world.force = force.real
     return world

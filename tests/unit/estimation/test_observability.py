@@ -24,6 +24,7 @@ def _lost(result):
     [
         ModelBlocks(),
         ModelBlocks(intrinsics=True, imu_matrix=True, target_scale=True, gravity="magnitude"),
+        ModelBlocks(intrinsics=True, readout=True),
     ],
 )
 def test_before_a_known_target_everything_is_observable(blocks):
@@ -45,6 +46,13 @@ def test_nor_do_lens_and_imu_errors_without_a_target_add_to_that():
         ModelBlocks(target_free=True, gravity="known", intrinsics=True, imu_matrix=True, points=5), order=10
     )
     assert full.unknowns - full.rank == 4
+
+
+def test_the_readout_of_rows_is_observable_and_lost_with_the_delay():
+    free = model_rank(ModelBlocks(target_free=True, gravity="known", readout=True))
+    assert free.unknowns - free.rank == 4 and "readout" not in _lost(free)
+    still = model_rank(ModelBlocks(readout=True), "constant")
+    assert "timeshift" in _lost(still)
 
 
 def test_rotation_about_one_axis_loses_the_lever_arm_along_it():
