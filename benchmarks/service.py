@@ -38,14 +38,22 @@ def main(argv: list[str]) -> int:
     """Run the study and print its table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks service", description=__doc__)
     parser.add_argument("--kills", type=int, default=20, help="of each process")
+    parser.add_argument("--only", choices=PROCESSES, help="kill this one alone")
     parser.add_argument("--keep-log", metavar="FILE", help="write the journal there")
     args = parser.parse_args(argv)
+    victims = (args.only,) if args.only else PROCESSES
     try:
         with Machine() as machine:
             _install(machine)
-            rows = _study(machine, args.kills)
-            if args.keep_log:
-                Path(args.keep_log).write_text(machine.run("journalctl", "--no-pager", "-o", "short-precise"))
+            try:
+                rows = _study(machine, args.kills, victims)
+            except MachineError as error:
+                print(f"failed: {error}", file=sys.stderr)
+                return 1
+            finally:
+                if args.keep_log:
+                    journal = machine.run("journalctl", "--no-pager", "-o", "short-precise", check=False)
+                    Path(args.keep_log).write_text(journal)
     except MachineError as error:
         print(f"skipped: {error}", file=sys.stderr)
         return 0
@@ -73,7 +81,7 @@ def _install(machine: Machine) -> None:
     (units / "vical-acquire.service.d/bench.conf").write_text(DROP_IN)
 
 
-def _study(machine: Machine, kills: int) -> list[tuple[str, str]]:
+def _study(machine: Machine, kills: int, victims: tuple[str, ...]) -> list[tuple[str, str]]:
     rows = [("boot to basic.target", f"{machine.boot():.1f} s")]
     machine.run("systemctl", "start", "rig-feed")
     begin_s = time.monotonic()
@@ -84,7 +92,7 @@ def _study(machine: Machine, kills: int) -> list[tuple[str, str]]:
     _wait(lambda: "converged" in _status(machine, "calibrate"), "converged", 180)
     rows.append(("calibration converged", _status(machine, "calibrate")[:70]))
     deeds: list[tuple[float, str]] = []
-    rows += [(f"kill -9 {name}, {kills} times", _kill(machine, name, kills, deeds)) for name in PROCESSES]
+    rows += [(f"kill -9 {name}, {kills} times", _kill(machine, name, kills, deeds)) for name in victims]
     rows += [(f"{name} hung (SIGSTOP)", _hang(machine, name, deeds)) for name in ("record", "acquire")]
     deeds.append((time.time(), "stop"))
     begin_s = time.monotonic()
@@ -111,6 +119,7 @@ def _kill(machine: Machine, name: str, kills: int, deeds: list[tuple[float, str]
         deeds.append((time.time(), f"kill {name}"))
         _wait(lambda pid=pid: _ready_again(machine, name, pid), f"{name} again", 90)
         outages.append(time.monotonic() - begin_s)
+        print(f"{name} killed {len(outages)} of {kills}: {outages[-1]:.1f} s", file=sys.stderr, flush=True)
         time.sleep(2.0)
     (restarts,) = machine.show(f"vical-{name}", "NRestarts")
     return f"ready again after {np.median(outages):.1f} s (longest {max(outages):.1f} s), {restarts} restarts"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import resource
 import secrets
 import socket as sockets
@@ -28,6 +29,8 @@ from vical_daemon.topics import Congestion, Priority, Topic, parse_key
 _log = logging.getLogger(__name__)
 _NUMBER = struct.Struct("<4sIQ")  # mark, publisher, number
 _MARK = b"vic1"
+_SOURCE_PLACE = re.compile(r"[.,]?\s+at /\S+\.rs:\d+\.?")
+_ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|wss|serial|unixsock-stream|unixpipe|vsock)/.+")
 _PAYLOAD_LIMIT = 256 * 2**20
 _QUEUE_SIZES = {
     "control": 2, "real_time": 16, "interactive_high": 2, "interactive_low": 2,
@@ -76,6 +79,9 @@ def open_bus(
     """
     if mode not in ("router", "client"):
         raise ValueError(f"mode {mode!r}: router or client")
+    for endpoint in (*listen, *connect):
+        if not _ENDPOINT.fullmatch(endpoint):
+            raise BusError(f"{endpoint!r} is no endpoint: write it like tcp/127.0.0.1:7447 or tls/robot:7447")
     local = [f"unixsock-stream/{socket}"] if socket else []
     if tcp_port:
         local.append(f"tcp/127.0.0.1:{tcp_port}")
@@ -210,12 +216,37 @@ def _open(config: dict[str, Any]) -> Any:
 
 
 def _explain(config: dict[str, Any], text: str) -> str:
-    first = " ".join(text.split())[:300]
+    """Say in one line what is wrong and what to try; places in zenoh's own source help nobody."""
+    detail = " ".join(_SOURCE_PLACE.sub("", text).split())[:200]
     if config["mode"] == "client":
-        where = ", ".join(config["connect"]["endpoints"])
-        return f"no bus at {where}: is vical-acquire running, are user and password right? ({first})"
+        endpoints = config["connect"]["endpoints"]
+        where = ", ".join(endpoint.removeprefix("unixsock-stream/") for endpoint in endpoints)
+        if any(_answers(endpoint) for endpoint in endpoints):
+            return (
+                f"no bus at {where}: a router is there but refuses us; check user and password, certificates"
+            )
+        words = f"no bus at {where}: nothing answers; start `vical run -c FILE` (or vical.target) there"
+        return words if detail.startswith("Unable to connect") else f"{words} ({detail})"
     where = ", ".join(config["listen"]["endpoints"])
-    return f"cannot host the bus at {where}: is another router running there? ({first})"
+    return f"cannot host the bus at {where}: is another router running there? ({detail})"
+
+
+def _answers(endpoint: str) -> bool:
+    """Whether anybody accepts connections at an endpoint (of the kinds that can be tried simply)."""
+    protocol, _, place = endpoint.partition("/")
+    try:
+        if protocol == "unixsock-stream":
+            with sockets.socket(sockets.AF_UNIX) as probe:
+                probe.settimeout(0.5)
+                probe.connect(place)
+                return True
+        host, _, port = place.partition("#")[0].rpartition(":")
+        if protocol not in ("tcp", "tls") or not port.isdigit():
+            return False
+        with sockets.create_connection((host.strip("[]"), int(port)), timeout=0.5):
+            return True
+    except OSError:
+        return False
 
 
 class _Outlet:

@@ -95,6 +95,7 @@ def run(args: argparse.Namespace) -> int:
     result["recordings"] = sorted(str(path) for path in set(out.rglob("*.mcap")) - before)
     problem = f"no solution: {estimate.reason or estimate.guidance}"
     if CAMERA in estimate.cameras:
+        result["cameras"][CAMERA]["resolution"] = list(config.cameras[CAMERA].size)
         table = demo_truth.compare(result, result["truth"], CAMERA)
         result["error"] = demo_truth.as_json(table)
         problem = demo_truth.verdict(result, table)

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             speed=args.speed,
             rig=args.rig,
             everything=args.all,
-            progress=not args.json,
+            progress=sys.stderr.isatty() and not args.quiet,
         )
     finally:
         bus.close()
@@ -86,7 +86,9 @@ def _open_bus(args: argparse.Namespace) -> Bus:
     print(
         f"nobody hosts the bus: hosting it at {path} and tcp/127.0.0.1:{settings.tcp_port}", file=sys.stderr
     )
-    return open_bus(mode="router", socket=path, tcp_port=settings.tcp_port)
+    bus = open_bus(mode="router", socket=path, tcp_port=settings.tcp_port)
+    time.sleep(args.wait)  # or those who wait for a router miss the beginning
+    return bus
 
 
 def replay(
@@ -120,8 +122,8 @@ def replay(
     begin_s, count, late_s, shown_s = time.monotonic(), 0, 0.0, 0.0
     first_ns = recording.begin_ns
     for key, payload in recording.messages(recording.streams if everything else None):
-        at_s = ((stamp_of(payload) or first_ns) - first_ns) * 1e-9 / speed if speed else 0.0
-        wait_s = begin_s + at_s - time.monotonic()
+        data_s = ((stamp_of(payload) or first_ns) - first_ns) * 1e-9
+        wait_s = begin_s + data_s / speed - time.monotonic() if speed else 0.0
         if wait_s > 0:
             stop.wait(wait_s)
         elif speed:
@@ -133,12 +135,7 @@ def replay(
         now_s = time.monotonic()
         if progress and now_s - shown_s >= _PROGRESS_S:
             shown_s = now_s
-            print(
-                f"\r{at_s * (speed or 1):7.1f} of {recording.duration_s:.1f} s",
-                end="",
-                file=sys.stderr,
-                flush=True,
-            )
+            print(f"\r{data_s:7.1f} of {recording.duration_s:.1f} s", end="", file=sys.stderr, flush=True)
     if progress:
         print(file=sys.stderr)
     return {"messages": count, "duration_s": time.monotonic() - begin_s, "late_ms": late_s * 1e3}

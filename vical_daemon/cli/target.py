@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
@@ -13,6 +13,11 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_daemon.vision.target import Target
 
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "aprilgrid": {"tag_cols": 6, "tag_rows": 6, "tag_size": None, "tag_spacing": 0.3},
+    "checkerboard": {"cols": 8, "rows": 7, "square": None},
+}
+"""Options of each kind of board with their defaults."""
 HELP = "a board to print, to scale, and its target YAML"
 
 EPILOG = """examples:
@@ -34,13 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--yaml", type=Path, metavar="FILE", help="target YAML (default: beside the board)")
     parser.add_argument("--paper", default="a4", help="a5 ... a0, letter, legal, tabloid or WxH in mm (a4)")
     grid = parser.add_argument_group("aprilgrid")
-    grid.add_argument("--tag-cols", type=int, default=6, help="tags along x (6)")
-    grid.add_argument("--tag-rows", type=int, default=6, help="tags along y (6)")
+    grid.add_argument("--tag-cols", type=int, metavar="N", help="tags along x (6)")
+    grid.add_argument("--tag-rows", type=int, metavar="N", help="tags along y (6)")
     grid.add_argument("--tag-size", metavar="LENGTH", help="edge of a tag, m or e.g. 30mm (as large as fits)")
-    grid.add_argument("--tag-spacing", type=float, default=0.3, help="gap between tags / tag size (0.3)")
+    grid.add_argument("--tag-spacing", type=float, metavar="X", help="gap between tags / tag size (0.3)")
     squares = parser.add_argument_group("checkerboard")
-    squares.add_argument("--cols", type=int, default=8, help="inner corners along x (8)")
-    squares.add_argument("--rows", type=int, default=7, help="inner corners along y (7)")
+    squares.add_argument("--cols", type=int, metavar="N", help="inner corners along x (8)")
+    squares.add_argument("--rows", type=int, metavar="N", help="inner corners along y (7)")
     squares.add_argument(
         "--square", metavar="LENGTH", help="edge of a square, m, or e.g. 30mm (as large as fits)"
     )
@@ -79,17 +84,35 @@ def _target(args: argparse.Namespace) -> Target:
     from vical_daemon.vision.board_sheet import largest_on
     from vical_daemon.vision.target import AprilGrid, Checkerboard, load_target
 
+    given = _options(args)
     if args.source is not None:
         return load_target(args.source)
-    wanted = args.tag_size if args.type == "aprilgrid" else args.square
+    wanted = given.pop("tag_size" if args.type == "aprilgrid" else "square")
     size = parse_length_m(wanted) if wanted is not None else 0.02
     board: Target
     if args.type == "aprilgrid":
-        board = AprilGrid(args.tag_cols, args.tag_rows, size, args.tag_spacing)
+        board = AprilGrid(given["tag_cols"], given["tag_rows"], size, given["tag_spacing"])
     else:
-        board = Checkerboard(args.cols, args.rows, size, size)
+        board = Checkerboard(given["cols"], given["rows"], size, size)
     _check(board, args.out)
     return board if wanted is not None else largest_on(board, args.paper)
+
+
+def _options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the options of the kind of board that is made.
+
+    Raises:
+        CliError: One of the other kind was given: ignoring it would print another board than was asked for.
+    """
+    for kind, options in _OPTIONS.items():
+        for name in options:
+            if getattr(args, name) is not None and kind != args.type:
+                flag, ours = f"--{name.replace('_', '-')}", _OPTIONS.get(args.type, {})
+                hint = f"; its options: {', '.join('--' + o.replace('_', '-') for o in ours)}" if ours else ""
+                what = args.type or "a board from a file"
+                raise CliError(f"{flag} is for {kind}, not for {what}{hint}", exit_code=2)
+    defaults = _OPTIONS.get(args.type, {})
+    return {k: v if getattr(args, k) is None else getattr(args, k) for k, v in defaults.items()}
 
 
 def _check(board: Target, out: Path) -> None:

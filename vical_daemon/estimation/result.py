@@ -51,6 +51,7 @@ class CameraEstimate:
         unobservable: Names of withheld directions, each with the motion that would reveal it.
         readout_s: Rolling-shutter readout first to last row, s (0: global shutter).
         readout_sigma_s: Its standard deviation, s.
+        resolution: width, height of the images, px; []: not known (it does not travel in the message).
     """
 
     T_imu_cam: PoseEstimate
@@ -66,6 +67,7 @@ class CameraEstimate:
     unobservable: list[str] = field(default_factory=list)
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
+    resolution: list[int] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,7 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         [],
         camera.readout_s,
         float(sigma[where.readout]) if where.readout is not None else 0.0,
+        [int(size) for size in camera.resolution],
     )
 
 

@@ -22,7 +22,7 @@ def rig_from_estimate(
 
     Args:
         estimate: The answer.
-        resolutions: Image sizes by camera name (an estimate does not hold them).
+        resolutions: Image sizes by camera name (an estimate that came over the bus does not hold them).
         noise: Densities of the imu.
         note: Comment for the files.
 

@@ -82,8 +82,9 @@ def test_options_fill_in_what_the_source_lacks(result_file, tmp_path, capsys):
 def estimate(stamp, camera, shift):
     pose = PoseEstimate([0.1, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], np.eye(6).tolist())
     known = CameraEstimate(
-        pose, shift, 1e-5, [500.0, 500.0, 320.0, 240.0], [0.0] * 4, "radtan", [0.0] * 4, [0.0] * 4, 0.2
-    )
+        pose, shift, 1e-5, [500.0, 500.0, 320.0, 240.0], [0.0] * 4, "radtan", [0.0] * 4, [0.0] * 4, 0.2,
+        resolution=[640, 480],
+    )  # fmt: skip
     return CalibrationEstimate(
         stamp, Status.CONVERGED, "", 1.0, "", 60.0, 100, 1000, {camera: known},
         ImuEstimate([0.0] * 3, [0.0] * 3), [0.0, 0.0, -9.81], 1.0, 0.0,
@@ -122,6 +123,8 @@ def test_store_gives_the_newest_calibration(tmp_path, capsys, monkeypatch):
     assert main(["export", "store", "--format", "json"]) == 0
     exported = json.loads(capsys.readouterr().out)
     assert exported["cameras"]["cam0"]["timeshift_cam_imu_s"] == pytest.approx(0.003)
+    assert main(["export", "store", "--format", "kalibr"]) == 0  # the README's line: nothing else is needed
+    assert yaml.safe_load(capsys.readouterr().out)["cam0"]["resolution"] == [640, 480]
 
 
 @pytest.mark.parametrize(

@@ -125,6 +125,11 @@ def test_the_command_writes_board_and_yaml(tmp_path, capsys):
         (("--type", "aprilgrid", "--tag-cols", "600", "-o", "b.pdf"), "above 587"),
         (("--type", "checkerboard", "--cols", "2", "-o", "b.pdf"), "below 3"),
         (("--type", "checkerboard", "--square", "88", "-o", "b.pdf"), "metres"),
+        (
+            ("--type", "aprilgrid", "--cols", "0", "-o", "b.pdf"),
+            "--cols is for checkerboard",
+        ),
+        (("--from", "t.yaml", "--rows", "3", "-o", "b.pdf"), "not for a board from a file"),
         (("--from", "none.yaml", "-o", "b.pdf"), "no such file"),
         (("--type", "checkerboard", "-o", "none/b.pdf"), "cannot be written"),
     ],
