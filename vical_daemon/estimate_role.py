@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vical_daemon import topics
 from vical_daemon.bus import Sample
@@ -11,9 +11,25 @@ from vical_daemon.config import Config
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.estimators import Estimator
-from vical_daemon.messages import DiagnosticStatus, ImuMessage, MessageError, decode_imu, decode_points
-from vical_daemon.publications import Message, calibration_messages, calibration_status, companion_messages
+from vical_daemon.messages import (
+    DiagnosticStatus,
+    ImuMessage,
+    MessageError,
+    decode_imu,
+    decode_points,
+)
+from vical_daemon.predictions import Predictions
+from vical_daemon.publications import (
+    Message,
+    calibration_messages,
+    calibration_status,
+    companion_messages,
+    delay_statuses,
+)
 from vical_daemon.stamp_order import StampOrder
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.td_icp_watch import DelayWatch
 
 Keep = Callable[[Sequence[Any]], None]
 Inspect = Callable[[CalibrationEstimate], CalibrationEstimate]
@@ -30,6 +46,7 @@ class EstimateRole:
         period_s: Between two publications; a change shows as soon as the next one.
         keep: Takes the verdict on every frame (for reports); None: they are dropped.
         inspect: Sees every estimate before it is published and may add to it.
+        watch: Compares the time shift with that of the rotations alone; None: nobody does.
     """
 
     def __init__(
@@ -40,9 +57,12 @@ class EstimateRole:
         *,
         keep: Keep | None = None,
         inspect: Inspect | None = None,
+        watch: DelayWatch | None = None,
     ) -> None:
         self.config, self.estimator = config, estimator
         self._period_s, self._keep, self._inspect = period_s, keep, inspect
+        self._watch = watch
+        self._predictions = Predictions(config.rig)
         self._imu_key = topics.imu_key(config.rig, config.calibration_imu)
         self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
         self._next_s = self._next_companion_s = -float("inf")
@@ -79,21 +99,26 @@ class EstimateRole:
         self._next_s = self._next_companion_s = -float("inf")
         return self._publications(0.0)
 
-    def reset(self, estimator: Estimator) -> None:
-        """Forget everything and begin anew with a fresh estimator."""
+    def reset(self, estimator: Estimator, watch: DelayWatch | None = None) -> None:
+        """Forget everything and begin anew with a fresh estimator (and watch)."""
         self._order.pop_all()
-        self.estimator, self.latest = estimator, None
+        self.estimator, self.latest, self._watch = estimator, None, watch
         self._next_s = self._next_companion_s = -float("inf")
 
     def _feed(self, items: list[ImuMessage | PointsFrame]) -> None:
         for item in items:
             if isinstance(item, ImuMessage):
                 self.estimator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+                if self._watch is not None:
+                    self._watch.add_imu(item.stamp_ns, item.gyro_rps)
             else:
+                if self._watch is not None:
+                    self._watch.add_points(item)
                 self.estimator.add_points(item)
                 self._report(self.estimator.process())
 
     def _report(self, frames: Sequence[Any]) -> None:
+        self._predictions.take(frames)
         if self._keep is not None:
             self._keep(frames)
 
@@ -103,7 +128,9 @@ class EstimateRole:
         self._next_s = now_s + self._period_s
         estimate = self.estimator.estimate()
         self.latest = estimate = self._inspect(estimate) if self._inspect else estimate
-        messages = calibration_messages(self.config, estimate)
+        if self._watch is not None:
+            self._watch.look(estimate)
+        messages = calibration_messages(self.config, estimate) + self._predictions.messages()
         if now_s >= self._next_companion_s:
             self._next_companion_s = now_s + COMPANION_S
             messages += companion_messages(self.config, estimate)
@@ -118,4 +145,5 @@ class EstimateRole:
             "refused": str(self._order.refused),
             "malformed": str(self._malformed),
         }
-        return [calibration_status(self.latest, counters)]
+        verdicts = {} if self._watch is None else self._watch.verdicts
+        return [calibration_status(self.latest, counters), *delay_statuses(verdicts)]

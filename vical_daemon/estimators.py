@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from vical_daemon import topics
 from vical_daemon.config import Config, ConfigError
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.priors import calibration_options, camera_prior
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.td_icp_watch import DelayWatch
 
 
 class Estimator(Protocol):
@@ -62,6 +65,19 @@ def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None)
 
     assert config.target_path is not None  # `config.load` has seen to it
     return Calibrator(options, priors, load_target(config.target_path).points_m)
+
+
+def make_watch(config: Config) -> DelayWatch | None:
+    """Make what compares the time shift with that of the rotations alone; None without a target."""
+    if config.target_path is None or config.calibration.mode == "target_free":
+        return None
+    from vical_daemon.estimation.td_icp import TdIcpOptions
+    from vical_daemon.estimation.td_icp_watch import DelayWatch
+    from vical_daemon.vision.target import load_target
+
+    noise = calibration_options(config).imu_noise
+    options = TdIcpOptions(gyro_density=noise.gyro_density, gyro_walk=noise.gyro_walk, gyro_log_sigma=0.7)
+    return DelayWatch(load_target(config.target_path).points_m, config.calibration_cameras, options)
 
 
 def input_keys(config: Config) -> list[str]:

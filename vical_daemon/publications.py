@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 from vical_daemon import topics
 from vical_daemon.bus import Bus
@@ -17,6 +18,9 @@ from vical_daemon.messages import (
     encode_pose,
     encode_transforms,
 )
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.td_icp_watch import DelayVerdict
 
 Message = tuple[str, bytes]
 
@@ -79,6 +83,27 @@ def calibration_status(estimate: CalibrationEstimate | None, counters: dict[str,
         "rejected_fraction": f"{estimate.rejected_fraction:.4f}",
     }
     return DiagnosticStatus(Level.WARN if bad else Level.OK, "estimate", message, "", values | counters)
+
+
+def delay_statuses(verdicts: Mapping[str, DelayVerdict]) -> list[DiagnosticStatus]:
+    """Return per camera what rotations alone say about its time shift; a warning where the filter differs."""
+    return [
+        DiagnosticStatus(
+            Level.WARN if verdict.warning else Level.OK,
+            f"{name} delay",
+            verdict.warning or _delay_words(verdict),
+            "",
+            verdict.values(),
+        )
+        for name, verdict in verdicts.items()
+    ]
+
+
+def _delay_words(verdict: DelayVerdict) -> str:
+    report = verdict.report
+    if report is None:
+        return verdict.why_refused or "waiting for motion"
+    return f"{1e3 * report.timeshift_s:+.2f} +- {1e3 * report.timeshift_sigma_s:.2f} ms from rotations alone"
 
 
 def publish(bus: Bus, messages: Iterable[Message]) -> None:

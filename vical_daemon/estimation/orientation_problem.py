@@ -133,7 +133,7 @@ def linearise(
         so3.log(measured @ np.swapaxes(R_ref_sensor, 1, 2)),
         J,
         H,
-        np.linalg.inv(C) * used[:, None, None],
+        np.asarray(np.linalg.inv(C) * used[:, None, None], dtype=np.float64),
         F,
         np.zeros_like(F),
         first_mean,

@@ -45,6 +45,53 @@ class DelayReport:
     window: TdIcpResult
 
 
+class DelayTracker:
+    """Delay and drift rate from one window after another: a Kalman filter with two states.
+
+    Args:
+        overlap: How many windows share each piece of data; 1 where windows do not overlap.
+    """
+
+    def __init__(self, overlap: float = 1.0) -> None:
+        self._overlap = max(1.0, overlap)
+        self._state: tuple[float, FloatArray, FloatArray] | None = None
+
+    @property
+    def timeshift_s(self) -> float | None:
+        """The delay after the last window, s; None before the first."""
+        return None if self._state is None else float(self._state[1][0])
+
+    def track(self, t_s: float, result: TdIcpResult) -> DelayReport:
+        """Take what a window gave; `t_s` is its middle (imu clock, s)."""
+        z, variance = result.timeshift_cam_imu_s, result.timeshift_sigma_s**2 * self._overlap
+        state, jumped = self._state, False
+        if state is not None:
+            x, P = _predict(state, t_s)
+            S = float(P[0, 0] + variance)
+            innovation = z - float(x[0])
+            jumped = bool(innovation**2 > _JUMP_SIGMAS**2 * S)
+            K = P[:, 0] / S
+            P = P - np.outer(K, P[0])
+            state = (t_s, x + K * innovation, 0.5 * (P + P.T))
+        if state is None or jumped:
+            state = (t_s, np.array([z, 0.0]), np.diag([variance, (1e-4) ** 2]))
+        self._state = state
+        _, x, P = state
+        return DelayReport(
+            t_s, float(x[0]), float(np.sqrt(P[0, 0])), float(x[1]), float(np.sqrt(P[1, 1])), jumped, result
+        )
+
+
+def _predict(state: tuple[float, FloatArray, FloatArray], t_s: float) -> tuple[FloatArray, FloatArray]:
+    """Delay and drift rate at a later time: the rate wanders slowly, the delay a little of its own."""
+    t0, x, P = state
+    dt = max(t_s - t0, 0.0)
+    F = np.array([[1.0, dt], [0.0, 1.0]])
+    Q = _DRIFT_WALK**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    Q[0, 0] += _OFFSET_WALK_S**2 * dt
+    return F @ x, F @ P @ F.T + Q
+
+
 class DelayMonitor:
     """Feed it both streams; it answers when a window is full.
 
@@ -62,7 +109,7 @@ class DelayMonitor:
         self._imu: deque[tuple[float, FloatArray]] = deque()
         self._cam: deque[tuple[float, FloatArray, FloatArray]] = deque()
         self._next_s = float("-inf")
-        self._state: tuple[float, FloatArray, FloatArray] | None = None
+        self._tracker = DelayTracker(window_s / every_s)
 
     def add_gyro(self, t_imu_s: float, gyro_rps: FloatArray) -> None:
         """Take one gyro sample (imu clock, s; rad/s, shape (3,))."""
@@ -91,46 +138,20 @@ class DelayMonitor:
         return self._register()
 
     def _reach(self) -> float:
-        return self._options.search_s if self._state is None else 0.2
+        return self._options.search_s if self._tracker.timeshift_s is None else 0.2
 
     def _register(self) -> DelayReport | None:
-        options = self._options
-        if self._state is not None:
-            options = replace(options, timeshift_guess_s=float(self._state[1][0]), search_s=0.2)
+        options, known = self._options, self._tracker.timeshift_s
+        if known is not None:
+            options = replace(options, timeshift_guess_s=known, search_s=0.2)
         t_imu = np.array([t for t, _ in self._imu])
         gyro = np.stack([g for _, g in self._imu])
         t_cam = np.array([t for t, _, _ in self._cam])
         R, C = np.stack([r for _, r, _ in self._cam]), np.stack([c for _, _, c in self._cam])
         result = td_icp(t_imu, gyro, t_cam, R, C, options)
-        if result.status == REFUSED and self._state is not None:
-            wide = replace(self._options, timeshift_guess_s=float(self._state[1][0]))
+        if result.status == REFUSED and known is not None:
+            wide = replace(self._options, timeshift_guess_s=known)
             result = td_icp(t_imu, gyro, t_cam, R, C, wide)
         if result.status == REFUSED:
             return None
-        return self._track(float(t_cam.mean() + result.timeshift_cam_imu_s), result)
-
-    def _track(self, t_s: float, result: TdIcpResult) -> DelayReport:
-        z, variance = result.timeshift_cam_imu_s, result.timeshift_sigma_s**2
-        # windows overlap: the share of new data is what counts as an independent measurement
-        variance *= max(1.0, self._window_s / self._every_s)
-        jumped = False
-        if self._state is not None:
-            t0, x, P = self._state
-            dt = max(t_s - t0, 0.0)
-            F = np.array([[1.0, dt], [0.0, 1.0]])
-            Q = _DRIFT_WALK**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-            Q[0, 0] += _OFFSET_WALK_S**2 * dt
-            x, P = F @ x, F @ P @ F.T + Q
-            S = float(P[0, 0] + variance)
-            innovation = z - float(x[0])
-            jumped = bool(innovation**2 > _JUMP_SIGMAS**2 * S)
-            if not jumped:
-                K = P[:, 0] / S
-                x, P = x + K * innovation, P - np.outer(K, P[0])
-                self._state = (t_s, x, 0.5 * (P + P.T))
-        if self._state is None or jumped:
-            self._state = (t_s, np.array([z, 0.0]), np.diag([variance, (1e-4) ** 2]))
-        _, x, P = self._state
-        return DelayReport(
-            t_s, float(x[0]), float(np.sqrt(P[0, 0])), float(x[1]), float(np.sqrt(P[1, 1])), jumped, result
-        )
+        return self._tracker.track(float(t_cam.mean() + result.timeshift_cam_imu_s), result)

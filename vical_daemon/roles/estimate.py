@@ -10,7 +10,7 @@ from vical_daemon import topics
 from vical_daemon.bus import Bus, Subscription
 from vical_daemon.config import Config
 from vical_daemon.estimate_role import PUBLISH_S, EstimateRole
-from vical_daemon.estimators import input_keys, make_estimator
+from vical_daemon.estimators import input_keys, make_estimator, make_watch
 from vical_daemon.health import StatusSender
 from vical_daemon.inbox import Inbox
 from vical_daemon.memory import Memory
@@ -37,13 +37,15 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     inbox = Inbox(bus, input_keys(config), INBOX)
     memory = Memory(config, bus, clock)
     priors = memory.priors()
-    role = EstimateRole(config, make_estimator(config, priors), inspect=memory.watch)
+    role = EstimateRole(
+        config, make_estimator(config, priors), inspect=memory.watch, watch=make_watch(config)
+    )
     commands = bus.subscribe(topics.command_key(config.rig, "estimate"), depth=8)
     status = StatusSender(config.rig, "estimate", bus, clock)
     while not stop.is_set():
         inbox.wait(PUBLISH_S / 2)
         if _reset_wanted(commands):
-            role.reset(make_estimator(config, priors))
+            role.reset(make_estimator(config, priors), make_watch(config))
         while True:  # a bounded number at a time, so that publications stay on time when data pile up
             for sample in inbox.take(256):
                 role.take(sample)
