@@ -54,6 +54,7 @@ def ros2_topic(key: str) -> Ros2Topic | None:
         "camera_info": f"/{name}/camera_info",
         "points": f"/{name}/target_points",
         "tracks": f"/{name}/feature_tracks",
+        "predicted": f"/{name}/predicted_points",
         "calibration": f"/calibration/{name}",
         "pose": f"/calibration/{name}/pose",
         "tf_static": "/tf_static",

@@ -106,6 +106,7 @@ CAMERA_INFO = _row(
 )
 POINTS = _row("points", "camera/{name}/points", messages.POINTS_TYPE, 30, _HIGH, _BLOCK, depth=256)
 TRACKS = _row("tracks", "camera/{name}/tracks", messages.TRACKS_TYPE, 30, _HIGH, _BLOCK, depth=256)
+PREDICTED = _row("predicted", "camera/{name}/predicted", messages.POINTS_TYPE, 5, _DATA, _DROP)
 CALIBRATION = _row(
     "calibration", "calibration/{name}", messages.CALIBRATION_TYPE, 5, _HIGH, _BLOCK, keep_last=True
 )
@@ -115,7 +116,8 @@ STATUS = _row("status", "status/{name}", messages.DIAGNOSTICS_TYPE, 1, _DATA, _D
 COMMAND = _row("command", "command/{name}", messages.STRING_TYPE, 0, _HIGH, _BLOCK)
 
 TOPICS: tuple[Topic, ...] = (
-    IMU, IMAGE, COMPRESSED, CAMERA_INFO, POINTS, TRACKS, CALIBRATION, POSE, TF_STATIC, STATUS, COMMAND,
+    IMU, IMAGE, COMPRESSED, CAMERA_INFO, POINTS, TRACKS, PREDICTED, CALIBRATION, POSE, TF_STATIC, STATUS,
+    COMMAND,
 )  # fmt: skip
 BY_KIND: dict[str, Topic] = {topic.kind: topic for topic in TOPICS}
 

@@ -60,6 +60,8 @@ class FrameReport:
         dof: Its degrees of freedom.
         sigma_px: Corner noise used, px.
         reason: Why a frame was refused; empty otherwise.
+        predicted_px: Where the points were expected before the update, shape (n, 2); not-a-number where
+            they could not be.
     """
 
     t_ns: int
@@ -73,6 +75,7 @@ class FrameReport:
     dof: int = 0
     sigma_px: float = 0.0
     reason: str = ""
+    predicted_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,16 +219,20 @@ class CalibrationFilter:
         noise = self.corner_noise[image.camera]
         lin = self._linearise(image, np.zeros(self.layout.size), self.S)
         innovation = image.uv - lin.z
+        predicted = np.where(lin.valid[:, None], lin.z, np.nan)
         keep = lin.valid & self._corner_gate(image, innovation, lin)
         if keep.sum() < 4:
-            return self._refused(image, innovation, "too few corners pass the gate")
+            return self._refused(image, innovation, predicted, "too few corners pass the gate")
         first = lin
         fit = self._solve(image, lin, keep)
         level = fit.nis / max(fit.dof, 1)
         if fit.nis > _frame_limit(fit.dof) * max(1.0, self.nis_level):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
-                image, innovation, f"innovation of the image is {level:.1f} times what it should be"
+                image,
+                innovation,
+                predicted,
+                f"innovation of the image is {level:.1f} times what it should be",
             )
         self.nis_level += 0.05 * (level - self.nis_level)
         self._accept(fit.S, fit.dx)
@@ -247,6 +254,7 @@ class CalibrationFilter:
             fit.nis,
             fit.dof,
             noise.sigma_px,
+            predicted_px=predicted,
         )
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
@@ -256,10 +264,10 @@ class CalibrationFilter:
         return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma)
 
     @staticmethod
-    def _refused(image: Image, residual: FloatArray, why: str) -> FrameReport:
+    def _refused(image: Image, residual: FloatArray, predicted: FloatArray, why: str) -> FrameReport:
         none = np.zeros(len(image.ids), dtype=bool)
         return FrameReport(
-            image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why
+            image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why, predicted
         )
 
     def surprise(self, image: Image) -> float | None:

@@ -35,7 +35,7 @@ from vical_daemon.recording.model import (
     in_stamp_order,
     stream_statistics,
 )
-from vical_daemon.topics import BY_KIND, parse_key
+from vical_daemon.topics import BY_KIND, PREDICTED, parse_key
 
 _KIND_OF_TYPE: dict[str, Kind] = {
     IMU_TYPE: "imu",
@@ -126,10 +126,11 @@ class LogRecording(Recording):
     def _meet(self, raw: RawMessage) -> _Channel | None:
         """Decide at the first message of a topic what it is."""
         kind = _KIND_OF_TYPE.get(raw.type_name)
-        if kind is None or raw.topic in self._others:
+        parsed = parse_key(raw.topic.removeprefix("/"))
+        ours_but_not_measured = parsed is not None and parsed.topic is PREDICTED
+        if kind is None or ours_but_not_measured or raw.topic in self._others:
             self._others[raw.topic] = raw.type_name
             return None
-        parsed = parse_key(raw.topic.removeprefix("/"))
         if parsed is not None:
             self.rig = parsed.rig
             name, key = parsed.name, raw.topic.removeprefix("/")

@@ -55,7 +55,8 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
                 break
     commands.close()
     inbox.close()
-    publish(bus, role.finish())
+    if role.latest is not None and role.latest.cameras:
+        publish(bus, role.finish())  # without a solution it would try once more to find one, for seconds
     memory.close(role.latest)
     status.tick(lambda: role.statuses(inbox.dropped), force=True)
 
