@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import random
 import sys
 import time
 from collections.abc import Callable
@@ -94,6 +95,8 @@ def _study(machine: Machine, kills: int, victims: tuple[str, ...]) -> list[tuple
     deeds: list[tuple[float, str]] = []
     rows += [(f"kill -9 {name}, {kills} times", _kill(machine, name, kills, deeds)) for name in victims]
     rows += [(f"{name} hung (SIGSTOP)", _hang(machine, name, deeds)) for name in ("record", "acquire")]
+    time.sleep(5.0)  # or the hole of the last one has no end in the log
+    rows.append(_stops(machine, max(kills // 2, 1)))
     deeds.append((time.time(), "stop"))
     begin_s = time.monotonic()
     machine.run("systemctl", "stop", "vical.target", *[f"vical-{name}" for name in PROCESSES])
@@ -138,6 +141,21 @@ def _hang(machine: Machine, name: str, deeds: list[tuple[float, str]]) -> str:
     deeds.append((time.time(), f"hang {name}"))
     _wait(lambda: _ready_again(machine, name, pid), f"{name} after a hang", 120)
     return f"watchdog: ready again after {time.monotonic() - begin_s:.1f} s"
+
+
+def _stops(machine: Machine, count: int) -> tuple[str, str]:
+    """Stop the calibration at random moments of its start, where a step of it takes longest."""
+    rng, durations, bad = random.Random(5), [], []
+    for _ in range(count):
+        time.sleep(rng.uniform(0.5, 8.0))
+        begin_s = time.monotonic()
+        machine.run("systemctl", "stop", "vical-calibrate")
+        durations.append(time.monotonic() - begin_s)
+        bad += [r for r in machine.show("vical-calibrate", "Result") if r != "success"]
+        machine.run("systemctl", "start", "--no-block", "vical-calibrate")
+    _wait(lambda: machine.show("vical-calibrate", "ActiveState") == ["active"], "calibrate active")
+    result = f"{np.median(durations):.1f} s (longest {max(durations):.1f} s), {', '.join(bad) or 'all clean'}"
+    return f"systemctl stop vical-calibrate, {count} times in its first seconds", result
 
 
 def _judge_logs(root: Path, deeds: list[tuple[float, str]]) -> list[tuple[str, str]]:

@@ -58,6 +58,11 @@ def needed_processes(config: Config) -> list[str]:
     return [name for name in needed if all(find_spec(f"vical_daemon.roles.{r}") for r in PROCESSES[name])]
 
 
+STOP_S = 10.0
+PATIENCE_S: dict[str, float] = {"estimate": 30.0}
+"""How long a role may take to stop: the estimator ends the step it is in, which a busy machine stretches."""
+
+
 class RoleThreads:
     """Roles running as threads of this process, on one bus.
 
@@ -93,16 +98,16 @@ class RoleThreads:
         thread = self._threads[role] = threading.Thread(target=guarded, name=f"role {role}", daemon=True)
         thread.start()
 
-    def stop(self, role: str, timeout_s: float = 10.0) -> bool:
-        """End a role; False if it does not end in time."""
+    def stop(self, role: str, timeout_s: float | None = None) -> bool:
+        """End a role; False if it does not end in time (None: as long as such a role may take)."""
         self._stops[role].set()
-        self._threads[role].join(timeout_s)
+        self._threads[role].join(PATIENCE_S.get(role, STOP_S) if timeout_s is None else timeout_s)
         stuck = self._threads[role].is_alive()
         if stuck:
             _log.error("role %s does not stop", role)
         return not stuck
 
-    def stop_all(self, timeout_s: float = 10.0) -> bool:
+    def stop_all(self, timeout_s: float | None = None) -> bool:
         """End all roles, the last started first: consumers are started first and see the last data."""
         ended = [self.stop(role, timeout_s) for role in reversed(list(self._threads))]
         return all(ended)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 HELP = "the daemon, or single roles of it"
 _log = logging.getLogger(__name__)
 _TICK_S = 1.0
-_CHILD_STOP_S = 15.0
+_CHILD_STOP_S = 45.0  # longer than any role may take
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
