@@ -11,7 +11,7 @@ docs/math/td_icp.md.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -20,15 +20,10 @@ from vical_daemon.estimation import so3
 from vical_daemon.estimation.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
 from vical_daemon.estimation.rotation_curves import GyroCurve
 from vical_daemon.estimation.rotation_registration import Registration, closest_point_registration
-from vical_daemon.estimation.rotation_start import debiased_start
+from vical_daemon.estimation.rotation_start import Start, debiased_start
+from vical_daemon.estimation.rotation_suspects import explain
 from vical_daemon.estimation.td_icp_input import clean_gyro, clean_orientations, world_cam_from_cam_target
-from vical_daemon.estimation.td_icp_refusals import (
-    SHIFT_LOST_S,
-    blame_stamps,
-    judge,
-    refuse_motion,
-    refuse_start,
-)
+from vical_daemon.estimation.td_icp_refusals import judge, refuse_motion, refuse_start
 from vical_daemon.estimation.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions, TdIcpResult
 
 __all__ = [
@@ -44,6 +39,8 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 
 _DEG = np.pi / 180.0
+_ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
+_DOUBTFUL_RAD = 0.5 * _DEG  # noise of one orientation above which the usual mistakes are tried out
 
 
 def td_icp(
@@ -75,45 +72,65 @@ def td_icp(
     if isinstance(imu, str) or isinstance(cam, str):
         return TdIcpResult(REFUSED, imu if isinstance(imu, str) else str(cam), rejected=n_given)
     base = float(imu[0][0])
-    t_imu, gyro = imu[0] - base, imu[1]
-    t_cam, R, covariance, index = cam[0] - base, cam[1], cam[2], cam[3]
-    q = so3.quat_from_matrix(R)
-    reason = refuse_motion(t_imu, gyro, t_cam, q, options)
+    shifts = (options.timeshift_guess_s - options.search_s, options.timeshift_guess_s + options.search_s)
+    t_cam, R, covariance, index = cam
+    data = _Data(imu[0] - base, imu[1], t_cam - base, R, covariance, so3.quat_from_matrix(R), index, n_given)
+    return _register(data, shifts, options)
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Cleaned input; stamps from the first gyro sample on."""
+
+    t_imu: FloatArray
+    gyro: FloatArray
+    t_cam: FloatArray
+    R_world_cam: FloatArray
+    covariance: FloatArray
+    q: FloatArray
+    index: npt.NDArray[np.intp]
+    n_given: int
+
+    def refused(self, reason: str) -> TdIcpResult:
+        return TdIcpResult(REFUSED, reason, rejected=self.n_given)
+
+    def mistake(self, shifts: tuple[float, float], start: Start | None) -> str:
+        """The usual mistake that explains why the rotations do not fit; empty if none, or too few data."""
+        if self.t_cam[-1] - self.t_cam[0] < _ENOUGH_S:
+            return ""
+        return explain(self.t_imu, self.gyro, self.t_cam, self.q, shifts, start)
+
+
+def _register(data: _Data, shifts: tuple[float, float], options: TdIcpOptions) -> TdIcpResult:
+    """Start, closest points, polish; or the reason why not."""
+    t_cam, q = data.t_cam, data.q
+    reason = refuse_motion(data.t_imu, data.gyro, t_cam, q, options)
     if reason:
-        return TdIcpResult(REFUSED, reason, rejected=n_given)
-    guess, reach = options.timeshift_guess_s, options.search_s
-    start, bias = debiased_start(t_imu, gyro, t_cam, q, (guess - reach, guess + reach))
-    curve = GyroCurve.integrate(t_imu, gyro, bias)
+        return data.refused(reason)
+    start, bias = debiased_start(data.t_imu, data.gyro, t_cam, q, shifts)
     reason = refuse_start(start, t_cam, q, options)
-    if reason or start is None:
-        reason = blame_stamps(curve, t_cam, q, options) or reason
-        return TdIcpResult(REFUSED, reason, rejected=n_given)
+    if start is None or reason:
+        return data.refused(data.mistake(shifts, start) or reason)
+    curve = GyroCurve.integrate(data.t_imu, data.gyro, bias)
     rough = closest_point_registration(curve, t_cam, q, replace(start, bias_rps=np.zeros(3)))
     try:
-        fit = _polish(t_imu, gyro, t_cam, R, covariance, bias, rough, options)
+        fit = _polish(data, bias, rough, options)
     except np.linalg.LinAlgError:
-        return TdIcpResult(REFUSED, "the orientations do not fit the gyro at any delay", rejected=n_given)
-    result = _result(fit, rough, (t_imu[0], t_imu[-1]), index, n_given)
-    if result.timeshift_sigma_s < SHIFT_LOST_S:
+        result = data.refused("the orientations do not fit the gyro at any delay")
+    else:
+        result = _result(fit, rough, (data.t_imu[0], data.t_imu[-1]), data.index, data.n_given)
+    uneven = abs(result.stamp_rate) > 3.0 * result.stamp_rate_sigma and result.status == DEGENERATE
+    if result.camera_noise_rad < _DOUBTFUL_RAD and not uneven:
         return result
-    reason = blame_stamps(curve, t_cam, q, options)
-    return TdIcpResult(REFUSED, reason, rejected=n_given) if reason else result
+    reason = data.mistake(shifts, start)
+    return data.refused(reason) if reason else result
 
 
-def _polish(
-    t_imu: FloatArray,
-    gyro: FloatArray,
-    t_cam: FloatArray,
-    R_world_cam: FloatArray,
-    covariance: FloatArray,
-    bias: FloatArray,
-    rough: Registration,
-    options: TdIcpOptions,
-) -> Fit:
+def _polish(data: _Data, bias: FloatArray, rough: Registration, options: TdIcpOptions) -> Fit:
     sensor = OrientationSensor(
-        t_s=t_cam,
-        R_world_sensor=R_world_cam,
-        covariance=covariance,
+        t_s=data.t_cam,
+        R_world_sensor=data.R_world_cam,
+        covariance=data.covariance,
         timeshift_s=rough.timeshift_s,
         R_imu_sensor=rough.R_imu_cam,
         R_world_ref=rough.R_world_ref,
@@ -128,7 +145,9 @@ def _polish(
         options.estimate_noise,
         options.gyro_matrix_sigma,
     )
-    return polish(lambda b: GyroCurve.integrate(t_imu, gyro, b), (sensor,), bias + rough.bias_rps, noise)
+    return polish(
+        lambda b: GyroCurve.integrate(data.t_imu, data.gyro, b), (sensor,), bias + rough.bias_rps, noise
+    )
 
 
 def _result(

@@ -6,9 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.orientation_fit import Fit
-from vical_daemon.estimation.rotation_curves import RotationCurve
 from vical_daemon.estimation.rotation_start import Start, camera_turns
-from vical_daemon.estimation.stamp_stretch import find_stretch
+from vical_daemon.estimation.rotation_suspects import stretched
 from vical_daemon.estimation.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions
 
@@ -16,12 +15,10 @@ FloatArray = npt.NDArray[np.float64]
 
 _DEG = np.pi / 180.0
 _MIN_RATE_RPS = 3.0 * _DEG  # slower than this is "not moving"
-SHIFT_LOST_S = 3e-3
+_SHIFT_LOST_S = 3e-3
 _ROTATION_LOST_RAD = 3.0 * _DEG
-_UNEVEN, _STRETCHED = (
-    1e-3,
-    5e-3,
-)  # no pair of crystals is as far apart; beyond the second no delay makes sense
+_UNEVEN = 1e-3  # no two crystals are as far apart
+_STRETCHED = 5e-3  # beyond this no delay makes sense
 _RATE_SIGMAS = 6.0
 
 
@@ -73,40 +70,17 @@ def refuse_start(start: Start | None, t_cam: FloatArray, q: FloatArray, options:
         return f"no delay {reach} makes the rotations of camera and gyro agree (not the same recording?)"
     turns = camera_turns(t_cam, q)
     typical = float(np.median(turns.angle))
-    if start.mirrored:
-        return (
-            "the rotations agree in size but are mirrored: one gyro axis has the wrong sign, or two axes are "
-            "swapped; the imu frame must be right-handed"
-        )
     if start.agreement < 0.3:
         return (
             f"no delay {reach} makes the rotations of camera and gyro agree in size "
             f"(best: {100 * start.agreement:.0f} % of the turns at {start.timeshift_s:+.2f} s)"
         )
-    if start.misfit_rad > max(0.5 * typical, 0.01):
+    if start.mirrored or start.misfit_rad > max(0.5 * typical, 0.01):
         return (
-            "the rotations agree in size but not in direction: are the orientations of the camera inverted "
-            "(world in camera instead of camera in world), or gyro axes mixed up?"
+            "the rotations agree in size but not in direction: is this the same recording, is the camera "
+            "fixed to the imu, are its orientations those of the camera in the world?"
         )
     return ""
-
-
-def blame_stamps(curve: RotationCurve, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions) -> str:
-    """Say that stamps are stretched, if that explains why the rotations do not fit; empty if not."""
-    guess, reach = options.timeshift_guess_s, options.search_s
-    factor = find_stretch(curve, t_cam, q, (guess - reach, guess + reach))
-    return "" if factor is None else _stretched(1.0 / factor - 1.0)
-
-
-def _stretched(rate: float) -> str:
-    """Words for a delay that grows by `rate` seconds a second."""
-    excess = 1.0 / (1.0 + rate) - 1.0
-    size = f"{100 * abs(excess):.1f} %" if abs(excess) >= 2e-3 else f"{1e6 * abs(excess):.0f} ppm"
-    return (
-        f"the stamps of camera and imu advance at different rates: the camera's are {size} too "
-        f"{'fast' if excess > 0 else 'slow'} for the imu's (or the imu's the other way round); the rotations "
-        "fit once that is taken out: look at how the stamps are made (a nominal rate, a wrong tick length?)"
-    )
 
 
 def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) -> tuple[str, str]:
@@ -115,11 +89,11 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
         return REFUSED, f"only {pairs} of {n} orientations fit the gyro at the best delay"
     rate, rate_sigma = float(fit.stamp_rate[0]), float(fit.stamp_rate_sigma[0])
     if abs(rate) > max(_STRETCHED, _RATE_SIGMAS * rate_sigma):
-        return REFUSED, _stretched(rate)
+        return REFUSED, stretched(rate)
     if noise > 3.0 * _DEG:
         return REFUSED, f"gyro and camera disagree by {noise / _DEG:.1f} deg (rms) at the best delay"
     reasons = []
-    if covariance[6, 6] > SHIFT_LOST_S**2:
+    if covariance[6, 6] > _SHIFT_LOST_S**2:
         reasons.append(
             f"the delay is not determined (sigma {1e3 * np.sqrt(covariance[6, 6]):.1f} ms): "
             "the rotation rate hardly changed; turn to and fro"
@@ -135,5 +109,5 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
             "turn about another"
         )
     if abs(rate) > max(_UNEVEN, _RATE_SIGMAS * rate_sigma):
-        reasons.append(_stretched(rate))
+        reasons.append(stretched(rate))
     return (DEGENERATE if reasons else OK), "; ".join(reasons)

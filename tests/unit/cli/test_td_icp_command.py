@@ -20,7 +20,7 @@ colSpacingMeters: 0.05
 """
 
 
-def _write(folder, run, *, gyro_factor=1.0, late_s=0.0):
+def _write(folder, run, *, gyro_factor=1.0, late_s=0.0, stretch=1.0):
     """The recording as an ASL folder; the gyro's unit and the camera's stamps may be spoiled."""
     (folder / "mav0/imu0").mkdir(parents=True)
     (folder / "mav0/cam0").mkdir(parents=True)
@@ -30,7 +30,8 @@ def _write(folder, run, *, gyro_factor=1.0, late_s=0.0):
     (folder / "mav0/imu0/data.csv").write_text("\n".join(rows))
     rows = ["#timestamp [ns],point_id,u [px],v [px]"]
     for frame in run.frames:
-        stamp = frame.t_cam_ns + round(late_s * 1e9)
+        first = run.frames[0].t_cam_ns
+        stamp = first + round(stretch * (frame.t_cam_ns - first) + late_s * 1e9)
         rows += [f"{stamp},{i},{u},{v}" for i, (u, v) in zip(frame.ids, frame.uv_px, strict=True)]
     (folder / "mav0/cam0/corners.csv").write_text("\n".join(rows))
     (folder / "mav0/cam0/sensor.yaml").write_text("resolution: [640, 480]\n")
@@ -70,6 +71,14 @@ def test_a_gyro_in_degrees_is_refused_with_the_reason(tmp_path, capsys, run):
     code, result, err = _vical(capsys, "td-icp", folder, "--initial", str(folder / "initial.yaml"))
     assert code == 1 and result["status"] == "refused"
     assert "degrees per second" in err and len(err.strip().splitlines()) == 1
+
+
+def test_stretched_stamps_are_refused_and_the_stamps_are_blamed(tmp_path, capsys, run):
+    folder = _write(tmp_path, run, stretch=1.05)
+    code, result, err = _vical(capsys, "td-icp", folder, "--initial", str(folder / "initial.yaml"))
+    assert code == 1 and result["status"] == "refused"
+    assert "the stamps of camera and imu advance at different rates" in err
+    assert "direction" not in err and len(err.strip().splitlines()) == 1
 
 
 def test_a_trajectory_file_joins_as_a_sensor(tmp_path, capsys, run):
