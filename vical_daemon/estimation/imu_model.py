@@ -1,9 +1,10 @@
 """Inertial measurements: a bounded buffer with exact end points, and strapdown integration of a batch.
 
-Between two samples the measured rate and specific force are taken as linear in time; every interval is
-integrated to second order in the attitude (with the coning term) and exactly in velocity and position for
-a specific force that is linear in the *world* frame. Averaging two samples as if both lay in one frame
-would bias the time shift by tenths of a millisecond (see docs/math/filter.md).
+Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by central
+differences), with the coning term for the attitude; velocity and position are integrated exactly for a
+specific force that is cubic in the *start* frame. Averaging two samples as if both lay in one frame would
+bias the time shift by tenths of a millisecond; straight lines between samples would shorten a 3 Hz shake by
+0.3 % at 100 Hz, which ends up in the lever arm, always in the same direction (see docs/math/filter.md).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
@@ -25,12 +27,16 @@ class ImuSegment(NamedTuple):
         gyro: Measured rates, rad/s, shape (n + 1, 3).
         accel: Measured specific forces, m/s^2, shape (n + 1, 3).
         gap_s: Longest interval between two real samples used, s.
+        gyro_slope: Their derivatives by time, rad/s^2, shape (n + 1, 3); None: straight lines.
+        accel_slope: m/s^3, shape (n + 1, 3).
     """
 
     t_s: FloatArray
     gyro: FloatArray
     accel: FloatArray
     gap_s: float
+    gyro_slope: FloatArray | None = None
+    accel_slope: FloatArray | None = None
 
 
 class ImuBuffer:
@@ -100,24 +106,54 @@ class ImuBuffer:
         t = rows[:, 0]
         low = int(np.searchsorted(t, from_s, side="right"))
         high = int(np.searchsorted(t, to_s, side="left"))
-        first = self._at(from_s, low)
-        last = self._at(to_s, max(high, 1))
-        cut = np.vstack([first, rows[low:high], last])
-        gap = float(np.max(np.diff(t[max(low - 1, 0) : high + 1]), initial=0.0))
-        return ImuSegment(cut[:, 0], cut[:, 1:4], cut[:, 4:7], gap)
+        first, last = max(low - 1, 0), min(max(high, 1), len(rows) - 1)
+        if last == first:
+            only = np.repeat(rows[first][None], 2, axis=0)
+            return ImuSegment(np.array([from_s, to_s]), only[:, 1:4], only[:, 4:], 0.0)
+        inside = rows[first : last + 1]
+        slope = _slopes(rows[max(first - 1, 0) : last + 2], first - max(first - 1, 0), len(inside))
+        ends = np.array([from_s, to_s])
+        k = np.array([0, len(inside) - 2])
+        value, change = _hermite(inside, slope, ends, k)
+        middle = slice(low - first, high - first)
+        cut = np.concatenate([value[:1], inside[middle, 1:], value[1:]])
+        rise = np.concatenate([change[:1], slope[middle], change[1:]])
+        times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
+        gap = float(np.max(np.diff(t[first : high + 1]), initial=0.0))
+        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:])
 
-    def _at(self, t_s: float, right: int) -> FloatArray:
-        """Interpolate one row; `right` is the index of the first row at or after `t_s`."""
-        rows = self.rows
-        right = min(max(right, 1), len(rows) - 1) if len(rows) > 1 else 0
-        if right == 0:
-            only: FloatArray = rows[0].copy()
-            return only
-        a, b = rows[right - 1], rows[right]
-        weight = (t_s - a[0]) / (b[0] - a[0])
-        row: FloatArray = a + weight * (b - a)
-        row[0] = t_s
-        return row
+
+def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:
+    """Derivatives of the readings at `count` rows from `begin` on, by central differences, shape (count, 6).
+
+    Next to a hole (four times the usual step and more) the difference over the hole says nothing about the
+    slope: the chord of the other side is taken, or none.
+    """
+    dt = np.diff(rows[:, 0])
+    chord = np.diff(rows[:, 1:], axis=0) / dt[:, None]
+    usual = float(np.min(dt))
+    weight = np.where(dt > 4.0 * usual, 0.0, 1.0)
+    left = np.concatenate([[0.0], weight])
+    right = np.concatenate([weight, [0.0]])
+    before = np.concatenate([chord[:1], chord])
+    after = np.concatenate([chord, chord[-1:]])
+    total = left + right
+    out = (left[:, None] * before + right[:, None] * after) / np.maximum(total, 1.0)[:, None]
+    return np.asarray(out[begin : begin + count])
+
+
+def _hermite(
+    rows: FloatArray, slope: FloatArray, t_s: FloatArray, k: npt.NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray]:
+    """Value and derivative of the cubic through rows k and k + 1 at instants `t_s`, shapes (m, 6)."""
+    h = (rows[k + 1, 0] - rows[k, 0])[:, None]
+    u = (t_s[:, None] - rows[k, :1]) / h
+    a, b = rows[k, 1:], rows[k + 1, 1:]
+    A, B = slope[k] * h, slope[k + 1] * h
+    d = b - a
+    value = a + u * (A + u * (3.0 * d - 2.0 * A - B + u * (A + B - 2.0 * d)))
+    change = (A + u * (2.0 * (3.0 * d - 2.0 * A - B) + u * 3.0 * (A + B - 2.0 * d))) / h
+    return value, change
 
 
 class Motion(NamedTuple):
@@ -178,17 +214,30 @@ def strapdown(
         omega = omega @ gyro_matrix.swapaxes(-1, -2)
     if accel_matrix is not None:
         force = force @ accel_matrix.swapaxes(-1, -2)
-    steps = rotation_steps(omega, dt)
+    turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
+    if turn_slope is not None and gyro_matrix is not None:
+        turn_slope = turn_slope @ gyro_matrix[0].T
+    steps = rotation_steps(omega, dt, turn_slope)
     dR = np.empty((len(omega), len(dt) + 1, 3, 3))
     dR[:, 0] = np.eye(3)
     for k in range(len(dt)):
         np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
     f_start = np.matmul(dR, force[..., None])[..., 0]
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
-    dv = np.zeros_like(f_start)
-    np.cumsum((before + after) * (0.5 * h), axis=1, out=dv[:, 1:])
-    dp = np.zeros_like(f_start)
-    np.cumsum(dv[:, :-1] * h + (2.0 * before + after) * (h * h / 6.0), axis=1, out=dp[:, 1:])
+    dv, dp = np.zeros_like(f_start), np.zeros_like(f_start)
+    gained = (before + after) * (0.5 * h)
+    moved = (2.0 * before + after) * (h * h / 6.0)
+    if force_slope is not None:
+        # slope of R f: R (omega x f + f'); it hardly depends on the bias: the first of the batch stands for all
+        slope = cross(omega[0], force[0]) + (
+            force_slope if accel_matrix is None else force_slope @ accel_matrix[0].T
+        )
+        slope = np.matmul(dR[0], slope[..., None])[..., 0]
+        bend = slope[:-1] - slope[1:]
+        gained = gained + bend * (h * h / 12.0)
+        moved = h * h * (0.35 * before + 0.15 * after) + (0.05 * slope[:-1] - slope[1:] / 30.0) * (h * h * h)
+    np.cumsum(gained, axis=1, out=dv[:, 1:])
+    np.cumsum(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
     return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0])
 
 
@@ -201,14 +250,15 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-def rotation_steps(omega: FloatArray, dt: FloatArray) -> FloatArray:
-    """Rotation over each interval for a rate linear in time, with the coning term.
+def rotation_steps(omega: FloatArray, dt: FloatArray, slope: FloatArray | None = None) -> FloatArray:
+    """Rotation over each interval for a rate linear (or cubic) in time, with the coning term.
 
-    Exp(dt (w0 + w1)/2 + dt^2/12 w0 x w1), exact to third order (Magnus expansion).
+    Exp(dt (w0 + w1)/2 + dt^2/12 (w0' - w1') + dt^2/12 w0 x w1) (Magnus expansion).
 
     Args:
         omega: Rates at the nodes, rad/s, shape (S, n + 1, 3).
         dt: Interval lengths, s, shape (n,).
+        slope: Derivatives of the rates at the nodes, rad/s^2, shape (n + 1, 3); None: straight lines.
 
     Returns:
         Rotations, shape (S, n, 3, 3).
@@ -216,7 +266,10 @@ def rotation_steps(omega: FloatArray, dt: FloatArray) -> FloatArray:
     w0, w1 = omega[:, :-1], omega[:, 1:]
     half = 0.5 * dt[:, None]
     # The coning term hardly depends on the bias: the first of the batch stands for all.
-    coning = cross(w0[:1], w1[:1]) * (dt * dt / 12.0)[:, None]
+    coning = cross(w0[:1], w1[:1])
+    if slope is not None:
+        coning = coning + (slope[:-1] - slope[1:])
+    coning = coning * (dt * dt / 12.0)[:, None]
     return so3.exp((w0 + w1) * half + coning)
 
 
