@@ -1,4 +1,4 @@
-"""Reading the IMU on a real pseudo terminal at 1000 Hz while another process loads every core."""
+"""Reading the IMU on a real pseudo terminal at 1000 Hz, onto the real bus, while others load every core."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
 
 import numpy as np
 from vical_drivers.microstrain.device import MicrostrainImu, open_imu
@@ -21,55 +25,108 @@ from vical_daemon.bus import LocalBus, Sample
 from vical_daemon.roles import imu as imu_role
 from vical_daemon.wall_clock import WallClock
 
+KEY = "vical/bench/imu/imu0"
+COLUMNS = (
+    "load", "samples", "lost", "missed by the subscriber", "read -> bus: median us", "p99", "max",
+    "read -> subscriber in another process: median us", "p99", "CPU of the process, % of a core",
+    "a bare wake-up of a thread: median us", "p99", "max",
+)  # fmt: skip
+
 
 def main(argv: list[str]) -> int:
     """Run and print a Markdown table."""
     parser = argparse.ArgumentParser(prog="benchmarks imu_reading", description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=1000.0)
-    parser.add_argument("--acquire", default="", help=argparse.SUPPRESS)  # the process under test: a port
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling, as the service has it")
+    parser.add_argument("--protocol", choices=("single-byte", "mip"), default="single-byte")
+    parser.add_argument("--no-bus", action="store_true", help="the bus in memory: the driver's part alone")
+    parser.add_argument("--acquire", default="", help=argparse.SUPPRESS)  # the process under test: a port
+    parser.add_argument("--subscribe", default="", help=argparse.SUPPRESS)  # the recorder's place: a socket
+    parser.add_argument("--socket", default="", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.acquire:
-        return _acquire(args.acquire, args.rate, args.seconds, fifo=args.fifo)
-    print("| load | samples | lost | read -> bus median us | p99 | max | CPU of the process |")
-    print("|---|---|---|---|---|---|---|")
+        return _acquire(args.acquire, args.rate, args.seconds, args.socket, fifo=args.fifo)
+    if args.subscribe:
+        return _subscribe(args.subscribe)
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     for busy in (0, os.cpu_count() or 2):
-        print(_case(busy, args.seconds, args.rate, fifo=args.fifo), flush=True)
+        print(_case(busy, args), flush=True)
     return 0
 
 
-def _case(busy: int, seconds: float, rate_hz: float, *, fifo: bool) -> str:
+def _case(busy: int, args: argparse.Namespace) -> str:
     emulator = subprocess.Popen(
-        [*_realtime(fifo), sys.executable, "-m", "vical_mocks.gx3_emulator", "--link", "direct"],
+        [
+            *_realtime(51, args.fifo), sys.executable, "-m", "vical_mocks.gx3_emulator",
+            "--link", "direct", "--protocol", args.protocol,
+        ],
         stdout=subprocess.PIPE,
         text=True,
-    )
+    )  # fmt: skip
     assert emulator.stdout is not None
     port = emulator.stdout.readline().strip()
     load = [multiprocessing.Process(target=_burn, daemon=True) for _ in range(busy)]
     for process in load:
         process.start()
-    command = [sys.executable, "-m", "benchmarks", "imu_reading", "--acquire", port]
-    command += ["--rate", str(rate_hz), "--seconds", str(seconds), *(["--fifo"] if fifo else [])]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    finally:
-        for process in load:
-            process.kill()
-        emulator.terminate()
-        emulator.wait()
-        emulator.stdout.close()
-    r = json.loads(answer.splitlines()[-1])
-    name = f"{busy} busy processes" if busy else "idle"
-    return (
-        f"| {name} | {r['samples']} | {r['lost']} | {r['median']:.0f} | {r['p99']:.0f} | {r['max']:.0f} "
-        f"| {100 * r['cpu']:.1f} % |"
-    )
+    with tempfile.TemporaryDirectory() as folder:
+        socket = "" if args.no_bus else str(Path(folder) / "bus")
+        try:
+            r = _measure(port, socket, args)
+        finally:
+            for process in load:
+                process.kill()
+            emulator.terminate()
+            emulator.wait()
+            emulator.stdout.close()
+    cells = [
+        f"{busy} busy processes" if busy else "idle", *(f"{r[k]}" for k in ("samples", "lost", "missed")),
+        *_spread(r["to_bus_us"]), *_spread(r["to_subscriber_us"])[:2], f"{100 * r['cpu']:.1f}",
+        *_spread(r["wake_up_us"]),
+    ]  # fmt: skip
+    return f"| {' | '.join(cells)} |"
 
 
-def _realtime(fifo: bool) -> list[str]:
-    return ["chrt", "-f", "51"] if fifo else []
+def _measure(port: str, socket: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Run the process under test and its subscriber; join what both noted of each sample."""
+    me = [sys.executable, "-m", "benchmarks", "imu_reading"]
+    acquire = subprocess.Popen(
+        [
+            *me, "--acquire", port, "--rate", str(args.rate), "--seconds", str(args.seconds),
+            "--socket", socket, *(["--fifo"] if args.fifo else []),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    received: dict[int, int] = {}
+    if socket:
+        command = [*_realtime(40, args.fifo), *me, "--subscribe", socket]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        received = dict(json.loads(done.stdout.splitlines()[-1]))
+    answer, _ = acquire.communicate()
+    r: dict[str, Any] = json.loads(answer.splitlines()[-1])
+    # The first second is held back on purpose, until the clock is known; then the subscriber arrives.
+    skip = max(int(1.5 * args.rate), min(received, default=0))
+    arrivals, published = np.array(r.pop("arrivals")), np.array(r.pop("published"))
+    count = min(len(arrivals), len(published))
+    numbers = [n for n in range(skip, count) if n in received]
+    return r | {
+        "samples": count - skip,
+        "lost": r["lost"] + len(arrivals) - len(published),
+        "missed": count - skip - len(numbers) if socket else "-",
+        "to_bus_us": (published[skip:count] - arrivals[skip:count]) * 1e-3,
+        "to_subscriber_us": np.array([received[n] - arrivals[n] for n in numbers]) * 1e-3,
+    }
+
+
+def _spread(values_us: Sequence[float]) -> list[str]:
+    if not len(values_us):
+        return ["-"] * 3
+    return [f"{v:.0f}" for v in (*np.percentile(values_us, [50, 99]), np.max(values_us))]
+
+
+def _realtime(priority: int, fifo: bool) -> list[str]:
+    return ["chrt", "-f", str(priority)] if fifo else []
 
 
 def _burn() -> None:
@@ -85,30 +142,47 @@ class _Noted(MicrostrainImu):
 
     def read(self, timeout_s: float) -> list[ImuSample]:
         samples = super().read(timeout_s)
-        self.arrivals += [s.t_arrival_ns for s in samples]
+        for sample in samples:
+            self.arrivals.append(sample.t_arrival_ns)
         return samples
 
 
-def _acquire(port: str, rate_hz: float, seconds: float, *, fifo: bool) -> int:
-    """The role `imu` as `vical run acquire` runs it: device thread, queue, encoder, bus."""
+class _NotedBus:
+    """A bus, noting when it had each sample."""
+
+    def __init__(self, bus: Any) -> None:
+        self.bus = bus
+        self.published: list[int] = []
+
+    def publish(self, key: str, payload: bytes) -> None:
+        self.bus.publish(key, payload)
+        if key == KEY:
+            self.published.append(time.monotonic_ns())
+
+
+def _acquire(port: str, rate_hz: float, seconds: float, socket: str, *, fifo: bool) -> int:
+    """The process `acquire` as the service runs it: bus router, device thread, queue, encoder."""
+    from vical_daemon.zenoh_bus import open_bus
+
     if fifo:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
     rig = config_module.loads(f"rig: bench\nimus:\n  imu0:\n    port: {port}\n    rate_hz: {rate_hz:g}\n")
-    sources: list[MicrostrainImu] = []
+    sources: list[_Noted] = []
 
     def open_source(imu: config_module.ImuConfig) -> MicrostrainImu:
         source = open_imu(imu.port, rate_hz=imu.rate_hz)
         source.__class__ = _Noted
-        source.arrivals = []  # type: ignore[attr-defined]
+        assert isinstance(source, _Noted)
+        source.arrivals = []
         sources.append(source)
         return source
 
-    published: list[int] = []
-    bus, stop = LocalBus(), threading.Event()
-    bus.subscribe("vical/bench/imu/imu0", _note_into(published))
-    role = threading.Thread(target=imu_role.run, args=(rig, bus, stop), kwargs={
-        "clock": WallClock(0), "open_source": open_source,
-    })  # fmt: skip
+    real = open_bus(mode="router", socket=socket) if socket else LocalBus()
+    bus, stop = _NotedBus(real), threading.Event()
+    role = threading.Thread(
+        target=imu_role.run, args=(rig, bus, stop),
+        kwargs={"clock": WallClock(0), "open_source": open_source},
+    )  # fmt: skip
     role.start()
     time.sleep(3.0)
     cpu_s, start_s = time.process_time(), time.monotonic()
@@ -116,23 +190,56 @@ def _acquire(port: str, rate_hz: float, seconds: float, *, fifo: bool) -> int:
     cpu = (time.process_time() - cpu_s) / (time.monotonic() - start_s)
     stop.set()
     role.join()
-    arrivals = sources[0].arrivals  # type: ignore[attr-defined]
-    count = min(len(arrivals), len(published))
-    # The first second is held back on purpose, until the clock is known.
-    skip = int(1.5 * rate_hz)
-    latency_us = (np.array(published[:count]) - np.array(arrivals[:count]))[skip:] * 1e-3
-    stats = sources[0].stats()
+    time.sleep(0.3)
+    real.close()
     result = {
-        "samples": count - skip,
-        "lost": stats.lost + len(arrivals) - len(published),
-        "median": float(np.median(latency_us)),
-        "p99": float(np.percentile(latency_us, 99)),
-        "max": float(latency_us.max()),
+        "arrivals": sources[0].arrivals,
+        "published": bus.published,
+        "lost": sources[0].stats().lost,
         "cpu": cpu,
+        "wake_up_us": _wake_ups(1.0 / rate_hz, min(seconds, 10.0)),
     }
     print(json.dumps(result))
     return 0
 
 
-def _note_into(published: list[int]) -> Callable[[Sample], None]:
-    return lambda _sample: published.append(time.monotonic_ns())
+def _wake_ups(period_s: float, seconds: float) -> list[float]:
+    """How long one thread needs to wake another, with nothing else in the process, us: the machine's part."""
+    waiting: SimpleQueue[int] = SimpleQueue()
+    late_us: list[float] = []
+
+    def wait() -> None:
+        while (sent_ns := waiting.get()) >= 0:
+            late_us.append((time.monotonic_ns() - sent_ns) * 1e-3)
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    for _ in range(int(seconds / period_s)):
+        time.sleep(period_s)
+        waiting.put(time.monotonic_ns())
+    waiting.put(-1)
+    thread.join()
+    return late_us
+
+
+def _subscribe(socket: str) -> int:
+    """What stands where the recorder does: note when each sample came, until the bus is gone."""
+    from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
+
+    bus: ZenohBus | None = None
+    while bus is None:
+        try:
+            bus = open_bus(mode="client", socket=socket)
+        except BusError:
+            time.sleep(0.05)
+    received: list[tuple[int, int]] = []
+    bus.subscribe(KEY, _note_into(received))
+    while bus.connected:
+        time.sleep(0.2)
+    bus.close()
+    print(json.dumps(received))
+    return 0
+
+
+def _note_into(received: list[tuple[int, int]]) -> Callable[[Sample], None]:
+    return lambda sample: received.append((sample.sequence, time.monotonic_ns()))

@@ -392,8 +392,10 @@ class ZenohBus:
                 outlet = self._outlets.get(key)
                 if outlet is None:
                     outlet = self._outlets[key] = _Outlet(self._session, key, self._publisher_id)
-        with suppress(zenoh.ZError):  # closing, or no link at this moment
+        try:
             outlet.put(payload)
+        except zenoh.ZError:  # closing, or no link at this moment
+            return
 
     def subscribe(
         self,

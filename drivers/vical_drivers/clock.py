@@ -2,21 +2,16 @@
 
 Three clocks meet, each with its own names: the device's ticks (``device_ticks``, wrapping on the wire,
 unwrapped inside), device seconds since the mapping began (``x_s``), and CLOCK_MONOTONIC of the host
-(``t_..._ns``).
-
-An arrival is late by a delay that is never negative, so the truth lies along the *lower* envelope of
-(device time, arrival - device time): a straight line with the offset and the skew of the two clocks,
-touched from above by the luckiest samples (Zhang, Liu, Xia, INFOCOM 2002). Averages (exponential,
-alpha-beta) carry the mean delay as a bias; the envelope does not. What no one-way method can see is the
-*smallest* delay itself: the caller takes off what it knows of it (wire time, the sensor's filters).
+(``t_..._ns``). The line between the last two is that of `envelope.LowerEnvelope`.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from typing import NamedTuple
+
+from vical_drivers.envelope import EnvelopeOptions, LowerEnvelope
 
 _NS = 1e9
 
@@ -43,182 +38,6 @@ class TickUnwrapper:
     def restart(self) -> None:
         """Forget the past; the next value is taken as it is."""
         self._last = None
-
-
-@dataclass(frozen=True, slots=True)
-class EnvelopeOptions:
-    """Tuning of `LowerEnvelope`; the defaults suit crystals of +-100 ppm on either side.
-
-    Attributes:
-        max_skew: Bound of the relative rate error of the two clocks (1e-6 is 1 ppm).
-        skew_prior: One-sigma of that error before anything is known.
-        skew_wander_per_s: How fast the skew itself drifts, 1/s (4e-8: 2.4 ppm a minute); with the jitter it
-            sets the window: long enough for lucky samples, short enough for a straight line.
-        min_window_s: Shortest memory.
-        max_window_s: Longest memory.
-        block_s: Only the luckiest sample of each block of this length is kept.
-    """
-
-    max_skew: float = 2000e-6
-    skew_prior: float = 100e-6
-    skew_wander_per_s: float = 4e-8
-    min_window_s: float = 20.0
-    max_window_s: float = 120.0
-    block_s: float = 0.2
-
-
-class LowerEnvelope:
-    """Lower envelope of (x, d): device seconds x, and d = arrival - x in seconds.
-
-    Keeps the luckiest point per block, forgets blocks older than a window chosen from the jitter, and
-    supports the convex hull of the rest by a line. Cost: O(window / block) when a block ends or a point
-    falls below the line, O(1) otherwise.
-    """
-
-    def __init__(self, options: EnvelopeOptions | None = None) -> None:
-        self.options = options or EnvelopeOptions()
-        self._blocks: deque[tuple[float, float]] = deque()
-        self._best: tuple[float, float] | None = None
-        self._block_start_s = 0.0
-        self._newest_s = 0.0
-        self._offset_s = 0.0
-        self._skew = 0.0
-        self._delay_mean_s = 0.0
-        self._delay_square_s2 = 0.0
-        self._points = 0
-        self._sigma_s = math.inf
-        self._skew_sigma = self.options.skew_prior
-
-    @property
-    def skew(self) -> float:
-        """Relative rate error: host seconds per device second, minus one."""
-        return self._skew
-
-    @property
-    def jitter_s(self) -> float:
-        """Standard deviation of the arrival delay, s (recent samples weigh most)."""
-        return math.sqrt(max(0.0, self._delay_square_s2 - self._delay_mean_s**2))
-
-    @property
-    def sigma_s(self) -> float:
-        """One-sigma uncertainty of the line at the newest point, s."""
-        return self._sigma_s
-
-    @property
-    def window_s(self) -> float:
-        """Present length of the memory, s: the cube root balances jitter/W against wander * W^2."""
-        o = self.options
-        window = (
-            1.5 * (self._delay_mean_s / o.skew_wander_per_s) ** (1 / 3) if self._delay_mean_s > 0 else 0.0
-        )
-        return min(max(window, o.min_window_s), o.max_window_s)
-
-    def line(self, x_s: float) -> float:
-        """Offset (host - device) at device time `x_s`, s."""
-        return self._offset_s + self._skew * x_s
-
-    def add(self, x_s: float, d_s: float) -> None:
-        """Take one arrival; `x_s` must not decrease."""
-        self._newest_s = x_s
-        self._points += 1
-        if self._best is None:
-            self._best, self._block_start_s = (x_s, d_s), x_s
-        elif d_s - self._skew * x_s < self._best[1] - self._skew * self._best[0]:
-            self._best = (x_s, d_s)
-        below = self._points < 2 or d_s < self.line(x_s)
-        if x_s - self._block_start_s >= self.options.block_s:
-            self._close_block()
-            below = True
-        if below:
-            self._fit()
-        self._note_delay(d_s - self.line(x_s))
-
-    def _close_block(self) -> None:
-        assert self._best is not None
-        self._blocks.append(self._best)
-        self._best = None
-        oldest = self._newest_s - self.window_s
-        while len(self._blocks) > 2 and self._blocks[0][0] < oldest:
-            self._blocks.popleft()
-
-    def _note_delay(self, delay_s: float) -> None:
-        gain = max(1.0 / self._points, 1e-3)
-        self._delay_mean_s += gain * (delay_s - self._delay_mean_s)
-        self._delay_square_s2 += gain * (delay_s * delay_s - self._delay_square_s2)
-
-    def _fit(self) -> None:
-        points = list(self._blocks)
-        if self._best is not None:
-            points.append(self._best)
-        hull = _lower_hull(points)
-        memory_s = min(self.window_s, points[-1][0] - points[0][0])
-        slope = _slope_at(hull, self._newest_s - memory_s / 2.0, memory_s / 4.0)
-        spread_s = self._spread_s(points)
-        # A short memory of jittery points says little about the skew: weigh it against the prior.
-        skew_sigma = 2.0 * spread_s / memory_s if memory_s > 0 else math.inf
-        prior = self.options.skew_prior
-        weight = 1.0 / (1.0 + (skew_sigma / prior) ** 2)
-        bound = self.options.max_skew
-        self._skew = min(max(slope * weight, -bound), bound)
-        self._offset_s = min(d - self._skew * x for x, d in hull)
-        self._skew_sigma = prior * math.sqrt(1.0 - weight)
-        self._sigma_s = self._uncertainty_s(points, spread_s)
-
-    def _spread_s(self, points: list[tuple[float, float]]) -> float:
-        """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
-        residuals = sorted(d - self.line(x) for x, d in points)
-        # A few points may agree by chance: their number bounds what can be believed.
-        believable_s = self._delay_mean_s / math.sqrt(self._points)
-        return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
-
-    def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float) -> float:
-        memory_s = max(points[-1][0] - points[0][0], self.options.block_s)
-        lead_s = memory_s / 3.0
-        if len(points) < 5:
-            spread_s = max(spread_s, self._delay_mean_s)
-        wander_s = 0.5 * self.options.skew_wander_per_s * lead_s**2
-        return math.hypot(spread_s, self._skew_sigma * lead_s, wander_s)
-
-
-def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Lower convex hull of points ordered by x (monotone chain)."""
-    hull: list[tuple[float, float]] = []
-    for x, d in points:
-        while len(hull) > 1:
-            (x1, d1), (x2, d2) = hull[-2], hull[-1]
-            if (d2 - d1) * (x - x1) < (d - d1) * (x2 - x1):
-                break
-            hull.pop()
-        if hull and x <= hull[-1][0]:
-            if d < hull[-1][1]:
-                hull[-1] = (x, d)
-            continue
-        hull.append((x, d))
-    return hull
-
-
-def _slope_at(hull: list[tuple[float, float]], x_s: float, span_s: float) -> float:
-    """Slope of the hull over `x_s`, from a chord of at least `span_s` where there is one.
-
-    The hull's edge there may join two lucky neighbours, whose slope is mostly the tick's rounding; it is
-    widened to whichever side bends less.
-    """
-    if len(hull) < 2:
-        return 0.0
-    right = 1
-    while right < len(hull) - 1 and hull[right][0] < x_s:
-        right += 1
-    left = right - 1
-    while hull[right][0] - hull[left][0] < span_s and (left > 0 or right < len(hull) - 1):
-        slope = _slope(hull[left], hull[right])
-        bend_left = abs(_slope(hull[left - 1], hull[left]) - slope) if left > 0 else math.inf
-        bend_right = abs(_slope(hull[right], hull[right + 1]) - slope) if right < len(hull) - 1 else math.inf
-        left, right = (left - 1, right) if bend_left < bend_right else (left, right + 1)
-    return _slope(hull[left], hull[right])
-
-
-def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
-    return (b[1] - a[1]) / (b[0] - a[0])
 
 
 class DeviceTime(NamedTuple):
@@ -278,14 +97,14 @@ class DeviceClock:
         self._tick_sigma_s = 0.5 / tick_hz
         self._period = tick_hz / rate_hz if rate_hz > 0.0 else 0.0
         self._options = options
-        self._unwrap = TickUnwrapper(tick_bits)
+        self._modulus = 0 if tick_bits is None else 1 << tick_bits
         self._suspect: tuple[int, int] | None = None
         self._begin()
 
     def _begin(self) -> None:
-        self._unwrap.restart()
         self.envelope = LowerEnvelope(self._options)
-        self._first_ticks: int | None = None
+        self._running = False
+        self._first_ticks = 0
         self._last_ticks = 0
         self._fine = 0.0
         self._t0_ns = 0
@@ -295,7 +114,7 @@ class DeviceClock:
     @property
     def age_s(self) -> float:
         """Device seconds since the mapping began; below about 1 s it is not worth much."""
-        return 0.0 if self._first_ticks is None else (self._last_ticks - self._first_ticks) / self.tick_hz
+        return (self._last_ticks - self._first_ticks) / self.tick_hz
 
     def add(self, ticks: int, t_arrival_ns: int) -> DeviceTime | None:
         """Take one sample; return its device time, None where the value cannot be true or was seen.
@@ -303,8 +122,13 @@ class DeviceClock:
         A value from the future is either damage or a restarted (or newly set) device timer. One such
         value is dropped; a second one that fits the first is a restart, and the mapping begins anew.
         """
-        step = self._unwrap.step(ticks)
-        if self._first_ticks is not None and not self._possible(step, t_arrival_ns):
+        step = ticks - self._last_ticks
+        if self._modulus:
+            step %= self._modulus  # the counter wrapped: the step is still forward
+        if not self._running:
+            self._start(ticks, t_arrival_ns)
+            step = 0
+        elif not self._possible(step, t_arrival_ns):
             if not self._continues_suspect(ticks, t_arrival_ns):
                 self._suspect = (ticks, t_arrival_ns)
                 self.outliers += 1
@@ -312,35 +136,40 @@ class DeviceClock:
             self.restarts += 1
             self.outliers -= 1
             self._begin()
-        self._suspect = None
-        if self._first_ticks is not None and step == 0:
+            self._start(ticks, t_arrival_ns)
+            step = 0
+        elif step == 0:
+            self._suspect = None
             self.repeats += 1
             return None
-        unwrapped = self._unwrap.accept(ticks)
-        if self._first_ticks is None:
-            self._first_ticks, self._t0_ns = unwrapped, t_arrival_ns
-            self._fine, self._last_ticks = float(unwrapped), unwrapped
-        self._fine = self._refined(unwrapped)
-        x_s = (self._fine - self._first_ticks) / self.tick_hz
+        self._suspect = None
+        unwrapped = self._last_ticks + step
+        self._fine = fine = self._refined(unwrapped, step)
+        x_s = (fine - self._first_ticks) / self.tick_hz
         self.envelope.add(x_s, (t_arrival_ns - self._t0_ns) / _NS - x_s)
         self._last_ticks = unwrapped
-        return DeviceTime(unwrapped, self._fine)
+        return DeviceTime(unwrapped, fine)
 
-    def _refined(self, unwrapped: int) -> float:
+    def _start(self, ticks: int, t_arrival_ns: int) -> None:
+        self._running, self._first_ticks, self._last_ticks = True, ticks, ticks
+        self._fine, self._t0_ns = float(ticks), t_arrival_ns
+
+    def _refined(self, unwrapped: int, step: int) -> float:
         """Ticks with the fraction that rounding took away.
 
         Samples come every 62.5 ticks at 1000 Hz, so the counter alternates between steps of 62 and 63. The
         instants themselves are evenly spaced by the same crystal: go on by whole periods, within the tick.
         """
-        if self._period <= 0.0:
+        period = self._period
+        if period <= 0.0:
             return float(unwrapped)
-        periods = round((unwrapped - self._last_ticks) / self._period)
-        fine = self._fine + periods * self._period
-        return float(unwrapped) if fine < unwrapped else min(fine, unwrapped + 1.0)
+        fine = self._fine + round(step / period) * period
+        if fine < unwrapped:
+            return float(unwrapped)
+        return fine if fine < unwrapped + 1.0 else unwrapped + 1.0
 
     def _possible(self, step: int, t_arrival_ns: int) -> bool:
         """Tell whether an arrival may be that of a sample `step` ticks after the last one."""
-        assert self._first_ticks is not None
         if step < 0:
             return False
         x_s = (self._last_ticks + step - self._first_ticks) / self.tick_hz
@@ -361,7 +190,6 @@ class DeviceClock:
 
         Stamps never go back: where the envelope just moved, the step is spread over some samples.
         """
-        assert self._first_ticks is not None
         x_s = (device.fine - self._first_ticks) / self.tick_hz
         t_ns = self._t0_ns + round((x_s + self.envelope.line(x_s)) * _NS)
         lost = 0
@@ -371,8 +199,11 @@ class DeviceClock:
             if t_ns < earliest_ns:
                 t_ns = earliest_ns
             # Half a period of tolerance swallows the 62/63 tick alternation at 1000 Hz.
-            lost = max(0, round(step_s * self.rate_hz) - 1)
-            self.lost += lost
+            lost = round(step_s * self.rate_hz) - 1
+            if lost > 0:
+                self.lost += lost
+            else:
+                lost = 0
         self._last_t_ns, self._stamped_ticks = t_ns, device.ticks
         sigma_s = math.hypot(self.envelope.sigma_s, self._tick_sigma_s)
         return Stamp(t_ns, int(sigma_s * _NS) if sigma_s < 1.0 else int(_NS), device.ticks, lost)

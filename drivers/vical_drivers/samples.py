@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Protocol, Self, runtime_checkable
+from typing import NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 
-@dataclass(frozen=True, slots=True)
-class ImuSample:
-    """One inertial sample.
+class ImuSample(NamedTuple):
+    """One inertial sample; a tuple, because it is made 1000 times a second.
 
     Attributes:
         t_host_ns: Instant the sensor *measured* (device clock mapped to CLOCK_MONOTONIC, wire time

@@ -29,7 +29,7 @@ from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, SequenceCounter
 from vical_drivers.camera.statistics import FrameStatistics
 from vical_drivers.camera.v4l2_stamp import SIGMA_NS, ExposureStamper, RawStamp
-from vical_drivers.clock import LowerEnvelope
+from vical_drivers.envelope import LowerEnvelope
 from vical_drivers.errors import (
     DeviceBusyError,
     DeviceLostError,

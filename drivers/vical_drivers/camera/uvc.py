@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from vical_drivers.clock import EnvelopeOptions, LowerEnvelope, TickUnwrapper
+from vical_drivers.clock import TickUnwrapper
+from vical_drivers.envelope import EnvelopeOptions, LowerEnvelope
 
 _HAS_PTS = 0x04
 _HAS_SCR = 0x08

@@ -120,6 +120,7 @@ class SerialPort:
             )
         except (OSError, ValueError, termios.error) as error:
             raise _explain(path, error) from None
+        self._note_baud()
         self._fd: int = self._serial.fileno()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
@@ -151,7 +152,11 @@ class SerialPort:
     @property
     def wire_byte_ns(self) -> float:
         """Time one byte occupies the wire, ns; 0 where no UART is in between."""
-        return 0.0 if self.link in ("usb", "unknown") else BITS_PER_BYTE * 1e9 / self.baud
+        return self._wire_byte_ns
+
+    def _note_baud(self) -> None:
+        no_wire = self.link in ("usb", "unknown")
+        self._wire_byte_ns = 0.0 if no_wire else BITS_PER_BYTE * 1e9 / self.baud
 
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """See `BytePort.read`."""
@@ -181,6 +186,7 @@ class SerialPort:
         try:
             self._serial.flush()
             self._serial.baudrate = baud
+            self._note_baud()
             self._serial.reset_input_buffer()
         except (OSError, termios.error) as error:
             raise self._lost(str(error)) from None
@@ -235,15 +241,18 @@ class ArrivalLog:
 
     def add(self, size: int, t_read_ns: int) -> None:
         """Note that `size` bytes arrived by a read at `t_read_ns`."""
-        self._end += size
-        self._chunks.append((self._end, t_read_ns))
+        self._end = end = self._end + size
+        self._chunks.append((end, t_read_ns))
 
     def arrival_ns(self, offset: int, wire_byte_ns: float) -> int:
         """When the byte that ends at stream offset `offset` was there, ns; offsets must not decrease."""
-        while len(self._chunks) > 1 and self._chunks[0][0] < offset:
-            self._chunks.popleft()
-        end, t_read_ns = self._chunks[0]
-        return t_read_ns - round((end - offset) * wire_byte_ns)
+        chunks = self._chunks
+        while True:
+            end, t_read_ns = chunks[0]
+            if end >= offset or len(chunks) == 1:
+                break
+            chunks.popleft()
+        return t_read_ns if end == offset else t_read_ns - round((end - offset) * wire_byte_ns)
 
 
 def wait_for_silence(port: BytePort, quiet_s: float, limit_s: float) -> bool:

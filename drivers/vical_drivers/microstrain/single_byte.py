@@ -177,7 +177,6 @@ _ENTRIES: list[_Entry | None] = [
     _entry(LAYOUTS[header]) if header in LAYOUTS else None for header in range(256)
 ]
 _HEADER = re.compile(b"[" + b"".join(re.escape(bytes([h])) for h in LAYOUTS) + b"]")
-_LENGTHS = [entry.length if entry else 0 for entry in _ENTRIES]
 _LARGEST, _SMALLEST = 1e9, 1e-30
 
 
@@ -222,6 +221,18 @@ class Decoder:
 
     def feed(self, data: bytes) -> list[Record]:
         """Take the next bytes of the stream and return the records they complete, in order."""
+        if self._in_step and data and not self._tail and not self.little_endian_floats:
+            # Nearly always one read brings one whole record: no need to look for anything.
+            entry, size = _ENTRIES[data[0]], len(data)
+            if (
+                entry is not None
+                and entry.length == size
+                and sum(data[:-2]) & 0xFFFF == data[-2] << 8 | data[-1]
+            ):
+                self._consumed += size
+                self._record_bytes += size
+                self.records += 1
+                return [Record(data[0], entry.unpack.unpack_from(data, 1), self._consumed)]
         return self._parse(self._tail + data if self._tail else data, waiting=True)
 
     def finish(self) -> list[Record]:
@@ -235,6 +246,7 @@ class Decoder:
         out: list[Record] = []
         position, size, base = 0, len(buffer), self._consumed
         kept: int | None = None
+        good_bytes = 0
         while position < size:
             entry = _ENTRIES[buffer[position]]
             if entry is None:
@@ -255,15 +267,16 @@ class Decoder:
                 position += 1
                 continue
             out.append(Record(buffer[position], values, base + end))
+            good_bytes += entry.length
             position = end
             kept = None
             self._in_step = True
+        self._record_bytes += good_bytes
         return self._keep(buffer, position if kept is None else kept, out)
 
     def _keep(self, buffer: bytes, position: int, out: list[Record]) -> list[Record]:
         self._tail = buffer[position:]
         self._consumed += position
-        self._record_bytes += sum(_LENGTHS[record.kind] for record in out)
         self.records += len(out)
         self.skipped_bytes = self._consumed - self._record_bytes
         return out

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import time
 
 from vical_drivers.errors import DeviceRefusedError, DriverError
@@ -18,6 +17,7 @@ _log = logging.getLogger(__name__)
 _REPLY_TIMEOUT_S = 0.5
 _TRIES = 3
 _STREAMED = 0xC2
+_G = sb.STANDARD_GRAVITY_MPS2
 _SELF_TEST_PARTS = {
     0: "3 V supply",
     1: "5 V supply",
@@ -164,14 +164,16 @@ class SingleByteSession:
         return [s for r in self._receive(timeout_s) if (s := self._sample(r)) is not None]
 
     def _sample(self, record: sb.Record) -> RawSample | None:
-        if record.kind != _STREAMED:
+        kind, values, end = record
+        if kind != _STREAMED:
             return None
-        ax, ay, az, wx, wy, wz, ticks = record.values
-        force = (ax * sb.STANDARD_GRAVITY_MPS2, ay * sb.STANDARD_GRAVITY_MPS2, az * sb.STANDARD_GRAVITY_MPS2)
-        if not math.isfinite(sum(force) + wx + wy + wz):
+        ax, ay, az, wx, wy, wz, ticks = values
+        total = ax + ay + az + wx + wy + wz
+        if total - total != 0.0:  # NaN or infinity: the device is idle or over range
             return None
-        arrival_ns = self._arrivals.arrival_ns(record.end, self._port.wire_byte_ns)
-        return RawSample(ticks, (wx, wy, wz), force, arrival_ns)
+        g = _G
+        arrival_ns = self._arrivals.arrival_ns(end, self._port.wire_byte_ns)
+        return RawSample(ticks, (wx, wy, wz), (ax * g, ay * g, az * g), arrival_ns)
 
     def _receive(self, timeout_s: float) -> list[sb.Record]:
         data, t_read_ns = self._port.read(timeout_s)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vical_drivers.clock import DeviceClock, LowerEnvelope, SampleCounter, TickUnwrapper, _lower_hull
+from vical_drivers.clock import DeviceClock, SampleCounter, TickUnwrapper
+from vical_drivers.envelope import LowerEnvelope, _lower_hull
 
 TICK_HZ = 62_500.0
 

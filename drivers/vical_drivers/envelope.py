@@ -1,0 +1,194 @@
+"""The lower envelope of one-way arrivals: offset and skew of two clocks. Pure arithmetic.
+
+An arrival is late by a delay that is never negative, so the truth lies along the *lower* envelope of
+(device time, arrival - device time): a straight line with the offset and the skew of the two clocks,
+touched from above by the luckiest samples (Zhang, Liu, Xia, INFOCOM 2002). Averages (exponential,
+alpha-beta) carry the mean delay as a bias; the envelope does not. What no one-way method can see is the
+*smallest* delay itself: the caller takes off what it knows of it (wire time, the sensor's filters).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+_DELAY_MEMORY = 1000
+"""So many samples weigh in the mean delay."""
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopeOptions:
+    """Tuning of `LowerEnvelope`; the defaults suit crystals of +-100 ppm on either side.
+
+    Attributes:
+        max_skew: Bound of the relative rate error of the two clocks (1e-6 is 1 ppm).
+        skew_prior: One-sigma of that error before anything is known.
+        skew_wander_per_s: How fast the skew itself drifts, 1/s (4e-8: 2.4 ppm a minute); with the jitter it
+            sets the window: long enough for lucky samples, short enough for a straight line.
+        min_window_s: Shortest memory.
+        max_window_s: Longest memory.
+        block_s: Only the luckiest sample of each block of this length is kept.
+    """
+
+    max_skew: float = 2000e-6
+    skew_prior: float = 100e-6
+    skew_wander_per_s: float = 4e-8
+    min_window_s: float = 20.0
+    max_window_s: float = 120.0
+    block_s: float = 0.2
+
+
+class LowerEnvelope:
+    """Lower envelope of (x, d): device seconds x, and d = arrival - x in seconds.
+
+    Keeps the luckiest point per block, forgets blocks older than a window chosen from the jitter, and
+    supports the convex hull of the rest by a line. Cost: O(window / block) when a block ends or a point
+    falls below the line, O(1) otherwise.
+    """
+
+    def __init__(self, options: EnvelopeOptions | None = None) -> None:
+        self.options = options or EnvelopeOptions()
+        self._block_s = self.options.block_s
+        self._blocks: deque[tuple[float, float]] = deque()
+        self._best: tuple[float, float] | None = None
+        self._block_start_s = 0.0
+        self._newest_s = 0.0
+        self._offset_s = 0.0
+        self._skew = 0.0
+        self._delay_mean_s = 0.0
+        self._delay_square_s2 = 0.0
+        self._points = 0
+        self._sigma_s = math.inf
+        self._skew_sigma = self.options.skew_prior
+
+    @property
+    def skew(self) -> float:
+        """Relative rate error: host seconds per device second, minus one."""
+        return self._skew
+
+    @property
+    def jitter_s(self) -> float:
+        """Standard deviation of the arrival delay, s (recent samples weigh most)."""
+        return math.sqrt(max(0.0, self._delay_square_s2 - self._delay_mean_s**2))
+
+    @property
+    def sigma_s(self) -> float:
+        """One-sigma uncertainty of the line at the newest point, s."""
+        return self._sigma_s
+
+    @property
+    def window_s(self) -> float:
+        """Present length of the memory, s: the cube root balances jitter/W against wander * W^2."""
+        o = self.options
+        window = (
+            1.5 * (self._delay_mean_s / o.skew_wander_per_s) ** (1 / 3) if self._delay_mean_s > 0 else 0.0
+        )
+        return min(max(window, o.min_window_s), o.max_window_s)
+
+    def line(self, x_s: float) -> float:
+        """Offset (host - device) at device time `x_s`, s."""
+        return self._offset_s + self._skew * x_s
+
+    def add(self, x_s: float, d_s: float) -> None:
+        """Take one arrival; `x_s` must not decrease."""
+        # 1000 times a second on a small computer: `line` is spelt out, and nothing is made anew.
+        self._newest_s = x_s
+        self._points += 1
+        best, skew = self._best, self._skew
+        if best is None:
+            self._best, self._block_start_s = (x_s, d_s), x_s
+        elif d_s - skew * x_s < best[1] - skew * best[0]:
+            self._best = (x_s, d_s)
+        delay_s = d_s - (self._offset_s + skew * x_s)
+        ends = x_s - self._block_start_s >= self._block_s
+        if ends or delay_s < 0.0 or self._points < 2:
+            if ends:
+                self._close_block()
+            self._fit()
+            delay_s = d_s - (self._offset_s + self._skew * x_s)
+        gain = 1.0 / self._points if self._points < _DELAY_MEMORY else 1.0 / _DELAY_MEMORY
+        self._delay_mean_s += gain * (delay_s - self._delay_mean_s)
+        self._delay_square_s2 += gain * (delay_s * delay_s - self._delay_square_s2)
+
+    def _close_block(self) -> None:
+        assert self._best is not None
+        self._blocks.append(self._best)
+        self._best = None
+        oldest = self._newest_s - self.window_s
+        while len(self._blocks) > 2 and self._blocks[0][0] < oldest:
+            self._blocks.popleft()
+
+    def _fit(self) -> None:
+        points = list(self._blocks)
+        if self._best is not None:
+            points.append(self._best)
+        hull = _lower_hull(points)
+        memory_s = min(self.window_s, points[-1][0] - points[0][0])
+        slope = _slope_at(hull, self._newest_s - memory_s / 2.0, memory_s / 4.0)
+        spread_s = self._spread_s(points)
+        # A short memory of jittery points says little about the skew: weigh it against the prior.
+        skew_sigma = 2.0 * spread_s / memory_s if memory_s > 0 else math.inf
+        prior = self.options.skew_prior
+        weight = 1.0 / (1.0 + (skew_sigma / prior) ** 2)
+        bound = self.options.max_skew
+        self._skew = min(max(slope * weight, -bound), bound)
+        self._offset_s = min(d - self._skew * x for x, d in hull)
+        self._skew_sigma = prior * math.sqrt(1.0 - weight)
+        self._sigma_s = self._uncertainty_s(points, spread_s)
+
+    def _spread_s(self, points: list[tuple[float, float]]) -> float:
+        """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
+        residuals = sorted(d - self.line(x) for x, d in points)
+        # A few points may agree by chance: their number bounds what can be believed.
+        believable_s = self._delay_mean_s / math.sqrt(self._points)
+        return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
+
+    def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float) -> float:
+        memory_s = max(points[-1][0] - points[0][0], self.options.block_s)
+        lead_s = memory_s / 3.0
+        if len(points) < 5:
+            spread_s = max(spread_s, self._delay_mean_s)
+        wander_s = 0.5 * self.options.skew_wander_per_s * lead_s**2
+        return math.hypot(spread_s, self._skew_sigma * lead_s, wander_s)
+
+
+def _lower_hull(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Lower convex hull of points ordered by x (monotone chain)."""
+    hull: list[tuple[float, float]] = []
+    for x, d in points:
+        while len(hull) > 1:
+            (x1, d1), (x2, d2) = hull[-2], hull[-1]
+            if (d2 - d1) * (x - x1) < (d - d1) * (x2 - x1):
+                break
+            hull.pop()
+        if hull and x <= hull[-1][0]:
+            if d < hull[-1][1]:
+                hull[-1] = (x, d)
+            continue
+        hull.append((x, d))
+    return hull
+
+
+def _slope_at(hull: list[tuple[float, float]], x_s: float, span_s: float) -> float:
+    """Slope of the hull over `x_s`, from a chord of at least `span_s` where there is one.
+
+    The hull's edge there may join two lucky neighbours, whose slope is mostly the tick's rounding; it is
+    widened to whichever side bends less.
+    """
+    if len(hull) < 2:
+        return 0.0
+    right = 1
+    while right < len(hull) - 1 and hull[right][0] < x_s:
+        right += 1
+    left = right - 1
+    while hull[right][0] - hull[left][0] < span_s and (left > 0 or right < len(hull) - 1):
+        slope = _slope(hull[left], hull[right])
+        bend_left = abs(_slope(hull[left - 1], hull[left]) - slope) if left > 0 else math.inf
+        bend_right = abs(_slope(hull[right], hull[right + 1]) - slope) if right < len(hull) - 1 else math.inf
+        left, right = (left - 1, right) if bend_left < bend_right else (left, right + 1)
+    return _slope(hull[left], hull[right])
+
+
+def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return (b[1] - a[1]) / (b[0] - a[0])
