@@ -51,6 +51,8 @@ class ImuConfig:
         protocol: auto asks the device which one it speaks.
         rate_hz: Samples a second; the GX3 divides 1000 Hz.
         filter_samples: Width M of the moving average in the device, ms; its delay is taken off the stamps.
+        baud: Bits a second on the line while streaming; None: as found, or more where the rate needs it.
+        link: What lies in between; on a real UART (ftdi, uart) the bytes' own time is taken off the stamps.
         noise: Densities for the estimator.
     """
 
@@ -59,6 +61,8 @@ class ImuConfig:
     protocol: Literal["auto", "single-byte", "mip"] = "auto"
     rate_hz: Annotated[float, Bound(low=1, high=1000)] = 500.0
     filter_samples: Annotated[int, Bound(low=1, high=32)] = 15
+    baud: Literal[115200, 230400, 460800, 921600] | None = None
+    link: Literal["auto", "usb", "ftdi", "uart"] = "auto"
     noise: NoiseConfig = field(default_factory=NoiseConfig)
 
 
@@ -207,12 +211,14 @@ class WebConfig:
         enabled: Serve it.
         host: Address to listen on; 127.0.0.1: this machine only.
         port: Of the page; 0: any free one.
+        picture_rate_hz: Pictures a second on the page, at most; each costs about 2 ms of a processor.
         foxglove_port: WebSocket for Foxglove (its usual port is 8765); 0: none.
     """
 
     enabled: bool = False
     host: str = "127.0.0.1"
     port: Annotated[int, Bound(low=0, high=65535)] = 8080
+    picture_rate_hz: Annotated[float, Bound(low=0.1, high=30)] = 2.0
     foxglove_port: Annotated[int, Bound(low=0, high=65535)] = 0
 
 

@@ -58,7 +58,7 @@ class _Feeds:
             subscription.close()
         if on:
             view, rig = self.views[camera], self._config.rig
-            kinds = (topics.POINTS, topics.TRACKS, topics.IMAGE, topics.COMPRESSED)
+            kinds = (topics.POINTS, topics.TRACKS, topics.PREDICTED, topics.IMAGE, topics.COMPRESSED)
             self._watched[camera] = [self._bus.subscribe(t.key(rig, camera), view.take) for t in kinds]
 
     def close(self) -> None:
@@ -110,7 +110,8 @@ async def _serve(
     def command(role: str, word: str) -> None:
         bus.publish(topics.COMMAND.key(config.rig, role), encode_string(word))
 
-    server = PageServer(state, feeds.views, feeds.watch, command, read_token())
+    rate_hz = config.web.picture_rate_hz
+    server = PageServer(state, feeds.views, feeds.watch, command, read_token(), rate_hz)
     runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=0.3)
     await runner.setup()
     host, port = config.web.host, config.web.port

@@ -1,12 +1,15 @@
-"""The camera view: the newest image that has its points, points drawn in, as JPEG."""
+"""The camera view: the newest image with the points found in it and where the filter expected them."""
 
 from __future__ import annotations
 
+import base64
 import struct
 import threading
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -14,21 +17,38 @@ from vical_daemon import topics
 from vical_daemon.bus import Sample
 from vical_daemon.messages import (
     MessageError,
+    PointsMessage,
     decode_compressed_image,
     decode_image,
     decode_points,
 )
 
 WIDTH_LIMIT = 800  # wider images are thinned: the page is for looking, not for measuring
+QUALITY = 70
 PATIENCE_NS = 1_200_000_000  # an image without points is shown when nothing better came for so long
 RESTART_NS = 5_000_000_000
 KEPT_BYTES = 24 * 2**20  # images that wait for their points: about a second of them
 _STAMP = struct.Struct("<4xiI")  # behind the four bytes that begin every CDR message
 _RING = np.array([(x, y) for x in range(-5, 6) for y in range(-5, 6) if 10 <= x * x + y * y <= 26])
-_PALETTE = np.array(
-    [(0, 94, 213), (115, 158, 0), (178, 114, 0), (66, 228, 240), (167, 121, 204), (0, 159, 230)],
-    dtype=np.uint8,
-)
+_CROSS = np.array([(d, s * d) for d in range(-3, 4) for s in (-1, 1)])
+_DETECTED, _PREDICTED = (115, 158, 0), (0, 94, 213)  # BGR: green and orange that the colour-blind tell apart
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """An image with what was found in it and what the filter had expected there.
+
+    Attributes:
+        stamp_ns: Stamp of all three, UNIX ns.
+        image: Image or compressed image message.
+        points: Points message of the same stamp; None: none came.
+        predicted: Predicted points of the same stamp; None: none came.
+    """
+
+    stamp_ns: int
+    image: Sample
+    points: Sample | None = None
+    predicted: Sample | None = None
 
 
 class CameraView:
@@ -43,55 +63,120 @@ class CameraView:
         self._lock = threading.Lock()
         self._images: deque[Sample] = deque(maxlen=40)
         self._points: deque[Sample] = deque(maxlen=60)
+        self._predicted: deque[Sample] = deque(maxlen=20)
         self._shown_ns = 0
 
     def take(self, sample: Sample) -> None:
-        """Keep an image or points message."""
+        """Keep an image or a message with points."""
         parsed = topics.parse_key(sample.key)
         if parsed is None or parsed.name != self.camera:
             return
-        is_image = parsed.topic in (topics.IMAGE, topics.COMPRESSED)
         with self._lock:
-            if not is_image:
+            if parsed.topic is topics.PREDICTED:
+                self._predicted.append(sample)
+            elif parsed.topic in (topics.IMAGE, topics.COMPRESSED):
+                if self._images and _stamp_ns(sample) < _stamp_ns(self._images[-1]) - RESTART_NS:
+                    self._begin_anew()
+                self._images.append(sample)
+                while len(self._images) > 2 and sum(len(s.payload) for s in self._images) > KEPT_BYTES:
+                    self._images.popleft()
+            else:
                 self._points.append(sample)
-                return
-            self._images.append(sample)
-            while len(self._images) > 2 and sum(len(s.payload) for s in self._images) > KEPT_BYTES:
-                self._images.popleft()
 
-    def jpeg(self) -> bytes | None:
-        """Return the next picture as JPEG; None while there is nothing newer than the last one."""
+    def _begin_anew(self) -> None:
+        """The clock went back: a replay that began again."""
+        for queue in (self._images, self._points, self._predicted):
+            queue.clear()
+        self._shown_ns = 0
+
+    def next(self) -> Sight | None:
+        """Return what is to be shown next; None while there is nothing newer than the last one.
+
+        The newest image that has both its points and a prediction; while nothing is predicted, one that
+        has its points; while nothing is detected, an image alone.
+        """
         with self._lock:
-            images, points = list(self._images), list(self._points)
-        known = {_stamp_ns(sample): sample for sample in points}
-        newest: tuple[int, Sample] | None = None
-        for sample in reversed(images):
-            stamp_ns = _stamp_ns(sample)
-            if stamp_ns < self._shown_ns - RESTART_NS:
-                self._shown_ns = 0  # the clock went back: a replay that began anew
-            if stamp_ns <= self._shown_ns:
-                break
-            if stamp_ns in known:
-                return self._encode(stamp_ns, sample, known[stamp_ns])
-            newest = newest or (stamp_ns, sample)
-        if newest is None or newest[0] - self._shown_ns < PATIENCE_NS:
+            images, predicted = list(self._images), {_stamp_ns(s): s for s in self._predicted}
+            points = {_stamp_ns(sample): sample for sample in self._points}
+        stamps = {_stamp_ns(sample): sample for sample in images}
+        newest_ns = max(stamps, default=0)
+        fresh = [stamp_ns for stamp_ns in sorted(stamps, reverse=True) if stamp_ns > self._shown_ns]
+        full = [stamp_ns for stamp_ns in fresh if stamp_ns in points and stamp_ns in predicted]
+        found = [stamp_ns for stamp_ns in fresh if stamp_ns in points]
+        if full:
+            chosen = full[0]
+        elif found and max(predicted, default=0) < max(points) - PATIENCE_NS:
+            chosen = found[0]
+        elif fresh and newest_ns - self._shown_ns > PATIENCE_NS:
+            chosen = (found or fresh)[0]
+        else:
             return None
-        return self._encode(*newest, None)
+        self._shown_ns = chosen
+        return Sight(chosen, stamps[chosen], points.get(chosen), predicted.get(chosen))
 
-    def _encode(self, stamp_ns: int, image: Sample, points_sample: Sample | None) -> bytes | None:
-        from vical_daemon.vision.image_codec import encode_image
 
-        self._shown_ns = stamp_ns
-        try:
-            pixels = _pixels(image)
-            points = None if points_sample is None else decode_points(points_sample.payload)
-        except MessageError:
-            return None
-        factor = -(-pixels.shape[1] // WIDTH_LIMIT)
-        picture = colour(pixels[::factor, ::factor])
-        if points is not None:
-            draw_rings(picture, points.uv_px / factor, points.ids)
-        return encode_image(picture, "jpeg", quality=80)
+def picture_event(sight: Sight) -> bytes | None:
+    """Return a server-sent event with the picture and its points for the browser to draw; None: unreadable.
+
+    The points travel as numbers, in pixels of the full image, so that they stay sharp on a small picture.
+    """
+    try:
+        pixels, points, predicted = _contents(sight)
+    except MessageError:
+        return None
+    from vical_daemon.vision.image_codec import encode_image
+
+    small, _ = thinned(pixels)
+    jpeg = encode_image(small, "jpeg", quality=QUALITY)
+    document = {
+        "stamp_s": round(sight.stamp_ns * 1e-9, 3),
+        "size": [pixels.shape[1], pixels.shape[0]],
+        "detected": _rows(points),
+        "predicted": _rows(predicted),
+        "jpeg": base64.b64encode(jpeg).decode(),
+    }
+    return b"event: picture\ndata: " + msgspec.json.encode(document) + b"\n\n"
+
+
+def drawn_jpeg(sight: Sight) -> bytes | None:
+    """Return the picture as JPEG with the points drawn in; None: unreadable."""
+    try:
+        pixels, points, predicted = _contents(sight)
+    except MessageError:
+        return None
+    from vical_daemon.vision.image_codec import encode_image
+
+    small, factor = thinned(pixels)
+    picture = colour(small)
+    for marks, shape, shade in ((points, _RING, _DETECTED), (predicted, _CROSS, _PREDICTED)):
+        if marks is not None:
+            draw(picture, marks.uv_px / factor, shape, shade)
+    return encode_image(picture, "jpeg", quality=QUALITY)
+
+
+def _contents(sight: Sight) -> tuple[npt.NDArray[Any], PointsMessage | None, PointsMessage | None]:
+    """Decode a sight.
+
+    Raises:
+        MessageError: One of its messages is not what it says.
+    """
+    read = [None if s is None else decode_points(s.payload) for s in (sight.points, sight.predicted)]
+    return _pixels(sight.image), read[0], read[1]
+
+
+def _rows(points: PointsMessage | None) -> list[list[float]]:
+    """Return id, u, v of each point, rounded to what a screen can show."""
+    if points is None:
+        return []
+    uv = np.round(points.uv_px, 2).tolist()
+    return [[number, u, v] for number, (u, v) in zip(points.ids.tolist(), uv, strict=True)]
+
+
+def thinned(pixels: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
+    """Return an image of at most `WIDTH_LIMIT` columns and 8 bits, and the step between the pixels taken."""
+    factor = -(-pixels.shape[1] // WIDTH_LIMIT)
+    small = np.ascontiguousarray(pixels[::factor, ::factor])
+    return ((small >> 8).astype(np.uint8) if small.dtype == np.uint16 else small), factor
 
 
 def _stamp_ns(sample: Sample) -> int:
@@ -108,13 +193,15 @@ def _pixels(sample: Sample) -> npt.NDArray[Any]:
         from vical_daemon.vision.image_codec import decode_image as decode_file
 
         return decode_file(np.frombuffer(decode_compressed_image(sample.payload).data, dtype=np.uint8))
-    return decode_image(sample.payload).pixels()
+    message = decode_image(sample.payload)
+    pixels = message.pixels()
+    if pixels.ndim == 3:  # BGR, as the encoder takes it, without alpha
+        return pixels[:, :, 2::-1] if message.encoding.startswith("rgb") else pixels[:, :, :3]
+    return pixels
 
 
-def colour(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    """Return a writable BGR image, shape (h, w, 3), of a grey or colour image of 8 or 16 bits."""
-    if pixels.dtype == np.uint16:
-        pixels = (pixels >> 8).astype(np.uint8)
+def colour(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return a writable BGR image, shape (h, w, 3), of a grey or colour one."""
     if pixels.ndim == 2:
         picture = np.empty((*pixels.shape, 3), dtype=np.uint8)
         for channel in range(3):  # three times as fast as np.repeat along the last axis
@@ -123,15 +210,18 @@ def colour(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     return np.array(pixels[:, :, :3], dtype=np.uint8, order="C")
 
 
-def draw_rings(
-    picture: npt.NDArray[np.uint8], uv_px: npt.NDArray[np.float64], ids: npt.NDArray[np.int64]
+def draw(
+    picture: npt.NDArray[np.uint8],
+    uv_px: npt.NDArray[np.float64],
+    shape: npt.NDArray[np.int64],
+    shade: tuple[int, int, int],
 ) -> None:
-    """Draw a ring round every point, in place; the colour follows the id."""
+    """Draw a mark (offsets of its pixels, shape (k, 2)) round every point, in place."""
     height, width = picture.shape[:2]
-    if not len(ids):
+    if not len(uv_px):
         return
-    centre = np.round(uv_px[:, None, :]).astype(np.int64) + _RING
-    shade = np.broadcast_to(_PALETTE[ids % len(_PALETTE)][:, None, :], (len(ids), len(_RING), 3))
-    x, y = centre[..., 0], centre[..., 1]
+    near = np.clip(uv_px, -1e4, 1e4)  # a prediction may lie anywhere
+    at = np.round(near[:, None, :]).astype(np.int64) + shape
+    x, y = at[..., 0].ravel(), at[..., 1].ravel()
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    picture[y[inside], x[inside]] = shade[inside]
+    picture[y[inside], x[inside]] = shade

@@ -10,22 +10,30 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from aiohttp import web
 
-from vical_daemon.web.images import CameraView
+from vical_daemon.web.images import CameraView, Sight, drawn_jpeg, picture_event
 from vical_daemon.web.metrics import metrics
 from vical_daemon.web.state import WebState
 
-TICK_S = 0.2
+TICK_S = 0.4
 VIEWERS_LIMIT = 32
 SLOW_S = 10.0  # a client that does not take one update within this is let go
 STATIC = Path(__file__).parent / "static"
+PICTURE_RATE_HZ = 2.0
 COMMANDS = {  # name on the page: role that is told, and the word it is told
     "record_start": ("record", "start"),
     "record_stop": ("record", "stop"),
     "reset": ("estimate", "reset"),
 }
-_FILES = {"": "index.html", "style.css": "style.css", "app.js": "app.js", "chart.js": "chart.js"}
+_FILES = {
+    "": "index.html",
+    "style.css": "style.css",
+    "app.js": "app.js",
+    "chart.js": "chart.js",
+    "camera.js": "camera.js",
+}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -48,6 +56,7 @@ class PageServer:
             the last one goes: without viewers no image is fetched.
         command: Called with (role, word) for a command; None: read-only.
         token: What a client must show to command; "": nobody may.
+        picture_rate_hz: Pictures a second, at most.
     """
 
     def __init__(
@@ -57,21 +66,26 @@ class PageServer:
         watch: Watch,
         command: Command | None = None,
         token: str = "",
+        picture_rate_hz: float = PICTURE_RATE_HZ,
     ) -> None:
         self.state, self.views = state, views
         self._watch, self._command, self._token = watch, command, token
         self._number = 0
         self._update = b""
         self._ticked = asyncio.Condition()
-        self._pictures: dict[str, tuple[int, bytes]] = {}
-        self._pictured = asyncio.Condition()
         self._listeners = 0
-        self._viewers: dict[str, int] = dict.fromkeys(views, 0)
+        self._picture_s = 1.0 / picture_rate_hz
+        self._shows = {
+            (name, kind): _Show(make)
+            for name in views
+            for kind, make in (("events", picture_event), ("mjpg", drawn_jpeg))
+        }
 
     def application(self) -> web.Application:
         """Return the aiohttp application."""
         app = web.Application(middlewares=[_secure], client_max_size=4096)
         app.router.add_get("/events", self._events)
+        app.router.add_get("/camera/{name}/events", self._picture_events)
         app.router.add_get("/camera/{name}.mjpg", self._mjpeg)
         app.router.add_get("/api/state", self._state)
         app.router.add_post("/api/command", self._post_command)
@@ -82,29 +96,31 @@ class PageServer:
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Tick until `stopped` says so: digest the bus, wake the listeners."""
         loop = asyncio.get_running_loop()
-        while not stopped():
-            begin_s = loop.time()
-            update = self.state.tick()
-            if self._listeners:
-                self._update = _event("update", update)
-            async with self._ticked:
-                self._number += 1
-                self._ticked.notify_all()
-            for name, view in self.views.items():
-                if self._viewers[name]:
-                    await self._make_picture(name, view)
-            await asyncio.sleep(max(TICK_S - (loop.time() - begin_s), 0.01))
-
-    async def _make_picture(self, name: str, view: CameraView) -> None:
+        pictures = [loop.create_task(self._make_pictures(name)) for name in self.views]
         try:
-            jpeg = await asyncio.to_thread(view.jpeg)
-        except (ValueError, IndexError) as error:  # an image that is not what it says
-            _log.debug("picture of %s: %s", name, error)
-            return
-        if jpeg is not None:
-            async with self._pictured:
-                self._pictures[name] = (self._pictures.get(name, (0, b""))[0] + 1, jpeg)
-                self._pictured.notify_all()
+            while not stopped():
+                begin_s = loop.time()
+                update = self.state.tick(wanted=self._listeners > 0)
+                self._update = _event("update", update) if update is not None else b""
+                async with self._ticked:
+                    self._number += 1
+                    self._ticked.notify_all()
+                await asyncio.sleep(max(TICK_S - (loop.time() - begin_s), 0.01))
+        finally:
+            for task in pictures:
+                task.cancel()
+            await asyncio.gather(*pictures, return_exceptions=True)
+
+    async def _make_pictures(self, name: str) -> None:
+        """Make each picture once for all who look, and none while nobody does."""
+        shows = [show for (camera, _), show in self._shows.items() if camera == name]
+        while True:
+            wanted = [show for show in shows if show.viewers]
+            sight = self.views[name].next() if wanted else None
+            if sight is not None:
+                for show in wanted:
+                    await show.make(sight)
+            await asyncio.sleep(self._picture_s)
 
     async def _static(self, request: web.Request) -> web.StreamResponse:
         name = _FILES.get(request.match_info["file"])
@@ -152,39 +168,42 @@ class PageServer:
             await self._ticked.wait_for(lambda: self._number != seen)
 
     async def _mjpeg(self, request: web.Request) -> web.StreamResponse:
+        kind = "multipart/x-mixed-replace; boundary=frame"
+        return await self._show(request, "mjpg", kind, _part)
+
+    async def _picture_events(self, request: web.Request) -> web.StreamResponse:
+        return await self._show(request, "events", "text/event-stream", lambda event: event)
+
+    async def _show(
+        self, request: web.Request, kind: str, content_type: str, wrap: Callable[[bytes], bytes]
+    ) -> web.StreamResponse:
         name = request.match_info["name"]
-        if name not in self.views:
+        show = self._shows.get((name, kind))
+        if show is None:
             raise web.HTTPNotFound
-        if sum(self._viewers.values()) >= VIEWERS_LIMIT:
+        if sum(other.viewers for other in self._shows.values()) >= VIEWERS_LIMIT:
             raise web.HTTPServiceUnavailable(text="too many viewers")
-        response = web.StreamResponse(
-            headers={"Content-Type": "multipart/x-mixed-replace; boundary=frame", **_HEADERS}
-        )
+        response = web.StreamResponse(headers={"Content-Type": content_type, **_HEADERS})
         await response.prepare(request)
-        self._viewers[name] += 1
-        if self._viewers[name] == 1:
-            self._watch(name, True)
+        self._look(name, show, 1)
         try:
-            await self._send_pictures(response, name)
+            seen = 0
+            while True:
+                seen, picture = await show.after(seen)
+                await asyncio.wait_for(response.write(wrap(picture)), SLOW_S)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
             pass
         finally:
-            self._viewers[name] -= 1
-            if self._viewers[name] == 0:
-                self._watch(name, False)
+            self._look(name, show, -1)
         return response
 
-    async def _send_pictures(self, response: web.StreamResponse, name: str) -> None:
-        seen = 0
-        while True:
-            seen, jpeg = await self._next_picture(name, seen)
-            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
-            await asyncio.wait_for(response.write(head.encode() + jpeg + b"\r\n"), SLOW_S)
-
-    async def _next_picture(self, name: str, seen: int) -> tuple[int, bytes]:
-        async with self._pictured:
-            await self._pictured.wait_for(lambda: self._pictures.get(name, (0, b""))[0] != seen)
-            return self._pictures[name]
+    def _look(self, name: str, show: _Show, change: int) -> None:
+        """Count a viewer in or out; the first one of a camera makes us fetch its images."""
+        before = any(s.viewers for (camera, _), s in self._shows.items() if camera == name)
+        show.viewers += change
+        after = any(s.viewers for (camera, _), s in self._shows.items() if camera == name)
+        if before != after:
+            self._watch(name, after)
 
     async def _post_command(self, request: web.Request) -> web.Response:
         if not self._token or self._command is None:
@@ -202,8 +221,41 @@ class PageServer:
         return web.json_response({"sent": document["command"]})
 
 
+class _Show:
+    """The newest picture of one camera in one form, for any number of viewers."""
+
+    def __init__(self, encode: Callable[[Sight], bytes | None]) -> None:
+        self.viewers = 0
+        self._encode = encode
+        self._number, self._picture = 0, b""
+        self._made = asyncio.Condition()
+
+    async def make(self, sight: Sight) -> None:
+        """Encode a picture and wake the viewers."""
+        try:
+            picture = self._encode(sight)  # a millisecond: handing it to a thread would cost more
+        except (ValueError, IndexError) as error:  # an image that is not what it says
+            _log.debug("picture: %s", error)
+            return
+        if picture is not None:
+            async with self._made:
+                self._number, self._picture = self._number + 1, picture
+                self._made.notify_all()
+
+    async def after(self, seen: int) -> tuple[int, bytes]:
+        """Wait for a picture that is not number `seen`."""
+        async with self._made:
+            await self._made.wait_for(lambda: self._number != seen)
+            return self._number, self._picture
+
+
+def _part(jpeg: bytes) -> bytes:
+    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+    return head.encode() + jpeg + b"\r\n"
+
+
 def _event(kind: str, document: dict[str, Any]) -> bytes:
-    return f"event: {kind}\ndata: {json.dumps(document, allow_nan=False)}\n\n".encode()
+    return f"event: {kind}\ndata: ".encode() + msgspec.json.encode(document) + b"\n\n"
 
 
 @web.middleware

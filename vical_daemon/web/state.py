@@ -68,8 +68,8 @@ class WebState:
         with self._lock:
             self._arrived.append(sample)
 
-    def tick(self) -> dict[str, Any]:
-        """Digest what has arrived and return the update for everybody who is up to date."""
+    def tick(self, *, wanted: bool = True) -> dict[str, Any] | None:
+        """Digest what has arrived; return the update for everybody who is up to date, if it is `wanted`."""
         with self._lock:
             arrived, self._arrived = self._arrived, deque(maxlen=4096)
         for sample in arrived:
@@ -77,7 +77,7 @@ class WebState:
                 self._digest(sample)
             except MessageError:
                 self.malformed += 1
-        document = self._document(full=False)
+        document = self._document(full=False) if wanted else None
         for camera in self._cameras.values():
             camera.fresh, camera.restarted = [], False
         return document

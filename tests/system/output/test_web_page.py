@@ -1,6 +1,7 @@
 """The page over HTTP and in a real browser, with data flowing."""
 
 import asyncio
+import base64
 import json
 import os
 import socket
@@ -8,6 +9,7 @@ import threading
 from pathlib import Path
 
 import aiohttp
+import numpy as np
 import pytest
 
 from vical_daemon.bus import LocalBus
@@ -31,12 +33,18 @@ def request(method, url, **options):
 
 
 def test_files_and_headers(served):
-    for name, kind in (("", "text/html"), ("style.css", "text/css"), ("app.js", "javascript")):
+    for name, kind in (
+        ("", "text/html"),
+        ("style.css", "text/css"),
+        ("app.js", "javascript"),
+        ("camera.js", "javascript"),
+    ):
         status, headers, text = request("GET", served.address + name)
         assert status == 200
         assert kind in headers["Content-Type"]
         assert "default-src 'self'" in headers["Content-Security-Policy"]
-        assert "http" not in text.replace("http-equiv", "")  # nothing from outside
+        names = text.replace("http-equiv", "").replace("http://www.w3.org/2000/svg", "")
+        assert "http" not in names  # nothing from outside
     for name in ("nothing", "../server.py", "server.py", "%2e%2e/server.py", "camera/none.mjpg"):
         assert request("GET", served.address + name)[0] == 404
 
@@ -81,6 +89,30 @@ def test_pictures_come_while_somebody_looks(fed):
             return data
 
     assert b"\xff\xd8\xff" in asyncio.run(look())
+
+
+def test_picture_events_hold_what_was_found_and_what_was_expected(fed):
+    async def look():
+        address = fed.address + "camera/cam0/events"
+        async with aiohttp.ClientSession() as session, session.get(address) as answer:
+            assert answer.headers["Content-Type"] == "text/event-stream"
+            pictures = []
+            async for line in answer.content:
+                if line.startswith(b"data: "):
+                    pictures.append(json.loads(line[6:]))
+                if len(pictures) == 3:
+                    return pictures
+        return []
+
+    pictures = asyncio.run(look())
+    stamps = [picture["stamp_s"] for picture in pictures]
+    assert stamps == sorted(set(stamps))
+    last = pictures[-1]
+    assert last["size"] == [640, 480]
+    assert base64.b64decode(last["jpeg"])[:3] == b"\xff\xd8\xff"
+    ids, near = [row[0] for row in last["detected"]], {row[0]: row[1:] for row in last["predicted"]}
+    assert ids == list(range(48))
+    assert all(np.hypot(u - near[i][0], v - near[i][1]) < 4.0 for i, u, v in last["detected"])
 
 
 def test_metrics(fed):
@@ -136,6 +168,8 @@ def test_in_a_browser(fed, browser, tmp_path):
         await page.open(fed.address)
         await page.wait("document.getElementById('link').textContent === 'live'")
         await page.wait("document.getElementById('picture').naturalWidth === 640")
+        marks = await page.wait("document.querySelectorAll('#corners path').length === 2")
+        misfit = await page.evaluate("document.getElementById('misfit').textContent")
         status = await page.wait("document.getElementById('status').classList.contains('converged')")
         lever = await page.evaluate("document.getElementById('lever').textContent")
         before = await page.evaluate("page.rows.cam0.length")
@@ -150,10 +184,14 @@ def test_in_a_browser(fed, browser, tmp_path):
             " && !e.name.startsWith('data:')).length"
         )
         await page.screenshot(keep / "page.png")
-        return status, lever, drawn, devices, outside, page.errors
+        return marks, misfit, status, lever, drawn, devices, outside, page.errors
 
-    status, lever, drawn, devices, outside, errors = browser.drive(script, tmp_path / "profile")
+    marks, misfit, status, lever, drawn, devices, outside, errors = browser.drive(
+        script, tmp_path / "profile"
+    )
     assert errors == []
+    assert marks  # detected and predicted
+    assert misfit.startswith("48 corners, half of them within 0.")
     assert status
     assert lever.startswith("x")
     assert "±" in lever

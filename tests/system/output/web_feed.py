@@ -61,7 +61,7 @@ def publish_status(bus, level=Level.OK, message="500.0 Hz, 0 lost"):
     bus.publish(topics.STATUS.key(RIG, "detect"), encode_diagnostics(T0_NS, "detect", [found, clock]))
 
 
-def publish_image(bus, number, *, with_points=True, width=640):
+def publish_image(bus, number, *, with_points=True, with_prediction=True, width=640):
     """A checkerboard drifting through the picture, its inner corners as points."""
     stamp = T0_NS + number * 50_000_000
     height = width * 3 // 4
@@ -76,4 +76,8 @@ def publish_image(bus, number, *, with_points=True, width=640):
         uv = grid + np.array([130 + shift, 90.0]) - 0.5
         payload = encode_points(stamp, CAMERA, np.arange(48), uv, None, (width, height))
         bus.publish(topics.POINTS.key(RIG, CAMERA), payload)
+        if with_prediction:
+            error = np.random.default_rng(number).normal([0.5, -0.3], 0.4, uv.shape)
+            expected = encode_points(stamp, CAMERA, np.arange(48), uv + error)
+            bus.publish(topics.PREDICTED.key(RIG, CAMERA), expected)
     return stamp

@@ -1,5 +1,6 @@
 """What the page keeps, says and draws, without a server."""
 
+import base64
 import json
 
 import numpy as np
@@ -11,7 +12,7 @@ from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.messages import decode_calibration, encode_calibration
 from vical_daemon.vision.image_codec import decode_image
 from vical_daemon.web import words
-from vical_daemon.web.images import CameraView, colour, draw_rings
+from vical_daemon.web.images import CameraView, colour, draw, drawn_jpeg, picture_event, thinned
 from vical_daemon.web.metrics import metrics
 from vical_daemon.web.state import COLUMNS, HISTORY, WebState, history_row
 
@@ -157,49 +158,76 @@ def fill(view, web_feed, **options):
     return lambda number: web_feed.publish_image(bus, number, **options)
 
 
-def test_picture_has_rings_where_the_points_are(web_feed):
+def test_picture_has_marks_where_the_points_are(web_feed):
     view = CameraView("cam0")
     fill(view, web_feed)(1)
-    picture = decode_image(np.frombuffer(view.jpeg(), dtype=np.uint8), colour=True)
+    sight = view.next()
+    picture = decode_image(np.frombuffer(drawn_jpeg(sight), dtype=np.uint8), colour=True)
     assert picture.shape == (480, 640, 3)
     shift = 30 * np.sin(0.2)
     around = picture[130:140, int(170 + shift) : int(181 + shift)].astype(int)
-    assert np.abs(around[..., 0] - around[..., 2]).max() > 60  # a coloured ring on a grey picture
-    assert view.jpeg() is None  # shown once
+    assert np.abs(around[..., 0] - around[..., 2]).max() > 60  # a coloured mark on a grey picture
+    assert view.next() is None  # shown once
+
+
+def test_picture_event_gives_points_in_pixels_of_the_full_image(web_feed):
+    view = CameraView("cam0")
+    fill(view, web_feed, width=1920)(1)
+    kind, data = picture_event(view.next()).decode().split("\n")[:2]
+    assert kind == "event: picture"
+    document = json.loads(data.removeprefix("data: "))
+    assert document["size"] == [1920, 1440]
+    jpeg = np.frombuffer(base64.b64decode(document["jpeg"]), dtype=np.uint8)
+    assert decode_image(jpeg).shape == (480, 640)  # thinned: the page is for looking
+    number, u, v = document["detected"][0]
+    assert (number, u, v) == (0, pytest.approx(174.5 + 30 * np.sin(0.2), abs=0.01), 134.5)
+    expected = np.array([row[1:] for row in document["predicted"]])
+    found = np.array([row[1:] for row in document["detected"]])
+    assert 0.2 < np.median(np.linalg.norm(expected - found, axis=1)) < 2.0
 
 
 def test_picture_waits_for_its_points_but_not_for_ever(web_feed):
     view = CameraView("cam0")
     fill(view, web_feed)(1)
-    assert view.jpeg()
+    assert view.next()
     bare = fill(view, web_feed, with_points=False)
     bare(2)
-    assert view.jpeg() is None
+    assert view.next() is None
     bare(30)
-    assert view.jpeg() is not None
+    assert view.next() is not None
+
+
+def test_picture_waits_for_a_prediction_while_there_are_any(web_feed):
+    view = CameraView("cam0")
+    fill(view, web_feed)(1)
+    fill(view, web_feed, with_prediction=False)(2)
+    assert view.next().predicted is not None  # the older image, which has everything
+    assert view.next() is None
+    fill(view, web_feed, with_prediction=False)(40)  # two seconds later nothing is predicted any more
+    sight = view.next()
+    assert sight.points is not None
+    assert sight.predicted is None
 
 
 def test_a_clock_that_goes_back_does_not_stop_the_picture(web_feed):
     view = CameraView("cam0")
     feed = fill(view, web_feed)
     feed(500)
-    assert view.jpeg()
+    assert view.next()
     feed(1)
-    assert view.jpeg()
+    assert view.next()
 
 
-def test_wide_images_are_thinned(web_feed):
-    view = CameraView("cam0")
-    fill(view, web_feed, width=1920)(1)
-    assert decode_image(np.frombuffer(view.jpeg(), dtype=np.uint8)).shape == (480, 640)
-
-
-def test_rings_at_the_border_and_other_depths():
-    picture = colour(np.full((20, 30), 40000, dtype=np.uint16))
+def test_marks_at_the_border_and_other_depths():
+    small, factor = thinned(np.full((20, 30), 40000, dtype=np.uint16))
+    picture = colour(small)
+    assert factor == 1
     assert picture[0, 0].tolist() == [156] * 3
-    draw_rings(picture, np.array([[0.0, 0.0], [29.4, 19.6], [-50.0, 4.0]]), np.array([0, 1, 2]))
-    assert (picture != 156).any()
-    draw_rings(picture, np.empty((0, 2)), np.empty(0, dtype=np.int64))
+    shape = np.array([[0, 0], [1, 1]])
+    draw(picture, np.array([[0.0, 0.0], [29.4, 19.6], [-50.0, 4.0], [1e300, 4.0]]), shape, (1, 2, 3))
+    assert picture[0, 0].tolist() == [1, 2, 3]
+    assert (picture != 156).any(axis=2).sum() == 2  # the others lie outside
+    draw(picture, np.empty((0, 2)), shape, (1, 2, 3))
     assert colour(np.zeros((4, 5, 3), dtype=np.uint8)).shape == (4, 5, 3)
 
 
@@ -207,4 +235,5 @@ def test_broken_images_are_passed_over(web_feed):
     view = CameraView("cam0")
     view.take(Sample(topics.IMAGE.key(web_feed.RIG, "cam0"), b"\x00\x01\x00\x00abc", 0))
     view.take(Sample(topics.IMAGE.key(web_feed.RIG, "other"), b"", 0))
-    assert view.jpeg() is None
+    sight = view.next()
+    assert sight is None or (picture_event(sight) is None and drawn_jpeg(sight) is None)

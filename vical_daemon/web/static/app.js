@@ -181,7 +181,7 @@ function drawTabs() {
 function choose(name) {
   page.camera = name;
   for (const tab of $("tabs").children) tab.setAttribute("aria-selected", String(tab.textContent === name));
-  if (page.views.includes(name)) $("picture").src = `camera/${encodeURIComponent(name)}.mjpg`;
+  if (page.views.includes(name)) camera.look(name);
 }
 
 function draw() {
@@ -218,13 +218,9 @@ function listen() {
   source.onopen = () => {
     $("link").classList.add("on");
     setText("link", "live");
-    if (page.camera) choose(page.camera); // the picture's connection broke as well
   };
   source.onerror = () => { $("link").classList.remove("on"); setText("link", "offline, trying again"); };
 }
-
-$("picture").onload = () => document.querySelector(".screen").classList.add("live");
-$("picture").onerror = () => document.querySelector(".screen").classList.remove("live");
 
 for (const button of document.querySelectorAll(".range button")) {
   button.onclick = () => {

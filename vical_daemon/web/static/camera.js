@@ -1,0 +1,71 @@
+"use strict";
+// The camera view: the newest picture, and over it the corners that were found and those that were expected.
+
+class CameraScreen {
+  constructor() {
+    this.byId = (id) => document.getElementById(id);
+    this.name = null;
+    this.source = null;
+    this.last = null;
+    for (const id of ["show-detected", "show-predicted"]) this.byId(id).onchange = () => this.draw();
+  }
+
+  look(name) { // the browser connects again by itself when the robot was away
+    if (name === this.name) return;
+    this.name = name;
+    if (this.source) this.source.close();
+    this.source = new EventSource(`camera/${encodeURIComponent(name)}/events`);
+    this.source.addEventListener("picture", (event) => this.show(JSON.parse(event.data)));
+    this.source.onerror = () => document.querySelector(".screen").classList.remove("live");
+  }
+
+  async show(picture) {
+    const image = this.byId("picture");
+    image.src = `data:image/jpeg;base64,${picture.jpeg}`;
+    try {
+      await image.decode(); // picture and corners change together
+    } catch (error) {
+      return;
+    }
+    this.last = picture;
+    this.draw();
+    document.querySelector(".screen").classList.add("live");
+  }
+
+  draw() {
+    if (!this.last) return;
+    const { size: [width, height], detected, predicted } = this.last;
+    const screen = document.querySelector(".screen");
+    screen.style.aspectRatio = `${width} / ${height}`;
+    const svg = this.byId("corners");
+    svg.setAttribute("viewBox", `-0.5 -0.5 ${width} ${height}`); // pixel centres lie at whole numbers
+    const unit = width / Math.max(svg.clientWidth, 1); // image pixels per pixel of the screen
+    const r = 4.5 * unit;
+    const ring = ([, u, v]) => `M${u - r},${v}a${r},${r} 0 1 0 ${2 * r},0a${r},${r} 0 1 0 ${-2 * r},0`;
+    const c = 3.6 * unit;
+    const cross = ([, u, v]) => `M${u - c},${v - c}l${2 * c},${2 * c}M${u - c},${v + c}l${2 * c},${-2 * c}`;
+    svg.replaceChildren(
+      ...this.path("detected", detected, ring), ...this.path("predicted", predicted, cross),
+    );
+    this.byId("misfit").textContent = this.misfit(detected, predicted);
+  }
+
+  path(kind, points, mark) {
+    if (!points.length || !this.byId(`show-${kind}`).checked) return [];
+    const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+    path.setAttribute("class", kind);
+    path.setAttribute("d", points.map(mark).join(""));
+    return [path];
+  }
+
+  misfit(detected, predicted) {
+    if (!detected.length) return "no corners found in this image";
+    if (!predicted.length) return `${detected.length} corners; no prediction yet`;
+    const found = new Map(detected.map(([id, u, v]) => [id, [u, v]]));
+    const off = predicted.filter(([id]) => found.has(id))
+      .map(([id, u, v]) => Math.hypot(u - found.get(id)[0], v - found.get(id)[1])).sort((a, b) => a - b);
+    return off.length ? `${detected.length} corners, half of them within ${off[off.length >> 1].toFixed(2)} px` : "";
+  }
+}
+
+const camera = new CameraScreen();
