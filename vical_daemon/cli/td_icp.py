@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from vical_daemon.estimation.measurements import CameraPrior
-    from vical_daemon.estimation.td_icp import TdIcpOptions, TdIcpResult
-    from vical_daemon.estimation.td_icp_joint import JointResult, OrientationStream
+    from vical_daemon.estimation.td_icp import TdIcpOptions
+    from vical_daemon.estimation.td_icp_joint import OrientationStream
     from vical_daemon.estimation.td_icp_monitor import DelayReport
     from vical_daemon.priors import Initial
     from vical_daemon.recording import Recording
@@ -42,8 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sensors",
         metavar="A,B,C",
-        help="several sensors jointly: names of imus and cameras, topics with poses, odometry or attitude, "
-        "trajectory files (TUM, EuRoC)",
+        help="several sensors jointly: names of imus and cameras, topics with orientations (Odometry, "
+        "PoseStamped, PoseWithCovarianceStamped, TransformStamped, QuaternionStamped, Imu), trajectory files "
+        "(TUM, EuRoC). The imu's gyro is the reference, or without one the fastest stream",
     )
     parser.add_argument(
         "--search", metavar="S", type=float, default=5.0, help="look for delays up to +-S seconds (5)"
@@ -69,16 +70,18 @@ def run(args: argparse.Namespace) -> int:
     if not Path(args.input).exists():
         raise CliError(f"{args.input} does not exist; check the path")
     names = [name.strip() for name in (args.sensors or "").split(",") if name.strip()]
-    if names or _is_trajectory(Path(args.input)):
+    if names or is_trajectory(Path(args.input)):
         return _joint(args, initial, names)
     return _single(args, initial)
 
 
-def _is_trajectory(path: Path) -> bool:
+def is_trajectory(path: Path) -> bool:
+    """Whether this is a trajectory as text rather than a recording."""
     return path.is_file() and path.suffix in (".txt", ".csv", ".tum")
 
 
-def _options(args: argparse.Namespace, initial: Initial) -> TdIcpOptions:
+def options_of(args: argparse.Namespace, initial: Initial) -> TdIcpOptions:
+    """Return the settings that follow from the command line and what is known of the imu."""
     from vical_daemon.estimation.td_icp import TdIcpOptions
 
     noise = initial.imu_noise
@@ -88,7 +91,8 @@ def _options(args: argparse.Namespace, initial: Initial) -> TdIcpOptions:
     return TdIcpOptions(search_s=args.search, gyro_density=noise.gyro_density, gyro_walk=noise.gyro_walk)
 
 
-def _open(path: str) -> Recording:
+def open_input(path: str) -> Recording:
+    """Open a recording without judging it; warnings go to stderr."""
     from vical_daemon.recording import open_recording
 
     recording = open_recording(path, check=False)  # wrong units are found here, with the reason
@@ -121,10 +125,11 @@ def choose_gyro(
 
 def _single(args: argparse.Namespace, initial: Initial) -> int:
     """One imu and one camera."""
+    from vical_daemon.cli.td_icp_report import print_single, report_json
     from vical_daemon.cli.td_icp_sources import camera_stream, seconds
     from vical_daemon.estimation.td_icp import DEGENERATE, REFUSED, td_icp
 
-    recording = _open(args.input)
+    recording = open_input(args.input)
     cameras = recording.cameras
     if not cameras:
         raise CliError(f"{recording.path} holds no camera: neither images nor points")
@@ -139,7 +144,7 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
         raise CliError(f"{recording.path} holds no camera {camera!r}, only {', '.join(cameras)}", EXIT_USAGE)
     imu, t_ns, gyro = choose_gyro(recording, args.imu)
     base = int(t_ns[0])
-    options = _options(args, initial)
+    options = options_of(args, initial)
     stream = camera_stream(recording, cameras[camera], prior_of(initial, camera), args.target, base)
     t_imu = seconds(t_ns, base)
     result = td_icp(t_imu, gyro, stream.t_s, stream.R_world_sensor, stream.rotation_sigma, options)
@@ -148,11 +153,11 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
         result = replace(result, status=DEGENERATE, reason=reason)
     document: dict[str, Any] = {**result.to_json(), "imu": imu, "camera": camera}
     if args.watch is not None and result.status != REFUSED:
-        document["watch"] = [_report_json(r) for r in _watch(t_imu, gyro, stream, options, args.watch)]
+        document["watch"] = [report_json(r) for r in _watch(t_imu, gyro, stream, options, args.watch)]
     if args.json:
         print(json.dumps(document))
     elif result.status != REFUSED:
-        _print_single(imu, camera, result, document.get("watch", []))
+        print_single(imu, camera, result, document.get("watch", []))
     if result.status == REFUSED:
         raise CliError(f"no delay found: {result.reason}")
     if result.reason:
@@ -195,120 +200,19 @@ def _watch(
     return reports
 
 
-def _report_json(report: DelayReport) -> dict[str, Any]:
-    return {
-        "t_s": report.t_s,
-        "timeshift_s": report.timeshift_s,
-        "timeshift_sigma_s": report.timeshift_sigma_s,
-        "drift_ppm": 1e6 * report.drift,
-        "drift_sigma_ppm": 1e6 * report.drift_sigma,
-        "jumped": report.jumped,
-        "window_s": report.window.timeshift_cam_imu_s,
-        "window_sigma_s": report.window.timeshift_sigma_s,
-    }
-
-
-def _print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[str, Any]]) -> None:
-    import numpy as np
-
-    from vical_daemon.estimation.so3 import quat_from_matrix
-
-    q = quat_from_matrix(result.R_imu_cam)
-    sigma_deg, bias = np.rad2deg(result.rotation_sigma_rad), np.rad2deg(result.gyro_bias_rps)
-    print(
-        f"{camera} against {imu} ({result.status}), {result.pairs} orientations, {result.rejected} rejected"
-    )
-    print(
-        f"  time shift   {1e3 * result.timeshift_cam_imu_s:+.3f} +- {1e3 * result.timeshift_sigma_s:.3f} ms"
-    )
-    print("               t_imu = t_cam + shift")
-    print(f"  R_imu_cam    q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f}")
-    print(f"               +- {sigma_deg[0]:.3f} {sigma_deg[1]:.3f} {sigma_deg[2]:.3f} deg")
-    print(f"  gyro bias    {bias[0]:+.3f} {bias[1]:+.3f} {bias[2]:+.3f} deg/s")
-    print(f"  noise of one orientation  {np.rad2deg(result.camera_noise_rad):.3f} deg")
-    for row in watch:
-        jump = "  jumped" if row["jumped"] else ""
-        delay = f"{1e3 * row['timeshift_s']:+.3f} +- {1e3 * row['timeshift_sigma_s']:.3f} ms"
-        drift = f"{row['drift_ppm']:+.1f} +- {row['drift_sigma_ppm']:.1f} ppm"
-        print(f"  {row['t_s']:8.1f} s  {delay}  drift {drift}{jump}")
-
-
 def _joint(args: argparse.Namespace, initial: Initial, names: list[str]) -> int:
     """Any number of sensors."""
+    from vical_daemon.cli.td_icp_report import print_joint
+    from vical_daemon.cli.td_icp_sensors import register
     from vical_daemon.estimation.td_icp import REFUSED
 
-    result = _register(args, initial, names)
+    result = register(args, initial, names)
     if args.json:
         print(json.dumps(result.to_json()))
     elif result.status != REFUSED:
-        _print_joint(result)
+        print_joint(result)
     if result.status == REFUSED:
         raise CliError(f"no delays found: {result.reason}")
     if result.reason:
         print(f"vical: warning: {result.reason}", file=sys.stderr)
     return 0
-
-
-def _register(args: argparse.Namespace, initial: Initial, names: list[str]) -> JointResult:
-    from vical_daemon.cli import td_icp_sources as sources
-    from vical_daemon.estimation.td_icp_joint import joint_of_orientations, joint_with_gyro
-
-    path = Path(args.input)
-    if _is_trajectory(path):
-        first, base = sources.trajectory_file(path, None)
-        others = [sources.trajectory_file(Path(name), base)[0] for name in names if _file(name)]
-        return joint_of_orientations([first, *others], _options(args, initial))
-    recording = _open(args.input)
-    gyros = [name for name in names if name in recording.imus]
-    if len(gyros) > 1:
-        raise CliError(f"one imu can be the reference, {' and '.join(gyros)} are two", EXIT_USAGE)
-    base = recording.begin_ns
-    streams = []
-    for name in names:
-        if name in gyros:
-            continue
-        if name in recording.cameras:
-            camera = recording.cameras[name]
-            streams.append(
-                sources.camera_stream(recording, camera, prior_of(initial, name), args.target, base)
-            )
-        elif Path(name).is_file():
-            streams.append(sources.trajectory_file(Path(name), base)[0])
-        elif name.startswith("/"):
-            streams.append(sources.pose_topic(recording, name, base))
-        else:
-            known = ", ".join([*recording.imus, *recording.cameras])
-            raise CliError(
-                f"--sensors: {name!r} is no sensor of the recording ({known}), no /topic and no file",
-                EXIT_USAGE,
-            )
-    if gyros:
-        imu, t_ns, gyro = choose_gyro(recording, gyros[0])
-        return joint_with_gyro(imu, sources.seconds(t_ns, base), gyro, streams, _options(args, initial))
-    return joint_of_orientations(streams, _options(args, initial))
-
-
-def _file(name: str) -> bool:
-    if not Path(name).is_file():
-        raise CliError(f"--sensors: {name} does not exist; with a trajectory as INPUT all sensors are files")
-    return True
-
-
-def _print_joint(result: JointResult) -> None:
-    import numpy as np
-
-    from vical_daemon.estimation.so3 import quat_from_matrix
-
-    print(f"reference: {result.reference}   (t_b = t_a + shift)")
-    for pair in result.pairs:
-        print(
-            f"  {pair.a:>12s} -> {pair.b:<12s} {1e3 * pair.timeshift_s:+10.3f} "
-            f"+- {1e3 * pair.timeshift_sigma_s:.3f} ms"
-        )
-    for name, sensor in result.sensors.items():
-        q = quat_from_matrix(sensor.R_ref_sensor)
-        sigma = np.rad2deg(sensor.rotation_sigma_rad).max()
-        print(
-            f"  {name}: R_{result.reference}_{name} q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f} "
-            f"+- {sigma:.3f} deg, {sensor.pairs} orientations, {sensor.rejected} rejected"
-        )

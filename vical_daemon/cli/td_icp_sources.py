@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_orientations import Orientations, target_orientations
 from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.lens_refinement import LensFit, refine_lens
@@ -156,100 +154,3 @@ def _image(payload: bytes, kind: str) -> tuple[int, Any]:
 
     packed = decode_compressed_image(payload)
     return packed.stamp_ns, image_codec.decode_image(np.frombuffer(packed.data, np.uint8))
-
-
-def pose_topic(recording: Recording, topic: str, base_ns: int) -> OrientationStream:
-    """Orientations of a topic with poses, odometry or an imu that computes its own attitude.
-
-    Raises:
-        CliError: No such topic, or of a type without an orientation.
-    """
-    stamps, quaternions, seen = [], [], ""
-    for type_name, message in _messages(recording, topic):
-        seen = type_name
-        if type_name not in _POSE_TYPES:
-            break
-        q: Any = message
-        for part in _POSE_TYPES[type_name].split("."):
-            q = getattr(q, part)
-        stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
-        quaternions.append((q.w, q.x, q.y, q.z))
-    if not seen:
-        raise CliError(f"{recording.path} holds no topic {topic}")
-    if seen not in _POSE_TYPES:
-        raise CliError(f"{topic} is a {seen}: it holds no orientation (known: {', '.join(_POSE_TYPES)})")
-    return _from_quaternions(topic, np.array(stamps), np.array(quaternions), base_ns)
-
-
-def _messages(recording: Recording, topic: str) -> Iterator[tuple[str, Any]]:
-    """Yield (type, message) of one topic of any log of ROS messages."""
-    from rosbags.highlevel import AnyReader
-
-    from vical_daemon.messages.schemas import typestore
-    from vical_daemon.recording.bags import BagRecording
-    from vical_daemon.recording.logs import LogRecording
-
-    store = typestore()
-    if isinstance(recording, BagRecording):
-        with AnyReader([recording.path], default_typestore=store) as reader:
-            wanted = [c for c in reader.connections if c.topic == topic]
-            for connection, _, data in reader.messages(connections=wanted) if wanted else ():
-                yield connection.msgtype, reader.deserialize(data, connection.msgtype)
-    elif isinstance(recording, LogRecording):
-        for raw in recording._raw():
-            if raw.topic == topic or raw.topic == topic.removeprefix("/"):
-                known = raw.type_name in store.fielddefs
-                yield raw.type_name, store.deserialize_cdr(raw.payload, raw.type_name) if known else None
-
-
-def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream, int]:
-    """Read a trajectory: TUM (`t x y z qx qy qz qw`, seconds) or EuRoC (`t, x, y, z, qw, qx, qy, qz`, ns).
-
-    Args:
-        path: The file.
-        base_ns: Subtracted from stamps; None: the file's first stamp.
-
-    Returns:
-        The stream, and the base that was used, ns.
-
-    Raises:
-        CliError: The file is neither.
-    """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        text = line.strip()
-        if not text or text.startswith("#") or (not rows and not (text[0].isdigit() or text[0] in "-+.")):
-            continue
-        words = text.replace(",", " ").split()
-        try:
-            values = [float(word) for word in words[1:8]]
-            stamp_ns = int(words[0]) if words[0].lstrip("+-").isdigit() else round(float(words[0]) * 1e9)
-        except ValueError:
-            raise CliError(f"{path} line {number}: not a number in '{text[:60]}'") from None
-        if len(values) < 7:
-            raise CliError(
-                f"{path} line {number}: expected `t x y z qx qy qz qw` (TUM) or "
-                "`t, x, y, z, qw, qx, qy, qz` (EuRoC)"
-            )
-        stamps.append(stamp_ns)
-        rows.append(values[3:7])
-    if len(rows) < 12:
-        raise CliError(f"{path}: {len(rows)} poses, at least 12 are needed")
-    t_ns = np.array(stamps, dtype=np.int64)
-    if np.median(np.diff(t_ns)) < 1000:  # whole seconds or milliseconds would be no trajectory: bare seconds
-        t_ns = t_ns * 1_000_000_000
-    q = np.array(rows)
-    comma = "," in next(line for line in path.read_text(encoding="utf-8").splitlines() if line[:1].isdigit())
-    q = q if comma else q[:, [3, 0, 1, 2]]
-    base = int(t_ns[0]) if base_ns is None else base_ns
-    return _from_quaternions(path.name, t_ns, q, base), base
-
-
-def _from_quaternions(name: str, t_ns: IntArray, q: FloatArray, base_ns: int) -> OrientationStream:
-    length = np.linalg.norm(q, axis=1)
-    good = np.abs(length - 1.0) < 0.05
-    if np.count_nonzero(good) < 12:
-        raise CliError(f"{name}: its orientations are no unit quaternions (not filled in by the sender?)")
-    R = so3.matrix_from_quat(so3.quat_normalise(q[good]))
-    return OrientationStream(name, seconds(t_ns[good], base_ns), R, _POSE_SIGMA_RAD)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,7 +31,8 @@ class DriftProblem:
         H: Their derivative by the state, shape (n, 3, d).
         weight: Information of the measurement noise (0 for a rejected orientation), shape (n, 3, 3).
         F: State transitions, shape (n - 1, d, d).
-        Q: Covariance of what is added to the state, shape (n - 1, d, d).
+        Q_inverse: Information of what is added to the state, shape (n - 1, d, d).
+        Q_log_determinant: Log determinant of its covariance, summed over all steps.
         first_mean: Prior mean of the first state, shape (d,).
         first_information: Its information, diagonal; 0 where nothing is known, shape (d,).
         prior_information: Of the parameters, around zero, shape (p, p).
@@ -41,7 +43,8 @@ class DriftProblem:
     H: FloatArray
     weight: FloatArray
     F: FloatArray
-    Q: FloatArray
+    Q_inverse: FloatArray
+    Q_log_determinant: float
     first_mean: FloatArray
     first_information: FloatArray
     prior_information: FloatArray
@@ -69,13 +72,13 @@ class DriftSolution:
     log_determinant: float
 
 
-def _band(problem: DriftProblem, Q_inverse: FloatArray) -> FloatArray:
+def _band(problem: DriftProblem) -> FloatArray:
     """Lower band of the block-tridiagonal information of all states, shape (2 d, n d)."""
     n, _, d = problem.H.shape
-    QF = Q_inverse @ problem.F
+    QF = problem.Q_inverse @ problem.F
     D = np.swapaxes(problem.H, 1, 2) @ (problem.weight @ problem.H)
     D[:-1] += np.swapaxes(problem.F, 1, 2) @ QF
-    D[1:] += Q_inverse
+    D[1:] += problem.Q_inverse
     D[0] += np.diag(problem.first_information)
     band = np.zeros((2 * d, n, d))
     rows, columns = np.tril_indices(d)
@@ -85,6 +88,62 @@ def _band(problem: DriftProblem, Q_inverse: FloatArray) -> FloatArray:
     return band.reshape(2 * d, n * d)
 
 
+@dataclass(frozen=True)
+class _Reduced:
+    """The problem with the states eliminated.
+
+    Attributes:
+        factor: Banded Cholesky factor L of the states' information.
+        Y: L^-1 [H' W J, H' W e + prior, unit vectors of the bias in the middle], shape (n d, p + 1 or p + 4).
+        P: Covariance of the parameters, shape (p, p).
+        x: Parameters, shape (p,).
+        quadratic: As in `DriftSolution`.
+        log_determinant: As in `DriftSolution`.
+    """
+
+    factor: FloatArray
+    Y: FloatArray
+    P: FloatArray
+    x: FloatArray
+    quadratic: float
+    log_determinant: float
+
+
+def _reduce(problem: DriftProblem, with_bias: bool) -> _Reduced:
+    n, _, p = problem.J.shape
+    d = problem.H.shape[2]
+    Ht = np.swapaxes(problem.H, 1, 2)
+    WJ = problem.weight @ problem.J
+    We = problem.weight @ problem.e[..., None]
+    mean, information = problem.first_mean, problem.first_information
+    rhs = np.zeros((p + 4 if with_bias else p + 1, n, d))  # columns one after the other, as LAPACK wants them
+    rhs[:p] = np.moveaxis(Ht @ WJ, 2, 0)
+    rhs[p] = (Ht @ We)[..., 0]
+    rhs[p, 0] += information * mean
+    if with_bias:
+        rhs[p + 1 :, n // 2, BIAS] = np.eye(3)
+    factor = cholesky_banded(_band(problem), lower=True, check_finite=False)
+    Y, _ = dtbtrs(factor, rhs.reshape(-1, n * d).T, uplo="L", overwrite_b=1)
+    S = np.einsum("kip,kiq->pq", problem.J, WJ) - Y[:, :p].T @ Y[:, :p] + problem.prior_information
+    g = np.einsum("kip,ki->p", problem.J, We[..., 0]) - Y[:, :p].T @ Y[:, p]
+    P, log_det_S = _inverse(0.5 * (S + S.T))
+    x = P @ g
+    squares = float(np.einsum("ki,ki->", problem.e, We[..., 0]) + information @ mean**2)
+    quadratic = squares - float(Y[:, p] @ Y[:, p]) - float(g @ x)
+    log_determinant = 2.0 * float(np.log(factor[0]).sum()) + log_det_S + problem.Q_log_determinant
+    return _Reduced(factor, np.asarray(Y, dtype=np.float64), P, x, quadratic, log_determinant)
+
+
+def cost(problem: DriftProblem) -> float:
+    """Return -2 log of the restricted likelihood, but for the weights' own part: what `solve` minimises.
+
+    Raises:
+        numpy.linalg.LinAlgError: all orientations rejected, or numbers that are not finite.
+    """
+    reduced = _reduce(problem, with_bias=False)
+    return reduced.quadratic + reduced.log_determinant
+
+
 def solve(problem: DriftProblem) -> DriftSolution:
     """Minimise over parameters and states together.
 
@@ -92,38 +151,18 @@ def solve(problem: DriftProblem) -> DriftSolution:
         numpy.linalg.LinAlgError: all orientations rejected, or numbers that are not finite.
     """
     n, _, p = problem.J.shape
-    d = problem.H.shape[2]
-    Ht = np.swapaxes(problem.H, 1, 2)
-    WJ = problem.weight @ problem.J
-    We = problem.weight @ problem.e[..., None]
-    mean, information = problem.first_mean, problem.first_information
-    rhs = np.zeros((n, d, p + 4))
-    rhs[:, :, :p] = Ht @ WJ
-    rhs[:, :, p] = (Ht @ We)[..., 0]
-    rhs[0, :, p] += information * mean
-    middle = n // 2
-    rhs[middle, BIAS, p + 1 :] = np.eye(3)
-    rhs = rhs.reshape(n * d, p + 4)
-    Q_inverse: FloatArray = np.asarray(np.linalg.inv(problem.Q), dtype=np.float64)
-    factor = cholesky_banded(_band(problem, Q_inverse), lower=True, check_finite=False)
-    Z = cho_solve_banded((factor, True), rhs, check_finite=False)
-    S = np.einsum("kip,kiq->pq", problem.J, WJ) - rhs[:, :p].T @ Z[:, :p] + problem.prior_information
-    g = np.einsum("kip,ki->p", problem.J, We[..., 0]) - rhs[:, :p].T @ Z[:, p]
-    P, log_det_S = _inverse(0.5 * (S + S.T))
-    x = P @ g
-    states = (Z[:, p] - Z[:, :p] @ x).reshape(n, d)
-    gain = Z.reshape(n, d, p + 4)[middle, BIAS]
+    reduced = _reduce(problem, with_bias=True)
+    Y, P, x = reduced.Y, reduced.P, reduced.x
+    back, _ = dtbtrs(reduced.factor, (Y[:, p] - Y[:, :p] @ x)[:, None], uplo="L", trans="T")
+    states = back.reshape(n, -1)
+    gain = Y[:, p + 1 :].T @ Y
     covariance = np.empty((p + 3, p + 3))
     covariance[:p, :p] = P
     covariance[p:, :p] = -gain[:, :p] @ P
     covariance[:p, p:] = covariance[p:, :p].T
     covariance[p:, p:] = gain[:, p + 1 :] + gain[:, :p] @ P @ gain[:, :p].T
-    squares = float(np.einsum("ki,ki->", problem.e, We[..., 0]) + information @ mean**2)
-    quadratic = squares - float(rhs[:, p] @ Z[:, p]) - float(g @ x)
-    log_determinant = 2.0 * float(np.log(factor[0]).sum()) + log_det_S
-    log_determinant -= float(np.linalg.slogdet(Q_inverse)[1].sum())
     noise = problem.e - (problem.H @ states[..., None])[..., 0] - problem.J @ x
-    return DriftSolution(x, covariance, states, noise, quadratic, log_determinant)
+    return DriftSolution(x, covariance, states, noise, reduced.quadratic, reduced.log_determinant)
 
 
 def _inverse(S: FloatArray) -> tuple[FloatArray, float]:

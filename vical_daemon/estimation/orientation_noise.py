@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.drift_smoother import DriftProblem, solve
+from vical_daemon.estimation.drift_smoother import DriftProblem
+from vical_daemon.estimation.drift_smoother import cost as drift_cost
 from vical_daemon.estimation.orientation_problem import DriftNoise, Linear, OrientationSensor
 
 FloatArray = npt.NDArray[np.float64]
 
 _SLOW_LIMITS = (-4.0, 4.0)
+_CLOSE = 0.1  # a minimum this close, in steps, is reached
 
 
 def scaled(linear: Linear, scales: FloatArray) -> DriftProblem:
@@ -20,17 +22,23 @@ def scaled(linear: Linear, scales: FloatArray) -> DriftProblem:
     S = len(linear.slow)
     sensor_scale, slow_scale = np.exp(2.0 * scales[:S]), np.exp(2.0 * (scales[:S] + scales[S : 2 * S]))
     drift = linear.drift * np.exp(2.0 * scales[2 * S])
-    Q = np.zeros_like(linear.problem.Q)
-    Q[:, [0, 1, 2], [0, 1, 2]] = drift[:, None]
-    Q[:, [3, 4, 5], [3, 4, 5]] = linear.walk[:, None]
-    if S == 1:
-        Q[:, :3, :3] += slow_scale[0] * linear.slow[0]
+    Q_inverse = np.zeros_like(linear.problem.Q_inverse)
+    Q_inverse[:, [3, 4, 5], [3, 4, 5]] = 1.0 / linear.walk[:, None]
+    log_determinant = 3.0 * float(np.log(linear.walk).sum())
+    if S == 1:  # the slow error joins the drift
+        Q = drift[:, None, None] * np.eye(3) + slow_scale[0] * linear.slow[0]
+        Q_inverse[:, :3, :3] = np.linalg.inv(Q)
+        log_determinant += float(np.log(np.linalg.det(Q)).sum())
     else:
+        Q_inverse[:, [0, 1, 2], [0, 1, 2]] = 1.0 / drift[:, None]
+        log_determinant += 3.0 * float(np.log(drift).sum())
         for i in range(S):
             part = slice(6 + 3 * i, 9 + 3 * i)
-            Q[:, part, part] = slow_scale[i] * linear.slow[i]
+            Q_inverse[:, part, part] = linear.slow_inverse[i] / slow_scale[i]
+            steps = len(linear.drift)
+            log_determinant += float(linear.slow_log_determinant[i] + 3.0 * steps * np.log(slow_scale[i]))
     weight = linear.problem.weight / sensor_scale[linear.sensor][:, None, None]
-    return replace(linear.problem, weight=weight, Q=Q)
+    return replace(linear.problem, weight=weight, Q_inverse=Q_inverse, Q_log_determinant=log_determinant)
 
 
 def scales_of(sensors: tuple[OrientationSensor, ...], log_gyro: float) -> FloatArray:
@@ -54,8 +62,7 @@ def estimate_scales(
     counts = np.array([np.count_nonzero(linear.used & (linear.sensor == i)) for i in range(S)])
 
     def cost(values: FloatArray) -> float:
-        solution = solve(scaled(linear, values))
-        likelihood = solution.quadratic + solution.log_determinant + 6.0 * float(counts @ values[:S])
+        likelihood = drift_cost(scaled(linear, values)) + 6.0 * float(counts @ values[:S])
         outside = np.maximum(np.abs(values[S : 2 * S]) - _SLOW_LIMITS[1], 0.0)
         return likelihood + float(values[-1] / noise.log_sigma) ** 2 + 1e3 * float(outside @ outside)
 
@@ -68,8 +75,10 @@ def estimate_scales(
             down, up = cost(scales - delta), cost(scales + delta)
             bend = down - 2.0 * here + up
             move = 0.5 * (down - up) / bend if bend > 1e-9 else float(np.sign(down - up)) * 2.0
-            trial = scales + delta * float(np.clip(move, -2.0, 2.0))
-            options = [(here, scales), (down, scales - delta), (up, scales + delta), (cost(trial), trial)]
+            options = [(here, scales), (down, scales - delta), (up, scales + delta)]
+            if abs(move) > _CLOSE:
+                trial = scales + delta * float(np.clip(move, -2.0, 2.0))
+                options.append((cost(trial), trial))
             here, scales = min(options, key=lambda o: o[0])
     sensors = tuple(
         replace(s, log_scale=float(scales[i]), log_slow=float(scales[S + i])) for i, s in enumerate(sensors)

@@ -86,7 +86,7 @@ class Linear:
     """The linearised problem in order of time, before scaling of the noises.
 
     Attributes:
-        problem: With unscaled weights; its Q is set by `orientation_noise.scaled`.
+        problem: With unscaled weights; its steps' noise is set by `orientation_noise.scaled`.
         sensor: Which sensor each row belongs to, shape (n,).
         order: Sorted row to row of the sensors strung together, shape (n,).
         used: Rows that take part, shape (n,).
@@ -94,6 +94,8 @@ class Linear:
         walk: Variance per axis of the bias over each step, (rad/s)^2, shape (n - 1,).
         middle_s: Time of each row from the middle of the data, s, shape (n,).
         slow: Covariance of each sensor's slow error over each step per unit of scale, shape (S, n - 1, 3, 3).
+        slow_inverse: Its inverse.
+        slow_log_determinant: Its log determinant, summed over the steps, shape (S,).
     """
 
     problem: DriftProblem
@@ -104,6 +106,8 @@ class Linear:
     walk: FloatArray
     middle_s: FloatArray
     slow: FloatArray
+    slow_inverse: FloatArray
+    slow_log_determinant: FloatArray
 
 
 def linearise(
@@ -136,6 +140,7 @@ def linearise(
         np.asarray(np.linalg.inv(C) * used[:, None, None], dtype=np.float64),
         F,
         np.zeros_like(F),
+        0.0,
         first_mean,
         first_information,
         _prior(S, p, noise.matrix_sigma),
@@ -146,7 +151,10 @@ def linearise(
         A = R[:-1] @ s.R_imu_sensor
         slow[i] = dt[:, None, None] * (A @ s.covariance.mean(axis=0) @ np.swapaxes(A, 1, 2))
     middle = tau - 0.5 * (tau[0] + tau[-1])
-    return Linear(problem, index, order, used, drift, noise.walk**2 * dt, middle, slow)
+    slow_inverse = np.asarray(np.linalg.inv(slow), dtype=np.float64)
+    determinant = np.log(np.linalg.det(slow)).sum(axis=1)
+    walk = noise.walk**2 * dt
+    return Linear(problem, index, order, used, drift, walk, middle, slow, slow_inverse, determinant)
 
 
 def _derivatives(

@@ -71,12 +71,13 @@ class Start:
     typical_rad: float
 
 
-def camera_turns(t_cam_s: FloatArray, q_world_cam: FloatArray) -> Turns:
+def camera_turns(t_cam_s: FloatArray, q_world_cam: FloatArray, most: int = _MAX_PAIRS) -> Turns:
     """Pair each orientation with the one about 0.2 s later (at most 0.6 s: holes are left out).
 
     Args:
         t_cam_s: Stamps, increasing, s, shape (n,).
         q_world_cam: Orientations w x y z, shape (n, 4).
+        most: So many pairs are kept, evenly.
     """
     first = np.arange(len(t_cam_s))
     second = np.searchsorted(t_cam_s, t_cam_s + _BASELINE_S * 0.999)
@@ -85,8 +86,8 @@ def camera_turns(t_cam_s: FloatArray, q_world_cam: FloatArray) -> Turns:
     dt = t_cam_s[second] - t_cam_s[first]
     keep = dt < max(3.0 * _BASELINE_S, 1.5 * float(np.median(dt)) if len(dt) else 0.0)
     first, second = first[keep], second[keep]
-    if len(first) > _MAX_PAIRS:
-        chosen = np.linspace(0, len(first) - 1, _MAX_PAIRS).round().astype(np.intp)
+    if len(first) > most:
+        chosen = np.linspace(0, len(first) - 1, most).round().astype(np.intp)
         first, second = first[chosen], second[chosen]
     turn = so3.rotvec_from_quat(
         so3.quat_multiply(so3.quat_conjugate(q_world_cam[first]), q_world_cam[second])

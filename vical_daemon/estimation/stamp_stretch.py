@@ -25,6 +25,7 @@ _MOST = 0.22
 _STEP, _FINE = 0.02, 0.0025
 _GRID_S = 0.02
 _LONGEST_S = 12.0  # with more data the grid of stretches would have to be finer
+_TURNS = 80  # enough to tell factors apart
 _AGREE = 0.6
 
 
@@ -50,7 +51,7 @@ def find_stretch(
 
     def cost(factor: float) -> float:
         stamps = middle + t / factor
-        turns = camera_turns(stamps, q)
+        turns = camera_turns(stamps, q, _TURNS)
         if len(turns.first) < 8:
             return 1.0
         return float(shift_costs(curve, stamps, turns, shifts, agreement_scale(turns)).min())

@@ -182,6 +182,7 @@ def _result(
         rejected=n_given - pairs,
         iterations=rough.iterations + fit.rounds,
         camera_noise_rad=noise,
+        slow_noise_ratio=float(np.exp(sensor.log_slow)),
         gyro_noise_ratio=float(np.exp(fit.log_gyro_scale)),
         used=used,
         stamp_rate=float(fit.stamp_rate[0]),

@@ -8,7 +8,7 @@ delays between any two sensors come with their covariance.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,7 @@ __all__ = [
 
 FloatArray = npt.NDArray[np.float64]
 
+_MOST = 3000  # orientations in all; more would add minutes and little accuracy
 _NO_BIAS_RPS = 1e-7  # a curve without a gyro has no bias to estimate
 
 
@@ -53,6 +54,22 @@ class OrientationStream:
     t_s: FloatArray
     R_world_sensor: FloatArray
     rotation_sigma: float | FloatArray = 1.7e-3
+
+
+def _thinned(streams: Sequence[OrientationStream], most: int = _MOST) -> list[OrientationStream]:
+    """Leave out every other orientation of the largest stream until all together are few enough."""
+    out = list(streams)
+    while sum(len(s.t_s) for s in out) > most:
+        i = int(np.argmax([len(s.t_s) for s in out]))
+        s = out[i]
+        sigma = np.asarray(s.rotation_sigma)
+        out[i] = replace(
+            s,
+            t_s=s.t_s[::2],
+            R_world_sensor=s.R_world_sensor[::2],
+            rotation_sigma=s.rotation_sigma if sigma.ndim == 0 else sigma[::2],
+        )
+    return out
 
 
 def joint_with_gyro(
@@ -80,7 +97,7 @@ def joint_with_gyro(
     sensors: list[tuple[str, OrientationSensor]] = []
     reasons: list[str] = []
     bias = np.zeros(3)
-    for stream in streams:
+    for stream in _thinned(streams):
         alone = td_icp(t_imu, gyro, stream.t_s - base, stream.R_world_sensor, stream.rotation_sigma, options)
         if alone.status == REFUSED:
             reasons.append(f"{stream.name}: {alone.reason}")
@@ -114,10 +131,19 @@ def _from_alone(
     t, R, covariance, index = cleaned
     curve = GyroCurve.integrate(t_imu, gyro, alone.gyro_bias_rps)
     R_world_ref = _world(curve, t, R, alone.used[index], alone.timeshift_cam_imu_s, alone.R_imu_cam)
+    told = float(np.sqrt(np.trace(covariance.mean(axis=0)) / 3.0))
     return OrientationSensor(
-        t, R, covariance, alone.timeshift_cam_imu_s, alone.R_imu_cam, R_world_ref, alone.used[index],
+        t,
+        R,
+        covariance,
+        alone.timeshift_cam_imu_s,
+        alone.R_imu_cam,
+        R_world_ref,
+        alone.used[index],
+        log_scale=float(np.log(alone.camera_noise_rad / told)),
+        log_slow=float(np.log(alone.slow_noise_ratio)),
         jitter_s=options.stamp_jitter_s,
-    )  # fmt: skip
+    )
 
 
 def _world(
@@ -146,6 +172,7 @@ def joint_of_orientations(
     options = options or TdIcpOptions()
     if len(streams) < 2:
         return JointResult(REFUSED, "two sensors at least are needed", streams[0].name if streams else "")
+    streams = _thinned(streams)
     reference = min(streams, key=lambda s: np.median(np.diff(np.sort(s.t_s))) if len(s.t_s) > 1 else 9.9)
     cleaned = clean_orientations(reference.t_s, reference.R_world_sensor, reference.rotation_sigma)
     if isinstance(cleaned, str):

@@ -63,6 +63,7 @@ class TdIcpResult:
         rejected: Orientations refused as outliers or without imu data at their time.
         iterations: Rounds of both iterative phases.
         camera_noise_rad: Measured noise of one orientation, rms per axis, rad.
+        slow_noise_ratio: Measured slow error that a second brings over the noise of one orientation.
         gyro_noise_ratio: Measured drift of the gyro over the stated one.
         used: Which of the given orientations took part, shape (n,).
         stamp_rate: By how much the delay grows with time in these data, s/s (1e-6: one microsecond a second);
@@ -82,6 +83,7 @@ class TdIcpResult:
     rejected: int = 0
     iterations: int = 0
     camera_noise_rad: float = float("nan")
+    slow_noise_ratio: float = float("nan")
     gyro_noise_ratio: float = float("nan")
     used: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     stamp_rate: float = float("nan")

@@ -188,7 +188,7 @@ def test_stamp_jitter_that_is_known_widens_the_sigma():
         assert abs(result.timeshift_cam_imu_s) < 4 * result.timeshift_sigma_s
 
 
-@pytest.mark.parametrize("factor", [1.05, 0.95, 1.01])
+@pytest.mark.parametrize("factor", [1.05, 0.95])
 def test_stretched_stamps_are_blamed_and_not_the_rotations(factor):
     t_imu, gyro, t_cam, R, *_ = record(20, 0.3)
     result = td_icp(t_imu, gyro, t_cam[0] + factor * (t_cam - t_cam[0]), R)

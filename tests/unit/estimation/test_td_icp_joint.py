@@ -75,3 +75,15 @@ def test_a_stream_that_does_not_belong_is_named_and_left_out():
     assert result.status == "degenerate" and "shelf" in result.reason
     assert list(result.sensors) == ["cam0"]
     assert joint_of_orientations([fast]).status == "refused"
+
+
+def test_long_streams_are_thinned_the_largest_first():
+    from vical_daemon.estimation.td_icp_joint import _thinned
+
+    def stream(name, n):
+        return OrientationStream(name, np.arange(n) * 1.0, np.tile(np.eye(3), (n, 1, 1)), np.full(n, 0.1))
+
+    thin = _thinned([stream("mocap", 8000), stream("cam0", 900)], most=3000)
+    assert [len(s.t_s) for s in thin] == [2000, 900]
+    assert len(thin[0].R_world_sensor) == len(thin[0].rotation_sigma) == 2000
+    assert thin[0].t_s[1] == 4.0

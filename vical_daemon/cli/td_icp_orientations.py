@@ -1,0 +1,189 @@
+"""Recorded orientations for `vical td-icp`: topics of any log of ROS messages, and trajectory files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.cli.errors import CliError
+from vical_daemon.cli.td_icp_sources import seconds
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.td_icp_joint import OrientationStream
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_POSE_SIGMA_RAD = 3e-3  # only a start: the fit measures it
+_MIN_POSES = 12
+# type -> path of the quaternion inside the message, path of its covariance ("": it has none)
+_POSE_TYPES = {
+    "nav_msgs/msg/Odometry": ("pose.pose.orientation", "pose.covariance"),
+    "geometry_msgs/msg/PoseStamped": ("pose.orientation", ""),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose.pose.orientation", "pose.covariance"),
+    "geometry_msgs/msg/TransformStamped": ("transform.rotation", ""),
+    "geometry_msgs/msg/QuaternionStamped": ("quaternion", ""),
+    "sensor_msgs/msg/Imu": ("orientation", "orientation_covariance"),
+}
+
+
+def pose_topic(path: Path, topic: str, base_ns: int | None) -> tuple[OrientationStream, int]:
+    """Orientations of a topic with poses, odometry or an imu that computes its own attitude.
+
+    Args:
+        path: MCAP file, folder of them, ROS 1 bag, or ROS 2 bag folder.
+        topic: As recorded; a leading slash that is not there does not matter.
+        base_ns: Subtracted from stamps; None: the topic's first stamp.
+
+    Returns:
+        The stream, and the base that was used, ns.
+
+    Raises:
+        CliError: No such topic, of a type without an orientation, or nobody filled it in.
+    """
+    stamps: list[int] = []
+    quaternions: list[tuple[float, ...]] = []
+    variances: list[float] = []
+    found: Counter[str] = Counter()
+    for name, type_name, message in _messages(path):
+        if name.removeprefix("/") != topic.removeprefix("/"):
+            found[f"{name} ({type_name})"] += type_name in _POSE_TYPES
+            continue
+        if type_name not in _POSE_TYPES:
+            known = ", ".join(_POSE_TYPES)
+            raise CliError(f"{topic} is a {type_name}: it holds no orientation (known: {known})")
+        quaternion, covariance = _POSE_TYPES[type_name]
+        decoded = message()
+        q = _member(decoded, quaternion)
+        stamps.append(decoded.header.stamp.sec * 1_000_000_000 + decoded.header.stamp.nanosec)
+        quaternions.append((q.w, q.x, q.y, q.z))
+        variances.append(_variance(_member(decoded, covariance)) if covariance else 0.0)
+    if not stamps:
+        others = ", ".join(sorted(name for name, n in found.items() if n))
+        raise CliError(f"{path} holds no topic {topic}; with orientations: {others or 'none'}")
+    if min(variances) < 0.0:
+        raise CliError(f"{topic}: its sender says that it holds no orientation (covariance[0] is -1)")
+    if max(stamps) == 0:
+        raise CliError(f"{topic}: all stamps are zero (not filled in by the sender)")
+    t_ns = np.array(stamps, dtype=np.int64)
+    base = int(t_ns.min()) if base_ns is None else base_ns
+    sigma = np.sqrt(np.array(variances))
+    return _from_quaternions(topic, t_ns, np.array(quaternions), base, sigma), base
+
+
+def _member(message: Any, path: str) -> Any:
+    for part in path.split("."):
+        message = getattr(message, part)
+    return message
+
+
+def _variance(covariance: Any) -> float:
+    """Mean variance of the three angles, rad^2; 0: not given; -1: the sender has no orientation."""
+    values = np.asarray(covariance, dtype=np.float64)
+    if values[0] == -1.0:
+        return -1.0
+    angles = np.diagonal(values.reshape((6, 6) if len(values) == 36 else (3, 3)))[-3:]
+    mean = float(angles.mean())
+    return mean if np.isfinite(mean) and mean > 0.0 else 0.0
+
+
+def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
+    """Yield (topic, type, function that decodes) of all messages of any log of ROS messages."""
+    from vical_daemon.mcap_log import LogError, LogReader
+    from vical_daemon.messages.schemas import typestore
+
+    store = typestore()
+    folder = path.is_dir() and not (path / "metadata.yaml").is_file()
+    if folder or (path.suffix != ".bag" and path.is_file() and path.suffix != ".db3"):
+        files = sorted(path.glob("*.mcap")) if folder else [path]
+        if not files:
+            raise CliError(f"{path} is no log of messages: topics need an MCAP or a bag")
+        try:
+            for file in files:
+                for m in LogReader(file).messages():
+                    channel = m.channel
+                    if channel.encoding == "cdr":
+                        data, kind = m.payload, channel.type_name
+                        yield channel.topic, kind, lambda d=data, k=kind: store.deserialize_cdr(d, k)
+        except LogError as error:
+            raise CliError(str(error)) from None
+        return
+    yield from _bag_messages(path.parent if path.suffix == ".db3" else path, store)
+
+
+def _bag_messages(path: Path, store: Any) -> Iterator[tuple[str, str, Any]]:
+    from rosbags.highlevel import AnyReader
+
+    try:
+        with AnyReader([path], default_typestore=None if path.suffix == ".bag" else store) as reader:
+            for c, _, data in reader.messages():
+                yield c.topic, c.msgtype, lambda d=data, k=c.msgtype: reader.deserialize(d, k)
+    except (CliError, GeneratorExit):
+        raise
+    except Exception as error:  # rosbags raises whatever its parsers raise on damaged files
+        raise CliError(f"{path} cannot be read as a bag: {' '.join(str(error).split())[:200]}") from None
+
+
+def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream, int]:
+    """Read a trajectory: TUM (`t x y z qx qy qz qw`, seconds) or EuRoC (`t, x, y, z, qw, qx, qy, qz`, ns).
+
+    Args:
+        path: The file.
+        base_ns: Subtracted from stamps; None: the file's first stamp.
+
+    Returns:
+        The stream, and the base that was used, ns.
+
+    Raises:
+        CliError: The file is neither.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        text = line.strip()
+        if not text or text.startswith("#") or (not rows and not (text[0].isdigit() or text[0] in "-+.")):
+            continue
+        words = text.replace(",", " ").split()
+        try:
+            values = [float(word) for word in words[1:8]]
+            stamp_ns = int(words[0]) if words[0].lstrip("+-").isdigit() else round(float(words[0]) * 1e9)
+        except ValueError:
+            raise CliError(f"{path} line {number}: not a number in '{text[:60]}'") from None
+        if len(values) < 7:
+            raise CliError(
+                f"{path} line {number}: expected `t x y z qx qy qz qw` (TUM) or "
+                "`t, x, y, z, qw, qx, qy, qz` (EuRoC)"
+            )
+        stamps.append(stamp_ns)
+        rows.append(values[3:7])
+    if len(rows) < _MIN_POSES:
+        raise CliError(f"{path}: {len(rows)} poses, at least {_MIN_POSES} are needed")
+    t_ns = np.array(stamps, dtype=np.int64)
+    if np.median(np.diff(t_ns)) < 1000:  # whole seconds or milliseconds would be no trajectory: bare seconds
+        t_ns = t_ns * 1_000_000_000
+    q = np.array(rows)
+    comma = "," in next(line for line in path.read_text(encoding="utf-8").splitlines() if line[:1].isdigit())
+    q = q if comma else q[:, [3, 0, 1, 2]]
+    base = int(t_ns[0]) if base_ns is None else base_ns
+    return _from_quaternions(path.name, t_ns, q, base), base
+
+
+def _from_quaternions(
+    name: str, t_ns: IntArray, q: FloatArray, base_ns: int, sigma: FloatArray | None = None
+) -> OrientationStream:
+    """A stream of quaternions w x y z; those that are no rotation are left out."""
+    length = np.linalg.norm(q, axis=1)
+    good = np.abs(length - 1.0) < 0.05
+    if np.count_nonzero(good) < _MIN_POSES:
+        raise CliError(f"{name}: its orientations are no unit quaternions (not filled in by the sender?)")
+    if np.ptp(q[good], axis=0).max() == 0.0:
+        raise CliError(f"{name}: its orientation never changes (not filled in by the sender?)")
+    R = so3.matrix_from_quat(so3.quat_normalise(q[good]))
+    told: float | FloatArray = _POSE_SIGMA_RAD
+    if sigma is not None and sigma[good].min() > 0.0:
+        told = np.clip(sigma[good], 1e-5, 3.0)
+    return OrientationStream(name, seconds(t_ns[good], base_ns), R, told)

@@ -1,0 +1,90 @@
+"""`vical td-icp --sensors`: what each name means, and all of them registered together."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.td_icp import choose_gyro, is_trajectory, open_input, options_of, prior_of
+from vical_daemon.cli.td_icp_orientations import pose_topic, trajectory_file
+from vical_daemon.cli.td_icp_sources import camera_stream, seconds
+from vical_daemon.estimation.td_icp_joint import (
+    JointResult,
+    OrientationStream,
+    joint_of_orientations,
+    joint_with_gyro,
+)
+from vical_daemon.recording import Recording, RecordingError
+
+if TYPE_CHECKING:
+    from vical_daemon.priors import Initial
+
+
+def register(args: argparse.Namespace, initial: Initial, names: list[str]) -> JointResult:
+    """Collect the sensors' orientations and register them.
+
+    Args:
+        args: Of the command.
+        initial: What is known of lenses and the imu's noise.
+        names: Of the sensors.
+
+    Raises:
+        CliError: A name means nothing, or its data cannot be used.
+    """
+    path = Path(args.input)
+    options = options_of(args, initial)
+    if is_trajectory(path):
+        first, base = trajectory_file(path, None)
+        others = [trajectory_file(Path(name), base)[0] for name in names if _file(name)]
+        return joint_of_orientations([first, *others], options)
+    recording = _recording(args.input, names)
+    imus = {} if recording is None else recording.imus
+    gyros = [name for name in names if name in imus]
+    if len(gyros) > 1:
+        raise CliError(f"one imu can be the reference, {' and '.join(gyros)} are two", EXIT_USAGE)
+    base_ns = None if recording is None else recording.begin_ns
+    streams = []
+    for name in names:
+        if name not in gyros:
+            stream, base_ns = _stream(args, initial, recording, name, base_ns)
+            streams.append(stream)
+    if gyros and recording is not None and base_ns is not None:
+        imu, t_ns, gyro = choose_gyro(recording, gyros[0])
+        return joint_with_gyro(imu, seconds(t_ns, base_ns), gyro, streams, options)
+    return joint_of_orientations(streams, options)
+
+
+def _recording(path: str, names: list[str]) -> Recording | None:
+    """Open the recording; None where it holds neither imu nor camera and none of the names is one."""
+    try:
+        return open_input(path)
+    except RecordingError:
+        if all(name.startswith("/") or Path(name).is_file() for name in names):
+            return None
+        raise
+
+
+def _stream(
+    args: argparse.Namespace, initial: Initial, recording: Recording | None, name: str, base_ns: int | None
+) -> tuple[OrientationStream, int]:
+    """One sensor's orientations, and what was subtracted from its stamps (its first, without a base)."""
+    if recording is not None and name in recording.cameras and base_ns is not None:
+        camera = recording.cameras[name]
+        prior = prior_of(initial, name)
+        return camera_stream(recording, camera, prior, args.target, base_ns), base_ns
+    if name.startswith("/") and not Path(name).is_file():
+        return pose_topic(Path(args.input), name, base_ns)
+    if Path(name).is_file():
+        return trajectory_file(Path(name), base_ns)
+    known = "" if recording is None else ", ".join([*recording.imus, *recording.cameras])
+    raise CliError(
+        f"--sensors: {name!r} is no sensor of the recording ({known}), no /topic and no file", EXIT_USAGE
+    )
+
+
+def _file(name: str) -> bool:
+    if not Path(name).is_file():
+        raise CliError(f"--sensors: {name} does not exist; with a trajectory as INPUT all sensors are files")
+    return True
