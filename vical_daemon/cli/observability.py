@@ -73,16 +73,17 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[Missin
     """What is missing, in words, from the bound with next to no prior."""
     import numpy as np
 
-    from vical_daemon.estimation.missing_motion import missing_motion
+    from vical_daemon.estimation.missing_motion import RunningMotion, missing_motion
     from vical_daemon.estimation.observability import covariance_of
 
     covariance = covariance_of(result)
     order = [result.blocks[name] for name in ("lever_arm", "rotation", "timeshift")]
     index = np.concatenate([np.arange(s.start, s.stop) for s in order])
-    scatter = np.einsum("ki,kj->ij", motion.rate_rps, motion.rate_rps) / len(motion.t_s)
-    change = np.gradient(motion.rate_rps, motion.t_s, axis=0)
-    rms = float(np.sqrt(np.median(np.sum(change**2, axis=1))))
-    return missing_motion(covariance[np.ix_(index, index)], setup.R_imu_cam, scatter, rms)
+    turning = RunningMotion(memory_s=1e6)  # all of it
+    for t, rate in zip(motion.t_s, motion.rate_rps, strict=True):
+        turning.add(float(t), rate)
+    part = covariance[np.ix_(index, index)]
+    return missing_motion(part, setup.R_imu_cam, turning.scatter(), turning.rate_change_rps2)
 
 
 def _document(

@@ -3,11 +3,12 @@
 A direction whose sigma is above its limit is named, in words that a person holding the rig understands (the
 optical axis, the image's x axis), together with the motion that would reveal it. Which motion that is follows
 from observability (docs/math/observability.md): the lever arm needs rotation about two axes, the mounting
-too, the delay needs a rate that changes.
+too, the delay needs a rate that changes. Live: feed `RunningMotion` with the gyro and ask `guidance`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ _SLOW_RPS = 12.0 * _DEG
 _ONE_AXIS = (
     0.03  # second over first eigenvalue of the rates' scatter below which the rig turned about one axis
 )
+_BLOCK_S = 0.1
 _ALONG = 0.85  # cosine above which two directions are called the same
 
 
@@ -43,6 +45,7 @@ class Missing:
         axis_cam: The direction in the camera frame, unit length, shape (3,); zeros for the time shift.
         sigma: Standard deviation along it, m, rad or s.
         advice: The motion to make.
+        limit: Above which sigma it counts as unknown.
     """
 
     block: str
@@ -50,15 +53,120 @@ class Missing:
     axis_cam: FloatArray
     sigma: float
     advice: str
+    limit: float
 
-    def __str__(self) -> str:
-        """One line for a person."""
-        what = {
+    @property
+    def name(self) -> str:
+        """What is not known, e.g. "lever arm along the optical axis"."""
+        return {
             "lever_arm": f"lever arm along {self.direction}",
             "rotation": f"rotation about {self.direction}",
             "timeshift": "time shift",
         }[self.block]
-        return f"{what}: {self.advice}"
+
+    @property
+    def excess(self) -> float:
+        """Its sigma over the limit; above 1."""
+        return self.sigma / self.limit
+
+    @property
+    def said(self) -> str:
+        """Name and figure."""
+        figure = {
+            "lever_arm": f"{1e3 * self.sigma:.1f} mm",
+            "rotation": f"{self.sigma / _DEG:.2f} deg",
+            "timeshift": f"{1e3 * self.sigma:.2f} ms",
+        }[self.block]
+        return f"{self.name}: +-{figure}"
+
+    @property
+    def motion(self) -> str:
+        """The motion that would reveal it."""
+        return self.advice
+
+    def __str__(self) -> str:
+        """One line for a person."""
+        return f"{self.name}: {self.advice}"
+
+
+class RunningMotion:
+    """How the rig turned of late: what `guidance` needs to know of the gyro, kept for next to nothing.
+
+    Rates are averaged over tenths of a second, so that the gyro's noise is not taken for acceleration.
+
+    Args:
+        memory_s: Older motion counts less and less, with this time constant, s.
+    """
+
+    def __init__(self, memory_s: float = 20.0) -> None:
+        self._keep = float(np.exp(-_BLOCK_S / memory_s))
+        self._begin_s = float("nan")
+        self._sum, self._count = [0.0, 0.0, 0.0], 0
+        self._last: FloatArray | None = None
+        self._weight = self._changes = 0.0
+        self._mean, self._scatter, self._change = np.zeros(3), np.zeros((3, 3)), 0.0
+
+    def add(self, t_s: float, gyro_rps: Sequence[float]) -> None:
+        """Take one reading (s; rad/s in the imu frame)."""
+        total = self._sum
+        total[0] += gyro_rps[0]
+        total[1] += gyro_rps[1]
+        total[2] += gyro_rps[2]
+        self._count += 1
+        if not t_s - self._begin_s < _BLOCK_S:  # also at the first reading
+            self._finish_block(t_s)
+
+    def _finish_block(self, t_s: float) -> None:
+        rate = np.array(self._sum) / self._count
+        dt, self._begin_s = t_s - self._begin_s, t_s
+        self._sum, self._count = [0.0, 0.0, 0.0], 0
+        self._weight = self._keep * self._weight + 1.0
+        self._mean += (rate - self._mean) / self._weight
+        self._scatter += (np.outer(rate, rate) - self._scatter) / self._weight
+        if self._last is not None and dt < 3.0 * _BLOCK_S:
+            self._changes = self._keep * self._changes + 1.0
+            square = float(np.sum((rate - self._last) ** 2)) / dt**2
+            self._change += (square - self._change) / self._changes
+        self._last = rate
+
+    def scatter(self, bias_rps: FloatArray | None = None) -> FloatArray:
+        """Mean of w w', w the rate less the gyro's bias, (rad/s)^2, shape (3, 3)."""
+        b = np.zeros(3) if bias_rps is None else np.asarray(bias_rps, dtype=np.float64)
+        cross = np.outer(self._mean, b)
+        return self._scatter - cross - cross.T + np.outer(b, b)
+
+    @property
+    def rate_change_rps2(self) -> float | None:
+        """RMS angular acceleration, rad/s^2; None before there are two blocks."""
+        return float(np.sqrt(self._change)) if self._changes else None
+
+
+def guidance(
+    pose_covariance: FloatArray,
+    R_imu_cam: FloatArray,
+    timeshift_sigma_s: float,
+    motion: RunningMotion,
+    limits: Limits,
+    bias_rps: FloatArray | None = None,
+) -> list[Missing]:
+    """Name what is not known well enough, worst first, with the motion that would reveal it.
+
+    Args:
+        pose_covariance: Of T_imu_cam, order [p r], m and rad (rotation local), shape (6, 6).
+        R_imu_cam: Present mounting, shape (3, 3).
+        timeshift_sigma_s: Standard deviation of the time shift, s.
+        motion: How the rig turned.
+        limits: What is good enough.
+        bias_rps: The gyro's bias, shape (3,).
+
+    Returns:
+        The gaps; empty when everything is known well enough.
+    """
+    covariance = np.zeros((7, 7))
+    covariance[:6, :6], covariance[6, 6] = pose_covariance, timeshift_sigma_s**2
+    scatter = motion.scatter(bias_rps)
+    found = missing_motion(covariance, R_imu_cam, scatter, motion.rate_change_rps2, limits)
+    return sorted(found, key=lambda m: -m.excess)
 
 
 def axis_words(axis_cam: FloatArray) -> str:
@@ -100,13 +208,15 @@ def missing_motion(
     found: list[Missing] = []
     in_cam = R_imu_cam.T @ covariance[:3, :3] @ R_imu_cam
     for sigma, axis in _beyond(in_cam, limits.lever_arm_m):
-        found.append(Missing("lever_arm", axis_words(axis), axis, sigma, turning.advice_lever_arm(axis)))
+        advice = turning.advice_lever_arm(axis)
+        found.append(Missing("lever_arm", axis_words(axis), axis, sigma, advice, limits.lever_arm_m))
     for sigma, axis in _beyond(covariance[3:6, 3:6], limits.rotation_rad):
-        found.append(Missing("rotation", axis_words(axis), axis, sigma, turning.advice_rotation(axis)))
+        advice = turning.advice_rotation(axis)
+        found.append(Missing("rotation", axis_words(axis), axis, sigma, advice, limits.rotation_rad))
     sigma_t = float(np.sqrt(covariance[6, 6]))
     if sigma_t > limits.timeshift_s:
         advice = turning.advice_timeshift(rate_change_rps2)
-        found.append(Missing("timeshift", "", np.zeros(3), sigma_t, advice))
+        found.append(Missing("timeshift", "", np.zeros(3), sigma_t, advice, limits.timeshift_s))
     return found
 
 

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.missing_motion import Limits, axis_words, missing_motion
+from vical_daemon.estimation.missing_motion import (
+    Limits,
+    RunningMotion,
+    axis_words,
+    guidance,
+    missing_motion,
+)
 from vical_daemon.estimation.observability import Motion, Setup, gramian, lost_in_block, pose_sensitivities
 from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
 
@@ -222,3 +228,40 @@ def test_axes_in_words():
     assert axis_words(np.array([0, 0, -2.0])) == "the optical axis"
     assert "between" in axis_words(np.array([1.0, 1.0, 0.0]))
     assert "oblique" in axis_words(np.array([1.0, 1.0, 1.0]))
+
+
+def _turned(rates, dt=0.01):
+    motion = RunningMotion(memory_s=5.0)
+    for k, rate in enumerate(rates):
+        motion.add(k * dt, rate)
+    return motion
+
+
+def test_running_motion_forgets_and_is_not_fooled_by_noise_or_bias():
+    rng, bias = np.random.default_rng(0), np.array([0.02, -0.03, 0.01])
+    steady = np.tile([0.0, 0.0, 0.7], (1500, 1)) + rng.normal(0, 5.2e-3, (1500, 3)) + bias
+    motion = _turned(steady)
+    np.testing.assert_allclose(motion.scatter(bias), np.diag([0, 0, 0.49]), atol=2e-3)
+    assert motion.rate_change_rps2 < 0.05
+    t = np.arange(0, 30, 0.01)
+    swinging = np.outer(np.sin(3 * t), [0.6, 0.0, 0.0])
+    later = _turned(np.vstack((steady, swinging)))
+    np.testing.assert_allclose(later.scatter(), np.diag([0.18, 0, 0]), atol=0.02)
+    assert later.rate_change_rps2 == pytest.approx(0.6 * 3 / np.sqrt(2), rel=0.1)
+    assert RunningMotion().rate_change_rps2 is None
+
+
+def test_guidance_of_a_running_calibration_is_worst_first_and_speaks_of_the_motion_so_far():
+    t = np.arange(0, 20, 0.01)
+    about_optical = _turned(np.outer(0.7 * np.sin(2 * t), R_IMU_CAM[:, 2]))
+    covariance = _covariance(arm=(1e-3, 1e-3, 0.05), rotation=(0.02, 1e-3, 1e-3))[:6, :6]
+    found = guidance(covariance, R_IMU_CAM, 1e-4, about_optical, Limits())
+    assert [g.name for g in found] == [
+        "lever arm along the optical axis",
+        "rotation about the image's x axis",
+    ]
+    assert found[0].excess == pytest.approx(10.0) and found[0].said.endswith("+-50.0 mm")
+    assert found[0].motion == "so far it turned about the optical axis only; rotate about another axis"
+    still = guidance(covariance, R_IMU_CAM, 1e-2, _turned(np.zeros((300, 3))), Limits())
+    assert still[0].name == "time shift" and "turn the rig" in still[0].motion
+    assert guidance(_covariance()[:6, :6], R_IMU_CAM, 1e-4, about_optical, Limits()) == []
