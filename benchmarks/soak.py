@@ -9,6 +9,7 @@ runs in a process of its own with a quota, so that rotation and deletion take pa
 from __future__ import annotations
 
 import argparse
+import json
 import multiprocessing as mp
 import os
 import tempfile
@@ -25,7 +26,18 @@ from vical_daemon.mcap_log import LogReader
 
 _CONTEXT = mp.get_context("spawn")
 _IMU, _IMAGE = topics.imu_key("rig0", "imu0"), topics.image_key("rig0", "cam0")
+_KEYS = {"inertial": _IMU, "images": _IMAGE, "statuses": "vical/rig0/status/*"}
 _SETTLE_S = 60.0
+
+
+class _Count:
+    """Counts what a subscription is given."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+
+    def __call__(self, _sample: Any) -> None:
+        self.messages += 1
 
 
 def main(argv: list[str]) -> int:
@@ -50,13 +62,13 @@ def main(argv: list[str]) -> int:
         done.set()
         recorder.join()
         bus.close()
-        status["lost_inertial"] = (folder / "lost_inertial").read_text()
+        received = json.loads((folder / "seen.json").read_text())
         holes, kept, segments = check_segments(folder / "log")
-    report(seen, sent, status, holes, kept, segments)
-    return int(holes > 0 or status["lost_inertial"] != "0" or status["dropped"] != "0")
+    report(seen, sent, received, status, (holes, kept, segments))
+    return int(holes > 0 or received["inertial"][1] > 0 or status["dropped"] != "0")
 
 
-def publish_and_watch(bus: Any, pid: int, seconds: float) -> tuple[list[tuple[Any, ...]], int]:
+def publish_and_watch(bus: Any, pid: int, seconds: float) -> tuple[list[tuple[Any, ...]], dict[str, int]]:
     """Publish on one clock; every 10 s note (memory, descriptors, threads) of both processes."""
     image = m.encode_image(
         1, "cam0", np.random.default_rng(1).integers(0, 2, (480, 752), dtype=np.uint8), "mono8"
@@ -72,7 +84,7 @@ def publish_and_watch(bus: Any, pid: int, seconds: float) -> tuple[list[tuple[An
         if elapsed_s > len(seen) * 10:
             seen.append((elapsed_s, _usage(os.getpid()), _usage(pid)))
         time.sleep(0.0007)
-    return seen, sent
+    return seen, {"inertial": sent, "images": images}
 
 
 def record(folder: str, done: Any) -> None:
@@ -85,12 +97,16 @@ def record(folder: str, done: Any) -> None:
     record = f"{{directory: {folder}/log, rotate_s: 20, quota_bytes: 400000000, reserve_bytes: 0}}"
     config = loads(f"rig: rig0\nrecord: {record}\n")
     bus = open_bus(mode="client", socket=Path(folder) / "z.sock")
-    inertial = bus.subscribe(_IMU, lambda _: None)  # to tell apart what was lost: images may be dropped
+    counts = {kind: _Count() for kind in _KEYS}  # to tell apart what was lost: images may be dropped
+    subscriptions = {kind: bus.subscribe(key, counts[kind]) for kind, key in _KEYS.items()}
     stop = threading.Event()
     thread = threading.Thread(target=role.run, args=(config, bus, stop), kwargs={"clock": private_clock()})
     thread.start()
     done.wait()
-    (Path(folder) / "lost_inertial").write_text(str(inertial.dropped))
+    seen = {
+        kind: (counts[kind].messages, subscription.dropped) for kind, subscription in subscriptions.items()
+    }
+    (Path(folder) / "seen.json").write_text(json.dumps(seen))
     stop.set()
     thread.join()
     bus.close()
@@ -107,7 +123,11 @@ def check_segments(log: Path) -> tuple[int, int, int]:
 
 
 def report(
-    seen: list[tuple[Any, ...]], sent: int, status: dict[str, str], holes: int, kept: int, segments: int
+    seen: list[tuple[Any, ...]],
+    sent: dict[str, int],
+    received: dict[str, list[int]],
+    status: dict[str, str],
+    left: tuple[int, int, int],
 ) -> None:
     """Print the table."""
     settled = [row for row in seen if row[0] > min(_SETTLE_S, seen[-1][0] / 4)]
@@ -122,11 +142,15 @@ def report(
                 f"{first:.1f} -> {last:.1f} ({100 * (last / first - 1):+.1f} %), most {max(values):.1f}"
             )
         print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
-    lost = f"{status['lost_on_bus']} messages lost on the bus ({status['lost_inertial']} of them inertial)"
+    print("\n| kind | sent by the host | received by the recorder's process | gaps in the numbers |")
+    print("|---|---:|---:|---:|")
+    for kind, (messages, gaps) in received.items():
+        print(f"| {kind} | {sent.get(kind, '-')} | {messages} | {gaps} |")
+    holes, kept, segments = left
     print(
-        f"\n{seen[-1][0] / 60:.1f} min, {sent} inertial samples sent, {lost}, {status['dropped']} dropped "
-        f"by the recorder, {status['files_deleted']} files deleted by the quota; {holes} holes in the {kept} "
-        f"samples of the {segments} files left."
+        f"\n{seen[-1][0] / 60:.1f} min; {status['lost_on_bus']} messages lost on the bus as the recorder "
+        f"counts, {status['dropped']} dropped by it, {status['files_deleted']} files deleted by the quota; "
+        f"{holes} holes in the {kept} inertial samples of the {segments} files left."
     )
 
 
