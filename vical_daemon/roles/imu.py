@@ -1,4 +1,4 @@
-"""Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> bounded queue -> bus."""
+"""Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> outbox -> bus."""
 
 from __future__ import annotations
 
@@ -67,7 +67,12 @@ def open_imu(config: ImuConfig) -> ImuSource:
     from vical_drivers.microstrain import device
 
     return device.open_imu(
-        config.port, protocol=config.protocol, rate_hz=config.rate_hz, filter_width=config.filter_samples
+        config.port,
+        protocol=config.protocol,
+        rate_hz=config.rate_hz,
+        filter_width=config.filter_samples,
+        baud=config.baud,
+        link=config.link,
     )
 
 
@@ -107,7 +112,7 @@ def _start(
     config: Config, name: str, bus: Bus, stop: threading.Event, clock: WallClock, open_source: OpenImu
 ) -> tuple[str, ImuRole, DeviceLoop[ImuSample], Outbox]:
     role = ImuRole(config.rig, name, clock)
-    outbox = Outbox(bus, QUEUE_DEPTH, f"imu/{name} out")
+    outbox = Outbox(bus, QUEUE_DEPTH, f"imu/{name} out", inline=True)
 
     def deliver(sample: ImuSample) -> None:
         payload = role.message(sample)

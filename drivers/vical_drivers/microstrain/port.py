@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import logging
 import os
 import select
@@ -96,8 +97,20 @@ def link_of(path: str) -> str:
     return "uart" if name.startswith("tty") else "unknown"
 
 
+def latency_timer_ms(path: str, sysfs: str = "/sys/bus/usb-serial/devices") -> int | None:
+    """Latency timer of an FTDI chip behind a port, ms; None where there is none."""
+    timer = Path(sysfs) / Path(os.path.realpath(path)).name / "latency_timer"
+    try:
+        return int(timer.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
 class SerialPort:
     """A serial port, opened raw, exclusively and in low-latency mode.
+
+    Exclusively: an advisory lock, which other drivers heed, and on real ports TIOCEXCL, which keeps out
+    whoever does not (`cat`, ModemManager). A pseudo terminal gets the lock alone: its flag would outlive us.
 
     Args:
         path: Device path; a link such as ``/dev/serial/by-id/...`` is best, it survives a replug.
@@ -124,6 +137,9 @@ class SerialPort:
         self._fd: int = self._serial.fileno()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
+        if self._link != "unknown":
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(self._fd, termios.TIOCEXCL)
         self._lower_latency()
 
     def _lower_latency(self) -> None:
@@ -133,6 +149,13 @@ class SerialPort:
         except (OSError, ValueError, NotImplementedError) as error:
             # Pseudo terminals, CDC-ACM and some adapters refuse; they need it least.
             _log.debug("port=%s low_latency=refused reason=%s", self._name, error)
+        timer_ms = latency_timer_ms(self._name)
+        if timer_ms is not None and timer_ms > 1:
+            _log.warning(
+                "port=%s latency_timer=%dms samples come late and in bunches; "
+                "`vical install-service` has the udev rule that sets 1 ms",
+                *(self._name, timer_ms),
+            )
 
     @property
     def name(self) -> str:
@@ -196,6 +219,13 @@ class SerialPort:
 
     def close(self) -> None:
         """Free the port; may be called twice."""
+        if not self._serial.is_open:
+            return
+        if self._link != "unknown":
+            with contextlib.suppress(OSError, termios.error):
+                # What a device did not take until now it never will, and the kernel would wait 30 s for it.
+                self._serial.reset_output_buffer()
+                fcntl.ioctl(self._fd, termios.TIOCNXCL)
         with contextlib.suppress(OSError, termios.error):
             self._serial.close()
 

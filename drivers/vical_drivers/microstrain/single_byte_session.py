@@ -177,8 +177,8 @@ class SingleByteSession:
 
     def _receive(self, timeout_s: float) -> list[sb.Record]:
         data, t_read_ns = self._port.read(timeout_s)
-        if not data:
-            return []
+        if not data:  # a silence: what looked like the beginning of a long record may hide a short one
+            return self._decoder.finish()
         self._arrivals.add(len(data), t_read_ns)
         return self._decoder.feed(data)
 

@@ -71,6 +71,8 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("rate_hz: 100", "rate_hz: 12:30", "imus.imu0.rate_hz: 12:30 would be read as base 60; write a plain number or quote it (config line 5)"),
         ("rate_hz: 100", "rate_hz: 0100", "imus.imu0.rate_hz: 0100 would be read as octal; drop the leading zero or quote it (config line 5)"),
         ("rate_hz: 100", "port: /dev/ttyUSB1", "imus.imu0.port: given twice (config line 5)"),
+        ("rate_hz: 100", "baud: 57600", "imus.imu0.baud: the number 57600 is none of 115200, 230400, 460800, 921600 (config line 5)"),
+        ("rate_hz: 100", "link: rs232", "imus.imu0.link: the text 'rs232' is none of auto, usb, ftdi, uart (config line 5)"),
         ("    port: /dev/ttyUSB0\n", "", "imus.imu0.port: missing (config line 3)"),
         ("rig: rover", "rig: ../etc", "rig: '../etc' is not accepted; letters, digits and _, begin with a letter, at most 63 (config line 1)"),
         ("cam0:", "Cam/0:", "cameras.Cam/0: 'Cam/0' is not accepted; letters, digits and _, begin with a letter, at most 63 (config line 7)"),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vical_drivers.microstrain import device as gx3_module
 from vical_drivers.samples import DeviceInfo, Frame, ImuSample, SourceStats
 
 from vical_daemon import topics
@@ -220,6 +221,23 @@ class TestAcquisition:
         assert message.gyro_rps == (0.1, 0.2, 0.3) and message.specific_force_mps2 == (1.0, 2.0, 3.0)
         assert role.message(ImuSample(5_000, 9_000, 1, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))) is None
         assert role.counters()["stamps_backwards"] == "1"
+
+    def test_every_setting_of_an_imu_reaches_its_driver(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        asked: dict[str, Any] = {}
+        monkeypatch.setattr(gx3_module, "open_imu", lambda port, **given: asked.update(given, port=port))
+        imu = loads(
+            "imus: {a: {port: /dev/x, protocol: mip, rate_hz: 250, filter_samples: 7, "
+            "baud: 460800, link: uart}}"
+        ).imus["a"]
+        imu_module.open_imu(imu)
+        assert asked == {
+            "port": "/dev/x",
+            "protocol": "mip",
+            "rate_hz": 250.0,
+            "filter_width": 7,
+            "baud": 460800,
+            "link": "uart",
+        }
 
     def test_image_is_stamped_mid_exposure_and_says_by_which_rule(self) -> None:
         role = CameraRole("rover", "cam0", CLOCK)

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import os
+import termios
 import tty
 
 import pytest
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceNotFoundError, DevicePermissionError
 from vical_drivers.microstrain import port as port_module
-from vical_drivers.microstrain.port import ArrivalLog, SerialPort, link_of, wait_for_silence
+from vical_drivers.microstrain.port import (
+    ArrivalLog,
+    SerialPort,
+    latency_timer_ms,
+    link_of,
+    wait_for_silence,
+)
 
 
 @pytest.fixture
@@ -71,6 +78,33 @@ def test_permission_denied_names_the_group(monkeypatch, tmp_path):
     monkeypatch.setattr(port_module.serial, "Serial", refuse)
     with pytest.raises(DevicePermissionError, match="usermod -aG"):
         SerialPort(str(tmp_path))
+
+
+@pytest.mark.parametrize("link", ["auto", "ftdi"])
+def test_a_real_port_is_held_and_left_for_good(terminal, monkeypatch, link):
+    """Nobody else gets in, and close waits for nothing. A terminal's flag would stay, its program reads on."""
+    asked = []
+
+    def ioctl(_fd, request, *_):
+        asked.append(request)
+        return bytes(4)
+
+    monkeypatch.setattr(port_module.fcntl, "ioctl", ioctl)
+    port = SerialPort(terminal[1], link=link)
+    monkeypatch.setattr(port._serial, "reset_output_buffer", lambda: asked.append("flush"))
+    port.close()
+    of_interest = [r for r in asked if r in (termios.TIOCEXCL, termios.TIOCNXCL, "flush")]
+    assert of_interest == ([] if link == "auto" else [termios.TIOCEXCL, "flush", termios.TIOCNXCL])
+
+
+def test_a_slow_latency_timer_is_found_and_said(tmp_path, terminal, monkeypatch, caplog):
+    (tmp_path / "ttyUSB0").mkdir()
+    (tmp_path / "ttyUSB0" / "latency_timer").write_text("16\n")
+    assert latency_timer_ms("/dev/ttyUSB0", str(tmp_path)) == 16
+    assert latency_timer_ms("/dev/ttyACM0", str(tmp_path)) is None
+    monkeypatch.setattr(port_module, "latency_timer_ms", lambda _name: 16)
+    SerialPort(terminal[1]).close()
+    assert "latency_timer=16ms" in caplog.text and "udev rule" in caplog.text
 
 
 def test_links_are_told_by_name():
