@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.calibration_text import euler_deg
@@ -12,6 +13,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 Row = tuple[str, str, str, str]  # name, estimate, sigma, unit
+Estimates = Mapping[tuple[str, str], CalibrationEstimate]  # by rig and camera
+Health = Mapping[tuple[str, str], tuple[str, str]]  # by rig and component: level and message
+_LEVELS = {"ok": "green", "warn": "yellow", "error": "red", "stale": "red"}
+_STEP_RAD = 1e-6
 
 
 def rows(camera: CameraEstimate) -> list[Row]:
@@ -24,8 +29,8 @@ def rows(camera: CameraEstimate) -> list[Row]:
     ]
     angles = euler_deg(pose.q_wxyz)
     table += [
-        (name, f"{angle:.3f}", f"{math.degrees(s):.3f}", "deg")
-        for name, angle, s in zip(("roll", "pitch", "yaw"), angles, sigma[3:], strict=True)
+        (name, f"{angle:.3f}", f"{s:.3f}", "deg")
+        for name, angle, s in zip(("roll", "pitch", "yaw"), angles, euler_sigma_deg(camera), strict=True)
     ]
     shift, shift_sigma = camera.timeshift_cam_imu_s, camera.timeshift_sigma_s
     table.append(("time shift", f"{1e3 * shift:.3f}", f"{1e3 * shift_sigma:.3f}", "ms"))
@@ -35,6 +40,26 @@ def rows(camera: CameraEstimate) -> list[Row]:
         ):
             table.append((name, f"{value:.2f}", f"{s:.2f}", "px"))
     return table
+
+
+def euler_sigma_deg(camera: CameraEstimate) -> list[float]:
+    """Return the sigmas of roll, pitch and yaw, deg: J C J^T with J by differences (large near pitch 90)."""
+    w, x, y, z = camera.T_imu_cam.q_wxyz
+    h = 0.5 * _STEP_RAD
+    turned = ([w - x * h, x + w * h, y + z * h, z - y * h],
+              [w - y * h, x - z * h, y + w * h, z + x * h],
+              [w - z * h, x + y * h, y - x * h, z + w * h])  # fmt: skip
+    angles = euler_deg(camera.T_imu_cam.q_wxyz)
+    rows = [[_wrapped(b - a) / _STEP_RAD for a, b in zip(angles, euler_deg(q), strict=True)] for q in turned]
+    cov = [row[3:] for row in camera.T_imu_cam.covariance[3:]]
+    variances = [
+        sum(rows[i][k] * cov[i][j] * rows[j][k] for i in range(3) for j in range(3)) for k in range(3)
+    ]
+    return [math.sqrt(max(variance, 0.0)) for variance in variances]
+
+
+def _wrapped(angle_deg: float) -> float:
+    return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def one_line(camera: str, estimate: CalibrationEstimate) -> str:
@@ -75,3 +100,21 @@ def picture(camera: str, estimate: CalibrationEstimate, health: list[str]) -> Re
     bar = ProgressBar(total=1.0, completed=min(max(estimate.progress, 0.0), 1.0), width=40)
     advice = Text(estimate.guidance or estimate.reason, style="yellow")
     return Group(head, bar, advice, table, *(Text(line, style="dim") for line in health))
+
+
+def screen(estimates: Estimates, health: Health) -> RenderableType:
+    """Return what `vical watch` shows: every camera, then what each component says of itself."""
+    from rich.console import Group
+    from rich.padding import Padding
+    from rich.table import Table
+    from rich.text import Text
+
+    parts: list[RenderableType] = []
+    for (rig, camera), estimate in sorted(estimates.items()):
+        parts += [Text(f"rig {rig}", style="bold"), Padding(picture(camera, estimate, []), (0, 0, 1, 0))]
+    if not parts:
+        parts.append(Text("waiting for a calibration; is `vical run` (vical.target) up?"))
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for (rig, name), (level, message) in sorted(health.items()):
+        table.add_row(Text(rig, style="dim"), name, Text(level, style=_LEVELS.get(level, "")), message)
+    return Group(*parts, table)

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from vical_daemon.cli.errors import EXIT_FAILURE, CliError
+from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
@@ -40,14 +40,14 @@ def run(args: argparse.Namespace) -> int:
 
     bus = open_client(args.config, args.connect)
     try:
-        view = _View(args)
+        view = View(args.rig, as_json=args.json)
         view.begin(bus)
         return _loop(args, view)
     finally:
         bus.close()
 
 
-def _loop(args: argparse.Namespace, view: _View) -> int:
+def _loop(args: argparse.Namespace, view: View) -> int:
     end_s = time.monotonic() + args.timeout if args.timeout else float("inf")
     if args.once:
         end_s = min(end_s, time.monotonic() + 3.0)
@@ -66,33 +66,52 @@ def _loop(args: argparse.Namespace, view: _View) -> int:
         if not view.estimates:
             raise CliError("nothing is calibrating here; is `vical run` (vical.target) up?")
         return 0
-    return EXIT_FAILURE
+    raise CliError(f"{args.timeout:g} s are over: {view.where()}")
 
 
-class _View:
+class View:
     """The last estimate of each camera and the last words of each role."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
-        self._rig: str = args.rig
-        self._json: bool = args.json
+    def __init__(self, rig: str, *, as_json: bool) -> None:
+        self._rig, self._json = rig, as_json
         self.estimates: dict[tuple[str, str], CalibrationEstimate] = {}
-        self.health: dict[tuple[str, str], str] = {}
+        self.health: dict[tuple[str, str], tuple[str, str]] = {}
         self._unprinted: deque[tuple[str, str, CalibrationEstimate]] = deque(maxlen=10_000)
 
     def begin(self, bus: Bus) -> None:
         """Ask for the last values first: a late joiner sees the state at once."""
         from vical_daemon import topics
 
-        for topic, handler in ((topics.CALIBRATION, self._on_estimate), (topics.STATUS, self._on_status)):
+        for topic in (topics.CALIBRATION, topics.STATUS):
             key = topic.pattern.format(rig=self._rig, name="*")
             for sample in bus.latest(key):
-                handler(sample)
-            bus.subscribe(key, handler)
+                self.take(sample)
+            bus.subscribe(key, self.take)
+
+    def take(self, sample: Sample) -> None:
+        """Take a message; others than calibrations and statuses are ignored."""
+        from vical_daemon import topics
+
+        parsed = topics.parse_key(sample.key)
+        if parsed is not None and parsed.topic is topics.CALIBRATION:
+            self._on_estimate(parsed.rig, parsed.name, sample)
+        elif parsed is not None and parsed.topic is topics.STATUS:
+            self._on_status(parsed.rig, sample)
 
     def all_converged(self) -> bool:
+        """Whether there is a camera and every one has converged."""
         return bool(self.estimates) and all(e.status == "converged" for e in self.estimates.values())
 
+    def where(self) -> str:
+        """Say in a few words how far each camera is."""
+        each = [
+            f"{camera} of {rig} is {estimate.status} ({estimate.progress:.0%})"
+            for (rig, camera), estimate in sorted(self.estimates.items())
+        ]
+        return ", ".join(each) or "nothing is calibrating here; is `vical run` (vical.target) up?"
+
     def print_all(self) -> None:
+        """Print the last estimate of each camera."""
         for (rig, camera), estimate in sorted(self.estimates.items()):
             self._print(rig, camera, estimate)
 
@@ -103,19 +122,15 @@ class _View:
             if self._json or not sys.stdout.isatty():
                 self._print(*entry)
 
-    def _on_estimate(self, sample: Sample) -> None:
-        from vical_daemon import topics
+    def _on_estimate(self, rig: str, camera: str, sample: Sample) -> None:
         from vical_daemon.messages import MessageError, decode_calibration
 
-        parsed = topics.parse_key(sample.key)
         try:
             estimate = decode_calibration(sample.payload).estimate
         except MessageError:
             return
-        if parsed is None or parsed.topic is not topics.CALIBRATION:
-            return
-        self.estimates[parsed.rig, parsed.name] = estimate
-        self._unprinted.append((parsed.rig, parsed.name, estimate))
+        self.estimates[rig, camera] = estimate
+        self._unprinted.append((rig, camera, estimate))
 
     def _print(self, rig: str, camera: str, estimate: CalibrationEstimate) -> None:
         if self._json:
@@ -125,19 +140,16 @@ class _View:
 
             print(f"{rig}  {one_line(camera, estimate)}", flush=True)
 
-    def _on_status(self, sample: Sample) -> None:
-        from vical_daemon import topics
+    def _on_status(self, rig: str, sample: Sample) -> None:
         from vical_daemon.messages import MessageError, decode_diagnostics
 
-        parsed = topics.parse_key(sample.key)
         try:
             statuses = decode_diagnostics(sample.payload).statuses
         except MessageError:
             return
-        if parsed is not None:
-            for status in statuses:
-                if status.name != "clock":
-                    self.health[parsed.rig, status.name] = f"{status.level.name.lower():<6}{status.message}"
+        for status in statuses:
+            if status.name != "clock":
+                self.health[rig, status.name] = (status.level.name.lower(), status.message)
 
 
 class _screen:  # noqa: N801 (used like a function)
@@ -159,21 +171,9 @@ class _screen:  # noqa: N801 (used like a function)
         if self._live is not None:
             self._live.__exit__(*args)
 
-    def _show(self, view: _View) -> None:
+    def _show(self, view: View) -> None:
         if self._live is None:
             return
-        from rich.console import Group
-        from rich.text import Text
+        from vical_daemon.cli.live_table import screen
 
-        from vical_daemon.cli.live_table import picture
-
-        parts: list[Any] = [
-            Group(Text(f"rig {rig}", style="bold"), picture(camera, estimate, []))
-            for (rig, camera), estimate in sorted(view.estimates.items())
-        ]
-        parts = parts or [Text("waiting for a calibration; is `vical run` (vical.target) up?")]
-        parts += [
-            Text(f"{rig}  {name:<14} {text}", style="dim")
-            for (rig, name), text in sorted(view.health.items())
-        ]
-        self._live.update(Group(*parts), refresh=True)
+        self._live.update(screen(view.estimates, view.health), refresh=True)

@@ -167,11 +167,15 @@ def test_in_a_browser(fed, browser, tmp_path):
     async def script(page):
         await page.open(fed.address)
         await page.wait("document.getElementById('link').textContent === 'live'")
-        await page.wait("document.getElementById('picture').naturalWidth === 640")
+        await page.wait("document.getElementById('picture').width === 640")
         marks = await page.wait("document.querySelectorAll('#corners path').length === 2")
         misfit = await page.evaluate("document.getElementById('misfit').textContent")
         status = await page.wait("document.getElementById('status').classList.contains('converged')")
         lever = await page.evaluate("document.getElementById('lever').textContent")
+        sigmas = await page.evaluate("anglesSigma([0.9238795, 0, 0, 0.3826834], [0.1, 0.2, 0.3])")
+        np.testing.assert_allclose(
+            sigmas, [0.3, 0.2, 0.1], rtol=1e-3
+        )  # of yaw, pitch, roll: turned about z alone
         before = await page.evaluate("page.rows.cam0.length")
         await page.wait(f"page.rows.cam0.length > {before}")  # live
         drawn = await page.evaluate(
@@ -214,7 +218,7 @@ def test_commands_and_a_phone_in_a_browser(fed, browser, tmp_path):
         await page.evaluate("document.getElementById('token').value = 'open sesame'")
         await page.evaluate("document.querySelector('button[value=record_start]').click()")
         await page.wait("document.getElementById('answer').textContent.startsWith('sent')")
-        await page.wait("document.getElementById('picture').naturalWidth === 640")
+        await page.wait("document.getElementById('picture').width === 640")
         await page.evaluate("window.scrollTo(0, 0)")
         await page.screenshot(keep / "phone.png")
         return wide

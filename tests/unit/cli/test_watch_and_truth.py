@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import threading
@@ -64,9 +65,10 @@ def test_until_converged_waits_for_every_camera_of_the_rig(bus: LocalBus, capsys
     assert "shift -12.50 ± 0.10 ms" in lines[0] and "turn about x" in lines[0]
 
 
-def test_out_of_time_exits_1(bus: LocalBus) -> None:
+def test_out_of_time_exits_1_and_says_where_it_stands(bus: LocalBus, capsys) -> None:
     _publish(bus, "rover", Status.CONVERGING)
     assert main(["watch", "--until-converged", "--timeout", "0.3"]) == 1
+    assert "cam0 of rover is converging (50%)" in capsys.readouterr().err
 
 
 def test_junk_on_the_bus_is_ignored(bus: LocalBus, capsys) -> None:
@@ -84,6 +86,32 @@ def test_table_rows_carry_units() -> None:
     rows = live_table.rows(_estimate().cameras["cam0"])
     assert rows[0] == ("position x", "80.00", "1.00", "mm")
     assert rows[6] == ("time shift", "-12.500", "0.100", "ms")
+
+
+def test_sigmas_of_roll_pitch_yaw_are_those_of_sampled_rotations() -> None:
+    x, y, z, w = Rotation.from_euler("ZYX", [87.0, 40.0, -120.0], degrees=True).as_quat(canonical=True)
+    root = np.diag([1e-3, 2e-3, 3e-3]) @ np.array([[1.0, 0, 0], [0.5, 0.8, 0], [-0.3, 0.2, 0.9]])
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = root @ root.T
+    pose = PoseEstimate([0.0] * 3, [w, x, y, z], covariance.tolist())
+    camera = CameraEstimate(pose, 0.0, 0.0, [], [], "radtan", [], [], 0.0)
+    errors = np.random.default_rng(3).standard_normal((20_000, 3)) @ root.T
+    sampled = Rotation.from_quat([x, y, z, w]) * Rotation.from_rotvec(errors)
+    yaw, pitch, roll = sampled.as_euler("ZYX", degrees=True).std(axis=0)
+    np.testing.assert_allclose(live_table.euler_sigma_deg(camera), [roll, pitch, yaw], rtol=0.03)
+
+
+def test_the_screen_shows_cameras_and_health() -> None:
+    from rich.console import Console
+
+    console = Console(record=True, width=100, force_terminal=True, file=io.StringIO())
+    health = {("rover", "imu/imu0"): ("ok", "100.0 Hz, 0 lost"), ("rover", "detect/cam0"): ("warn", "few")}
+    console.print(live_table.screen({("rover", "cam0"): _estimate()}, health))
+    text = console.export_text(clear=False)
+    assert "cam0 in the imu frame" in text and "turn about x" in text and "100.0 Hz, 0 lost" in text
+    assert "<svg" in console.export_svg(title="vical watch")
+    console.print(live_table.screen({}, {}))
+    assert "is `vical run` (vical.target) up?" in console.export_text()
 
 
 def _result(p_m: Any, rotation: Rotation, shift_s: float, sigma: float) -> dict[str, Any]:

@@ -68,6 +68,14 @@ function yawPitchRoll(q) { // Rz(yaw) Ry(pitch) Rx(roll), degrees
   ].map((v) => (v * 180) / Math.PI);
 }
 
+function anglesSigma(q, s) { // of yaw, pitch, roll in degrees, from sigmas (deg) about the camera's axes
+  const h = 1e-4;
+  const turned = [[1, h, 0, 0], [1, 0, h, 0], [1, 0, 0, h]].map((d) => conjugateTimes([q[0], -q[1], -q[2], -q[3]], d));
+  const base = yawPitchRoll(q);
+  const wrap = (a) => a - 360 * Math.round(a / 360);
+  return base.map((angle, k) => Math.hypot(...turned.map((t, i) => (wrap(yawPitchRoll(t)[k] - angle) / ((h * 360) / Math.PI)) * s[i])));
+}
+
 function drawCharts() {
   const rows = page.rows[page.camera] || [];
   const at = (name) => page.columns.indexOf(name);
@@ -88,8 +96,8 @@ function drawCharts() {
   const turns = rows.map((r) => turnFrom(now, r.slice(first, first + 4)));
   charts.rotation.set(AXES.map((_, i) => ({ t, v: turns.map((r) => r[i]), s: column(SR[i]), colour: COLOURS[i] })), page.span);
   const angles = last ? yawPitchRoll(now) : [null, null, null];
-  const worst = last ? Math.max(...SR.map(value)) : 0;
-  fillValues("rotation", [["yaw", "one", angles[0], worst], ["pitch", "one", angles[1], worst], ["roll", "one", angles[2], worst]]);
+  const sigmas = last ? anglesSigma(now, SR.map(value)) : [0, 0, 0];
+  fillValues("rotation", ["yaw", "pitch", "roll"].map((name, i) => [name, "one", angles[i], sigmas[i]]));
 
   charts.shift.set([{ t, v: column("shift_ms"), s: column("sshift_ms"), colour: "--one" }], page.span);
   fillValues("shift", [["", "one", value("shift_ms"), value("sshift_ms")]]);

@@ -7,6 +7,7 @@ class CameraScreen {
     this.name = null;
     this.source = null;
     this.last = null;
+    this.number = 0;
     for (const id of ["show-detected", "show-predicted"]) this.byId(id).onchange = () => this.draw();
   }
 
@@ -15,18 +16,26 @@ class CameraScreen {
     this.name = name;
     if (this.source) this.source.close();
     this.source = new EventSource(`camera/${encodeURIComponent(name)}/events`);
-    this.source.addEventListener("picture", (event) => this.show(JSON.parse(event.data)));
+    this.source.addEventListener("picture", (event) => {
+      this.number += 1;
+      this.show(Object.assign(JSON.parse(event.data), { number: this.number }));
+    });
     this.source.onerror = () => document.querySelector(".screen").classList.remove("live");
   }
 
   async show(picture) {
-    const image = this.byId("picture");
+    const image = new Image();
     image.src = `data:image/jpeg;base64,${picture.jpeg}`;
     try {
-      await image.decode(); // picture and corners change together
+      await image.decode();
     } catch (error) {
-      return;
+      return; // not a picture: the next one comes soon
     }
+    if (this.last && picture.number < this.last.number) return;
+    const canvas = this.byId("picture"); // picture and corners change in one step, never one before the other
+    canvas.width = image.naturalWidth;
+    canvas.height = image.naturalHeight;
+    canvas.getContext("2d").drawImage(image, 0, 0);
     this.last = picture;
     this.draw();
     document.querySelector(".screen").classList.add("live");

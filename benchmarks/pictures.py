@@ -1,0 +1,129 @@
+"""The pictures of the documentation, taken from a demo: page, phone, terminal and report.
+
+    python -m benchmarks pictures --out docs/_static
+
+A browser looks at the live page of a running `vical demo`; afterwards `vical calibrate --report` makes the
+report from the log of that demo, and what `vical watch` shows is drawn from the messages in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import io
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from vical_daemon.cli import live_table
+from vical_daemon.cli.watch import View
+from vical_daemon.mcap_log import LogReader
+
+ROOT = Path(__file__).resolve().parents[1]
+_VICAL = [sys.executable, "-m", "vical_daemon"]
+
+
+def main(argv: list[str]) -> int:
+    """Take the pictures."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks pictures", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("pictures"), help="folder (default: ./pictures)")
+    parser.add_argument("--seconds", type=float, default=45.0, help="length of the demo")
+    args = parser.parse_args(argv)
+    browser = _browser()
+    if browser.find() is None:
+        print("skipped: no Chromium here (apt-get install chromium)", file=sys.stderr)
+        return 0
+    args.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        log = live_page(browser, work, args.out, args.seconds)
+        terminal(browser, work, log, args.out / "terminal.png")
+        report(browser, work, log, args.out / "demo_report.png")
+    print("\n".join(str(path) for path in sorted(args.out.glob("*.png"))))
+    return 0
+
+
+def live_page(browser: Any, work: Path, out: Path, seconds: float) -> Path:
+    """Run the demo, look at its page on a desk and on a phone; return the demo's log."""
+    command = [*_VICAL, "demo", "--web", "0", "--seconds", str(seconds), "--out", str(work / "demo")]
+    demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert demo.stderr is not None
+    address = next(m.group(1) for line in demo.stderr if (m := re.search(r"live page at (\S+)", line)))
+
+    async def script(page: Any) -> None:
+        await page.open(address)
+        await page.wait("document.getElementById('status').classList.contains('converged')", seconds + 15)
+        await page.wait(f"page.latest.cam0.duration_s > {0.7 * seconds}", seconds + 15)
+        await page.wait("document.querySelectorAll('#corners path').length === 2")
+        await page.screenshot(out / "page.png")
+        await page.open(address, 390, 844, dark=True)
+        await page.wait("document.querySelectorAll('#corners path').length === 2")
+        await page.screenshot(out / "phone.png")
+
+    try:
+        browser.drive(script, work / "profile")
+        demo.communicate(timeout=seconds + 60)
+    finally:
+        demo.kill()
+    return next(iter((work / "demo").glob("*.mcap")))
+
+
+def terminal(browser: Any, work: Path, log: Path, path: Path) -> None:
+    """Draw what `vical watch` showed at the end of the log."""
+    from rich.console import Console
+
+    from vical_daemon.bus import Sample
+
+    view = View("*", as_json=False)
+    for message in LogReader(log).messages():
+        view.take(Sample(message.channel.topic.removeprefix("/"), message.payload, 0))
+    console = Console(record=True, width=104, force_terminal=True, file=io.StringIO())
+    console.print(live_table.screen(view.estimates, view.health))
+    picture(browser, work, console.export_svg(title="vical watch"), path)
+
+
+def picture(browser: Any, work: Path, svg: str, path: Path) -> None:
+    """Turn an SVG of rich into a PNG, its fonts replaced by the browser's own: nothing is fetched."""
+    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)
+    (work / "terminal.html").write_text(f"<body style='margin:0;background:#fff'>{svg}</body>")
+
+    async def script(page: Any) -> None:
+        await page.open((work / "terminal.html").as_uri(), 1100, 900)
+        await page.wait("!!document.querySelector('svg')")
+        height = await page.evaluate("document.querySelector('svg').getBoundingClientRect().height")
+        await page.open((work / "terminal.html").as_uri(), 1100, round(height) + 2)
+        await page.wait("!!document.querySelector('svg')")
+        await page.screenshot(path)
+
+    browser.drive(script, work / "profile")
+
+
+def report(browser: Any, work: Path, log: Path, path: Path) -> None:
+    """Make the report of the log and look at its first page."""
+    html = work / "report.html"
+    command = [*_VICAL, "calibrate", str(log), "--target", str(work / "demo" / "target.yaml"), "--report"]
+    subprocess.run([*command, str(html)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    async def script(page: Any) -> None:
+        await page.open(html.as_uri(), 1100, 1400)
+        await page.wait("document.readyState === 'complete' && document.images.length > 0")
+        await page.screenshot(path)
+
+    browser.drive(script, work / "profile")
+
+
+def _browser() -> Any:
+    """Load the tests' driver of a headless Chromium (tests have no packages)."""
+    path = ROOT / "tests" / "system" / "output" / "browser.py"
+    spec = importlib.util.spec_from_file_location("vical_browser", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
