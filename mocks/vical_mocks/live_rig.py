@@ -163,7 +163,7 @@ class LiveCamera:
     @property
     def info(self) -> DeviceInfo:
         """Who the camera is."""
-        return DeviceInfo("simulated", "rendered board", SERIAL_CAMERA)
+        return DeviceInfo("camera", "rendered board", SERIAL_CAMERA, protocol="simulated")
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `FrameSource.read`."""

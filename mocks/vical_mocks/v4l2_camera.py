@@ -29,7 +29,11 @@ INTEGER, BOOLEAN, MENU = 1, 2, 3
 
 @dataclass
 class FakeControl:
-    """One control; `off_unless` names (control id, value) that must hold, or the kernel says EACCES."""
+    """One control; `off_unless` names (control id, value) that must hold, or the kernel says EACCES.
+
+    `broken` is the error of every request about it: the camera announces it and does not know it. `stalled`
+    that of reading and writing alone.
+    """
 
     control_id: int
     name: str
@@ -40,6 +44,8 @@ class FakeControl:
     step: int = 1
     menu: dict[int, str] = field(default_factory=dict)
     off_unless: tuple[int, int] | None = None
+    broken: int = 0
+    stalled: int = 0
 
 
 def webcam_controls() -> list[FakeControl]:

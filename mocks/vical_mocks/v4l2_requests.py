@@ -21,6 +21,7 @@ from vical_mocks.v4l2_camera import INACTIVE, Bytes, FakeCamera, FakeControl, Fr
 
 VIDEO, META = 1, 13
 _T = TypeVar("_T")
+_NEXT_CONTROL = 0x80000000
 
 
 class VirtualClock:
@@ -229,9 +230,14 @@ class Requests:
     def _query_ctrl(self, held: OpenNode, data: bytearray) -> None:
         (wanted,) = struct.unpack_from("<I", data, 0)
         camera = held.plugged.camera
-        later = [c for c in sorted(camera.controls, key=lambda c: c.control_id)
-                 if c.control_id > wanted & 0x0FFFFFFF]  # fmt: skip
-        c = _pick(later, 0)
+        number = wanted & 0x0FFFFFFF
+        ordered = sorted(camera.controls, key=lambda c: c.control_id)
+        if wanted & _NEXT_CONTROL:
+            c = _pick([c for c in ordered if c.control_id > number], 0)
+        else:
+            c = _pick([c for c in ordered if c.control_id == number], 0)
+        if c.broken:
+            raise OSError(c.broken, "the camera does not know it")
         flags = 0 if _active(camera, c) else INACTIVE
         struct.pack_into("<II32s", data, 0, c.control_id, c.kind, c.name.encode())
         struct.pack_into("<qqQqI", data, 40, c.minimum, c.maximum, c.step, c.value, flags)
@@ -265,6 +271,8 @@ class Requests:
         control = held.plugged.camera.control(control_id)
         if count != 1 or control is None:
             raise OSError(errno.EINVAL, "no such control")
+        if control.broken or control.stalled:
+            raise OSError(control.broken or control.stalled, "the camera does not know it")
         return control, int(address)
 
     def _subscribe(self, held: OpenNode, data: bytearray) -> None:

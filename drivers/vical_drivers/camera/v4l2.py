@@ -278,7 +278,8 @@ class V4l2Camera:
         self._stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
 
     def _frame(self, session: _Session, buffer: DequeuedBuffer) -> Frame | None:
-        t_arrival_ns = self._kernel.monotonic_ns()
+        # Both clocks at once, and before anything takes time: a stamp of the wall clock is moved by the pair.
+        t_arrival_ns, t_realtime_ns = self._kernel.monotonic_ns(), self._kernel.realtime_ns()
         self._pending_loss += self._sequence.missing_before(buffer.sequence)
         image = self._image(session, buffer)
         if image is None:
@@ -291,7 +292,7 @@ class V4l2Camera:
             if not image.flags.owndata:
                 image = image.copy()
             session.node.queue(buffer.index)
-        raw = self._raw_stamp(session, buffer, t_arrival_ns)
+        raw = self._raw_stamp(session, buffer, t_arrival_ns, t_realtime_ns)
         stamp, exposure_ns = self._stamper.stamp(raw)
         self._say_rule(stamp.rule)
         dropped, self._pending_loss = self._pending_loss, 0
@@ -326,7 +327,9 @@ class V4l2Camera:
             _log.debug("corrupt image sequence=%d: %s", buffer.sequence, error)
             return None
 
-    def _raw_stamp(self, session: _Session, buffer: DequeuedBuffer, t_arrival_ns: int) -> RawStamp:
+    def _raw_stamp(
+        self, session: _Session, buffer: DequeuedBuffer, t_arrival_ns: int, t_realtime_ns: int
+    ) -> RawStamp:
         if session.metadata is not None:
             fitted = session.metadata.stamp(buffer)
             if fitted is not None:
@@ -335,7 +338,7 @@ class V4l2Camera:
             buffer,
             driver=session.identity.driver,
             monotonic_ns=t_arrival_ns,
-            realtime_ns=self._kernel.realtime_ns(),
+            realtime_ns=t_realtime_ns,
             forced=self._settings.stamp,
             uvc_hwtimestamps=session.uvc_hwtimestamps,
         )

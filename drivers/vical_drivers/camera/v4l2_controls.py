@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import logging
+import os
 import re
 from dataclasses import dataclass, field
 
@@ -12,6 +14,7 @@ from vical_drivers.camera.kernel import Kernel
 from vical_drivers.camera.v4l2_node import VideoNode, translate
 from vical_drivers.errors import DeviceRefusedError
 
+_log = logging.getLogger(__name__)
 ALIASES: dict[str, int] = {
     "exposure_absolute": abi.CID_EXPOSURE_ABSOLUTE,
     "exposure_time_absolute": abi.CID_EXPOSURE_ABSOLUTE,
@@ -36,6 +39,21 @@ _SIMPLE_TYPES = frozenset(
         abi.CTRL_TYPE_BUTTON,
     }
 )
+_ESSENTIAL = (
+    abi.CID_EXPOSURE_AUTO,
+    abi.CID_EXPOSURE_ABSOLUTE,
+    abi.CID_EXPOSURE_AUTO_PRIORITY,
+    abi.CID_AUTOGAIN,
+    abi.CID_GAIN,
+    abi.CID_ANALOGUE_GAIN,
+    abi.CID_FOCUS_AUTO,
+    abi.CID_AUTO_WHITE_BALANCE,
+)
+"""Asked for by number where the list breaks off."""
+_STALLED = frozenset(
+    {errno.EIO, errno.EPIPE, errno.EILSEQ, errno.ERANGE, errno.ETIMEDOUT, errno.EREMOTEIO, errno.EPROTO}
+)
+"""What uvcvideo returns where a camera does not know its own controls. A camera that is gone is ENODEV."""
 _KINDS = {abi.CTRL_TYPE_BOOLEAN: "boolean", abi.CTRL_TYPE_BUTTON: "button"}
 
 
@@ -101,10 +119,28 @@ class Controls:
             except OSError as error:
                 if error.errno in (errno.EINVAL, errno.ENOTTY):
                     return found
+                if error.errno in _STALLED:
+                    # Many kernels end the list at a control that the camera announces and does not know.
+                    _log.warning("controls path=%s listed=in part reason=%s", self._node.path, error.strerror)
+                    return found + self._asked_by_number({c.control_id for c in found})
                 raise translate(error, self._node.path, "list its controls") from error
             control_id = query.id
-            if query.type in _SIMPLE_TYPES and not query.flags & abi.CTRL_FLAG_DISABLED:
+            if _usable(query):
                 found.append(self._describe(query))
+
+    def _asked_by_number(self, known: set[int]) -> list[Control]:
+        found = []
+        for control_id in _ESSENTIAL:
+            query = abi.QueryExtCtrl(id=control_id)
+            try:
+                self._kernel.ioctl(self._node.fd, abi.VIDIOC_QUERY_EXT_CTRL, query)
+            except OSError as error:
+                if error.errno in _STALLED or error.errno == errno.EINVAL:
+                    continue
+                raise translate(error, self._node.path, "list its controls") from error
+            if control_id not in known and _usable(query):
+                found.append(self._describe(query))
+        return found
 
     def _describe(self, query: abi.QueryExtCtrl) -> Control:
         is_menu = query.type in (abi.CTRL_TYPE_MENU, abi.CTRL_TYPE_INTEGER_MENU)
@@ -196,9 +232,18 @@ class Controls:
                     f"{self._node.path}: cannot {doing}: the control is inactive or grabbed now; "
                     "switch the automatic control of it off first"
                 ) from error
+            if error.errno in _STALLED:
+                raise DeviceRefusedError(
+                    f"{self._node.path}: cannot {doing}: the camera answers with an error "
+                    f"({os.strerror(error.errno or 0)})"
+                ) from error
             raise translate(error, self._node.path, doing) from error
         wide = control.kind == "integer" and (control.minimum < -(1 << 31) or control.maximum >= 1 << 32)
         return int(item.value64) if wide else ctypes.c_int32(item.value64 & 0xFFFFFFFF).value
+
+
+def _usable(query: abi.QueryExtCtrl) -> bool:
+    return query.type in _SIMPLE_TYPES and not query.flags & abi.CTRL_FLAG_DISABLED
 
 
 def control_name(text: str) -> str:

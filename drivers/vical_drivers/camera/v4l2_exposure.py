@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 
 from vical_drivers.camera import v4l2_abi as abi
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.v4l2_controls import Control, Controls
 from vical_drivers.errors import DeviceRefusedError
 
+_log = logging.getLogger(__name__)
 _FIXED_EXPOSURE = (abi.EXPOSURE_MANUAL, abi.EXPOSURE_SHUTTER_PRIORITY)
 
 
@@ -69,8 +71,12 @@ def read_exposure_ns(controls: Controls) -> int | None:
     """Return the exposure time in force, ns; None where unknown or chosen by the camera itself."""
     if controls.find(abi.CID_EXPOSURE_ABSOLUTE) is None:
         return None
-    if controls.find(abi.CID_EXPOSURE_AUTO) is not None:
-        mode = controls.get(abi.CID_EXPOSURE_AUTO)
-        if mode not in _FIXED_EXPOSURE:
-            return None
-    return controls.get(abi.CID_EXPOSURE_ABSOLUTE) * abi.EXPOSURE_UNIT_NS
+    try:
+        if controls.find(abi.CID_EXPOSURE_AUTO) is not None:
+            mode = controls.get(abi.CID_EXPOSURE_AUTO)
+            if mode not in _FIXED_EXPOSURE:
+                return None
+        return controls.get(abi.CID_EXPOSURE_ABSOLUTE) * abi.EXPOSURE_UNIT_NS
+    except DeviceRefusedError as error:  # announced, and not known: some cameras are like that
+        _log.warning("exposure=unknown reason=%s", error)
+        return None

@@ -240,7 +240,8 @@ class VideoNode:
             return 0.0
         if rate_hz is not None and parm.parm.capture.capability & abi.CAP_TIMEPERFRAME:
             parm.parm.capture.timeperframe = abi.Fract(1_000_000, round(rate_hz * 1_000_000))
-            self.request(abi.VIDIOC_S_PARM, parm, f"run at {rate_hz:g} Hz")
+            if not self._enumerate(abi.VIDIOC_S_PARM, parm):  # it says that it can, and cannot: as it runs
+                self._enumerate(abi.VIDIOC_G_PARM, parm)
         return _rate_hz(parm.parm.capture.timeperframe)
 
     def start(self, buffers: int) -> int:

@@ -82,7 +82,7 @@ def test_permission_denied_names_the_group(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("link", ["auto", "ftdi"])
 def test_a_real_port_is_held_and_left_for_good(terminal, monkeypatch, link):
-    """Nobody else gets in, and close waits for nothing. A terminal's flag would stay, its program reads on."""
+    """Nobody else gets in; close waits for nothing. A terminal's flag would stay, its program reads on."""
     asked = []
 
     def ioctl(_fd, request, *_):
