@@ -16,8 +16,6 @@ source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build", "_ext"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
-# Pages may link source files, which are not part of the documentation.
-suppress_warnings = ["myst.xref_missing"]
 
 html_theme = "furo"
 html_title = f"vical {release}"

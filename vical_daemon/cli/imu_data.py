@@ -14,6 +14,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.imu_options import COLUMNS
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 
+MOVED_RPS, MOVED_MPS2 = 9e-3, 0.2  # 0.5 deg/s; twenty mg
 LOST_LIMIT = 0.02  # a recording that misses more samples than this is refused
 
 
@@ -58,6 +59,10 @@ def load(args: argparse.Namespace) -> EvenSamples:
         raise CliError(
             f"{path}: only {np.count_nonzero(use)} samples after --skip and --seconds, 100 are needed"
         )
+    from vical_daemon.recording.checks import check_imu
+    from vical_daemon.recording.model import ImuArrays
+
+    check_imu(name, ImuArrays(t_ns[use], gyro[use], accel[use]))  # units: g and deg/s are refused by name
     samples = even_grid(name, t_ns[use], gyro[use], accel[use])
     if samples.filled:
         print(
@@ -66,6 +71,22 @@ def load(args: argparse.Namespace) -> EvenSamples:
             file=sys.stderr,
         )
     return samples
+
+
+def moved_at_s(samples: EvenSamples) -> float | None:
+    """Return when a recording that should be at rest first moves, s; None if it never does.
+
+    Judged by means over a second: warming up and noise stay far below these limits, a touch does not.
+    """
+    n = max(round(samples.rate_hz), 1)
+    count = len(samples.gyro_rps) // n
+    if count < 2:
+        return None
+    moved = np.zeros(count, dtype=bool)
+    for signal, limit in ((samples.gyro_rps, MOVED_RPS), (samples.accel_mps2, MOVED_MPS2)):
+        means = signal[: count * n].reshape(count, n, 3).mean(axis=1)
+        moved |= (np.abs(means - np.median(means, axis=0)) > limit).any(axis=1)
+    return float(np.argmax(moved)) * n / samples.rate_hz if moved.any() else None
 
 
 def even_grid(name: str, t_ns: IntArray, gyro: FloatArray, accel: FloatArray) -> EvenSamples:

@@ -197,6 +197,28 @@ def test_csv_mistakes(tmp_path, capsys, text, says):
     assert len(error.splitlines()) == 1
 
 
+def test_units_and_motion_are_noticed(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    path = tmp_path / "x.csv"
+
+    def allan(gyro, force):
+        rows = np.hstack([gyro, force]) + 1e-3 * rng.standard_normal((2000, 6))
+        text = (f"{10**18 + k * 10**7}," + ",".join(map(str, row)) for k, row in enumerate(rows))
+        path.write_text("\n".join(text))
+        return main(["allan", str(path)]), capsys.readouterr().err
+
+    still, down = np.zeros((2000, 3)), np.tile([0.0, 0.0, 9.8], (2000, 1))
+    assert allan(still, down) == (0, "")
+    code, error = allan(still, down / 9.8)
+    assert code == 1
+    assert "it looks like g: multiply by 9.80665" in error
+    touched = still.copy()
+    touched[1205:1290, 1] = 0.05
+    code, error = allan(touched, down)
+    assert code == 0
+    assert "the IMU moved, first 12 s from the start" in error
+
+
 def test_many_lost_samples_are_refused(tmp_path, capsys):
     rng = np.random.default_rng(0)
     keep = np.sort(rng.choice(4000, 3000, replace=False))
