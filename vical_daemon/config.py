@@ -92,6 +92,7 @@ class CameraConfig:
         pixel_format: What travels from the camera, e.g. GREY or MJPG; None: the cheapest.
         stamp: What the driver's stamp marks; auto: what the driver says.
         controls: More controls by the camera's own names.
+        record_as: What a log holds: raw images, or compressed ones (png is lossless, jpeg is small).
         lens: Prior of intrinsics and mounting.
     """
 
@@ -104,6 +105,7 @@ class CameraConfig:
     pixel_format: str | None = None
     stamp: Literal["auto", "raw", "soe", "eof", "first-packet", "shutter-closed"] = "auto"
     controls: dict[str, float] = field(default_factory=dict)
+    record_as: Literal["raw", "png", "jpeg"] = "raw"
     lens: LensConfig = field(default_factory=LensConfig)
 
 

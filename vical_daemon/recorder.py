@@ -18,6 +18,7 @@ from vical_daemon.messages import (
     decode_string,
     merge_calibrations,
 )
+from vical_daemon.record_images import ImageCompressor
 from vical_daemon.record_queue import Arrival, RecordQueue
 from vical_daemon.topics import CALIBRATION, STATUS, Topic, command_key
 from vical_daemon.wall_clock import WallClock
@@ -33,6 +34,7 @@ class Recorder:
 
     def __init__(self, config: Config, folder: LogFolder, clock: WallClock) -> None:
         self._config, self._folder, self._clock = config, folder, clock
+        self._images = ImageCompressor(config)
         self._wanted = config.record.enabled
         self._session: LogSession | None = None
         self._problem = ""
@@ -62,8 +64,9 @@ class Recorder:
         self._learn(item)
         if self._session is None:
             return
+        key, payload = self._images.as_recorded(item.key, item.payload)
         try:
-            self._session.write(item.key, item.payload, item.log_time_ns, latched=_latches(item.topic))
+            self._session.write(key, payload, item.log_time_ns, latched=_latches(item.topic))
             self.messages += 1
         except LogError as error:
             self._fail(str(error))
@@ -229,6 +232,7 @@ class Recorder:
             "dropped": str(sum(queue.dropped.values())),
             "lost_on_bus": str(lost),
             "refused": str(self.refused),
+            "images_not_compressed": str(self._images.failures),
             "files_deleted": str(self._folder.deleted),
         }
         try:
