@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.rotation_curves import GyroCurve
-from vical_daemon.estimation.rotation_start import Start, debiased_start
+from vical_daemon.estimation.rotation_curves import GyroCurve, RotationCurve
+from vical_daemon.estimation.rotation_start import Start, coarse_start, debiased_start
 from vical_daemon.estimation.stamp_stretch import find_stretch
 
 FloatArray = npt.NDArray[np.float64]
@@ -63,6 +63,24 @@ def explain(
     return "" if factor is None else stretched(1.0 / factor - 1.0)
 
 
+def explain_stream(
+    curve: RotationCurve,
+    t_s: FloatArray,
+    q_world_sensor: FloatArray,
+    shifts_s: tuple[float, float],
+    found: Start | None,
+) -> str:
+    """The same for two streams of orientations, without a gyro; arguments as in `explain`."""
+    inverted = _score(coarse_start(curve, t_s, so3.quat_conjugate(q_world_sensor), shifts_s))
+    if inverted < min(_FITS, _BETTER * _score(found)):
+        return (
+            "its orientations or the reference's are inverted: the world's in the sensor, not the sensor's "
+            "in the world (with the inverses the rotations fit)"
+        )
+    factor = find_stretch(curve, t_s, q_world_sensor, shifts_s)
+    return "" if factor is None else stretched(1.0 / factor - 1.0, "sensor", "reference")
+
+
 def _score(start: Start | None) -> float:
     """How badly a start fits: misfit over size of the turns; infinite where it is none."""
     if start is None or start.mirrored or start.agreement < 0.3:
@@ -70,12 +88,13 @@ def _score(start: Start | None) -> float:
     return start.misfit_rad / max(start.typical_rad, 1e-9)
 
 
-def stretched(rate: float) -> str:
+def stretched(rate: float, sensor: str = "camera", reference: str = "imu") -> str:
     """Words for a delay that grows by `rate` seconds a second."""
     excess = 1.0 / (1.0 + rate) - 1.0
     size = f"{100 * abs(excess):.1f} %" if abs(excess) >= 2e-3 else f"{1e6 * abs(excess):.0f} ppm"
     return (
-        f"the stamps of camera and imu advance at different rates: the camera's are {size} too "
-        f"{'fast' if excess > 0 else 'slow'} for the imu's (or the imu's the other way round); the rotations "
-        "fit once that is taken out: look at how the stamps are made (a nominal rate, a wrong tick length?)"
+        f"the stamps of {sensor} and {reference} advance at different rates: the {sensor}'s are {size} too "
+        f"{'fast' if excess > 0 else 'slow'} for the {reference}'s (or those the other way round); the "
+        "rotations fit once that is taken out: look at how the stamps are made (a nominal rate, a "
+        "wrong tick length?)"
     )

@@ -18,10 +18,11 @@ from vical_daemon.estimation.orientation_fit import DriftNoise, Fit, Orientation
 from vical_daemon.estimation.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.rotation_registration import closest_point_registration
 from vical_daemon.estimation.rotation_start import coarse_start
+from vical_daemon.estimation.rotation_suspects import explain_stream, stretched
 from vical_daemon.estimation.td_icp import td_icp
 from vical_daemon.estimation.td_icp_input import clean_gyro, clean_orientations
 from vical_daemon.estimation.td_icp_joint_result import JointResult, PairDelay, SensorDelay
-from vical_daemon.estimation.td_icp_refusals import refuse_start
+from vical_daemon.estimation.td_icp_refusals import RATE_SIGMAS, UNEVEN, refuse_start
 from vical_daemon.estimation.td_icp_result import OK, REFUSED, TdIcpOptions, TdIcpResult
 
 __all__ = [
@@ -194,7 +195,8 @@ def joint_of_orientations(
         start = coarse_start(curve, t, q, (guess - reach, guess + reach))
         reason = refuse_start(start, t, q, options)
         if start is None or reason:
-            reasons.append(f"{stream.name}: {reason}")
+            mistake = explain_stream(curve, t, q, (guess - reach, guess + reach), start)
+            reasons.append(f"{stream.name}: {mistake or reason}")
             continue
         rough = closest_point_registration(curve, t, q, start)
         sensors.append(
@@ -225,6 +227,7 @@ def _together(
         fit = polish(make_curve, tuple(sensor for _, sensor in sensors), bias, noise)
     except np.linalg.LinAlgError:
         return JointResult(REFUSED, "the orientations do not fit the reference together", reference)
+    reasons += _uneven(names, fit, known="".join(reasons))
     S = len(names)
     covariance = fit.covariance[: 4 * S, : 4 * S]
     low, high = make_curve(bias).span_s
@@ -239,6 +242,14 @@ def _together(
         covariance,
         fit.bias_rps,
     )
+
+
+def _uneven(names: list[str], fit: Fit, known: str) -> list[str]:
+    """Sensors whose delay does not stay, unless that has been said."""
+    limit = np.maximum(UNEVEN, RATE_SIGMAS * fit.stamp_rate_sigma)
+    bad = np.flatnonzero(np.abs(fit.stamp_rate) > limit)
+    rates = {names[i]: float(fit.stamp_rate[i]) for i in bad if f"{names[i]}: " not in known}
+    return [f"{name}: {stretched(rate, 'sensor', 'reference')}" for name, rate in rates.items()]
 
 
 def _delay(fit: Fit, i: int, span_s: tuple[float, float]) -> SensorDelay:

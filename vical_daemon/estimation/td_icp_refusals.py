@@ -17,9 +17,9 @@ _DEG = np.pi / 180.0
 _MIN_RATE_RPS = 3.0 * _DEG  # slower than this is "not moving"
 _SHIFT_LOST_S = 3e-3
 _ROTATION_LOST_RAD = 3.0 * _DEG
-_UNEVEN = 1e-3  # no two crystals are as far apart
+UNEVEN = 1e-3  # no two crystals are as far apart
 _STRETCHED = 5e-3  # beyond this no delay makes sense
-_RATE_SIGMAS = 6.0
+RATE_SIGMAS = 6.0
 
 
 def refuse_motion(
@@ -88,7 +88,7 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
     if pairs < max(MIN_ORIENTATIONS, 0.25 * n):
         return REFUSED, f"only {pairs} of {n} orientations fit the gyro at the best delay"
     rate, rate_sigma = float(fit.stamp_rate[0]), float(fit.stamp_rate_sigma[0])
-    if abs(rate) > max(_STRETCHED, _RATE_SIGMAS * rate_sigma):
+    if abs(rate) > max(_STRETCHED, RATE_SIGMAS * rate_sigma):
         return REFUSED, stretched(rate)
     if noise > 3.0 * _DEG:
         return REFUSED, f"gyro and camera disagree by {noise / _DEG:.1f} deg (rms) at the best delay"
@@ -108,6 +108,6 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
             f"(sigma {np.sqrt(values[2]) / _DEG:.0f} deg): the motion turned about this axis only; "
             "turn about another"
         )
-    if abs(rate) > max(_UNEVEN, _RATE_SIGMAS * rate_sigma):
+    if abs(rate) > max(UNEVEN, RATE_SIGMAS * rate_sigma):
         reasons.append(stretched(rate))
     return (DEGENERATE if reasons else OK), "; ".join(reasons)

@@ -1,5 +1,7 @@
 """Several sensors at once: delays of all pairs agree with the truth and with each other."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -75,6 +77,19 @@ def test_a_stream_that_does_not_belong_is_named_and_left_out():
     assert result.status == "degenerate" and "shelf" in result.reason
     assert list(result.sensors) == ["cam0"]
     assert joint_of_orientations([fast]).status == "refused"
+
+
+def test_inverted_and_stretched_streams_are_named_without_a_gyro_too():
+    fast, slow = _stream("mocap", 50, 0.0, 0.05 * DEG, 11)[0], _stream("cam0", 15, 0.1, 0.1 * DEG, 12)[0]
+    inverted = OrientationStream("cam1", slow.t_s, np.swapaxes(slow.R_world_sensor, 1, 2))
+    stretched = OrientationStream("cam2", 1.05 * slow.t_s, slow.R_world_sensor)
+    uneven = OrientationStream("cam3", 1.003 * slow.t_s, slow.R_world_sensor, 0.1 * DEG)
+    result = joint_of_orientations([fast, inverted, stretched, uneven])
+    assert result.status == "degenerate" and "cam1" not in result.sensors
+    reasons = dict(part.split(": ", 1) for part in re.split("; (?=cam)", result.reason))
+    assert "inverted" in reasons["cam1"]
+    assert "the stamps of sensor and reference" in reasons["cam2"] and " too fast" in reasons["cam2"]
+    assert "the stamps of sensor and reference" in reasons["cam3"]
 
 
 def test_long_streams_are_thinned_the_largest_first():
