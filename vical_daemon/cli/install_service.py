@@ -57,6 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Install or remove; doing it twice changes nothing."""
     root = Path(args.root)
+    if not root.is_dir():
+        raise CliError(f"--root {root}: no such folder", 2)
     if args.remove:
         steps = removal(root)
     else:

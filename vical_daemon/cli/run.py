@@ -35,15 +35,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "as a service: vical install-service; on a laptop: vical run -c vical.yaml, then vical watch"
     )
-    parser.add_argument(
+    roles = parser.add_argument(
         "roles",
         metavar="ROLE",
         nargs="*",
         help="acquire, record, calibrate, web (processes) or imu, camera, record, detect, estimate, web "
         "(roles); none: all processes that the config asks for, as children",
     )
+    roles.completer = _known_roles  # type: ignore[attr-defined]  # for argcomplete
     add_config(parser)
     add_json(parser)
+
+
+def _known_roles(**_: object) -> list[str]:
+    from vical_daemon.cli.process_sets import PROCESSES
+
+    return list(dict.fromkeys([*PROCESSES, *(role for roles in PROCESSES.values() for role in roles)]))
 
 
 def run(args: argparse.Namespace) -> int:

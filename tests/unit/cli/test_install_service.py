@@ -32,6 +32,12 @@ def _files(root: Path) -> dict[str, str]:
     return {str(p.relative_to(root)): p.read_text() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
+def test_a_root_that_is_not_there_is_not_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["install-service", "--root", str(tmp_path / "typo")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+    assert not (tmp_path / "typo").exists()
+
+
 def test_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [
         "install-service",
