@@ -28,6 +28,8 @@ from vical_daemon.messages.schemas import ros2_schema
 
 BACKLOG = 256  # messages kept for a slow viewer; the oldest go first
 _SUFFIX = "/annotations"
+_GREEN, _ORANGE = Color(r=0.0, g=0.8, b=0.4, a=1.0), Color(r=1.0, g=0.55, b=0.26, a=1.0)
+_DRAWN = {topics.POINTS: _GREEN, topics.TRACKS: _GREEN, topics.PREDICTED: _ORANGE}
 
 
 class FoxgloveError(Exception):
@@ -76,7 +78,7 @@ class FoxgloveServer:
         self._channels[topic] = foxglove.Channel(
             topic, schema=schema, message_encoding="cdr", context=self._context
         )
-        if parsed.topic in (topics.POINTS, topics.TRACKS):
+        if parsed.topic in _DRAWN:
             drawn = topic + _SUFFIX
             self._annotations[drawn] = ImageAnnotationsChannel(drawn, context=self._context)
 
@@ -110,16 +112,18 @@ class FoxgloveServer:
         self._channels[f"/{sample.key}"].log(sample.payload)
 
     def _draw(self, sample: Sample) -> None:
+        parsed = topics.parse_key(sample.key)
         try:
             points = decode_points(sample.payload)
         except MessageError:
             return
+        assert parsed is not None
         stamp = Timestamp(sec=points.stamp_ns // 10**9, nsec=points.stamp_ns % 10**9)
         dots = PointsAnnotation(
             timestamp=stamp,
             type=PointsAnnotationType.Points,
             points=[Point2(x=float(u), y=float(v)) for u, v in points.uv_px],
-            outline_color=Color(r=0.0, g=0.8, b=0.4, a=1.0),
+            outline_color=_DRAWN[parsed.topic],
             thickness=3.0,
         )
         self._annotations[f"/{sample.key}{_SUFFIX}"].log(ImageAnnotations(points=[dots]))
