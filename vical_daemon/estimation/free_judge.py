@@ -1,0 +1,337 @@
+"""Says how far to trust a target-free calibration: fits, agreement of windows, status, words."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from scipy.stats import chi2
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.free_bundle import Carry, Fit
+from vical_daemon.estimation.gaps import Gap, gaps
+from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
+from vical_daemon.estimation.result import (
+    CalibrationEstimate,
+    CameraEstimate,
+    ImuEstimate,
+    PoseEstimate,
+    Status,
+    TracePoint,
+)
+
+_PATIENCE_S = 15.0
+_LOST = 3.0
+_HYSTERESIS = 2.0
+_ENOUGH_WINDOWS = 2
+_MOST_SIGMA_PX = 3.0
+_MOST_INERTIAL = 2.5
+_MOST_REFUSED = 0.4
+_DOUBT = 1e-5  # chance of a window that disagrees this much
+_LEARNING = 4  # windows
+_MOST_FACTOR = 100.0
+_MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
+_BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
+_PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
+_TRACE_MOST = 7200
+_CALIBRATION = 11  # first calibration error of a carry
+
+
+class FreeJudge:
+    """Watches what goes in and out of the windows.
+
+    Args:
+        options: Switches and targets.
+        camera: Name of the camera.
+        active: Which of the 15 calibration errors are estimated.
+    """
+
+    def __init__(self, options: CalibrationOptions, camera: str, active: BoolArray) -> None:
+        self.options, self.camera, self.active = options, camera, active
+        self.imu_samples = self.imu_refused = self.frames_ignored = self.frames_seen = 0
+        self.frames = 0
+        self.status = Status.WAITING
+        self.events: list[str] = []
+        self.misfit = self.disagreement = ""
+        self._reason, self._motion_missing = "", False
+        self._first_ns = self._newest_ns = 0
+        self._first_frame_s: float | None = None
+        self._started_s: float | None = None
+        self._now_s = 0.0
+        self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
+        self._windows = 0
+        self._squares: deque[tuple[float, int]] = deque(maxlen=10)
+        self._refused: deque[tuple[int, int]] = deque(maxlen=10)
+        self._sigma_px = 0.0
+        self._trace: list[TracePoint] = []
+        self._ever_converged = False
+        self._bumped = ""
+        self._quiet = ""
+
+    # ------------------------------------------------------------------ what happens
+    def saw_imu(self, t_ns: int, accel: FloatArray) -> None:
+        """Count one inertial reading."""
+        del accel
+        if not self.imu_samples:
+            self._first_ns = t_ns
+        self.imu_samples += 1
+        self._newest_ns = t_ns
+
+    def saw_points(self, t_s: float, count: int) -> None:
+        """Count one image with `count` tracks."""
+        if count >= 4:
+            self.frames_seen += 1
+            if self._first_frame_s is None:
+                self._first_frame_s = t_s
+
+    def waiting(self, why: str, motion_missing: bool) -> None:
+        """No start yet; `motion_missing`: more motion, not more time, would help."""
+        self._reason, self._motion_missing = why, motion_missing
+
+    def started(self, t_s: float) -> None:
+        """A window runs from `t_s` on."""
+        self._reason = ""
+        if self._started_s is None:
+            self._started_s = t_s
+        if self._bumped:
+            self.events.append("started anew after the change")
+            self._bumped = ""
+        if self._quiet:
+            self.events.append(f"went on after: {self._quiet}")
+            self._quiet = ""
+
+    def lost(self, why: str, kept: Carry | None) -> None:
+        """The window was given up; `kept`: the calibration that stays."""
+        self._reason, self._motion_missing = why, False
+        if kept is not None and not self._quiet:
+            self._quiet = why
+        if kept is None:
+            self._started_s, self._windows = None, 0
+            self._agreement.clear()
+
+    def changed(self, why: str, before: Carry) -> None:
+        """The rig is not what it was."""
+        del before
+        self.events.append(f"bumped: {why}" if self._ever_converged else f"started over: {why}")
+        self._bumped, self._quiet = why, ""
+        self._started_s, self._windows = None, 0
+        self._agreement.clear()
+
+    # ------------------------------------------------------------------ windows
+    def fits(self, fit: Fit, *, first: bool = False) -> bool:
+        """Whether a window holds together at all; `misfit` says why not."""
+        share = fit.refused / max(fit.used + fit.refused, 1)
+        usual = _MOST_SIGMA_PX if first or not self._sigma_px else max(_MOST_SIGMA_PX, 3.0 * self._sigma_px)
+        self.misfit = ""
+        if fit.sigma_px > usual:
+            self.misfit = f"features miss their places by {fit.sigma_px:.1f} px"
+        elif fit.inertial > _MOST_INERTIAL:
+            self.misfit = f"inertial data and images disagree ({fit.inertial:.1f} times their noise)"
+        elif share > _MOST_REFUSED:
+            self.misfit = f"{share:.0%} of the features do not move with the scene"
+        return not self.misfit
+
+    def saw_fit(self, fit: Fit, t_s: float, *, fresh: bool = False) -> None:
+        """Take the result of an adjustment."""
+        del fresh
+        self._now_s, self._sigma_px = t_s, fit.sigma_px
+        self._squares.append((fit.squares, fit.dof))
+        self._refused.append((fit.refused, fit.used + fit.refused))
+        self._maybe_trace(fit.carry)
+
+    def closed(self, fit: Fit) -> None:
+        """A window is complete and agreed."""
+        del fit
+        self._windows += 1
+
+    def agrees(self, fit: Fit, carry: Carry) -> bool:
+        """Compare how far a window moved the calibration with how far its own data may move it.
+
+        For consistent sigmas, cov(new - old) = P_old - P_new.
+        """
+        P_old = carry.covariance()[_CALIBRATION:, _CALIBRATION:]
+        P_new = fit.carry.covariance()[_CALIBRATION:, _CALIBRATION:]
+        scale = np.sqrt(np.diag(P_old))
+        values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
+        told = values > 0.02  # directions in which the window had something to say
+        if not told.any():
+            return True
+        d = vectors.T @ (fit.change / scale)
+        statistic, dof = float((d[told] ** 2 / values[told]).sum()), int(told.sum())
+        factor = self.factor()
+        limit = float(chi2.isf(_DOUBT, dof)) * factor
+        if self._windows < _LEARNING:  # not enough seen yet to tell a poor model from a changed rig
+            limit *= 50.0
+        doubtful = statistic > limit and (factor < _MODEL_FITS or self._matters(fit.change))
+        self._agreement.append((min(statistic, limit), dof))
+        if doubtful:
+            self.disagreement = _said(fit.change, self.active)
+        return not doubtful
+
+    def _matters(self, change: FloatArray) -> bool:
+        """Whether a change is large enough to be a changed rig where the model itself fits poorly."""
+        full = np.zeros(15)
+        full[np.flatnonzero(self.active)] = change
+        arm, turn, shift = np.linalg.norm(full[:3]), np.linalg.norm(full[3:6]), abs(full[6])
+        return bool(arm > _BIG_M or turn > _BIG_RAD or shift > _BIG_S)
+
+    def factor(self) -> float:
+        """Measured variance over the stated one, at least 1 (a prior of a few windows says 1)."""
+        dof = 15.0 if self.active[7] else 7.0
+        total = sum(s for s, _ in self._agreement) + _PRIOR_WINDOWS * dof
+        return max(1.0, total / (sum(n for _, n in self._agreement) + _PRIOR_WINDOWS * dof))
+
+    # ------------------------------------------------------------------ what is said
+    def trace(self) -> list[TracePoint]:
+        """The development of the calibration."""
+        return list(self._trace)
+
+    def _maybe_trace(self, carry: Carry) -> None:
+        if self._trace and self._now_s - self._trace[-1].t_s < 1.0:
+            return
+        e = self._camera(carry)
+        sigma = np.sqrt(np.diag(np.array(e.T_imu_cam.covariance)))
+        point = TracePoint(
+            self._now_s,
+            e.T_imu_cam.p_m,
+            sigma[:3].tolist(),
+            e.T_imu_cam.q_wxyz,
+            sigma[3:].tolist(),
+            e.timeshift_cam_imu_s,
+            e.timeshift_sigma_s,
+            self.nis_per_dof(),
+            str(self.status),
+        )
+        self._trace.append(point)
+        if len(self._trace) > _TRACE_MOST:
+            del self._trace[1 : _TRACE_MOST // 2 : 2]
+
+    def nis_per_dof(self) -> float:
+        """Agreement of the windows: squared change over what it should be; 1 when consistent."""
+        dof = sum(n for _, n in self._agreement)
+        return sum(s for s, _ in self._agreement) / dof if dof else 0.0
+
+    def estimate(self, carry: Carry | None, *, running: bool, gravity: list[float]) -> CalibrationEstimate:
+        """Put everything together."""
+        camera = None if carry is None else self._camera(carry)
+        missing = [] if camera is None else self._gaps(camera)
+        self.status, reason, guidance = self._decide(camera is not None, running, missing)
+        self._ever_converged |= self.status == Status.CONVERGED
+        if camera is not None and self.status == Status.DEGENERATE:
+            named = [f"{g.name}: {g.motion}" for g in missing if g.excess > _LOST]
+            camera.unobservable.extend(named)
+        events, self.events = self.events, []
+        refused, seen = (sum(x) for x in zip(*self._refused, strict=True)) if self._refused else (0, 0)
+        return CalibrationEstimate(
+            self._newest_ns,
+            self.status,
+            reason,
+            self._progress(camera is not None, missing),
+            guidance,
+            (self._newest_ns - self._first_ns) * 1e-9,
+            self.frames_seen,
+            self.imu_samples,
+            {} if camera is None else {self.camera: camera},
+            None if carry is None else self._imu(carry),
+            gravity,
+            self.nis_per_dof(),
+            refused / max(seen, 1),
+            events,
+        )
+
+    def _camera(self, carry: Carry) -> CameraEstimate:
+        full = np.zeros((15, 15))
+        at = np.flatnonzero(self.active)
+        full[np.ix_(at, at)] = carry.covariance()[_CALIBRATION:, _CALIBRATION:] * self.factor()
+        sigma = np.sqrt(np.diag(full))
+        c = carry.camera
+        return CameraEstimate(
+            PoseEstimate(
+                c.p_imu_cam.tolist(), so3.quat_from_matrix(c.R_imu_cam).tolist(), full[:6, :6].tolist()
+            ),
+            c.timeshift_s,
+            float(sigma[6]),
+            c.intrinsics.tolist(),
+            sigma[7:11].tolist(),
+            c.distortion_model,
+            c.distortion.tolist(),
+            sigma[11:].tolist(),
+            self._sigma_px
+            * float(np.sqrt(sum(s for s, _ in self._squares) / max(sum(n for _, n in self._squares), 1))),
+            self._sigma_px,
+            [],
+            c.readout_s,
+            0.0,
+        )
+
+    def _imu(self, carry: Carry) -> ImuEstimate:
+        sigma = np.sqrt(np.diag(carry.covariance())[5:11])
+        return ImuEstimate(
+            carry.bias[:3].tolist(), carry.bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist()
+        )
+
+    def _gaps(self, e: CameraEstimate) -> list[Gap]:
+        R = so3.matrix_from_quat(np.array(e.T_imu_cam.q_wxyz))
+        return gaps(np.array(e.T_imu_cam.covariance), R, e.timeshift_sigma_s, self.options.targets)
+
+    def _decide(self, known: bool, running: bool, missing: list[Gap]) -> tuple[Status, str, str]:
+        """Status, reason and guidance."""
+        if not known:
+            return self._before_start()
+        if not running and self._windows == 0:
+            return Status.INITIALISING, self._reason, ""
+        pause = "" if running else f" (paused: {self._reason or self._quiet})"
+        if self.status == Status.CONVERGED:
+            missing = [g for g in missing if g.excess > _HYSTERESIS]
+        if not missing:
+            if self._windows < _ENOUGH_WINDOWS:
+                return (
+                    Status.CONVERGING,
+                    "sigmas are small; waiting for more data to confirm them" + pause,
+                    "",
+                )
+            if self.factor() > _MOST_FACTOR:
+                return Status.INCONSISTENT, "stretches of the data disagree more than their sigmas say", ""
+            return Status.CONVERGED, pause.strip(" ()"), ""
+        worst = missing[0]
+        if self._now_s - (self._started_s or 0.0) > _PATIENCE_S and worst.excess > _LOST:
+            names = "; ".join(g.said for g in missing[:3])
+            return Status.DEGENERATE, f"the motion does not show: {names}" + pause, worst.motion
+        return Status.CONVERGING, worst.said + pause, worst.motion
+
+    def _before_start(self) -> tuple[Status, str, str]:
+        if self._bumped:
+            return Status.INCONSISTENT, f"{self._bumped}; calibrating anew: {self._reason}", ""
+        if not self.imu_samples:
+            return Status.WAITING, "no inertial data yet", ""
+        if self._first_frame_s is None:
+            return Status.WAITING, "no features have been followed yet: is the picture dark or blurred?", ""
+        seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
+        if self._motion_missing and seen_for > _PATIENCE_S:
+            return (
+                Status.DEGENERATE,
+                self._reason,
+                "turn the rig about all three axes while moving it to and fro",
+            )
+        return Status.INITIALISING, self._reason or "collecting the first seconds", ""
+
+    def _progress(self, known: bool, missing: list[Gap]) -> float:
+        if self.status == Status.CONVERGED:
+            return 1.0
+        if not known:
+            return min(0.1, 0.001 * self.frames_seen)
+        worst = max((g.excess for g in missing), default=1.0)
+        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
+
+
+def _said(change: FloatArray, active: BoolArray) -> str:
+    """A change in words with figures: what moved by how much."""
+    full = np.zeros(15)
+    full[np.flatnonzero(active)] = change
+    parts = []
+    if active[0]:
+        parts.append(f"the camera by {1e3 * np.linalg.norm(full[:3]):.1f} mm")
+        parts.append(f"{np.rad2deg(np.linalg.norm(full[3:6])):.2f} deg")
+    if active[6]:
+        parts.append(f"the time shift by {1e3 * full[6]:+.2f} ms")
+    return f"the last seconds move {', '.join(parts)}, more than the sigmas allow"

@@ -1,0 +1,170 @@
+"""Velocity, gravity, lever arm and structure from tracks and an IMU, linearly, once rotations are known.
+
+With attitudes from the gyro, every camera centre is linear in z = (v0, gravity's direction, lever arm, accel bias):
+c_i = q_i + A_i z (gravity's size is known; its direction is linearised anew each round), and a landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes from
+the accelerometer, so that the system is inhomogeneous. [Martinelli, "Closed-form solution of visual-inertial
+structure from motion", 2014; Dong-Si & Mourikis, "Estimator initialization in vision-aided inertial
+navigation with unknown camera-IMU calibration", 2012]. Squares are divided by the distances found in the
+round before, or near points would draw everything towards the camera.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.free_window import Landmarks, Seen, Window, rays_of
+from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.inertial_links import Link, make_link
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.state import CameraState
+
+_ROUNDS = 8
+_ARM_SIGMA_M, _BIAS_SIGMA, _MAX_ARM_M = 0.2, 0.2, 1.5
+_RAY_SIGMA = 2e-3
+_NEAR, _FAR = 0.1, 100.0
+
+
+def free_start(
+    buffer: ImuBuffer,
+    frames: list[tuple[float, PointsFrame]],
+    camera: CameraState,
+    gyro_bias: FloatArray,
+    noise: ImuNoise,
+    gravity_mps2: float,
+    arm_sigma_m: float = _ARM_SIGMA_M,
+) -> Window | str:
+    """Turn a stretch of tracks into a window that a bundle adjustment can start from.
+
+    Args:
+        buffer: Inertial readings.
+        frames: (stamp in the camera's clock in s, tracks), in order.
+        camera: Mounting rotation, time shift and lens must be roughly right; the lever arm is found.
+        gyro_bias: rad/s, shape (3,).
+        noise: Densities.
+        gravity_mps2: Magnitude of gravity.
+        arm_sigma_m: How far the camera's lever arm may be off.
+
+    Returns:
+        The window, world z up, first image at the origin; or why not.
+    """
+    shift = camera.timeshift_s
+    links: list[Link] = []
+    for (t0, _), (t1, _) in zip(frames, frames[1:], strict=False):
+        link = make_link(buffer, t0 + shift, t1 + shift, gyro_bias, np.zeros(3), noise)
+        if link is None:
+            return "inertial data do not cover the images"
+        links.append(link)
+    R, q, A = _centres(links)
+    none = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    zero = np.zeros((len(frames), 3))
+    window = Window(camera, noise, list(frames), R, zero, zero, np.zeros((1, 6)), links, shift, none)
+    window.bias[:, :3] = gyro_bias
+    window.fit_knots()
+    seen = window.observe()
+    if len(seen.begin) < 15:
+        return f"only {len(seen.begin)} features can be followed: more texture or slower motion is needed"
+    found = _solve(seen, R, q, A, camera, (gravity_mps2, arm_sigma_m))
+    if isinstance(found, str):
+        return found
+    z, gravity = found
+    down = gravity / gravity_mps2
+    T = np.concatenate([[0.0], np.cumsum([x.dt_s for x in links])])
+    world = _upright(down)
+    motion = q[:, :3] + T[:, None] * z[:3] + 0.5 * (T * T)[:, None] * gravity + A[:, :, 9:] @ z[9:]
+    window.p = motion @ world.T
+    window.R = world @ R
+    # the velocity by differences of positions would be coarse: it is carried along the links
+    v = [z[:3]]
+    for k, link in enumerate(links):
+        v.append(v[-1] + link.dt_s * gravity + R[k] @ link.dv)
+    window.v = np.array(v) @ world.T
+    camera.p_imu_cam = z[6:9].copy()
+    window.bias[:, 3:] = z[9:]
+    window.gravity = np.array([0.0, 0.0, -gravity_mps2])
+    window.landmarks = none
+    return window
+
+
+def _centres(links: list[Link]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Attitudes R_i, and positions q_i + A_i z without the lever arm, in the first image's imu frame."""
+    R, P, V = np.eye(3), np.zeros(3), np.zeros(3)
+    PB, VB, T = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
+    all_R, all_q, all_A = [R], [P], [np.zeros((3, 12))]
+    all_A[0][:, 6:9] = np.eye(3)
+    for x in links:
+        P = P + x.dt_s * V + R @ x.dp
+        PB = PB + x.dt_s * VB + R @ x.by_bias[6:9, 3:]
+        V = V + R @ x.dv
+        VB = VB + R @ x.by_bias[3:6, 3:]
+        R = R @ x.dR
+        T += x.dt_s
+        A = np.concatenate([T * np.eye(3), 0.5 * T * T * np.eye(3), R, PB], axis=1)
+        all_R.append(R)
+        all_q.append(P)
+        all_A.append(A)
+    return np.array(all_R), np.array(all_q), np.array(all_A)
+
+
+def _solve(
+    seen: Seen, R: FloatArray, q: FloatArray, A: FloatArray, camera: CameraState, known: tuple[float, float]
+) -> tuple[FloatArray, FloatArray] | str:
+    """Iteratively reweighted least squares: (z, gravity), or why there is none."""
+    rays, ok = rays_of(seen.uv, camera)
+    d = np.matmul(R[seen.frame] @ camera.R_imu_cam, rays[..., None])[..., 0]
+    P = np.eye(3) - d[:, :, None] * d[:, None, :]
+    weight = ok / (2.0 * _RAY_SIGMA) ** 2
+    prior = np.zeros(12)
+    gravity_mps2, arm_sigma_m = known
+    prior[6:9], prior[9:] = arm_sigma_m**-2, _BIAS_SIGMA**-2
+    wanted = np.concatenate([np.zeros(6), camera.p_imu_cam, np.zeros(3)])
+    # over seconds the speed changes little against g T: force is mostly gravity's opposite
+    gravity = -q[-1] * (gravity_mps2 / float(np.linalg.norm(q[-1])))
+    z, reduced = np.zeros(12), np.eye(12)
+    for _ in range(_ROUNDS):
+        reduced = _tangent_map(gravity)
+        q_now, A_now = q + A[:, :, 3:6] @ gravity, A @ reduced
+        WP = P * weight[:, None, None]
+        PA, Pq = WP @ A_now[seen.frame], np.matmul(WP, q_now[seen.frame][..., None])
+        N = np.add.reduceat(WP, seen.begin) + 1e-6 * np.eye(3)
+        B = np.add.reduceat(np.concatenate([PA, Pq], axis=2), seen.begin)
+        inner = np.linalg.solve(N, B)  # X = inner_q + inner_A z
+        At, Bt = np.swapaxes(A_now[seen.frame], 1, 2), np.swapaxes(B[..., :-1], 1, 2)
+        H = (At @ PA).sum(axis=0) - (Bt @ inner[..., :-1]).sum(axis=0)
+        g = (At @ Pq).sum(axis=0)[:, 0] - (Bt @ inner[..., -1:]).sum(axis=0)[:, 0]
+        try:
+            y = np.linalg.solve(H + reduced.T @ (prior[:, None] * reduced), reduced.T @ (prior * wanted) - g)
+        except np.linalg.LinAlgError:
+            return "speed and scale are not visible yet: move the rig to and fro while turning it"
+        z = reduced @ y
+        X = inner[..., -1] + inner[..., :-1] @ y
+        away = X[seen.landmark] - q_now[seen.frame] - A_now[seen.frame] @ y
+        depth = np.clip((away * d).sum(axis=1), _NEAR, _FAR)
+        off = np.linalg.norm(np.matmul(P, away[..., None])[..., 0], axis=1) / depth
+        spread = 1.4826 * float(np.median(off)) + 1e-6
+        weight = ok / (_RAY_SIGMA * depth) ** 2 / (1.0 + (off / (3.0 * spread)) ** 2) ** 2
+        gravity = gravity + z[3:6]
+        gravity *= gravity_mps2 / float(np.linalg.norm(gravity))
+    if not np.isfinite(z).all() or float(np.abs(z[6:9]).max()) > _MAX_ARM_M:
+        return "the lever arm is not visible yet: turn the rig about two axes while moving it"
+    return z, gravity
+
+
+def _tangent_map(gravity: FloatArray) -> FloatArray:
+    """From (v0, two tilts of gravity, lever arm, accel bias) to z, shape (12, 11)."""
+    out = np.zeros((12, 11))
+    out[:3, :3] = np.eye(3)
+    basis = np.linalg.svd(gravity[None])[2][1:]
+    out[3:6, 3:5] = basis.T * float(np.linalg.norm(gravity))
+    out[6:9, 5:8] = out[9:, 8:] = np.eye(3)
+    return out
+
+
+def _upright(down: FloatArray) -> FloatArray:
+    """Least rotation that turns `down` into -z."""
+    target = np.array([0.0, 0.0, -1.0])
+    axis = np.cross(down, target)
+    cosine = float(down @ target)
+    if cosine < -0.999999:
+        return np.diag([1.0, -1.0, -1.0])
+    hat = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + hat + hat @ hat / (1.0 + cosine))

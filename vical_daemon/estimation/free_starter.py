@@ -1,0 +1,220 @@
+"""Attempts to start a target-free calibration from the tracks and inertial data of the last seconds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.epipolar_fit import EpipolarFit, epipolar_fit
+from vical_daemon.estimation.free_bundle import Carry
+from vical_daemon.estimation.free_start import free_start
+from vical_daemon.estimation.free_window import Window
+from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.state import CameraState
+from vical_daemon.estimation.td_icp import td_icp
+from vical_daemon.estimation.track_orientations import track_orientations
+
+Frames = list[tuple[float, PointsFrame]]
+
+_SPAN_S, _LONG_SPAN_S = 5.0, 8.0
+_LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
+_EVERY_S, _EVERY_MOST_S = 1.0, 4.0
+_ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
+_SHIFT_SIGMA_S = 4e-3
+_MIN_TRACKS = 12
+_MAX_HOLE_S = 0.5
+_STILL_PX = 1.0  # median travel of a feature over half a second
+
+
+class Starter:
+    """Decides when to try, and tries.
+
+    Args:
+        options: Switches and noise.
+        prior: What is known about the camera.
+    """
+
+    def __init__(self, options: CalibrationOptions, prior: CameraPrior) -> None:
+        self.options, self.prior = options, prior
+        self.motion_missing = False
+        self._next_s = -np.inf
+        self._every_s = _EVERY_S
+
+    def again(self) -> None:
+        """Start over: try soon."""
+        self._next_s, self._every_s = -np.inf, _EVERY_S
+
+    def attempt(
+        self, buffer: ImuBuffer, frames: Frames, end_s: float, known: Carry | None, *, last: bool
+    ) -> Window | str | None:
+        """Try when it is time to.
+
+        Args:
+            buffer: Inertial readings.
+            frames: Images that wait, in order.
+            end_s: Inertial data cover images up to about here, s.
+            known: Calibration and biases of before, where there are any.
+            last: End of the data: try now.
+
+        Returns:
+            A window to adjust; why there is none; or None when it is not time to try.
+        """
+        if end_s < self._next_s and not last:
+            return None
+        shift = known.camera.timeshift_s if known else self.prior.timeshift_cam_imu_s or 0.0
+        span = _LONG_SPAN_S if self._every_s > 1.5 * _EVERY_S else _SPAN_S
+        usable = _last_stretch(
+            frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), span
+        )
+        if not usable or usable[-1][0] - usable[0][0] < (_LEAST_KNOWN_S if known else _LEAST_S) - 0.1:
+            self.motion_missing = False
+            return "collecting the first seconds: move the rig, keep textured things in view"
+        self._next_s = end_s + self._every_s
+        self._every_s = min(1.3 * self._every_s, _EVERY_MOST_S)
+        self.motion_missing = True
+        if _still(usable):
+            return "the camera stands still: move the rig to and fro while turning it"
+        found = self._rotations(buffer, usable) if known is None else _known(known)
+        if isinstance(found, str):
+            return found
+        camera, bias, arm_sigma = found
+        usable = [x for x in usable if buffer.oldest_s < x[0] + camera.timeshift_s < buffer.newest_s - 5e-3]
+        if len(usable) < 20:
+            return "inertial data do not cover the images: are both stamped by the same clock?"
+        noise, gravity = self.options.imu_noise, self.options.gravity_mps2
+        return free_start(buffer, usable, camera, bias, noise, gravity, arm_sigma)
+
+    def _rotations(self, buffer: ImuBuffer, frames: Frames) -> tuple[CameraState, FloatArray, float] | str:
+        """Mounting, delay, lens and gyro bias from the epipolar constraint; or why not."""
+        camera = starting_camera(self.prior)
+        rows = buffer.rows
+        reach = (rows[:, 0] > frames[0][0] - 2.0) & (rows[:, 0] < frames[-1][0] + 2.0)
+        t, gyro = rows[reach, 0], rows[reach, 1:4]
+        seeds, reason = self._seeds(t, gyro, frames, camera)
+        lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
+        free_lens = "intrinsics" not in self.options.fix
+        fits = [epipolar_fit(t, gyro, frames, lens, R, s, fit_lens=free_lens) for R, s in seeds]
+        good = [f for f in fits if f is not None]
+        if not good:
+            return (
+                reason or "too few features are followed from image to image: more texture or light is needed"
+            )
+        best = min(good, key=lambda f: f.error / max(f.inliers, 0.1))
+        why = _not_sure_yet(best)
+        if why:
+            return reason or why
+        camera.R_imu_cam, camera.timeshift_s = best.R_imu_cam, best.timeshift_s
+        camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
+        sigma = 0.2
+        if self.prior.T_imu_cam is not None and "extrinsics" in self.options.fix:
+            camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in self.prior.T_imu_cam)
+            sigma = 1e-4
+        if self.prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
+            camera.timeshift_s = self.prior.timeshift_cam_imu_s
+        return camera, best.gyro_bias, sigma
+
+    def _seeds(
+        self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState
+    ) -> tuple[list[tuple[FloatArray, float]], str]:
+        """Places from which to start the fit, and what TD-ICP has to say against its own."""
+        seeds: list[tuple[FloatArray, float]] = []
+        if self.prior.T_imu_cam is not None:
+            seeds.append((self.prior.T_imu_cam[0].copy(), self.prior.timeshift_cam_imu_s or 0.0))
+        chains = track_orientations(
+            (f for _, f in frames), camera.intrinsics, camera.distortion, camera.distortion_model
+        )
+        if not chains:
+            return seeds, ""
+        chain = max(chains, key=lambda c: len(c.t_cam_ns))
+        t_cam = np.array([s for s, f in frames if f.t_cam_ns in set(chain.t_cam_ns.tolist())])
+        result = td_icp(t, gyro, t_cam, chain.R_world_cam, chain.covariance)
+        if result.timeshift_cam_imu_s is None or result.R_imu_cam is None or result.status == "refused":
+            return seeds, result.reason
+        R, shift = result.R_imu_cam, result.timeshift_cam_imu_s
+        seeds.append((R, shift))
+        if self.prior.T_imu_cam is not None:
+            seeds.append((self.prior.T_imu_cam[0].copy(), shift))
+        if result.status != "ok":  # one axis may be off by far: look around
+            tilt = np.deg2rad(20.0)
+            seeds += [(R @ so3.exp(s * tilt * axis), shift) for axis in np.eye(3) for s in (-1.0, 1.0)]
+        return seeds, ""
+
+
+def starting_camera(prior: CameraPrior) -> CameraState:
+    """Camera as given; a lens of 60 degrees across where nothing is."""
+    width, height = prior.resolution
+    guess = (0.87 * width, 0.87 * width, 0.5 * (width - 1), 0.5 * (height - 1))
+    R, p = (np.eye(3), np.zeros(3)) if prior.T_imu_cam is None else prior.T_imu_cam
+    return CameraState(
+        np.array(R, np.float64),
+        np.array(p, np.float64),
+        prior.timeshift_cam_imu_s or 0.0,
+        np.array(prior.intrinsics if prior.intrinsics is not None else guess, np.float64),
+        np.array(prior.distortion if prior.distortion is not None else (0.0,) * 4, np.float64),
+        prior.distortion_model,
+        prior.resolution,
+        prior.readout_s,
+    )
+
+
+def start_sigmas(camera: CameraState) -> FloatArray:
+    """How far each of the 15 calibration errors may be off at a start: many times what it is worth."""
+    f = float(camera.intrinsics[0])
+    lens = [0.05 * f, 0.05 * f, 0.03 * f, 0.03 * f]
+    distortion = [0.1, 0.1, 0.01, 0.01] if camera.distortion_model == "radtan" else [0.05] * 4
+    return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion)
+
+
+def _known(known: Carry) -> tuple[CameraState, FloatArray, float]:
+    c = known.camera
+    copy = CameraState(
+        c.R_imu_cam.copy(),
+        c.p_imu_cam.copy(),
+        c.timeshift_s,
+        c.intrinsics.copy(),
+        c.distortion.copy(),
+        c.distortion_model,
+        c.resolution,
+        c.readout_s,
+    )
+    return copy, known.bias[:3].copy(), 5e-3
+
+
+def _not_sure_yet(fit: EpipolarFit) -> str:
+    worst = float(np.max(fit.rotation_sigma_rad))
+    if worst > _ROTATION_SIGMA_RAD:
+        return (
+            f"mounting rotation known to {np.rad2deg(worst):.1f} deg so far: turn the rig about a second axis"
+        )
+    if fit.timeshift_sigma_s > _SHIFT_SIGMA_S:
+        known = 1e3 * fit.timeshift_sigma_s
+        return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
+    return ""
+
+
+def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -> Frames:
+    """The last images without a hole between them."""
+    out: Frames = []
+    for t, frame in reversed(frames):
+        if t > end_s or len(frame.ids) < _MIN_TRACKS:
+            continue
+        if t < begin_s or (out and (out[-1][0] - t > _MAX_HOLE_S or out[0][0] - t > span_s)):
+            break
+        out.append((t, frame))
+    return out[::-1]
+
+
+def _still(frames: Frames) -> bool:
+    """Whether features hardly move over half a second, all along."""
+    t = np.array([s for s, _ in frames])
+    ahead = np.searchsorted(t, t + 0.5)
+    travels = []
+    for i in range(0, len(t), 3):
+        if ahead[i] >= len(t):
+            break
+        a, b = frames[i][1], frames[int(ahead[i])][1]
+        _, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+        if len(ka):
+            travels.append(float(np.median(np.linalg.norm(a.uv_px[ka] - b.uv_px[kb], axis=1))))
+    return bool(travels) and float(np.median(travels)) < _STILL_PX

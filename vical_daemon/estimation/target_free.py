@@ -1,0 +1,340 @@
+"""Calibration without a target: tracks of unknown points and an IMU in, calibration out. No clock, no I/O.
+
+Flow: buffer -> `free_start.Starter` (rotations and delay from the epipolar constraint, then speed, gravity and
+structure linearly) -> one inertial bundle adjustment per window of a few seconds, grown as images arrive ->
+what the window knows is carried into the next as a prior on tilt, speed, biases and calibration. The
+statistic of how a window's own data moved the calibration, against how much it was allowed to, says whether
+to believe it (see docs/math/target_free.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vical_daemon.estimation.free_bundle import Bundle, Carry, Fit, first_carry
+from vical_daemon.estimation.free_judge import FreeJudge
+from vical_daemon.estimation.free_starter import Starter, start_sigmas
+from vical_daemon.estimation.free_window import KNOT_S, Landmarks, Window
+from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+
+MAX_RATE_HZ = 21.0  # images beyond are thinned: neighbours add little and the window's cost is quadratic
+STEP_S = 1.5  # the window is adjusted again after this much new data
+WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
+WINDOW_S = 6.0
+_SLACK_S = 1e-3  # stamps are not quite even
+_MAX_GAP_S = 1.5  # images further apart are not tied by inertial data alone
+_MIN_PARALLAX_DEG = 0.4
+_KEEP_S = 12.0
+_LATE_S = 0.02  # inertial data must reach this far beyond an image
+_SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
+_STEPS_GROW, _STEPS_START = 6, 30
+
+
+class TargetFreeCalibrator:
+    """Calibrates one camera against one IMU, online, from feature tracks.
+
+    Args:
+        options: Switches and noise.
+        cameras: What is known about the camera (one).
+
+    Raises:
+        ValueError: More than one camera, or an option that needs a target.
+    """
+
+    def __init__(self, options: CalibrationOptions, cameras: dict[str, CameraPrior]) -> None:
+        if len(cameras) != 1:
+            raise ValueError(
+                f"target-free calibration takes one camera at a time, not {len(cameras)}; choose one"
+            )
+        if options.estimate:
+            raise ValueError(
+                f"target-free calibration cannot estimate {', '.join(sorted(options.estimate))} yet"
+            )
+        self.options = options
+        self.camera, self.prior = next(iter(cameras.items()))
+        self.active = np.ones(15, dtype=bool)
+        self.active[:6] = "extrinsics" not in options.fix
+        self.active[6] = "timeshift" not in options.fix
+        self.active[7:] = "intrinsics" not in options.fix
+        self.judge = FreeJudge(options, self.camera, self.active)
+        self.starter = Starter(options, self.prior)
+        self.window: Window | None = None
+        self.carry: Carry | None = None  # before the window
+        self.latest: Carry | None = None  # after its last adjustment
+        self._closed = 0
+        self._noise = (options.corner_sigma_px, 1.0)  # px, and how long errors last
+        self._buffer: ImuBuffer | None = None
+        self._base_ns = 0
+        self._pending: list[tuple[float, PointsFrame]] = []
+        self._taken_s = -np.inf
+        self._doubted: Carry | None = None
+
+    # ------------------------------------------------------------------ input
+    def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
+        """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
+        if self._buffer is None:
+            self._base_ns = t_imu_ns
+            self._buffer = ImuBuffer(t_imu_ns)
+        gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
+        fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
+        if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
+            self.judge.saw_imu(t_imu_ns, accel)
+        else:
+            self.judge.imu_refused += 1
+
+    def add_points(self, frame: PointsFrame) -> None:
+        """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
+        if frame.camera != self.camera or self._buffer is None:
+            self.judge.frames_ignored += 1
+            return
+        t_cam_s = (frame.t_cam_ns - self._base_ns) * 1e-9
+        if t_cam_s <= self._taken_s:
+            self.judge.frames_ignored += 1
+            return
+        if t_cam_s - self._taken_s < 1.0 / MAX_RATE_HZ:
+            return
+        self._taken_s = t_cam_s
+        ok = np.isfinite(frame.uv_px).all(axis=1)
+        _, first = np.unique(frame.ids, return_index=True)
+        ok[np.setdiff1d(np.arange(len(ok)), first)] = False
+        frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok])
+        self.judge.saw_points(t_cam_s, len(frame.ids))
+        if len(frame.ids) >= 4:
+            self._pending.append((t_cam_s, frame))
+
+    # ------------------------------------------------------------------ work
+    def process(self) -> list[Fit]:
+        """Do what can be done with what has arrived."""
+        return self._work(flush=False)
+
+    def finish(self) -> list[Fit]:
+        """End of the data: everything that inertial data cover."""
+        return self._work(flush=True)
+
+    def _work(self, *, flush: bool) -> list[Fit]:
+        if self._buffer is None:
+            return []
+        fits: list[Fit] = []
+        while True:
+            if self.window is None:
+                if not self._try_start(flush):
+                    break
+                continue
+            ready = self._ready()
+            if not ready:
+                break
+            new_s = ready[-1][0] - self.window.frames[-1][0]
+            if new_s < STEP_S - _SLACK_S and not flush:
+                break
+            fit = self._grow(self.window, ready)
+            if fit is not None:
+                fits.append(fit)
+        self._trim()
+        return fits
+
+    def _ready(self) -> list[tuple[float, PointsFrame]]:
+        """Images that inertial data cover, at most a step's worth, up to the first gap."""
+        assert self._buffer is not None
+        assert self.window is not None
+        end = self._buffer.newest_s - self.window.shift_s - _LATE_S
+        begin = before = self.window.frames[-1][0]
+        out: list[tuple[float, PointsFrame]] = []
+        for t, frame in self._pending:
+            if t > end or before - begin > STEP_S - _SLACK_S:
+                break
+            if t - before > _MAX_GAP_S:
+                if not out:
+                    self._lost(f"no usable images for {t - before:.1f} s")
+                break
+            out.append((t, frame))
+            before = t
+        if not out and self._pending and end - begin > 2.0 * _MAX_GAP_S:
+            self._lost(f"no usable images for {end - begin:.1f} s")
+        return out
+
+    def _trim(self) -> None:
+        """Memory stays bounded whatever happens."""
+        assert self._buffer is not None
+        newest = self._buffer.newest_s
+        if self.window is None:
+            self._pending = [x for x in self._pending if x[0] > newest - _KEEP_S]
+            self._buffer.trim(newest - 2.0 * _KEEP_S)
+        else:
+            self._buffer.trim(self.window.frames[0][0] + self.window.shift_s - 2.0)
+
+    # ------------------------------------------------------------------ start
+    def _try_start(self, flush: bool) -> bool:
+        """Attempt to start from what waits; True when there is a window now."""
+        assert self._buffer is not None
+        end = self._buffer.newest_s - _LATE_S
+        known = self._doubted or self.latest
+        attempt = self.starter.attempt(self._buffer, self._pending, end, known, last=flush)
+        if attempt is None:
+            return False
+        if isinstance(attempt, str):
+            self.judge.waiting(attempt, self.starter.motion_missing)
+            return False
+        window = attempt
+        carry = self._carry_into(window, known)
+        bundle = Bundle(window, carry, *self._noise)
+        fit = bundle.solve(self._buffer, _STEPS_START)
+        if fit is None or not self.judge.fits(fit, first=True):
+            self.judge.waiting(
+                "the first seconds do not fit together yet: keep moving in all directions", True
+            )
+            return False
+        last = window.frames[-1][0]
+        self._pending = [x for x in self._pending if x[0] > last]
+        self.window, self.carry, self.latest = window, carry, fit.carry
+        self._noise = (fit.sigma_px, fit.spread)
+        self._closed = 0 if known is None else self._closed
+        self.judge.started(window.frames[0][0])
+        self.judge.saw_fit(fit, last + window.shift_s, fresh=True)
+        if _full(window):
+            self._close(fit)
+        return True
+
+    def _carry_into(self, window: Window, known: Carry | None) -> Carry:
+        """Prior of a window that starts afresh: wide, or the calibration and biases known before."""
+        sigmas = start_sigmas(window.camera)
+        wide = first_carry(window, self.active, sigmas)
+        if known is None:
+            return wide
+        keep = known.covariance()[5:, 5:]
+        keep[:3, :3] += 4e-4**2 * np.eye(3)
+        keep[3:6, 3:6] += 5e-3**2 * np.eye(3)
+        d = len(wide.root)
+        covariance = np.diag(np.diag(wide.root) ** -2.0)
+        covariance[5:, 5:] = keep
+        root = np.linalg.inv(np.linalg.cholesky(covariance + 1e-20 * np.eye(d)))
+        return replace(wide, root=root, bias=known.bias.copy(), camera=known.camera)
+
+    # ------------------------------------------------------------------ windows
+    def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> Fit | None:
+        """Take images into the window and adjust it; close it when it is long enough."""
+        assert self._buffer is not None
+        assert self.carry is not None
+        added = window.extend(self._buffer, ready)
+        done = {id(f) for _, f in ready}
+        self._pending = [x for x in self._pending if id(x[1]) not in done]
+        if added < len(ready):
+            self._lost("inertial data have a gap")
+            return None
+        if len(window.frames) < 8:
+            return None
+        fit = Bundle(window, self.carry, *self._noise).solve(self._buffer, _STEPS_GROW)
+        if fit is None:
+            self._lost("too few features can be followed")
+            return None
+        if not self.judge.fits(fit):
+            self._lost(self.judge.misfit)
+            return None
+        self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread)
+        self.judge.saw_fit(fit, window.frames[-1][0] + window.shift_s)
+        if _full(window):
+            self._close(fit)
+        return fit
+
+    def _close(self, fit: Fit) -> None:
+        """Carry what the window knows into the next; see whether it agrees with what was known before."""
+        window, carry = self.window, self.carry
+        assert window is not None
+        assert carry is not None
+        if fit.parallax_deg < _MIN_PARALLAX_DEG:
+            self.latest = carry if self._closed else None
+            self._lost("the camera stands still or sees no depth")
+            return
+        if self._closed and not self.judge.agrees(fit, carry):
+            self._disagreed(carry)
+            return
+        if self._doubted is not None:
+            self._doubted = None
+        self._closed += 1
+        self.judge.closed(fit)
+        self.carry = self._aged(fit.carry, KNOT_S, window.span_s)
+        t, last = window.frames[-1]
+        none = PointsFrame(last.camera, last.t_cam_ns, last.ids[:0], last.uv_px[:0])
+        c = self.carry
+        empty = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        self.window = Window(
+            c.camera,
+            self.options.imu_noise,
+            [(t, none)],
+            c.R[None],
+            np.zeros((1, 3)),
+            (c.R @ c.speed)[None],
+            c.bias[None].copy(),
+            [],
+            window.shift_s,
+            empty,
+            gravity=window.gravity,
+        )
+
+    def _aged(self, carry: Carry, knot_s: float, span_s: float) -> Carry:
+        """Let biases and delay walk a little before the next window."""
+        P = carry.covariance()
+        noise = self.options.imu_noise
+        P[range(5, 8), range(5, 8)] += noise.gyro_walk**2 * knot_s
+        P[range(8, 11), range(8, 11)] += noise.accel_walk**2 * knot_s
+        place = self._shift_place()
+        if place is not None:
+            P[place, place] += _SHIFT_WALK**2 * span_s
+        return replace(carry, root=np.linalg.inv(np.linalg.cholesky(P + 1e-20 * np.eye(len(P)))))
+
+    def _shift_place(self) -> int | None:
+        return 11 + int(self.active[:6].sum()) if self.active[6] else None
+
+    def _disagreed(self, carry: Carry) -> None:
+        """A window contradicts what was known: once may be a bad window, twice is a changed rig."""
+        if self._doubted is None:
+            self._doubted = carry
+            self.latest = carry
+            self._lost("the last seconds do not fit the calibration; looking again")
+            return
+        why = self.judge.disagreement
+        self._doubted = None
+        lens = carry.camera
+        self.prior = replace(
+            self.prior,
+            intrinsics=tuple(lens.intrinsics.tolist()),
+            distortion=tuple(lens.distortion.tolist()),
+            T_imu_cam=None if self.active[0] else self.prior.T_imu_cam,
+        )
+        self.starter = Starter(self.options, self.prior)
+        self.latest = None
+        self._closed = 0
+        self.judge.changed(why, carry)
+        self.window = self.carry = None
+
+    def _lost(self, why: str) -> None:
+        """Go back to waiting, with the calibration kept as it was before this window."""
+        window = self.window
+        self.window = None
+        if window is not None and self.carry is not None:
+            self.latest = self.carry if self._closed else None
+        self.carry = None
+        self.starter.again()
+        self.judge.lost(why, self.latest)
+
+    # ------------------------------------------------------------------ output
+    def estimate(self) -> CalibrationEstimate:
+        """Return what is known now; takes the events since the last call along."""
+        gravity = [] if self.latest is None else [0.0, 0.0, -self.options.gravity_mps2]
+        return self.judge.estimate(
+            self._doubted or self.latest, running=self.window is not None, gravity=gravity
+        )
+
+    def trace(self, camera: str) -> list[TracePoint]:
+        """Return how the calibration developed."""
+        return self.judge.trace() if camera == self.camera else []
+
+
+def _full(window: Window) -> bool:
+    """Whether the next step would make the window too long."""
+    step = STEP_S / max(window.span_s, 1e-3) * len(window.frames)
+    return window.span_s + 0.5 * STEP_S > WINDOW_S or len(window.frames) + 0.5 * step > WINDOW_FRAMES
