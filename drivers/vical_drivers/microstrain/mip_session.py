@@ -5,48 +5,33 @@ from __future__ import annotations
 import contextlib
 import struct
 import time
-from dataclasses import dataclass
 
 from vical_drivers.errors import DeviceRefusedError, DriverError
 from vical_drivers.microstrain import mip
 from vical_drivers.microstrain import mip_fields as fields
-from vical_drivers.microstrain.port import ArrivalLog, BytePort, timeout, wait_for_silence
+from vical_drivers.microstrain.mip_link import REPLY_TIMEOUT_S, TRIES, MipLink, UnknownCommandError
+from vical_drivers.microstrain.port import BytePort, timeout
 from vical_drivers.microstrain.session import Applied, ImuSettings, RawSample, group_delay_s, raise_baud
 from vical_drivers.samples import DeviceInfo
 
-_REPLY_TIMEOUT_S = 0.5
-_TRIES = 3
 _BAUDS = (115_200, 230_400, 460_800, 921_600)
 _BUSY_WIRE = 0.9
 """Share of a UART that a stream may fill; a saturated one drops packets silently."""
 _FLAGS_INERTIAL_ONLY = 0x0D00
 """Signal conditioning of the GX3: no orientation, no magnetometer, no compensations."""
 _LEGACY_STREAM, _SENSOR_STREAM = 1, mip.SET_SENSOR
-_UNKNOWN_COMMAND = 1
 _SAVE = 3
 """Function selector that writes the EEPROM; only `store_gyro_bias` uses it."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Reply:
-    code: int
-    data: bytes | None
-
-
 class MipSession:
-    """See `session.Session`. The port stays the caller's.
-
-    Attributes:
-        reply_timeout_s: How long one try waits for a reply; more for a device that samples at 1 Hz.
-    """
+    """See `session.Session`. The port stays the caller's."""
 
     protocol = "mip"
 
     def __init__(self, port: BytePort) -> None:
         self._port = port
-        self.reply_timeout_s = _REPLY_TIMEOUT_S
-        self._decoder = mip.Decoder()
-        self._arrivals = ArrivalLog()
+        self._link = MipLink(port, self._keep)
         self._baud_found = port.baud
         self._backlog: list[RawSample] = []
         self._known: frozenset[int] = frozenset()
@@ -54,31 +39,39 @@ class MipSession:
         self._stream = _LEGACY_STREAM
 
     @property
+    def reply_timeout_s(self) -> float:
+        """How long one try waits for a reply, s; more for a device that samples at 1 Hz."""
+        return self._link.reply_timeout_s
+
+    @reply_timeout_s.setter
+    def reply_timeout_s(self, timeout_s: float) -> None:
+        self._link.reply_timeout_s = timeout_s
+
+    @property
     def checksum_errors(self) -> int:
         """Damaged packets."""
-        return self._decoder.checksum_errors
+        return self._link.stream.checksum_errors
 
     @property
     def skipped_bytes(self) -> int:
         """Bytes that belong to no packet."""
-        return self._decoder.skipped_bytes
+        return self._link.stream.skipped_bytes
 
     def probe(self, timeout_s: float) -> bool:
         """Tell whether a sensor answers here in MIP."""
         with contextlib.suppress(DriverError):
-            self._transact(mip.SET_BASE, 0x01, b"", timeout_s=timeout_s, tries=1)
+            self._link.transact(mip.SET_BASE, 0x01, b"", timeout_s=timeout_s, tries=1)
             return True
         return False
 
     def quiet(self) -> None:
         """Stop whatever streams and wait until it is silent."""
-        self._port.write(mip.idle())
-        wait_for_silence(self._port, quiet_s=0.1, limit_s=1.0)
-        self._reset_decoder()
+        self._link.quiet()
+        self._backlog = []
 
     def identify(self) -> DeviceInfo:
         """See `Session.identify`."""
-        text = fields.identity(self._ask(mip.SET_BASE, 0x03, 0x81, size=82))
+        text = fields.identity(self._link.ask(mip.SET_BASE, 0x03, 0x81, size=82))
         self._known = self._descriptors()
         return DeviceInfo(
             kind="imu",
@@ -93,9 +86,9 @@ class MipSession:
     def _descriptors(self) -> frozenset[int]:
         """Every descriptor the device knows, as set << 8 | descriptor; empty where it will not say."""
         known: set[int] = set()
-        for command, reply, tries in ((0x04, 0x82, _TRIES), (0x07, 0x86, 1)):
+        for command, reply, tries in ((0x04, 0x82, TRIES), (0x07, 0x86, 1)):
             with contextlib.suppress(DriverError):
-                data = self._transact(mip.SET_BASE, command, b"", reply=reply, tries=tries).data or b""
+                data = self._link.transact(mip.SET_BASE, command, b"", reply=reply, tries=tries).data or b""
                 known.update(struct.unpack(f">{len(data) // 2}H", data[: len(data) // 2 * 2]))
         return frozenset(known)
 
@@ -120,7 +113,7 @@ class MipSession:
         """Base rate of the inertial data; newer devices want the data set named."""
         for command, reply, ask in ((0x06, 0x83, b""), (0x0E, 0x8E, bytes([mip.SET_SENSOR]))):
             with contextlib.suppress(DriverError):
-                data = self._ask(mip.SET_3DM, command, reply, ask)
+                data = self._link.ask(mip.SET_3DM, command, reply, ask)
                 rate = int.from_bytes(data[-2:], "big")
                 if rate:
                     return float(rate)
@@ -132,10 +125,10 @@ class MipSession:
             return 0.0, None
         wanted = struct.pack(">HHBBHHBH", 10, _FLAGS_INERTIAL_ONLY, taps, 17, 10, 10, 1, 0)
         try:
-            self._command(mip.SET_3DM, 0x35, bytes([mip.APPLY]) + wanted)
+            self._link.command(mip.SET_3DM, 0x35, bytes([mip.APPLY]) + wanted)
         except DriverError:
             return 0.0, None
-        in_force = self._ask(mip.SET_3DM, 0x35, 0x86, bytes([mip.READ]))
+        in_force = self._link.ask(mip.SET_3DM, 0x35, 0x86, bytes([mip.READ]))
         if len(in_force) >= 5 and in_force[4] != taps:
             raise DeviceRefusedError(
                 f"{self._port.name}: the device did not take its settings: "
@@ -164,11 +157,11 @@ class MipSession:
         items = b"".join(struct.pack(">BH", d, decimation) for d in descriptors)
         body = bytes([len(descriptors)]) + items
         try:
-            self._command(mip.SET_3DM, 0x08, bytes([mip.APPLY]) + body)
-            in_force = self._ask(mip.SET_3DM, 0x08, 0x80, bytes([mip.READ]))
-        except _UnknownCommandError:
-            self._command(mip.SET_3DM, 0x0F, bytes([mip.APPLY, mip.SET_SENSOR]) + body)
-            in_force = self._ask(mip.SET_3DM, 0x0F, 0x8F, bytes([mip.READ, mip.SET_SENSOR]))[1:]
+            self._link.command(mip.SET_3DM, 0x08, bytes([mip.APPLY]) + body)
+            in_force = self._link.ask(mip.SET_3DM, 0x08, 0x80, bytes([mip.READ]))
+        except UnknownCommandError:
+            self._link.command(mip.SET_3DM, 0x0F, bytes([mip.APPLY, mip.SET_SENSOR]) + body)
+            in_force = self._link.ask(mip.SET_3DM, 0x0F, 0x8F, bytes([mip.READ, mip.SET_SENSOR]))[1:]
         if _items(in_force) != _items(body):
             raise DeviceRefusedError(
                 f"{self._port.name}: the device did not take its message format: "
@@ -185,13 +178,14 @@ class MipSession:
     def change_baud(self, baud: int) -> None:
         """Change both sides' baud until the device's next power-up."""
         try:
-            self._command(mip.SET_3DM, 0x40, struct.pack(">BI", mip.APPLY, baud))
-        except _UnknownCommandError:
-            self._command(mip.SET_BASE, 0x09, struct.pack(">BBI", mip.APPLY, 1, baud))
+            self._link.command(mip.SET_3DM, 0x40, struct.pack(">BI", mip.APPLY, baud))
+        except UnknownCommandError:
+            self._link.command(mip.SET_BASE, 0x09, struct.pack(">BBI", mip.APPLY, 1, baud))
         self._port.set_baud(baud)
         time.sleep(0.05)
-        self._reset_decoder()
-        if not any(self.probe(_REPLY_TIMEOUT_S) for _ in range(3)):
+        self._link.stream.restart()
+        self._backlog = []
+        if not any(self.probe(REPLY_TIMEOUT_S) for _ in range(3)):
             raise timeout(self._port, f"the change to {baud} baud")
 
     def start(self) -> None:
@@ -200,7 +194,7 @@ class MipSession:
         ids = (_SENSOR_STREAM, _LEGACY_STREAM) if newer else (_LEGACY_STREAM, _SENSOR_STREAM)
         for stream in ids:
             try:
-                self._command(mip.SET_3DM, 0x11, bytes([mip.APPLY, stream, 1]))
+                self._link.command(mip.SET_3DM, 0x11, bytes([mip.APPLY, stream, 1]))
             except DeviceRefusedError:
                 if stream == ids[-1]:
                     raise
@@ -209,14 +203,14 @@ class MipSession:
             break
         # Idle, which found the device, suspends streams on some models until they are resumed.
         with contextlib.suppress(DriverError):
-            self._transact(mip.SET_BASE, 0x06, b"", tries=1)
+            self._link.transact(mip.SET_BASE, 0x06, b"", tries=1)
 
     def read(self, timeout_s: float) -> list[RawSample]:
         """See `Session.read`."""
         if self._backlog:
             out, self._backlog = self._backlog, []
             return out
-        return [s for p in self._receive(timeout_s) if (s := self._sample(p)) is not None]
+        return [s for p in self._link.stream.receive(timeout_s) if (s := self._sample(p)) is not None]
 
     def _sample(self, packet: mip.Packet) -> RawSample | None:
         if packet.descriptor_set != mip.SET_SENSOR:
@@ -231,94 +225,25 @@ class MipSession:
             return None
         date = packet.field(self._time.descriptor) if self._time else None
         ticks = self._time.ticks(date) if self._time and date is not None else None
-        arrival_ns = self._arrivals.arrival_ns(packet.end, self._port.wire_byte_ns)
+        arrival_ns = self._link.stream.arrival_ns(packet.end)
         return RawSample(ticks, (wx, wy, wz), (ax, ay, az), arrival_ns)
-
-    def _receive(self, timeout_s: float) -> list[mip.Packet]:
-        data, t_read_ns = self._port.read(timeout_s)
-        if not data:  # a silence: what looked like the beginning of a long record may hide a short one
-            return self._decoder.finish()
-        self._arrivals.add(len(data), t_read_ns)
-        return self._decoder.feed(data)
-
-    def _command(self, descriptor_set: int, command: int, data: bytes) -> None:
-        self._transact(descriptor_set, command, data)
-
-    def _ask(
-        self, descriptor_set: int, command: int, reply: int, data: bytes = b"", size: int | None = None
-    ) -> bytes:
-        """Send a command and return the data of its reply field."""
-        found = self._transact(descriptor_set, command, data, reply=reply).data
-        if found is None or (size is not None and len(found) != size):
-            raise DeviceRefusedError(
-                f"{self._port.name}: the answer to MIP command "
-                f"0x{descriptor_set:02X},0x{command:02X} lacks its data"
-            )
-        return found
-
-    def _transact(
-        self, descriptor_set: int, command: int, data: bytes, *,
-        reply: int | None = None, also: tuple[int, int] | None = None,
-        timeout_s: float | None = None, tries: int = _TRIES,
-    ) -> _Reply:  # fmt: skip
-        """Send a command and return its reply; samples that stream in between are kept.
-
-        Args:
-            descriptor_set: Set of command and reply.
-            command: Descriptor of the command.
-            data: Its data.
-            reply: Descriptor of the field that carries the answer; None: the ACK is all.
-            also: Set and descriptor of data that come in a packet of their own.
-            timeout_s: For one try.
-            tries: How often to send it.
-        """
-        for _ in range(tries):
-            self._port.write(mip.encode(descriptor_set, (command, data)))
-            deadline = time.monotonic() + (timeout_s or self.reply_timeout_s)
-            while (left := deadline - time.monotonic()) > 0:
-                for packet in self._receive(left):
-                    if also and packet.descriptor_set == also[0] and packet.field(also[1]) is not None:
-                        return _Reply(0, packet.field(also[1]))
-                    if (answer := _answer(packet, descriptor_set, command, reply)) is None:
-                        self._keep(packet)
-                        continue
-                    self._raise_refusal(answer.code, descriptor_set, command)
-                    if not also:
-                        return answer
-        raise timeout(self._port, f"MIP command 0x{descriptor_set:02X},0x{command:02X}")
 
     def _keep(self, packet: mip.Packet) -> None:
         if (sample := self._sample(packet)) is not None:
             self._backlog.append(sample)
 
-    def _raise_refusal(self, code: int, descriptor_set: int, command: int) -> None:
-        if code:
-            reason = mip.NACK_REASONS.get(code, f"reason {code}")
-            kind = _UnknownCommandError if code == _UNKNOWN_COMMAND else DeviceRefusedError
-            raise kind(
-                f"{self._port.name}: the device refused MIP command "
-                f"0x{descriptor_set:02X},0x{command:02X}: {reason}"
-            )
-
-    def _reset_decoder(self) -> None:
-        errors = self._decoder.checksum_errors
-        self._decoder = mip.Decoder()
-        self._decoder.checksum_errors = errors
-        self._arrivals = ArrivalLog()
-        self._backlog = []
-
     def stop(self) -> None:
         """See `Session.stop`; a temporary baud is put back so that other software finds the device."""
         with contextlib.suppress(DriverError):
             self.quiet()
-            self._transact(mip.SET_3DM, 0x11, bytes([mip.APPLY, self._stream, 0]), tries=2)
+            self._link.transact(mip.SET_3DM, 0x11, bytes([mip.APPLY, self._stream, 0]), tries=2)
             if self._port.baud != self._baud_found:
                 self.change_baud(self._baud_found)
 
     def capture_gyro_bias(self, duration_s: float) -> tuple[float, float, float]:
         """See `Session.capture_gyro_bias`."""
         duration_ms = min(max(round(duration_s * 1e3), 1000), 30_000)
-        answer = self._transact(
+        answer = self._link.transact(
             mip.SET_3DM, 0x39, struct.pack(">H", duration_ms),
             reply=0x9B, timeout_s=duration_ms / 1e3 + 3.0, tries=1,
         )  # fmt: skip
@@ -330,33 +255,29 @@ class MipSession:
     def poll(self, kind: int) -> dict[str, object]:
         """See `Session.poll`. The data follow the ACK in a packet of their own."""
         wanted = bytes([0, 1, kind, 0, 0])
-        answer = self._transact(mip.SET_3DM, 0x01, wanted, also=(mip.SET_SENSOR, kind))
+        answer = self._link.transact(mip.SET_3DM, 0x01, wanted, also=(mip.SET_SENSOR, kind))
         field = mip.Field(kind, answer.data or b"")
         return {"kind": "0x80", **fields.describe(mip.Packet(mip.SET_SENSOR, (field,)))}
 
     def store_gyro_bias(self) -> None:
         """See `Session.store_gyro_bias`."""
-        self._command(mip.SET_3DM, 0x38, bytes([_SAVE]))
+        self._link.command(mip.SET_3DM, 0x38, bytes([_SAVE]))
 
     def settings(self) -> dict[str, object]:
         """See `Session.settings`."""
         base_hz = self._base_rate_hz()
         out: dict[str, object] = {"base_rate_hz": base_hz}
         with contextlib.suppress(DriverError):
-            data = self._ask(mip.SET_3DM, 0x08, 0x80, bytes([mip.READ]))
+            data = self._link.ask(mip.SET_3DM, 0x08, 0x80, bytes([mip.READ]))
             items = [struct.unpack_from(">BH", data, 1 + 3 * i) for i in range(len(data) // 3)]
             out["message"] = {f"0x{d:02X}": base_hz / max(1, decimation) for d, decimation in items}
         return out
 
     def self_test(self) -> dict[str, bool]:
         """See `Session.self_test`; takes some seconds on a GX3-35."""
-        answer = self._transact(mip.SET_BASE, 0x05, b"", reply=0x83, timeout_s=10.0, tries=1)
+        answer = self._link.transact(mip.SET_BASE, 0x05, b"", reply=0x83, timeout_s=10.0, tries=1)
         flags = int.from_bytes(answer.data or b"\xff", "big")
         return {f"built-in test (0x{flags:08X})": flags == 0}
-
-
-class _UnknownCommandError(DeviceRefusedError):
-    """NACK 1: this model has no such command; another spelling may exist."""
 
 
 def _items(message_format: bytes) -> list[bytes]:
@@ -369,18 +290,3 @@ _THREE = struct.Struct(">3f")
 
 def _size_of(time_field: fields.TimeField) -> int:
     return {fields.TICKS: 4, fields.REFERENCE_TIME: 8, fields.PPS_TIME: 9}.get(time_field.descriptor, 12)
-
-
-def _answer(packet: mip.Packet, descriptor_set: int, command: int, reply: int | None) -> _Reply | None:
-    """The reply to a command in a packet; some models send ACK and data in two packets."""
-    if packet.descriptor_set != descriptor_set:
-        return None
-    for descriptor, data in packet.fields:
-        if descriptor == mip.ACK and len(data) == 2 and data[0] == command:
-            found = packet.field(reply) if reply is not None else None
-            if data[1] == 0 and reply is not None and found is None:
-                return None
-            return _Reply(data[1], found)
-    if reply is not None and (found := packet.field(reply)) is not None:
-        return _Reply(0, found)
-    return None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import grp
 import logging
 import os
 import select
@@ -253,7 +254,7 @@ def _explain(path: str, error: Exception) -> DriverError:
 
 def _group_of(path: str) -> str:
     try:
-        return Path(path).group()
+        return grp.getgrgid(Path(path).stat().st_gid).gr_name
     except (OSError, KeyError):
         return "dialout"
 

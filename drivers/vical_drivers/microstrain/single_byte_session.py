@@ -9,7 +9,8 @@ import time
 from vical_drivers.errors import DeviceRefusedError, DriverError
 from vical_drivers.microstrain import single_byte as sb
 from vical_drivers.microstrain import single_byte_commands as cmd
-from vical_drivers.microstrain.port import ArrivalLog, BytePort, timeout, wait_for_silence
+from vical_drivers.microstrain.port import BytePort, timeout, wait_for_silence
+from vical_drivers.microstrain.record_stream import RecordStream
 from vical_drivers.microstrain.session import Applied, ImuSettings, RawSample, group_delay_s, raise_baud
 from vical_drivers.samples import DeviceInfo
 
@@ -48,8 +49,7 @@ class SingleByteSession:
     def __init__(self, port: BytePort) -> None:
         self._port = port
         self.reply_timeout_s = _REPLY_TIMEOUT_S
-        self._decoder = sb.Decoder()
-        self._arrivals = ArrivalLog()
+        self._stream: RecordStream[sb.Record] = RecordStream(port, sb.Decoder)
         self._baud_found = port.baud
         self._backlog: list[RawSample] = []
         self._firmware = cmd.FIRST_VOLATILE_FIRMWARE
@@ -57,12 +57,12 @@ class SingleByteSession:
     @property
     def checksum_errors(self) -> int:
         """Damaged records."""
-        return self._decoder.checksum_errors
+        return self._stream.checksum_errors
 
     @property
     def skipped_bytes(self) -> int:
         """Bytes that belong to no record."""
-        return self._decoder.skipped_bytes
+        return self._stream.skipped_bytes
 
     def probe(self, timeout_s: float) -> bool:
         """Tell whether a GX3 answers here in this protocol."""
@@ -75,7 +75,7 @@ class SingleByteSession:
         """Stop whatever streams and wait until it is silent."""
         self._port.write(cmd.STOP_STREAM * 2)
         wait_for_silence(self._port, quiet_s=0.1, limit_s=1.0)
-        self._reset_decoder()
+        self._restart()
 
     def identify(self) -> DeviceInfo:
         """See `Session.identify`."""
@@ -146,7 +146,7 @@ class SingleByteSession:
             )
         self._port.set_baud(baud)
         time.sleep(0.05)
-        self._reset_decoder()
+        self._restart()
         if not self.probe(_REPLY_TIMEOUT_S) and not self.probe(_REPLY_TIMEOUT_S):
             raise timeout(self._port, f"the change to {baud} baud")
 
@@ -161,7 +161,7 @@ class SingleByteSession:
         if self._backlog:
             out, self._backlog = self._backlog, []
             return out
-        return [s for r in self._receive(timeout_s) if (s := self._sample(r)) is not None]
+        return [s for r in self._stream.receive(timeout_s) if (s := self._sample(r)) is not None]
 
     def _sample(self, record: sb.Record) -> RawSample | None:
         kind, values, end = record
@@ -172,15 +172,8 @@ class SingleByteSession:
         if total - total != 0.0:  # NaN or infinity: the device is idle or over range
             return None
         g = _G
-        arrival_ns = self._arrivals.arrival_ns(end, self._port.wire_byte_ns)
+        arrival_ns = self._stream.arrival_ns(end)
         return RawSample(ticks, (wx, wy, wz), (ax * g, ay * g, az * g), arrival_ns)
-
-    def _receive(self, timeout_s: float) -> list[sb.Record]:
-        data, t_read_ns = self._port.read(timeout_s)
-        if not data:  # a silence: what looked like the beginning of a long record may hide a short one
-            return self._decoder.finish()
-        self._arrivals.add(len(data), t_read_ns)
-        return self._decoder.feed(data)
 
     def _transact(
         self, command: bytes, kind: int, timeout_s: float | None = None, tries: int = _TRIES
@@ -191,7 +184,7 @@ class SingleByteSession:
             deadline = time.monotonic() + (timeout_s or self.reply_timeout_s)
             found: sb.Record | None = None
             while found is None and (left := deadline - time.monotonic()) > 0:
-                for record in self._receive(left):
+                for record in self._stream.receive(left):
                     if record.kind == kind:
                         found = record
                     elif record.kind == sb.ERROR_REPLY:
@@ -204,10 +197,8 @@ class SingleByteSession:
                 return found
         raise timeout(self._port, f"command 0x{kind:02X}")
 
-    def _reset_decoder(self) -> None:
-        old, self._decoder = self._decoder, sb.Decoder()
-        self._decoder.checksum_errors = old.checksum_errors
-        self._arrivals = ArrivalLog()
+    def _restart(self) -> None:
+        self._stream.restart()
         self._backlog = []
 
     def stop(self) -> None:
