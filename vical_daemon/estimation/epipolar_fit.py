@@ -223,7 +223,7 @@ class _Fit:
             size = 15 if self.fit_lens and step >= _LENS_AFTER else 7
             H, g, _ = self._normal(e, J[:, :size], Jt, weight / spread**2)
             self._prior(H, g, bias)
-            dx = -np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g)
+            dx = np.asarray(-np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g), np.float64)
             dx *= min(
                 1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12), self.max_step_s / max(abs(dx[3]), 1e-12)
             )

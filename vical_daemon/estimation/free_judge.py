@@ -8,7 +8,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.free_bundle import Carry, Fit
+from vical_daemon.estimation.free_bundle import Fit
+from vical_daemon.estimation.free_carry import CALIBRATION, Carry
 from vical_daemon.estimation.gaps import Gap, gaps
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.result import (
@@ -34,7 +35,6 @@ _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
 _BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
 _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
 _TRACE_MOST = 7200
-_CALIBRATION = 11  # first calibration error of a carry
 
 
 class FreeJudge:
@@ -149,8 +149,8 @@ class FreeJudge:
 
         For consistent sigmas, cov(new - old) = P_old - P_new.
         """
-        P_old = carry.covariance()[_CALIBRATION:, _CALIBRATION:]
-        P_new = fit.carry.covariance()[_CALIBRATION:, _CALIBRATION:]
+        P_old = carry.covariance()[CALIBRATION:, CALIBRATION:]
+        P_new = fit.carry.covariance()[CALIBRATION:, CALIBRATION:]
         scale = np.sqrt(np.diag(P_old))
         values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
         told = values > 0.02  # directions in which the window had something to say
@@ -242,7 +242,7 @@ class FreeJudge:
     def _camera(self, carry: Carry) -> CameraEstimate:
         full = np.zeros((15, 15))
         at = np.flatnonzero(self.active)
-        full[np.ix_(at, at)] = carry.covariance()[_CALIBRATION:, _CALIBRATION:] * self.factor()
+        full[np.ix_(at, at)] = carry.covariance()[CALIBRATION:, CALIBRATION:] * self.factor()
         sigma = np.sqrt(np.diag(full))
         c = carry.camera
         return CameraEstimate(

@@ -1,14 +1,17 @@
 """Velocity, gravity, lever arm and structure from tracks and an IMU, linearly, once rotations are known.
 
-With attitudes from the gyro, every camera centre is linear in z = (v0, gravity's direction, lever arm, accel bias):
-c_i = q_i + A_i z (gravity's size is known; its direction is linearised anew each round), and a landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes from
-the accelerometer, so that the system is inhomogeneous. [Martinelli, "Closed-form solution of visual-inertial
-structure from motion", 2014; Dong-Si & Mourikis, "Estimator initialization in vision-aided inertial
-navigation with unknown camera-IMU calibration", 2012]. Squares are divided by the distances found in the
-round before, or near points would draw everything towards the camera.
+With attitudes from the gyro, every camera centre is linear in z = (v0, gravity, lever arm, accel bias):
+c_i = q_i + A_i z, and a landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes from
+the accelerometer, so that the system is inhomogeneous; gravity's size is known and its direction is
+linearised anew each round. Squares are divided by the distances found in the round before, or near points
+would draw everything towards the camera. [Martinelli, "Closed-form solution of visual-inertial structure
+from motion", 2014; Dong-Si & Mourikis, "Estimator initialization in vision-aided inertial navigation with
+unknown camera-IMU calibration", 2012]
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 
@@ -49,7 +52,7 @@ def free_start(
     """
     shift = camera.timeshift_s
     links: list[Link] = []
-    for (t0, _), (t1, _) in zip(frames, frames[1:], strict=False):
+    for (t0, _), (t1, _) in pairwise(frames):
         link = make_link(buffer, t0 + shift, t1 + shift, gyro_bias, np.zeros(3), noise)
         if link is None:
             return "inertial data do not cover the images"

@@ -6,7 +6,7 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.epipolar_fit import EpipolarFit, epipolar_fit
-from vical_daemon.estimation.free_bundle import Carry
+from vical_daemon.estimation.free_carry import Carry
 from vical_daemon.estimation.free_start import free_start
 from vical_daemon.estimation.free_window import Window
 from vical_daemon.estimation.imu_model import ImuBuffer

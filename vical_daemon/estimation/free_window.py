@@ -8,6 +8,7 @@ are no special case: X = c + m / rho. [Civera et al., "Inverse depth parametriza
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +83,7 @@ class Window:
         links: Inertial constraints between neighbours.
         shift_s: Time shift for which instants and links hold; the camera's own differs from it by little.
         landmarks: What has been placed so far.
+        gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
     """
 
@@ -95,6 +97,7 @@ class Window:
     links: list[Link]
     shift_s: float
     landmarks: Landmarks
+    gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
     bad: set[tuple[int, int]] = field(default_factory=set)
 
     @property
@@ -106,7 +109,7 @@ class Window:
         """Knot in force on each link, shape (F - 1,)."""
         t = np.array([s for s, _ in self.frames])
         last = max(round(float(t[-1] - t[0]) / KNOT_S), 1) - 1
-        return np.minimum(((t[:-1] - t[0]) / KNOT_S).astype(np.intp), last)
+        return np.asarray(np.minimum(((t[:-1] - t[0]) / KNOT_S).astype(np.intp), last), np.intp)
 
     def fit_knots(self) -> None:
         """Give every second of the window a knot; new ones start where the last one is."""
@@ -142,14 +145,12 @@ class Window:
         self.fit_knots()
         return added
 
-    gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
-
     def relink(self, buffer: ImuBuffer) -> bool:
         """Integrate anew at the present time shift and biases; False where inertial data do not reach."""
         d = self.camera.timeshift_s - self.shift_s
         knots = self.knots()
-        links = []
-        for k, ((t0, _), (t1, _)) in enumerate(zip(self.frames, self.frames[1:], strict=False)):
+        links: list[Link] = []
+        for k, ((t0, _), (t1, _)) in enumerate(pairwise(self.frames)):
             b = self.bias[knots[k]]
             link = make_link(
                 buffer, t0 + self.camera.timeshift_s, t1 + self.camera.timeshift_s, b[:3], b[3:], self.noise
@@ -243,7 +244,7 @@ def rays_of(uv: FloatArray, camera: CameraState) -> tuple[FloatArray, BoolArray]
 def place(
     seen: Seen, R: FloatArray, p: FloatArray, camera: CameraState, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Anchor, bearing and inverse distance where the rays of each landmark meet (far away where they do not)."""
+    """Anchor, bearing, inverse distance where the rays of each landmark meet; a guess where they do not."""
     if not count:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     rays, ok = rays_of(seen.uv, camera)

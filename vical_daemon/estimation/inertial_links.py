@@ -110,7 +110,9 @@ class Links(NamedTuple):
         """Whitened errors and derivatives of all links.
 
         Args:
-            R, p, v: Motion at the m + 1 images (world; m, m/s).
+            R: Attitudes at the m + 1 images, shape (m + 1, 3, 3).
+            p: Positions in the world, m, shape (m + 1, 3).
+            v: Velocities in the world, m/s, shape (m + 1, 3).
             bias: [gyro, accel] bias in force on each link, shape (m, 6).
             gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
 

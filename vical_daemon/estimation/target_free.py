@@ -1,10 +1,10 @@
 """Calibration without a target: tracks of unknown points and an IMU in, calibration out. No clock, no I/O.
 
-Flow: buffer -> `free_start.Starter` (rotations and delay from the epipolar constraint, then speed, gravity and
-structure linearly) -> one inertial bundle adjustment per window of a few seconds, grown as images arrive ->
-what the window knows is carried into the next as a prior on tilt, speed, biases and calibration. The
-statistic of how a window's own data moved the calibration, against how much it was allowed to, says whether
-to believe it (see docs/math/target_free.md).
+Flow: buffer -> `free_starter.Starter` (rotations and delay from the epipolar constraint, then speed, gravity
+and structure linearly) -> one inertial bundle adjustment per window of a few seconds, grown as images arrive
+-> what the window knows is carried into the next as a prior on tilt, speed, biases and calibration. How far a
+window's own data moved the calibration, against how far they may, says whether to believe it.
+[docs/math/target_free.md]
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.free_bundle import Bundle, Carry, Fit, first_carry
+from vical_daemon.estimation.free_bundle import Bundle, Fit
+from vical_daemon.estimation.free_carry import CALIBRATION, Carry, first_carry, root_of
 from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.free_starter import Starter, start_sigmas
 from vical_daemon.estimation.free_window import KNOT_S, Landmarks, Window
 from vical_daemon.estimation.imu_model import ImuBuffer
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 
 MAX_RATE_HZ = 21.0  # images beyond are thinned: neighbours add little and the window's cost is quadratic
@@ -99,7 +100,7 @@ class TargetFreeCalibrator:
         if t_cam_s - self._taken_s < 1.0 / MAX_RATE_HZ:
             return
         self._taken_s = t_cam_s
-        ok = np.isfinite(frame.uv_px).all(axis=1)
+        ok: BoolArray = np.asarray(np.isfinite(frame.uv_px).all(axis=1))
         _, first = np.unique(frame.ids, return_index=True)
         ok[np.setdiff1d(np.arange(len(ok)), first)] = False
         frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok])
@@ -208,11 +209,9 @@ class TargetFreeCalibrator:
         keep = known.covariance()[5:, 5:]
         keep[:3, :3] += 4e-4**2 * np.eye(3)
         keep[3:6, 3:6] += 5e-3**2 * np.eye(3)
-        d = len(wide.root)
         covariance = np.diag(np.diag(wide.root) ** -2.0)
         covariance[5:, 5:] = keep
-        root = np.linalg.inv(np.linalg.cholesky(covariance + 1e-20 * np.eye(d)))
-        return replace(wide, root=root, bias=known.bias.copy(), camera=known.camera)
+        return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
 
     # ------------------------------------------------------------------ windows
     def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> Fit | None:
@@ -284,10 +283,10 @@ class TargetFreeCalibrator:
         place = self._shift_place()
         if place is not None:
             P[place, place] += _SHIFT_WALK**2 * span_s
-        return replace(carry, root=np.linalg.inv(np.linalg.cholesky(P + 1e-20 * np.eye(len(P)))))
+        return replace(carry, root=root_of(P))
 
     def _shift_place(self) -> int | None:
-        return 11 + int(self.active[:6].sum()) if self.active[6] else None
+        return CALIBRATION + int(self.active[:6].sum()) if self.active[6] else None
 
     def _disagreed(self, carry: Carry) -> None:
         """A window contradicts what was known: once may be a bad window, twice is a changed rig."""

@@ -1,0 +1,125 @@
+"""What one window of images hands on to the next: tilt, speed, biases, calibration, and how well known.
+
+In coordinates that do not know where the world's origin and heading are, so that no information about them
+can arise from nothing. [docs/math/target_free.md, eq. (9)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.free_window import Window
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.retract import orthonormal
+from vical_daemon.estimation.state import CameraState
+
+ARM, TURN, SHIFT, LENS = slice(0, 3), slice(3, 6), 6, slice(7, 15)  # of the calibration's 15 errors
+FULL = 15
+CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
+
+
+@dataclass(slots=True)
+class Carry:
+    """What is known at the first image of a window before its own data.
+
+    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of 15).
+
+    Attributes:
+        R: Attitude there; only its tilt matters.
+        speed: Velocity in the imu frame, m/s, shape (3,).
+        bias: [gyro, accel], shape (6,).
+        camera: Calibration.
+        root: W with W^T W = information of the errors, shape (d, d).
+        active: Which of the 15 calibration errors are estimated.
+    """
+
+    R: FloatArray
+    speed: FloatArray
+    bias: FloatArray
+    camera: CameraState
+    root: FloatArray
+    active: BoolArray
+
+    def covariance(self) -> FloatArray:
+        """Covariance of the errors, shape (d, d)."""
+        inverse = np.linalg.inv(self.root)
+        return np.asarray(inverse @ inverse.T)
+
+
+def calibration_difference(now: CameraState, then: CameraState) -> FloatArray:
+    """Errors [arm, turn (local), shift, lens 8] that lead from `then` to `now`, shape (15,)."""
+    return np.concatenate(
+        [
+            now.p_imu_cam - then.p_imu_cam,
+            so3.log(then.R_imu_cam.T @ now.R_imu_cam),
+            [now.timeshift_s - then.timeshift_s],
+            now.intrinsics - then.intrinsics,
+            now.distortion - then.distortion,
+        ]
+    )
+
+
+def moved(camera: CameraState, d: FloatArray) -> CameraState:
+    """The camera with an error of 15 applied."""
+    return replace(
+        camera,
+        R_imu_cam=orthonormal(camera.R_imu_cam @ so3.exp(d[TURN])),
+        p_imu_cam=camera.p_imu_cam + d[ARM],
+        timeshift_s=camera.timeshift_s + float(d[SHIFT]),
+        intrinsics=camera.intrinsics + d[7:11],
+        distortion=camera.distortion + d[11:],
+    )
+
+
+def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
+    """Next to nothing known: wide sigmas around a start.
+
+    Args:
+        window: Started window; its camera is the centre of the prior.
+        active: Which of the 15 calibration errors are estimated, shape (15,).
+        sigmas: Of the 15 calibration errors.
+    """
+    wide = np.concatenate([[1.0] * 2, [5.0] * 3, [0.02] * 3, [0.3] * 3, sigmas[np.flatnonzero(active)]])
+    R = window.R[0]
+    return Carry(R.copy(), R.T @ window.v[0], np.zeros(6), window.camera, np.diag(1.0 / wide), active)
+
+
+def tangents(bearing: FloatArray) -> FloatArray:
+    """Two directions across each unit vector, shape (n, 3, 2); smooth but at one pole."""
+    x, y, z = bearing[:, 0], bearing[:, 1], bearing[:, 2]
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    out = np.empty((len(bearing), 3, 2))
+    out[:, :, 0] = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    out[:, :, 1] = np.stack([b, sign + y * y * a, -y], axis=1)
+    return out
+
+
+def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Carry:
+    """Turn the marginal at a window's last image into coordinates without origin and heading.
+
+    Args:
+        window: Adjusted.
+        covariance: Of [last image 9, last knot 6, active calibration errors].
+        active: Which of the 15 calibration errors are estimated.
+    """
+    k = int(np.count_nonzero(active))
+    R, v = window.R[-1], window.v[-1]
+    J = np.zeros((CALIBRATION + k, 15 + k))
+    speed = R.T @ v
+    J[:2, :3] = tangents(R[2][None])[0].T
+    J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R.T
+    J[5:11, 9:15] = np.eye(6)
+    J[11:, 15:] = np.eye(k)
+    return Carry(
+        R.copy(), speed, window.bias[-1].copy(), window.camera, root_of(J @ covariance @ J.T), active
+    )
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """W with W^T W = inverse of a covariance."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance + 1e-20 * np.eye(len(covariance)))))

@@ -1,0 +1,253 @@
+"""Normal equations of one window: pixels, inertial links and what was carried in; landmarks kept apart."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.camera_model import project_jacobians
+from vical_daemon.estimation.free_carry import (
+    ARM,
+    FULL,
+    LENS,
+    SHIFT,
+    TURN,
+    Carry,
+    calibration_difference,
+    tangents,
+)
+from vical_daemon.estimation.free_window import KNOT_S, Seen, Window
+from vical_daemon.estimation.inertial_links import Links
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
+
+HUBER = 2.5  # sigmas (of the two axes together)
+_GAUGE = 1e10
+_INVERSE_SIGMA = 5.0  # 1/m: next to nothing is known about the depth of a new landmark
+
+
+class Normal(NamedTuple):
+    """Normal equations about the present values.
+
+    Attributes:
+        H: Of the states, ordered as `Order`, shape (n, n).
+        g: Gradient, shape (n,).
+        V: Blocks of the landmarks, shape (L, 3, 3).
+        W: Coupling of landmarks to [turn, position] of the images and to the calibration, (L, 3, 6 F + k).
+        gl: Gradient of the landmarks, shape (L, 3).
+        cost: Sum of the (robust) squares.
+    """
+
+    H: FloatArray
+    g: FloatArray
+    V: FloatArray
+    W: FloatArray
+    gl: FloatArray
+    cost: float
+
+
+class Order:
+    """Places of the unknowns: images but the last, knots but the last, last image, last knot, calibration."""
+
+    def __init__(self, F: int, K: int, k: int) -> None:
+        self.size = 9 * F + 6 * K + k
+        self.tail = 9 * (F - 1) + 6 * (K - 1)
+        frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
+        knots = 9 * (F - 1) + np.arange(6 * (K - 1)).reshape(K - 1, 6)
+        self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
+        self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
+        self.calib = self.tail + 15 + np.arange(k)
+
+
+class Problem:
+    """Whitened errors of a window and their derivatives.
+
+    Args:
+        window: Present values.
+        carry: What was known before.
+        sigma_px: Pixel noise.
+        spread: Square root of how many neighbouring images share an error of the pixels.
+    """
+
+    def __init__(self, window: Window, carry: Carry, sigma_px: float, spread: float) -> None:
+        self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
+        self.active = np.flatnonzero(carry.active)
+
+    def order(self) -> Order:
+        """Places of the unknowns."""
+        return Order(len(self.window.frames), len(self.window.bias), len(self.active))
+
+    # ------------------------------------------------------------------ pixels
+    def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Landmarks in the camera frame at their observations, scaled by rho; and parts for derivatives."""
+        w, cam = self.window, self.window.camera
+        late = cam.timeshift_s - w.shift_s + seen.row_s
+        rates = w.rates()[seen.frame]
+        R = w.R[seen.frame] @ so3.exp(rates * late[:, None])
+        p = w.p[seen.frame] + w.v[seen.frame] * late[:, None]
+        marks = w.landmarks
+        rho = marks.inverse[seen.landmark]
+        X = marks.bearing[seen.landmark] + rho[:, None] * (marks.anchor[seen.landmark] - p)
+        x_imu = np.einsum("nji,nj->ni", R, X)
+        y = (x_imu - rho[:, None] * cam.p_imu_cam) @ cam.R_imu_cam
+        return y, x_imu, R, rates
+
+    def pixel_errors(self, seen: Seen) -> tuple[FloatArray, BoolArray, FloatArray]:
+        """Whitened errors (N, 2), which are valid, and Huber weights."""
+        y = self._rays(seen)[0]
+        cam = self.window.camera
+        with np.errstate(all="ignore"):
+            uv = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)[0]
+        return self._weigh(seen, uv)
+
+    def _weigh(self, seen: Seen, uv: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
+        ok: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
+        e = np.where(ok[:, None], (np.where(ok[:, None], uv, 0.0) - seen.uv) / self.sigma_px, 0.0)
+        size = np.sqrt((e**2).sum(axis=1))
+        weight = np.where(ok, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
+        return e, ok, weight
+
+    def normal(self, seen: Seen, links: Links) -> Normal:
+        """Normal equations with landmarks kept apart."""
+        w, cam = self.window, self.window.camera
+        y, x_imu, R, rates = self._rays(seen)
+        with np.errstate(all="ignore"):
+            uv, Jy, Jlens = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)
+        e, ok, weight = self._weigh(seen, uv)
+        root = np.sqrt(weight) / (self.sigma_px * self.spread)
+        Jy = np.where(ok[:, None, None], Jy, 0.0) * root[:, None, None]
+        Jlens = np.where(ok[:, None, None], Jlens, 0.0) * root[:, None, None]
+        e = e * np.sqrt(weight)[:, None]
+        cost = self._robust_cost(e, weight) / self.spread**2
+        e = e / self.spread
+        marks = w.landmarks
+        rho = marks.inverse[seen.landmark][:, None, None]
+        Rt = np.swapaxes(R, 1, 2)
+        JR = Jy @ cam.R_imu_cam.T  # by the point in the imu frame
+        JW = JR @ Rt  # by the point in the world
+        Jf = np.concatenate([JR @ so3.hat(x_imu), -rho * JW], axis=2)
+        Jc = np.empty((len(e), 2, FULL))
+        Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, Jy @ so3.hat(y)
+        v_imu = np.matmul(Rt, w.v[seen.frame][..., None])
+        spin = np.cross(x_imu, rates)[..., None] - rho * v_imu
+        Jc[:, :, SHIFT] = np.matmul(JR, spin)[..., 0]
+        Jc[:, :, LENS] = Jlens
+        Jc = Jc[:, :, self.active]
+        basis = tangents(marks.bearing)[seen.landmark]
+        away = marks.anchor[seen.landmark] - w.p[seen.frame]
+        by_rho = np.matmul(JW, away[..., None])[..., 0] - JR @ cam.p_imu_cam
+        Jl = np.concatenate([JW @ basis, by_rho[..., None]], axis=2)
+        return self._assemble(seen, links, e, Jf, Jc, Jl, cost)
+
+    def _robust_cost(self, e: FloatArray, weight: FloatArray) -> float:
+        """Sum of the Huber losses (e is weighted already: weight * size^2)."""
+        square = (e**2).sum(axis=1)
+        inner = square
+        outer = 2.0 * HUBER * np.sqrt(square / np.maximum(weight, 1e-12)) - HUBER**2
+        return float(np.where(weight < 1.0, outer, inner).sum()) + 1e4 * float((weight == 0.0).sum())
+
+    def _assemble(
+        self,
+        seen: Seen,
+        links: Links,
+        e: FloatArray,
+        Jf: FloatArray,
+        Jc: FloatArray,
+        Jl: FloatArray,
+        cost: float,
+    ) -> Normal:
+        w = self.window
+        F, K, k, L = len(w.frames), len(w.bias), len(self.active), len(seen.begin)
+        order = Order(F, K, k)
+        H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
+        JfT, JlT = np.swapaxes(Jf, 1, 2), np.swapaxes(Jl, 1, 2)
+        begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
+        Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
+        blocks = np.add.reduceat((JfT @ Jall)[by], fb)
+        pose = order.frames[:, :6]
+        at = pose[fw]
+        H[at[:, :, None], at[:, None, :]] += blocks[:, :, :6]
+        H[at[:, :, None], order.calib] += blocks[:, :, 6:-1]
+        H[order.calib[:, None], at.reshape(1, -1)] += blocks[:, :, 6:-1].reshape(-1, k).T
+        g[at] += blocks[:, :, -1]
+        flat = Jc.reshape(-1, k)
+        H[order.calib[:, None], order.calib] += flat.T @ flat
+        g[order.calib] += flat.T @ e.reshape(-1)
+        V = np.add.reduceat(JlT @ Jl, begin)
+        V[:, 2, 2] += _INVERSE_SIGMA**-2
+        gl = np.add.reduceat(np.matmul(JlT, e[..., None])[..., 0], begin)
+        gl[:, 2] += w.landmarks.inverse * _INVERSE_SIGMA**-2
+        cost += float((w.landmarks.inverse**2).sum()) * _INVERSE_SIGMA**-2
+        W = np.zeros((L, 3, 6 * F + k))
+        W[:, :, 6 * F :] = np.add.reduceat(JlT @ Jc, begin)
+        poses = np.zeros((L, F, 3, 6))  # a landmark is seen once in an image
+        poses[seen.landmark, seen.frame] = JlT @ Jf
+        W[:, :, : 6 * F] = poses.transpose(0, 2, 1, 3).reshape(L, 3, 6 * F)
+        cost += self._add_links(H, g, order, links)
+        cost += self._add_prior(H, g, order)
+        return Normal(H, g, V, W, gl, cost)
+
+    # ------------------------------------------------------------------ inertial part and prior
+    def _add_links(self, H: FloatArray, g: FloatArray, order: Order, links: Links) -> float:
+        w = self.window
+        knots = w.knots()
+        e, J = links.errors(w.R, w.p, w.v, w.bias[knots], w.gravity)
+        JT = np.swapaxes(J, 1, 2)
+        A, b = JT @ J, np.matmul(JT, e[..., None])[..., 0]
+        # neighbours share an image and many links a knot: even and odd links, then the knots one by one
+        for first in (0, 1):
+            at = np.concatenate([order.frames[first:-1:2], order.frames[first + 1 :: 2]], axis=1)
+            H[at[:, :, None], at[:, None, :]] += A[first::2, :18, :18]
+            g[at] += b[first::2, :18]
+        for knot in range(len(w.bias)):
+            own = np.flatnonzero(knots == knot)
+            rows = order.knots[knot]
+            H[rows[:, None], rows] += A[own, 18:, 18:].sum(axis=0)
+            g[rows] += b[own, 18:].sum(axis=0)
+            for first in (0, 9):
+                at = order.frames[own + first // 9].reshape(-1)
+                side = A[own, first : first + 9, 18:].reshape(-1, 6)
+                H[at[:, None], rows] += side
+                H[rows[:, None], at] += side.T
+        cost = float((e**2).sum())
+        information = np.repeat([w.noise.gyro_walk**-2, w.noise.accel_walk**-2], 3) / KNOT_S
+        for m in range(len(w.bias) - 1):
+            a, c = order.knots[m], order.knots[m + 1]
+            off = w.bias[m + 1] - w.bias[m]
+            H[a, a] += information
+            H[c, c] += information
+            H[a, c] -= information
+            H[c, a] -= information
+            g[a] -= information * off
+            g[c] += information * off
+            cost += float(information @ off**2)
+        return cost
+
+    def _prior_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Errors (d,) of the carried knowledge and derivatives (d, 9 + 6 + k)."""
+        w, c = self.window, self.carry
+        R0, v0 = w.R[0], w.v[0]
+        up, now = c.R[2], R0[2]
+        B = tangents(up[None])[0]
+        speed = R0.T @ v0
+        calibration = calibration_difference(w.camera, c.camera)[self.active]
+        e = np.concatenate([B.T @ np.cross(now, up), speed - c.speed, w.bias[0] - c.bias, calibration])
+        J = np.zeros((len(e), 15 + len(self.active)))
+        J[:2, :3] = B.T
+        J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R0.T
+        J[5:11, 9:15] = np.eye(6)
+        J[11:, 15:] = np.eye(len(self.active))
+        return c.root @ e, c.root @ J
+
+    def _add_prior(self, H: FloatArray, g: FloatArray, order: Order) -> float:
+        e, J = self._prior_errors()
+        at = np.concatenate([order.frames[0], order.knots[0], order.calib])
+        H[at[:, None], at] += J.T @ J
+        g[at] += J.T @ e
+        # where the origin lies and which way is north cannot be seen: held, at no cost
+        turn, place = order.frames[0][:3], order.frames[0][3:6]
+        up = self.window.R[0][2]
+        H[turn[:, None], turn] += _GAUGE * np.outer(up, up)
+        H[place, place] += _GAUGE
+        return float(e @ e)
