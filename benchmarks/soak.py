@@ -31,13 +31,21 @@ _SETTLE_S = 60.0
 
 
 class _Count:
-    """Counts what a subscription is given."""
+    """Counts what a subscription is given; notes when numbers were missing and how long nothing had come."""
 
     def __init__(self) -> None:
-        self.messages = 0
+        self.messages, self.longest_s = 0, 0.0
+        self.bursts: list[tuple[float, int, float]] = []
+        self._begin_s = self._last_s = time.monotonic()
+        self._next: int | None = None
 
-    def __call__(self, _sample: Any) -> None:
-        self.messages += 1
+    def __call__(self, sample: Any) -> None:
+        now_s, self.messages = time.monotonic(), self.messages + 1
+        pause_s, self._last_s = now_s - self._last_s, now_s
+        self.longest_s = max(self.longest_s, pause_s if self._next is not None else 0.0)
+        if self._next is not None and sample.sequence > self._next:
+            self.bursts.append((now_s - self._begin_s, sample.sequence - self._next, pause_s))
+        self._next = sample.sequence + 1
 
 
 def main(argv: list[str]) -> int:
@@ -82,7 +90,7 @@ def publish_and_watch(bus: Any, pid: int, seconds: float) -> tuple[list[tuple[An
             bus.publish(_IMAGE, image)
             images += 1
         if elapsed_s > len(seen) * 10:
-            seen.append((elapsed_s, _usage(os.getpid()), _usage(pid)))
+            seen.append((elapsed_s, usage(os.getpid()), usage(pid)))
         time.sleep(0.0007)
     return seen, {"inertial": sent, "images": images}
 
@@ -104,7 +112,8 @@ def record(folder: str, done: Any) -> None:
     thread.start()
     done.wait()
     seen = {
-        kind: (counts[kind].messages, subscription.dropped) for kind, subscription in subscriptions.items()
+        kind: (counts[kind].messages, subscription.dropped, counts[kind].longest_s, counts[kind].bursts)
+        for kind, subscription in subscriptions.items()
     }
     (Path(folder) / "seen.json").write_text(json.dumps(seen))
     stop.set()
@@ -125,7 +134,7 @@ def check_segments(log: Path) -> tuple[int, int, int]:
 def report(
     seen: list[tuple[Any, ...]],
     sent: dict[str, int],
-    received: dict[str, list[int]],
+    received: dict[str, list[Any]],
     status: dict[str, str],
     left: tuple[int, int, int],
 ) -> None:
@@ -142,10 +151,13 @@ def report(
                 f"{first:.1f} -> {last:.1f} ({100 * (last / first - 1):+.1f} %), most {max(values):.1f}"
             )
         print(f"| {what}, after a minute -> at the end | {cells[0]} | {cells[1]} |")
-    print("\n| kind | sent by the host | received by the recorder's process | gaps in the numbers |")
-    print("|---|---:|---:|---:|")
-    for kind, (messages, gaps) in received.items():
-        print(f"| {kind} | {sent.get(kind, '-')} | {messages} | {gaps} |")
+    print("\n| kind | sent by the host | received in the recorder's process | missing | longest pause, s |")
+    print("|---|---:|---:|---:|---:|")
+    for kind, (messages, gaps, longest_s, _) in received.items():
+        print(f"| {kind} | {sent.get(kind, '-')} | {messages} | {gaps} | {longest_s:.2f} |")
+    bursts = [(*burst, kind) for kind, row in received.items() if kind != "statuses" for burst in row[3]]
+    for at_s, lost, pause_s, kind in sorted(bursts)[:20]:
+        print(f"{lost} {kind} missing at {at_s:.0f} s, after a pause of {pause_s:.2f} s")
     holes, kept, segments = left
     print(
         f"\n{seen[-1][0] / 60:.1f} min; {status['lost_on_bus']} messages lost on the bus as the recorder "
@@ -158,7 +170,8 @@ def _values(sample: Any) -> dict[str, str]:
     return m.decode_diagnostics(sample.payload).statuses[0].values
 
 
-def _usage(pid: int) -> tuple[float, int, int]:
+def usage(pid: int) -> tuple[float, int, int]:
+    """Return memory (MB), descriptors and threads of a process."""
     process = Path(f"/proc/{pid}")
     pages = int((process / "statm").read_text().split()[1])
     return (

@@ -66,7 +66,7 @@ def _as_text(summary: Summary, problem: str) -> str:
         f"begins {begin:%Y-%m-%d %H:%M:%S} UTC" if begin else "without date",
         "",
         f"{'topic':<40} {'count':>8} {'Hz':>8} {'missing':>8} {'max gap':>9} {'jitter':>9} "
-        f"{'latency p50/p99':>18}",
+        f"{'latency p50 / p99':>19}",
     ]
     lines += [_row(topic) for topic in summary.topics]
     for name, values in summary.metadata.items():
@@ -80,8 +80,21 @@ def _as_text(summary: Summary, problem: str) -> str:
 
 
 def _row(topic: TopicSummary) -> str:
-    latency = "" if topic.latency_ms is None else "{:.2f}/{:.2f} ms".format(*topic.latency_ms)
+    latency = (
+        "" if topic.latency_ms is None else "{} / {}".format(*(_time(1e-3 * v) for v in topic.latency_ms))
+    )
     return (
         f"{topic.topic:<40} {topic.count:>8} {topic.rate_hz:>8.2f} {topic.missing:>8} "
-        f"{topic.largest_gap_s:>7.3f} s {topic.jitter_us:>6.1f} us {latency:>18}"
+        f"{topic.largest_gap_s:>7.3f} s {_time(1e-6 * topic.jitter_us):>9} {latency:>19}"
     )
+
+
+def _time(seconds: float) -> str:
+    """Return a duration in the unit that suits it.
+
+    >>> _time(0.000174), _time(0.2227), _time(9.1)
+    ('174 us', '223 ms', '9.1 s')
+    """
+    if seconds >= 1.0:
+        return f"{seconds:.3g} s" if seconds < 1000 else f"{seconds:.0f} s"
+    return f"{1e3 * seconds:.3g} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.0f} us"
