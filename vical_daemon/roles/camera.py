@@ -12,17 +12,14 @@ import numpy.typing as npt
 from vical_drivers.samples import Frame, FrameSource
 
 from vical_daemon import topics
+from vical_daemon.acquisition import Line, clock_of_the_service, run_lines, start_line
 from vical_daemon.bus import Bus
 from vical_daemon.config import CameraConfig, Config
-from vical_daemon.device_loop import DeviceLoop, SingleReads
-from vical_daemon.health import StatusSender, device_status
-from vical_daemon.messages import DiagnosticStatus, encode_image
-from vical_daemon.outbox import Outbox
-from vical_daemon.places import make_private, runtime_directory
-from vical_daemon.wall_clock import WallClock, shared_clock
+from vical_daemon.device_loop import SingleReads
+from vical_daemon.messages import encode_image
+from vical_daemon.wall_clock import WallClock
 
 QUEUE_DEPTH = 8  # images are large: 8 of 1.3 MB
-JOIN_S = 3.0
 
 OpenCamera = Callable[[CameraConfig], FrameSource]
 
@@ -120,32 +117,14 @@ def run(
         clock: Monotonic to UNIX time; None: the one that all processes of the service share.
         open_source: Opens a device (the demo gives a rendered one).
     """
-    clock = clock or shared_clock(make_private(runtime_directory()))
-    devices = [_start(config, name, bus, stop, clock, open_source) for name in config.cameras]
+    clock = clock or clock_of_the_service()
 
-    def statuses() -> list[DiagnosticStatus]:
-        return [
-            device_status(loop.name, loop.health(), outbox, config.cameras[name].rate_hz, role.counters())
-            for name, role, loop, outbox in devices
-        ]
+    def start(name: str) -> Line[Frame]:
+        camera = config.cameras[name]
+        maker = CameraRole(config.rig, name, clock)
+        return start_line(
+            f"camera/{name}", maker, lambda: SingleReads(open_source(camera)), bus, stop,
+            rate_hz=camera.rate_hz, depth=QUEUE_DEPTH,
+        )  # fmt: skip
 
-    StatusSender(config.rig, "camera", bus, clock).run_until(stop, statuses)
-    for _, _, loop, outbox in devices:
-        loop.join(JOIN_S)
-        outbox.close()
-
-
-def _start(
-    config: Config, name: str, bus: Bus, stop: threading.Event, clock: WallClock, open_source: OpenCamera
-) -> tuple[str, CameraRole, DeviceLoop[Frame], Outbox]:
-    role = CameraRole(config.rig, name, clock)
-    outbox = Outbox(bus, QUEUE_DEPTH, f"camera/{name} out")
-
-    def deliver(frame: Frame) -> None:
-        payload = role.message(frame)
-        if payload is not None:
-            outbox.put(role.key, payload)
-
-    loop = DeviceLoop(f"camera/{name}", lambda: SingleReads(open_source(config.cameras[name])), deliver, stop)
-    loop.start()
-    return name, role, loop, outbox
+    run_lines(config.rig, "camera", [start(name) for name in config.cameras], bus, stop, clock)

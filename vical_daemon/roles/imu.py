@@ -8,17 +8,13 @@ from collections.abc import Callable
 from vical_drivers.samples import ImuSample, ImuSource
 
 from vical_daemon import topics
+from vical_daemon.acquisition import Line, clock_of_the_service, run_lines, start_line
 from vical_daemon.bus import Bus
 from vical_daemon.config import Config, ImuConfig
-from vical_daemon.device_loop import DeviceLoop
-from vical_daemon.health import StatusSender, device_status
-from vical_daemon.messages import DiagnosticStatus, encode_imu
-from vical_daemon.outbox import Outbox
-from vical_daemon.places import make_private, runtime_directory
-from vical_daemon.wall_clock import WallClock, shared_clock
+from vical_daemon.messages import encode_imu
+from vical_daemon.wall_clock import WallClock
 
 QUEUE_DEPTH = 8192  # 8 s at 1000 Hz
-JOIN_S = 3.0
 
 OpenImu = Callable[[ImuConfig], ImuSource]
 
@@ -93,32 +89,14 @@ def run(
         clock: Monotonic to UNIX time; None: the one that all processes of the service share.
         open_source: Opens a device (the demo's is the real one, on a pseudo terminal).
     """
-    clock = clock or shared_clock(make_private(runtime_directory()))
-    devices = [_start(config, name, bus, stop, clock, open_source) for name in config.imus]
+    clock = clock or clock_of_the_service()
 
-    def statuses() -> list[DiagnosticStatus]:
-        return [
-            device_status(loop.name, loop.health(), outbox, config.imus[name].rate_hz, role.counters())
-            for name, role, loop, outbox in devices
-        ]
+    def start(name: str) -> Line[ImuSample]:
+        imu = config.imus[name]
+        maker = ImuRole(config.rig, name, clock)
+        return start_line(
+            f"imu/{name}", maker, lambda: open_source(imu), bus, stop,
+            rate_hz=imu.rate_hz, depth=QUEUE_DEPTH, inline=True,
+        )  # fmt: skip
 
-    StatusSender(config.rig, "imu", bus, clock).run_until(stop, statuses)
-    for _, _, loop, outbox in devices:
-        loop.join(JOIN_S)
-        outbox.close()
-
-
-def _start(
-    config: Config, name: str, bus: Bus, stop: threading.Event, clock: WallClock, open_source: OpenImu
-) -> tuple[str, ImuRole, DeviceLoop[ImuSample], Outbox]:
-    role = ImuRole(config.rig, name, clock)
-    outbox = Outbox(bus, QUEUE_DEPTH, f"imu/{name} out", inline=True)
-
-    def deliver(sample: ImuSample) -> None:
-        payload = role.message(sample)
-        if payload is not None:
-            outbox.put(role.key, payload)
-
-    loop = DeviceLoop(f"imu/{name}", lambda: open_source(config.imus[name]), deliver, stop)
-    loop.start()
-    return name, role, loop, outbox
+    run_lines(config.rig, "imu", [start(name) for name in config.imus], bus, stop, clock)

@@ -1,0 +1,103 @@
+"""What the acquiring roles have in common: devices with their threads, and a status until the end."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+from vical_daemon.bus import Bus
+from vical_daemon.device_loop import DeviceLoop, Source
+from vical_daemon.health import StatusSender, device_status
+from vical_daemon.messages import DiagnosticStatus
+from vical_daemon.outbox import Outbox
+from vical_daemon.places import make_private, runtime_directory
+from vical_daemon.wall_clock import WallClock, shared_clock
+
+JOIN_S = 3.0
+T = TypeVar("T")
+T_contra = TypeVar("T_contra", contravariant=True)
+
+
+class MessageMaker(Protocol[T_contra]):
+    """Turns what one device delivers into messages. No I/O."""
+
+    @property
+    def key(self) -> str:
+        """Where they go."""
+        ...
+
+    def message(self, item: T_contra) -> bytes | None:
+        """Return the message of one item; None: there is none to send."""
+        ...
+
+    def counters(self) -> dict[str, str]:
+        """Return what the driver's counters do not say."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Line(Generic[T]):
+    """One device on its way to the bus; make it with `start_line`."""
+
+    maker: MessageMaker[T]
+    loop: DeviceLoop[T]
+    outbox: Outbox
+    rate_hz: float
+
+    def status(self) -> DiagnosticStatus:
+        """Return the status of the device."""
+        loop = self.loop
+        return device_status(loop.name, loop.health(), self.outbox, self.rate_hz, self.maker.counters())
+
+
+def start_line(
+    name: str,
+    maker: MessageMaker[T],
+    open_source: Callable[[], AbstractContextManager[Source[T]]],
+    bus: Bus,
+    stop: threading.Event,
+    *,
+    rate_hz: float,
+    depth: int,
+    inline: bool = False,
+) -> Line[T]:
+    """Start the threads of one device: blocking read -> stamp (in the driver) -> outbox -> bus.
+
+    Args:
+        name: For logs and status, e.g. ``imu/imu0``.
+        maker: Makes its messages.
+        open_source: Opens it.
+        bus: Where the messages go.
+        stop: Ends it.
+        rate_hz: Nominal.
+        depth: Messages that may wait for the bus.
+        inline: See `Outbox`.
+    """
+    outbox = Outbox(bus, depth, f"{name} out", inline=inline)
+
+    def deliver(item: T) -> None:
+        payload = maker.message(item)
+        if payload is not None:
+            outbox.put(maker.key, payload)
+
+    loop = DeviceLoop(name, open_source, deliver, stop)
+    loop.start()
+    return Line(maker, loop, outbox, rate_hz)
+
+
+def run_lines(
+    rig: str, role: str, lines: Sequence[Line[Any]], bus: Bus, stop: threading.Event, clock: WallClock
+) -> None:
+    """Publish the status of the devices until `stop`, then end their threads."""
+    StatusSender(rig, role, bus, clock).run_until(stop, lambda: [line.status() for line in lines])
+    for line in lines:
+        line.loop.join(JOIN_S)
+        line.outbox.close()
+
+
+def clock_of_the_service() -> WallClock:
+    """Return the clock that all processes of the service share."""
+    return shared_clock(make_private(runtime_directory()))
