@@ -8,47 +8,30 @@ packet, only without its jitter, and half an exposure earlier.
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
-import json
 import logging
-import os
-import select
-import shutil
-import struct
-import subprocess
 import time
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
+from vical_drivers.camera.aravis_process import OPEN_TIMEOUT_S, GrabberProcess
 from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Layout, PixelFormat
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, SequenceCounter
 from vical_drivers.camera.statistics import FrameStatistics
 from vical_drivers.camera.v4l2_stamp import SIGMA_NS, ExposureStamper, RawStamp
+from vical_drivers.closing import Closing
 from vical_drivers.envelope import LowerEnvelope
 from vical_drivers.errors import (
-    DeviceBusyError,
     DeviceLostError,
-    DeviceNotFoundError,
     DeviceRefusedError,
     DeviceTimeoutError,
     DriverError,
-    MissingLibraryError,
 )
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
 _log = logging.getLogger(__name__)
 
-PACKAGES = "gir1.2-aravis-0.8 python3-gi"
-_GRABBER = Path(__file__).with_name("aravis_grabber.py")
-_HEADER = struct.Struct("<4sII")
-_MAGIC = b"VGRB"
-_OPEN_TIMEOUT_S = 15.0
-_PIPE_BYTES = 1 << 20
 _MIN_AGE_S = 1.0
 _FORMATS: dict[str, PixelFormat] = {
     "Mono8": FORMATS["GREY"],
@@ -64,110 +47,9 @@ _FORMATS: dict[str, PixelFormat] = {
         for name, order in (("RG", "RGGB"), ("GB", "GBRG"), ("GR", "GRBG"), ("BG", "BGGR"))
     },
 }
-_ERRORS: dict[str, type[DriverError]] = {
-    "not-found": DeviceNotFoundError,
-    "busy": DeviceBusyError,
-    "refused": DeviceRefusedError,
-}
 
 
-class _Grabber:
-    """The process at the other end of a pipe, and its messages."""
-
-    def __init__(self, request: dict[str, Any]) -> None:
-        python = system_python()
-        self._buffer = bytearray()
-        self._process = subprocess.Popen(
-            # -I: nothing of this environment's packages may leak into the other Python
-            [python, "-I", str(_GRABBER), json.dumps(request)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-        )
-        assert self._process.stdout is not None and self._process.stdin is not None
-        self._out = self._process.stdout.fileno()
-        self._in = self._process.stdin
-        with contextlib.suppress(OSError):
-            fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-
-    def receive(self, timeout_s: float) -> tuple[dict[str, Any], memoryview] | None:
-        """Return the next message and its data; None after `timeout_s`.
-
-        Raises:
-            DriverError: The process reported a failure, or ended.
-        """
-        deadline = time.monotonic() + timeout_s
-        while True:
-            message = self._parse()
-            if message is not None:
-                return self._check(message)
-            left_s = deadline - time.monotonic()
-            poller = select.poll()
-            poller.register(self._out, select.POLLIN)
-            if not poller.poll(max(0.0, left_s) * 1e3):
-                return None
-            data = os.read(self._out, _PIPE_BYTES)
-            if not data:
-                raise DeviceLostError("aravis: the grabber process ended")
-            self._buffer += data
-
-    def _parse(self) -> tuple[dict[str, Any], memoryview] | None:
-        if len(self._buffer) < _HEADER.size:
-            return None
-        magic, text_bytes, data_bytes = _HEADER.unpack_from(self._buffer)
-        if magic != _MAGIC:
-            raise DeviceLostError("aravis: the grabber process sent nonsense")
-        start = _HEADER.size + text_bytes
-        end = start + data_bytes
-        if len(self._buffer) < end:
-            return None
-        # what belongs to this message is cut off, so that its pixels need no copy
-        message, self._buffer = self._buffer[:end], self._buffer[end:]
-        return json.loads(message[_HEADER.size : start]), memoryview(message)[start:]
-
-    @staticmethod
-    def _check(message: tuple[dict[str, Any], memoryview]) -> tuple[dict[str, Any], memoryview]:
-        fields = message[0]
-        if fields["kind"] == "lost":
-            raise DeviceLostError(f"aravis: {fields['text']}")
-        if fields["kind"] == "error":
-            if fields["error"] == "missing":
-                raise MissingLibraryError(f"GenICam cameras need Aravis: sudo apt install {PACKAGES}")
-            raise _ERRORS[fields["error"]](fields["text"])
-        return message
-
-    def send(self, command: dict[str, Any]) -> None:
-        try:
-            self._in.write(json.dumps(command).encode() + b"\n")
-            self._in.flush()
-        except OSError as error:
-            raise DeviceLostError("aravis: the grabber process ended") from error
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._in.close()  # the end of its input ends it
-        try:
-            self._process.wait(2.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        assert self._process.stdout is not None
-        self._process.stdout.close()
-
-
-def system_python() -> str:
-    """Return the distribution's Python, which has the bindings; VICAL_SYSTEM_PYTHON names another.
-
-    Raises:
-        MissingLibraryError: There is none.
-    """
-    python = os.environ.get("VICAL_SYSTEM_PYTHON", "/usr/bin/python3")
-    if shutil.which(python) is None:
-        raise MissingLibraryError(f"GenICam cameras need {python}: sudo apt install python3 {PACKAGES}")
-    return python
-
-
-class AravisCamera:
+class AravisCamera(Closing):
     """A `FrameSource` over one GenICam camera.
 
     Args:
@@ -192,13 +74,13 @@ class AravisCamera:
         self._stamper = ExposureStamper(s)
         self._pending_loss = 0
         self._closed = False
-        self._grabber: _Grabber | None = None
+        self._grabber: GrabberProcess | None = None
         self._open()
 
     def _open(self) -> None:
-        self._grabber = grabber = _Grabber(self._request)
+        self._grabber = grabber = GrabberProcess(self._request)
         try:
-            answer = grabber.receive(_OPEN_TIMEOUT_S)
+            answer = grabber.receive(OPEN_TIMEOUT_S)
             if answer is None:
                 raise DeviceTimeoutError(f"aravis:{self._request['id']}: no answer from the camera")
             self._info = self._describe(answer[0])
@@ -363,14 +245,6 @@ class AravisCamera:
         self._closed = True
         self._drop()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 def _ns(seconds: float | None) -> int | None:
     return None if seconds is None else round(seconds * 1e9)
@@ -382,9 +256,9 @@ def list_aravis_cameras(interfaces: tuple[str, ...] = ()) -> list[DeviceInfo]:
     Raises:
         MissingLibraryError: Aravis' bindings are not installed.
     """
-    grabber = _Grabber({"list": True, "interfaces": list(interfaces)})
+    grabber = GrabberProcess({"list": True, "interfaces": list(interfaces)})
     try:
-        answer = grabber.receive(_OPEN_TIMEOUT_S)
+        answer = grabber.receive(OPEN_TIMEOUT_S)
     finally:
         grabber.close()
     devices = [] if answer is None else answer[0]["devices"]

@@ -6,18 +6,17 @@ import csv
 import time
 from collections import deque
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.statistics import FrameStatistics
+from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
 
-class ImageFolder:
+class ImageFolder(Closing):
     """A `FrameSource` that replays a folder as fast as it is read.
 
     Args:
@@ -105,11 +104,3 @@ class ImageFolder:
     def close(self) -> None:
         """Forget the rest; may be called twice."""
         self._frames.clear()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -11,8 +11,7 @@ from __future__ import annotations
 import logging
 import select
 import time
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, SequenceCounter
 from vical_drivers.camera.statistics import FrameStatistics
 from vical_drivers.camera.v4l2_stamp import SIGMA_NS, ExposureStamper, RawStamp
+from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
@@ -42,7 +42,7 @@ PACKET_STAMP_SIGMA_NS = 36_000
 """The first packet is dated by its bus cycle of 125 us: a uniform error of 125 us / sqrt(12)."""
 
 
-class IidcCamera:
+class IidcCamera(Closing):
     """A `FrameSource` over one FireWire camera.
 
     Args:
@@ -133,14 +133,6 @@ class IidcCamera:
         """Stop the camera and free the bus; may be called twice."""
         self._closed = True
         self._drop()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     # -- who and how -----------------------------------------------------------------------------------
 

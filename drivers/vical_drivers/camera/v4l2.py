@@ -17,8 +17,6 @@ from __future__ import annotations
 import logging
 import select
 from collections.abc import Callable
-from types import TracebackType
-from typing import Self
 
 from vical_drivers.camera import v4l2_abi as abi
 from vical_drivers.camera.discovery import NodeEntry, find_again, find_node
@@ -34,6 +32,7 @@ from vical_drivers.camera.v4l2_controls import Controls
 from vical_drivers.camera.v4l2_exposure import apply_settings, read_exposure_ns, set_exposure
 from vical_drivers.camera.v4l2_node import DequeuedBuffer, NodeIdentity, ObtainedFormat, VideoNode
 from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp, kernel_stamp
+from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
@@ -85,7 +84,7 @@ class _Session:
         self.node.close()
 
 
-class V4l2Camera:
+class V4l2Camera(Closing):
     """A `FrameSource` over one V4L2 node.
 
     Args:
@@ -154,14 +153,6 @@ class V4l2Camera:
         """Stop streaming and free the device; may be called twice."""
         self._closed = True
         self._drop_session()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     # -- who and how ---------------------------------------------------------------------------------
 

@@ -6,9 +6,8 @@ import contextlib
 import logging
 import time
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Self
 
+from vical_drivers.closing import Closing
 from vical_drivers.envelope import EnvelopeOptions
 from vical_drivers.errors import DeviceLostError, DeviceTimeoutError, DriverError
 from vical_drivers.microstrain.probe import PROTOCOLS, connect
@@ -71,7 +70,7 @@ def open_imu(
     return MicrostrainImu(port, ImuSettings(rate_hz, filter_width, baud), options)
 
 
-class MicrostrainImu:
+class MicrostrainImu(Closing):
     """The source behind `open_imu`. One thread at a time may use it."""
 
     def __init__(self, path: str, settings: ImuSettings, options: ImuOptions | None = None) -> None:
@@ -203,11 +202,3 @@ class MicrostrainImu:
             self._past_skipped_bytes += session.skipped_bytes
             session.stop()
         self._close_port.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
