@@ -32,7 +32,7 @@ class Motion(TypedDict):
 def sentence(estimate: CalibrationEstimate) -> str:
     """Return the status in words, with the reason where there is one."""
     text = _SENTENCES[estimate.status]
-    return f"{text} {estimate.reason}" if estimate.reason else text
+    return f"{text.removesuffix('.')}: {estimate.reason.removesuffix('.')}." if estimate.reason else text
 
 
 def motion(texts: Iterable[str]) -> Motion:
