@@ -15,7 +15,7 @@ from vical_daemon.mcap_log.writer import LogWriter
 
 _log = logging.getLogger(__name__)
 FLUSH_S = 0.8  # the recorder goes round each 0.1 s: so a crash costs less than a second
-SYNC_S = 5.0
+SYNC_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +66,7 @@ class LogSession:
         self._segment = 0
         self._latched: dict[str, bytes] = {}
         self.messages = 0
+        self._syncing: threading.Thread | None = None
         self._writer = self._open()
 
     @property
@@ -118,9 +119,10 @@ class LogSession:
         if now_s - self._flushed_s >= FLUSH_S:
             self._flushed_s = now_s
             self._writer.flush()
-        if now_s - self._synced_s >= SYNC_S:
-            self._synced_s = now_s
-            threading.Thread(target=self._writer.sync, name="log sync", daemon=True).start()
+        if now_s - self._synced_s >= SYNC_S and (self._syncing is None or not self._syncing.is_alive()):
+            self._synced_s = now_s  # a disk that takes longer gets its next one when it is done
+            self._syncing = threading.Thread(target=self._writer.sync, name="log sync", daemon=True)
+            self._syncing.start()
         if now_s - self._opened_s >= self._rotate_s or self.segment_bytes >= self._rotate_bytes:
             self.rotate(now_ns)
 
