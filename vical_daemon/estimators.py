@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import import_module
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol
 
 from vical_daemon import topics
@@ -88,9 +86,9 @@ def input_keys(config: Config) -> list[str]:
 
 
 def _target_free(options: CalibrationOptions, priors: dict[str, CameraPrior]) -> Estimator:
-    """Look the module up: a build without it says so in one line."""
-    name = "vical_daemon.estimation.target_free"
-    if find_spec(name) is None:
-        raise ConfigError("calibration without a target is not in this build; give a target file (--target)")
-    estimator: Estimator = import_module(name).TargetFreeCalibrator(options, priors)
-    return estimator
+    from vical_daemon.estimation.target_free import TargetFreeCalibrator
+
+    try:
+        return TargetFreeCalibrator(options, priors)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error

@@ -195,6 +195,8 @@ class Calibrator:
                 return None
         if refused > used:
             return None
+        for name, camera in trial.state.cameras.items():
+            state.cameras[name] = replace(camera, timeshift_s=state.cameras[name].timeshift_s, skew=0.0)
         fresh = self._new_filter(state)
         for name, noise in trial.corner_noise.items():
             fresh.corner_noise[name].sigma_px = noise.sigma_px

@@ -83,6 +83,7 @@ class Bundle:
     def __init__(self, window: Window, carry: Carry, sigma_px: float, spread: float = 1.0) -> None:
         self.window, self.carry = window, carry
         self.problem = Problem(window, carry, sigma_px, spread)
+        self.seen: Seen | None = None
 
     # ------------------------------------------------------------------ the loop
     def solve(self, buffer: ImuBuffer, most: int) -> Fit | None:
@@ -241,6 +242,7 @@ class Bundle:
         except np.linalg.LinAlgError:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
+        self.seen = seen
         links_e = links.errors(w.R, w.p, w.v, w.bias[w.knots()], w.gravity)[0]
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())

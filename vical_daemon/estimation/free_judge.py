@@ -131,17 +131,15 @@ class FreeJudge:
             self.misfit = f"{share:.0%} of the features do not move with the scene"
         return not self.misfit
 
-    def saw_fit(self, fit: Fit, t_s: float, *, fresh: bool = False) -> None:
+    def saw_fit(self, fit: Fit, t_s: float) -> None:
         """Take the result of an adjustment."""
-        del fresh
         self._now_s, self._sigma_px = t_s, fit.sigma_px
         self._squares.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
         self._maybe_trace(fit.carry)
 
-    def closed(self, fit: Fit) -> None:
+    def closed(self) -> None:
         """A window is complete and agreed."""
-        del fit
         self._windows += 1
 
     def agrees(self, fit: Fit, carry: Carry) -> bool:

@@ -228,7 +228,7 @@ def strapdown(
     gained = (before + after) * (0.5 * h)
     moved = (2.0 * before + after) * (h * h / 6.0)
     if force_slope is not None:
-        # slope of R f: R (omega x f + f'); it hardly depends on the bias: the first of the batch stands for all
+        # slope of R f: R (omega x f + f'); hardly depends on the bias: the first of the batch stands for all
         slope = cross(omega[0], force[0]) + (
             force_slope if accel_matrix is None else force_slope @ accel_matrix[0].T
         )

@@ -14,9 +14,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation.calibration_filter import FrameReport
 from vical_daemon.estimation.free_bundle import Bundle, Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, Carry, first_carry, root_of
 from vical_daemon.estimation.free_judge import FreeJudge
+from vical_daemon.estimation.free_reports import window_reports
 from vical_daemon.estimation.free_starter import Starter, start_sigmas
 from vical_daemon.estimation.free_window import KNOT_S, Landmarks, Window
 from vical_daemon.estimation.imu_model import ImuBuffer
@@ -74,6 +76,7 @@ class TargetFreeCalibrator:
         self._pending: list[tuple[float, PointsFrame]] = []
         self._taken_s = -np.inf
         self._doubted: Carry | None = None
+        self._reports: list[FrameReport] = []
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -109,18 +112,17 @@ class TargetFreeCalibrator:
             self._pending.append((t_cam_s, frame))
 
     # ------------------------------------------------------------------ work
-    def process(self) -> list[Fit]:
-        """Do what can be done with what has arrived."""
+    def process(self) -> list[FrameReport]:
+        """Do what can be done with what has arrived; reports on the images of windows that are complete."""
         return self._work(flush=False)
 
-    def finish(self) -> list[Fit]:
+    def finish(self) -> list[FrameReport]:
         """End of the data: everything that inertial data cover."""
         return self._work(flush=True)
 
-    def _work(self, *, flush: bool) -> list[Fit]:
+    def _work(self, *, flush: bool) -> list[FrameReport]:
         if self._buffer is None:
             return []
-        fits: list[Fit] = []
         while True:
             if self.window is None:
                 if not self._try_start(flush):
@@ -132,11 +134,10 @@ class TargetFreeCalibrator:
             new_s = ready[-1][0] - self.window.frames[-1][0]
             if new_s < STEP_S - _SLACK_S and not flush:
                 break
-            fit = self._grow(self.window, ready)
-            if fit is not None:
-                fits.append(fit)
+            self._grow(self.window, ready)
         self._trim()
-        return fits
+        reports, self._reports = self._reports, []
+        return reports
 
     def _ready(self) -> list[tuple[float, PointsFrame]]:
         """Images that inertial data cover, at most a step's worth, up to the first gap."""
@@ -195,9 +196,9 @@ class TargetFreeCalibrator:
         self._noise = (fit.sigma_px, fit.spread)
         self._closed = 0 if known is None else self._closed
         self.judge.started(window.frames[0][0])
-        self.judge.saw_fit(fit, last + window.shift_s, fresh=True)
+        self.judge.saw_fit(fit, last + window.shift_s)
         if _full(window):
-            self._close(fit)
+            self._close(fit, bundle)
         return True
 
     def _carry_into(self, window: Window, known: Carry | None) -> Carry:
@@ -214,7 +215,7 @@ class TargetFreeCalibrator:
         return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
 
     # ------------------------------------------------------------------ windows
-    def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> Fit | None:
+    def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> None:
         """Take images into the window and adjust it; close it when it is long enough."""
         assert self._buffer is not None
         assert self.carry is not None
@@ -223,23 +224,23 @@ class TargetFreeCalibrator:
         self._pending = [x for x in self._pending if id(x[1]) not in done]
         if added < len(ready):
             self._lost("inertial data have a gap")
-            return None
+            return
         if len(window.frames) < 8:
-            return None
-        fit = Bundle(window, self.carry, *self._noise).solve(self._buffer, _STEPS_GROW)
+            return
+        bundle = Bundle(window, self.carry, *self._noise)
+        fit = bundle.solve(self._buffer, _STEPS_GROW)
         if fit is None:
             self._lost("too few features can be followed")
-            return None
+            return
         if not self.judge.fits(fit):
             self._lost(self.judge.misfit)
-            return None
+            return
         self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread)
         self.judge.saw_fit(fit, window.frames[-1][0] + window.shift_s)
         if _full(window):
-            self._close(fit)
-        return fit
+            self._close(fit, bundle)
 
-    def _close(self, fit: Fit) -> None:
+    def _close(self, fit: Fit, bundle: Bundle) -> None:
         """Carry what the window knows into the next; see whether it agrees with what was known before."""
         window, carry = self.window, self.carry
         assert window is not None
@@ -254,7 +255,9 @@ class TargetFreeCalibrator:
         if self._doubted is not None:
             self._doubted = None
         self._closed += 1
-        self.judge.closed(fit)
+        self.judge.closed()
+        if bundle.seen is not None:
+            self._reports += window_reports(bundle.problem, bundle.seen)
         self.carry = self._aged(fit.carry, KNOT_S, window.span_s)
         t, last = window.frames[-1]
         none = PointsFrame(last.camera, last.t_cam_ns, last.ids[:0], last.uv_px[:0])
