@@ -27,7 +27,8 @@ from vical_daemon.wall_clock import WallClock
 
 KEY = "vical/bench/imu/imu0"
 COLUMNS = (
-    "load", "samples", "lost", "missed by the subscriber", "read -> bus: median us", "p99", "max",
+    "load", "samples", "lost", "missed by the subscriber", "most in one read",
+    "read -> bus: median us", "p99", "max",
     "read -> subscriber in another process: median us", "p99", "CPU of the process, % of a core",
     "a bare wake-up of a thread: median us", "p99", "max",
 )  # fmt: skip
@@ -80,7 +81,8 @@ def _case(busy: int, args: argparse.Namespace) -> str:
             emulator.wait()
             emulator.stdout.close()
     cells = [
-        f"{busy} busy processes" if busy else "idle", *(f"{r[k]}" for k in ("samples", "lost", "missed")),
+        f"{busy} busy processes" if busy else "idle",
+        *(f"{r[k]}" for k in ("samples", "lost", "missed", "bunch")),
         *_spread(r["to_bus_us"]), *_spread(r["to_subscriber_us"])[:2], f"{100 * r['cpu']:.1f}",
         *_spread(r["wake_up_us"]),
     ]  # fmt: skip
@@ -114,6 +116,8 @@ def _measure(port: str, socket: str, args: argparse.Namespace) -> dict[str, Any]
         "samples": count - skip,
         "lost": r["lost"] + len(arrivals) - len(published),
         "missed": count - skip - len(numbers) if socket else "-",
+        # Bunches are the device's and the machine's: they wait for one another on their way to the bus.
+        "bunch": int(np.unique(arrivals[skip:count], return_counts=True)[1].max()),
         "to_bus_us": (published[skip:count] - arrivals[skip:count]) * 1e-3,
         "to_subscriber_us": np.array([received[n] - arrivals[n] for n in numbers]) * 1e-3,
     }

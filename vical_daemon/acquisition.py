@@ -62,7 +62,6 @@ def start_line(
     *,
     rate_hz: float,
     depth: int,
-    inline: bool = False,
 ) -> Line[T]:
     """Start the threads of one device: blocking read -> stamp (in the driver) -> outbox -> bus.
 
@@ -74,9 +73,8 @@ def start_line(
         stop: Ends it.
         rate_hz: Nominal.
         depth: Messages that may wait for the bus.
-        inline: See `Outbox`.
     """
-    outbox = Outbox(bus, depth, f"{name} out", inline=inline)
+    outbox = Outbox(bus, depth, f"{name} out")
 
     def deliver(item: T) -> None:
         payload = maker.message(item)

@@ -1,4 +1,4 @@
-"""Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> outbox -> bus."""
+"""Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> bounded queue -> bus."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def run(
         maker = ImuRole(config.rig, name, clock)
         return start_line(
             f"imu/{name}", maker, lambda: open_source(imu), bus, stop,
-            rate_hz=imu.rate_hz, depth=QUEUE_DEPTH, inline=True,
+            rate_hz=imu.rate_hz, depth=QUEUE_DEPTH,
         )  # fmt: skip
 
     run_lines(config.rig, "imu", [start(name) for name in config.imus], bus, stop, clock)

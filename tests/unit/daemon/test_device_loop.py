@@ -11,7 +11,6 @@ import pytest
 from vical_drivers.errors import DeviceLostError, DeviceNotFoundError
 from vical_drivers.samples import DeviceInfo, SourceStats
 
-from vical_daemon import outbox as outbox_module
 from vical_daemon.bus import LocalBus
 from vical_daemon.device_loop import DeviceLoop
 from vical_daemon.health import STUCK_S, _judge, device_status
@@ -155,27 +154,6 @@ def test_outbox_keeps_order_and_drops_the_oldest_when_the_bus_is_slow() -> None:
     gate.set()
     outbox.close()
     assert got == [b"0", b"3", b"4", b"5"] and outbox.published == 4
-
-
-def test_an_inline_outbox_leaves_a_slow_bus_to_its_thread_and_comes_back(monkeypatch) -> None:
-    monkeypatch.setattr(outbox_module, "RECOVERY_S", 0.05)
-    bus, gate, got = LocalBus(), threading.Event(), []
-
-    def handle(sample) -> None:
-        if sample.payload == b"1":
-            gate.wait(0.05)
-        got.append((sample.payload, threading.current_thread().name))
-
-    bus.subscribe("vical/**", handle)
-    outbox, me = Outbox(bus, 100, "out", inline=True), threading.current_thread().name
-    for i in range(3):  # the bus is slow with 1, so 2 goes by the thread
-        outbox.put("vical/a", b"%d" % i)
-    _wait_for(lambda: outbox._handled == 1)
-    time.sleep(0.06)
-    outbox.put("vical/a", b"3")
-    outbox.close()
-    assert got == [(b"0", me), (b"1", me), (b"2", "out"), (b"3", me)]
-    assert outbox.published == 4 and outbox.dropped == 0
 
 
 def test_a_bus_that_raises_does_not_end_acquisition() -> None:
