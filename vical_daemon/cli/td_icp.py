@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +22,6 @@ if TYPE_CHECKING:
     from vical_daemon.priors import Initial
     from vical_daemon.recording import Recording
 
-_TRACKS = (
-    "from tracks of unknown points the delay is coarse and the mounting may be off by 2 deg, whatever the "
-    "sigmas; `vical calibrate` without --target does better"
-)
 HELP = "the delay between imu, cameras and other sensors, from their rotations alone"
 
 
@@ -126,8 +121,9 @@ def choose_gyro(
 def _single(args: argparse.Namespace, initial: Initial) -> int:
     """One imu and one camera."""
     from vical_daemon.cli.td_icp_report import print_single, report_json
-    from vical_daemon.cli.td_icp_sources import camera_stream, seconds
-    from vical_daemon.estimation.td_icp import DEGENERATE, REFUSED, td_icp
+    from vical_daemon.cli.td_icp_sources import camera_stream, seconds, track_frames
+    from vical_daemon.estimation.td_icp import REFUSED, td_icp
+    from vical_daemon.estimation.track_registration import track_registration
 
     recording = open_input(args.input)
     cameras = recording.cameras
@@ -145,14 +141,18 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     imu, t_ns, gyro = choose_gyro(recording, args.imu)
     base = int(t_ns[0])
     options = options_of(args, initial)
-    stream = camera_stream(recording, cameras[camera], prior_of(initial, camera), args.target, base)
-    t_imu = seconds(t_ns, base)
-    result = td_icp(t_imu, gyro, stream.t_s, stream.R_world_sensor, stream.rotation_sigma, options)
-    if cameras[camera].kind == "tracks" and result.status != REFUSED:
-        reason = "; ".join(filter(None, [_TRACKS, result.reason]))
-        result = replace(result, status=DEGENERATE, reason=reason)
+    t_imu, prior = seconds(t_ns, base), prior_of(initial, camera)
+    stream = None
+    if cameras[camera].kind == "tracks":
+        frames, lens = track_frames(recording, cameras[camera], prior, base)
+        result = track_registration(t_imu, gyro, frames, lens, options)
+    else:
+        stream = camera_stream(recording, cameras[camera], prior, args.target, base)
+        result = td_icp(t_imu, gyro, stream.t_s, stream.R_world_sensor, stream.rotation_sigma, options)
     document: dict[str, Any] = {**result.to_json(), "imu": imu, "camera": camera}
-    if args.watch is not None and result.status != REFUSED:
+    if args.watch is not None and stream is None:
+        raise CliError("--watch needs a board: tracks of unknown points are fitted as a whole", EXIT_USAGE)
+    if args.watch is not None and stream is not None and result.status != REFUSED:
         document["watch"] = [report_json(r) for r in _watch(t_imu, gyro, stream, options, args.watch)]
     if args.json:
         print(json.dumps(document))

@@ -70,6 +70,21 @@ def camera_stream(
     return _stream(stream.name, found, base_ns)
 
 
+def track_frames(
+    recording: Recording, stream: Stream, prior: CameraPrior | None, base_ns: int
+) -> tuple[list[tuple[float, PointsFrame]], tuple[FloatArray, FloatArray, str]]:
+    """Tracks with their stamps in seconds, and the lens.
+
+    Raises:
+        CliError: The lens is not known.
+    """
+    if prior is None or prior.intrinsics is None:
+        raise CliError(f"{stream.name}: tracks need the lens: give --initial with its intrinsics", EXIT_USAGE)
+    lens = lens_of(stream, prior)
+    frames = [((f.t_cam_ns - base_ns) * 1e-9, f) for f in recording.points_frames(stream.name)]
+    return frames, (lens.intrinsics, lens.distortion, lens.model)
+
+
 def board_poses(
     recording: Recording, stream: Stream, lens: Lens, guess: bool, target: str | None
 ) -> tuple[Orientations, LensFit]:

@@ -92,6 +92,14 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
         return REFUSED, stretched(rate)
     if noise > 3.0 * _DEG:
         return REFUSED, f"gyro and camera disagree by {noise / _DEG:.1f} deg (rms) at the best delay"
+    reasons = lost_in_words(covariance, fit.sensors[0].R_imu_sensor)
+    if abs(rate) > max(UNEVEN, RATE_SIGMAS * rate_sigma):
+        reasons.append(stretched(rate))
+    return (DEGENERATE if reasons else OK), "; ".join(reasons)
+
+
+def lost_in_words(covariance: FloatArray, R_imu_cam: FloatArray) -> list[str]:
+    """Name what a covariance [mounting, bias, shift] leaves open, and the motion that would show it."""
     reasons = []
     if covariance[6, 6] > _SHIFT_LOST_S**2:
         reasons.append(
@@ -100,7 +108,7 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
         )
     values, vectors = np.linalg.eigh(covariance[:3, :3])
     if values[2] > _ROTATION_LOST_RAD**2:
-        axis = fit.sensors[0].R_imu_sensor @ vectors[:, 2]
+        axis = R_imu_cam @ vectors[:, 2]
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         words = " ".join(f"{a:+.2f}" for a in axis)
         reasons.append(
@@ -108,6 +116,4 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
             f"(sigma {np.sqrt(values[2]) / _DEG:.0f} deg): the motion turned about this axis only; "
             "turn about another"
         )
-    if abs(rate) > max(UNEVEN, RATE_SIGMAS * rate_sigma):
-        reasons.append(stretched(rate))
-    return (DEGENERATE if reasons else OK), "; ".join(reasons)
+    return reasons
