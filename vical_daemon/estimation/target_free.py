@@ -34,6 +34,7 @@ _MAX_GAP_S = 1.5  # images further apart are not tied by inertial data alone
 _MIN_PARALLAX_DEG = 0.4
 _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
+_LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
 _STEPS_GROW, _STEPS_START = 6, 30
 
@@ -77,6 +78,7 @@ class TargetFreeCalibrator:
         self._taken_s = -np.inf
         self._doubted: Carry | None = None
         self._reports: list[FrameReport] = []
+        self._gap_follows = False  # the images that are ready are the last before a hole
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -132,7 +134,7 @@ class TargetFreeCalibrator:
             if not ready:
                 break
             new_s = ready[-1][0] - self.window.frames[-1][0]
-            if new_s < STEP_S - _SLACK_S and not flush:
+            if new_s < STEP_S - _SLACK_S and not (flush or self._gap_follows):
                 break
             self._grow(self.window, ready)
         self._trim()
@@ -146,17 +148,19 @@ class TargetFreeCalibrator:
         end = self._buffer.newest_s - self.window.shift_s - _LATE_S
         begin = before = self.window.frames[-1][0]
         out: list[tuple[float, PointsFrame]] = []
+        self._gap_follows = False
         for t, frame in self._pending:
             if t > end or before - begin > STEP_S - _SLACK_S:
                 break
             if t - before > _MAX_GAP_S:
+                self._gap_follows = True
                 if not out:
-                    self._lost(f"no usable images for {t - before:.1f} s")
+                    self._lost(f"no usable images for {t - before:.1f} s", keep=True)
                 break
             out.append((t, frame))
             before = t
         if not out and self._pending and end - begin > 2.0 * _MAX_GAP_S:
-            self._lost(f"no usable images for {end - begin:.1f} s")
+            self._lost(f"no usable images for {end - begin:.1f} s", keep=True)
         return out
 
     def _trim(self) -> None:
@@ -223,7 +227,7 @@ class TargetFreeCalibrator:
         done = {id(f) for _, f in ready}
         self._pending = [x for x in self._pending if id(x[1]) not in done]
         if added < len(ready):
-            self._lost("inertial data have a gap")
+            self._lost("inertial data have a gap", keep=True)
             return
         if len(window.frames) < 8:
             return
@@ -313,12 +317,16 @@ class TargetFreeCalibrator:
         self.judge.changed(why, carry)
         self.window = self.carry = None
 
-    def _lost(self, why: str) -> None:
-        """Go back to waiting, with the calibration kept as it was before this window."""
+    def _lost(self, why: str, *, keep: bool = False) -> None:
+        """Go back to waiting; the calibration stays as before this window, or as adjusted last (`keep`)."""
         window = self.window
         self.window = None
         if window is not None and self.carry is not None:
-            self.latest = self.carry if self._closed else None
+            if keep and window.span_s > _LEAST_S:
+                self._closed += 1
+                self.judge.closed()
+            else:
+                self.latest = self.carry if self._closed else None
         self.carry = None
         self.starter.again()
         self.judge.lost(why, self.latest)

@@ -1,0 +1,140 @@
+"""The target-free calibrator from its input to its words."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from vical_mocks.rig import reference_rig
+from vical_mocks.tracks import simulate_tracks
+from vical_mocks.trajectory import one_axis, still
+
+from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, points_frame
+from benchmarks.scores import nees
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.target_free import TargetFreeCalibrator
+
+pytestmark = pytest.mark.timeout(400)
+
+
+def subject_for(run, *, lens_known=True, seed=0, start=None):
+    prior = camera_prior(run, seed, start or StartErrors(0.05, 5.0), exact_lens=lens_known)
+    fix = frozenset({"intrinsics"}) if lens_known else frozenset()
+    options = CalibrationOptions(fix=fix, target_free=True, imu_noise=imu_noise(run))
+    return CalibratorSubject(options, prior, None)
+
+
+def simulated(seed=4, seconds=12.0, shift_s=-0.03, **options):
+    return simulate_tracks(
+        seed, seconds, rig=reference_rig(seed, timeshift_cam_imu_s=shift_s), camera_rate_hz=10.0, **options
+    )
+
+
+def looking(seed, motion, *arguments):
+    """A rig that moves as told while its camera looks into the room."""
+    plain = reference_rig(seed)
+    return replace(plain, trajectory=motion(*arguments, T_imu_cam=(plain.R_imu_cam, plain.p_imu_cam)))
+
+
+@pytest.fixture(scope="module")
+def followed():
+    run = simulated(outlier_fraction=0.03)
+    subject = subject_for(run)
+    return run, subject, feed(run, subject)
+
+
+def test_converges_from_nothing_and_is_right_within_its_sigmas(followed):
+    _, _, record = followed
+    last = record.snapshots[-1]
+    assert last.status == "converged"
+    assert record.started_s() <= 5.0
+    assert nees(last.error, last.covariance, 7) < chi2.isf(1e-3, 7)
+    assert np.sqrt(np.diag(last.covariance))[:3].max() < 1.5e-3
+    assert abs(last.error[6]) < 3e-4
+
+
+def test_every_answer_on_the_way_was_honest(followed):
+    _, _, record = followed
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
+
+
+def test_says_what_the_commands_promise(followed):
+    run, subject, _ = followed
+    estimate = subject.calibrator.estimate()
+    json.dumps(estimate.to_json())
+    camera = estimate.cameras["cam0"]
+    assert camera.corner_sigma_px == pytest.approx(run.options.corner_sigma_px, rel=0.1)
+    assert camera.intrinsics_sigma == [0.0] * 4
+    bias = np.array(estimate.imu.gyro_bias_rps) - run.rig.gyro_bias.value(run.duration_s)
+    assert np.all(np.abs(bias) < 5 * np.array(estimate.imu.gyro_bias_sigma_rps))
+    assert estimate.frames == len(run.frames)
+    assert 3 < len(subject.calibrator.trace("cam0")) < 12
+    assert subject.calibrator.trace("another") == []
+
+
+def test_the_lens_is_found_too():
+    run = simulated(seed=6, seconds=8.0)
+    record = feed(run, subject_for(run, lens_known=False, seed=6))
+    last = record.snapshots[-1]
+    assert nees(last.error, last.covariance, 15) < chi2.isf(1e-4, 15)
+    assert np.abs(last.error[7:9]).max() < 2.0  # px, from five percent
+
+
+def test_waits_through_darkness_and_goes_on_with_what_it_knew():
+    run = simulated(seed=5, seconds=15.0)
+    run.frames[:] = [f for f in run.frames if not 7.0 < f.t_s < 10.5]
+    subject = subject_for(run)
+    record = feed(run, subject)
+    dark = record.at(10.0)
+    assert dark.error == pytest.approx(record.at(8.0).error)
+    assert any("went on after" in text for _, text in record.events)
+    last = record.snapshots[-1]
+    assert nees(last.error, last.covariance, 7) < chi2.isf(1e-4, 7)
+    assert np.trace(last.covariance[:3, :3]) < np.trace(dark.covariance[:3, :3])
+
+
+def test_standing_still_gives_no_answer_and_says_what_to_do():
+    rig = looking(2, still)
+    run = simulate_tracks(2, 20.0, rig=rig, camera_rate_hz=5.0, imu_rate_hz=50.0)
+    record = feed(run, subject_for(run))
+    assert record.snapshots == []
+    assert record.statuses[-1][1] == "degenerate"
+    assert "stands still" in record.statuses[-1][2]
+    assert "turn the rig" in record.guidance
+
+
+def test_one_axis_is_never_called_converged():
+    rig = looking(3, one_axis, 3, [0.3, 1.0, 0.2])
+    run = simulate_tracks(3, 20.0, rig=rig, camera_rate_hz=8.0)
+    record = feed(run, subject_for(run))
+    assert "converged" not in {status for _, status, _ in record.statuses}
+    assert record.statuses[-1][1] in ("degenerate", "converging", "initialising")
+    assert record.statuses[-1][2] or record.guidance
+
+
+def test_order_strangers_and_nonsense_are_only_counted():
+    run = simulated(seconds=1.0)
+    calibrator = subject_for(run).calibrator
+    frame = points_frame(run.frames[3])
+    calibrator.add_points(frame)
+    calibrator.add_imu(int(run.t_imu_ns[0]), [0.0, 0.0, np.nan], [0.0, 0.0, 9.8])
+    calibrator.add_imu(int(run.t_imu_ns[0]), [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
+    calibrator.add_points(points_frame(run.frames[3], camera="other"))
+    calibrator.add_points(frame)
+    calibrator.add_points(frame)
+    assert calibrator.process() == []
+    assert calibrator.judge.frames_ignored == 3
+    assert calibrator.judge.imu_refused == 1
+    assert calibrator.estimate().cameras == {}
+
+
+@pytest.mark.parametrize(
+    ("cameras", "estimate", "said"),
+    [(("a", "b"), frozenset(), "one camera"), (("a",), frozenset({"readout"}), "readout")],
+)
+def test_what_it_cannot_do_is_said_at_once(cameras, estimate, said):
+    priors = {name: CameraPrior((640, 480)) for name in cameras}
+    with pytest.raises(ValueError, match=said):
+        TargetFreeCalibrator(CalibrationOptions(target_free=True, estimate=estimate), priors)

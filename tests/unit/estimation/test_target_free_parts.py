@@ -1,0 +1,205 @@
+"""Pieces of the target-free calibration, each against something that does not share its code."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from vical_mocks.rig import reference_rig
+from vical_mocks.tracks import simulate_tracks
+
+from vical_daemon.estimation.epipolar_fit import epipolar_fit
+from vical_daemon.estimation.free_bundle import Bundle, _correlation
+from vical_daemon.estimation.free_carry import calibration_difference, first_carry, moved, tangents
+from vical_daemon.estimation.free_start import free_start
+from vical_daemon.estimation.free_starter import start_sigmas
+from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.inertial_links import Links, make_link
+from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
+from vical_daemon.estimation.state import CameraState
+
+SHIFT_S = 0.013
+
+
+class Scene:
+    """Four seconds of tracks, and the truth in the form of a camera."""
+
+    def __init__(self, seed=3, seconds=4.5):
+        rig = reference_rig(seed, timeshift_cam_imu_s=SHIFT_S)
+        self.run = simulate_tracks(seed, seconds, rig=rig)
+        base = int(self.run.t_imu_ns[0])
+        self.buffer = ImuBuffer(base)
+        for t, w, f in zip(self.run.t_imu_ns, self.run.gyro_rps, self.run.specific_force_mps2, strict=True):
+            self.buffer.append((int(t) - base) * 1e-9, w, f)
+        self.frames = [
+            ((f.t_cam_ns - base) * 1e-9, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px))
+            for f in self.run.frames
+        ]
+        self.frames = [x for x in self.frames if 0.1 < x[0] < seconds - 0.2]
+        lens = rig.lens
+        self.camera = CameraState(
+            rig.R_imu_cam,
+            rig.p_imu_cam,
+            SHIFT_S,
+            np.array(lens.intrinsics),
+            np.array(lens.distortion),
+            lens.model,
+            lens.resolution,
+            0.0,
+        )
+        d = rig.densities
+        self.noise = ImuNoise(d.gyro, d.gyro_walk, d.accel, d.accel_walk)
+        self.rig = rig
+
+    def window(self):
+        start = moved(self.camera, np.zeros(15))
+        start.p_imu_cam = np.zeros(3)
+        return free_start(self.buffer, self.frames, start, self.rig.gyro_bias.value(0.0), self.noise, 9.80665)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+def test_links_derivatives_agree_with_differences(scene):
+    links = Links.stack(
+        [
+            make_link(scene.buffer, 0.3 + 0.05 * k, 0.35 + 0.05 * k, np.zeros(3), np.zeros(3), scene.noise)
+            for k in range(3)
+        ]
+    )
+    rng = np.random.default_rng(1)
+    R = Rotation.from_rotvec(0.4 * rng.standard_normal((4, 3))).as_matrix()
+    p, v = rng.standard_normal((2, 4, 3))
+    bias = 0.01 * rng.standard_normal((3, 6))
+    gravity = np.array([0.0, 0.0, -9.8])
+    e0, J = links.errors(R, p, v, bias, gravity)
+    h = 1e-6
+    for k in range(24):
+        R2, p2, v2, b2 = R.copy(), p.copy(), v.copy(), bias.copy()
+        image, axis = (1 if k < 9 else 2), k % 9
+        if k >= 18:
+            b2[1, k - 18] += h
+        elif axis < 3:
+            R2[image] = R[image] @ Rotation.from_rotvec(h * np.eye(3)[axis]).as_matrix()
+        elif axis < 6:
+            p2[image, axis - 3] += h
+        else:
+            v2[image, axis - 6] += h
+        change = (links.errors(R2, p2, v2, b2, gravity)[0][1] - e0[1]) / h
+        np.testing.assert_allclose(J[1, :, k], change, rtol=2e-3, atol=1e-3 * np.abs(J[1]).max())
+
+
+def test_link_carries_the_true_motion(scene):
+    link = make_link(
+        scene.buffer, 1.0, 1.5, scene.rig.gyro_bias.value(1.2), scene.rig.accel_bias.value(1.2), scene.noise
+    )
+    offset = (scene.run.t_imu_ns[0] - scene.run.options.epoch_ns) * 1e-9
+    move, g = scene.rig.trajectory, scene.rig.gravity_world_mps2
+    a, b = 1.0 + offset, 1.5 + offset
+    R = move.R_world_imu(a).T @ move.R_world_imu(b)
+    dv = move.R_world_imu(a).T @ (move.v_world_imu(b) - move.v_world_imu(a) - 0.5 * g)
+    e = np.concatenate([Rotation.from_matrix(link.dR.T @ R).as_rotvec(), dv - link.dv])
+    assert np.abs(link.root_information[:6, :6] @ e).max() < 4.5
+
+
+def test_epipolar_fit_finds_mounting_delay_and_bias_without_knowing_any(scene):
+    rows = scene.buffer.rows
+    start = scene.camera.R_imu_cam @ Rotation.from_rotvec([0.15, -0.1, 0.2]).as_matrix()
+    lens = (scene.camera.intrinsics * [1.03, 1.03, 1.0, 1.0], np.zeros(4), "radtan")
+    fit = epipolar_fit(rows[:, 0], rows[:, 1:4], scene.frames, lens, start, -0.02, fit_lens=True)
+    off = Rotation.from_matrix(scene.camera.R_imu_cam.T @ fit.R_imu_cam).as_rotvec()
+    assert np.all(np.abs(off) < np.maximum(4.5 * fit.rotation_sigma_rad, 2e-3))
+    assert abs(fit.timeshift_s - SHIFT_S) < max(4.5 * fit.timeshift_sigma_s, 3e-4)
+    np.testing.assert_allclose(fit.gyro_bias, scene.rig.gyro_bias.value(2.0), atol=3e-3)
+    assert fit.intrinsics[0] == pytest.approx(scene.camera.intrinsics[0], rel=0.015)
+    assert fit.inliers > 0.9
+
+
+def test_start_finds_lever_arm_and_speed_linearly(scene):
+    window = scene.window()
+    assert np.linalg.norm(window.camera.p_imu_cam - scene.camera.p_imu_cam) < 0.03
+    offset = (scene.run.t_imu_ns[0] - scene.run.options.epoch_ns) * 1e-9
+    t = np.array([s for s, _ in window.frames]) + SHIFT_S + offset
+    speed = np.linalg.norm(scene.rig.trajectory.v_world_imu(t), axis=1)
+    assert np.abs(np.linalg.norm(window.v, axis=1) - speed).max() < 0.1
+
+
+def test_bundle_gradient_agrees_with_differences_of_the_cost(scene):
+    window = scene.window()
+    active = np.ones(15, dtype=bool)
+    problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 50.0).problem
+    seen, links = window.observe(), window.stacked()
+    normal, order = problem.normal(seen, links), problem.order()
+    rng = np.random.default_rng(2)
+    scales = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-5] + [0.01] * 4 + [1e-5] * 4)
+    for k in range(15):
+        step = np.zeros(15)
+        step[k] = scales[k] * rng.choice([-1.0, 1.0])
+        camera = window.camera
+        window.camera = moved(camera, step)
+        up = problem.normal(seen, links).cost
+        window.camera = moved(camera, -step)
+        down = problem.normal(seen, links).cost
+        window.camera = camera
+        slope, wanted = (up - down) / 2.0 / step[k] / 2.0, normal.g[order.calib[k]]
+        assert slope == pytest.approx(
+            wanted, rel=0.02, abs=0.02 * np.sqrt(normal.H[order.calib[k], order.calib[k]])
+        ), k
+
+
+def test_adjusted_window_is_right_within_its_own_sigmas(scene):
+    window = scene.window()
+    active = np.arange(15) < 7
+    bundle = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 1.0)
+    fit = bundle.solve(scene.buffer, 25)
+    error = calibration_difference(fit.carry.camera, scene.camera)[:7]
+    P = fit.carry.covariance()[11:, 11:]
+    assert error @ np.linalg.solve(P, error) < 24.3  # chi-square, 7 degrees of freedom, 99.9 %
+    assert np.sqrt(np.diag(P))[:3].max() < 2e-3
+    assert fit.sigma_px == pytest.approx(0.5, rel=0.06)
+    assert fit.spread < 1.15
+
+
+def test_where_north_and_origin_are_changes_nothing(scene):
+    active = np.arange(15) < 7
+    results = []
+    for turn in (0.0, 2.0):
+        window = scene.window()
+        world = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
+        window.R, window.v = world @ window.R, window.v @ world.T
+        window.p = window.p @ world.T + turn * np.array([3.0, -1.0, 0.5])
+        fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 0.5).solve(
+            scene.buffer, 25
+        )
+        results.append(fit)
+    a, b = (np.sqrt(np.diag(r.carry.covariance())) for r in results)
+    np.testing.assert_allclose(a, b, rtol=0.02)
+    change = calibration_difference(results[0].carry.camera, results[1].carry.camera)[:7]
+    assert np.abs(change / a[11:]).max() < 0.05
+
+
+def test_errors_that_last_are_counted_once():
+    rng = np.random.default_rng(5)
+    frames, marks, memory = 60, 40, 0.8
+    e = rng.standard_normal((marks, frames, 2))
+    for k in range(1, frames):
+        e[:, k] = memory * e[:, k - 1] + np.sqrt(1 - memory**2) * e[:, k]
+
+    class Seen:
+        landmark = np.repeat(np.arange(marks), frames)
+        frame = np.tile(np.arange(frames), marks)
+
+    wanted = (1 + memory) / (1 - memory)
+    assert _correlation(e.reshape(-1, 2), Seen) == pytest.approx(wanted, rel=0.15)
+    white = rng.standard_normal((marks * frames, 2))
+    assert _correlation(white, Seen) < 1.15
+
+
+def test_tangents_are_orthonormal_everywhere():
+    bearings = np.random.default_rng(7).standard_normal((500, 3))
+    bearings = np.vstack([bearings, np.eye(3), -np.eye(3)])
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    frame = np.concatenate([bearings[..., None], tangents(bearings)], axis=2)
+    np.testing.assert_allclose(
+        np.swapaxes(frame, 1, 2) @ frame, np.broadcast_to(np.eye(3), frame.shape), atol=1e-12
+    )
