@@ -42,7 +42,7 @@ def print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[st
     print(f"  R_imu_cam    q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f}")
     print(f"               +- {sigma_deg[0]:.3f} {sigma_deg[1]:.3f} {sigma_deg[2]:.3f} deg")
     print(f"  gyro bias    {bias[0]:+.3f} {bias[1]:+.3f} {bias[2]:+.3f} deg/s")
-    print(f"  noise of one orientation  {np.rad2deg(result.camera_noise_rad):.3f} deg")
+    print(f"  noise of one sighting  {np.rad2deg(result.camera_noise_rad):.3f} deg")
     for row in watch:
         jump = "  jumped" if row["jumped"] else ""
         delay = f"{1e3 * row['timeshift_s']:+.3f} +- {1e3 * row['timeshift_sigma_s']:.3f} ms"

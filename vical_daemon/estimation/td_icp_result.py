@@ -62,7 +62,7 @@ class TdIcpResult:
         pairs: Orientations that took part.
         rejected: Orientations refused as outliers or without imu data at their time.
         iterations: Rounds of both iterative phases.
-        camera_noise_rad: Measured noise of one orientation, rms per axis, rad.
+        camera_noise_rad: Measured noise of one orientation, rms per axis, rad (from tracks: of one feature).
         slow_noise_ratio: Measured slow error that a second brings over the noise of one orientation.
         gyro_noise_ratio: Measured drift of the gyro over the stated one.
         used: Which of the given orientations took part, shape (n,).
