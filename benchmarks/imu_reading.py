@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import multiprocessing
 import os
@@ -187,6 +188,8 @@ def _acquire(port: str, rate_hz: float, seconds: float, socket: str, *, fifo: bo
         target=imu_role.run, args=(rig, bus, stop),
         kwargs={"clock": WallClock(0), "open_source": open_source},
     )  # fmt: skip
+    gc.collect()
+    gc.freeze()  # as `vical run` does
     role.start()
     time.sleep(3.0)
     cpu_s, start_s = time.process_time(), time.monotonic()
