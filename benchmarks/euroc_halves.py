@@ -45,7 +45,7 @@ def read(folder: Path) -> list[tuple[int, object]]:
         if "/imu/" in key:
             imu = decode_imu(payload)
             items.append((imu.stamp_ns, 0, imu))
-        elif key.endswith("/points"):
+        elif key.endswith(("/points", "/tracks")):
             frame = decode_points(payload).to_frame()
             items.append((frame.t_cam_ns, 1, frame))
     items.sort(key=lambda item: item[:2])

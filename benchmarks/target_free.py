@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def run(folder: Path, truth: dict[str, Any], *, given: bool, lens_fixed: bool) -
     begin_s = time.process_time()
     for t_ns, item in items:
         if isinstance(item, PointsFrame):
-            calibrator.add_points(item)
+            calibrator.add_points(replace(item, camera="cam0"))
             calibrator.process()
             frames += 1
         else:

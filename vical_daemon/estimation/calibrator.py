@@ -93,7 +93,7 @@ class Calibrator:
         )
         fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
         if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
-            self.judge.saw_imu(t_imu_ns, accel)
+            self.judge.saw_imu(t_imu_ns, gyro, accel)
         else:
             self.judge.imu_refused += 1
 

@@ -12,6 +12,7 @@ from vical_daemon.estimation.free_bundle import Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, Carry
 from vical_daemon.estimation.gaps import Gap, gaps
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
+from vical_daemon.estimation.missing_motion import RunningMotion, shortcoming
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
@@ -48,6 +49,7 @@ class FreeJudge:
 
     def __init__(self, options: CalibrationOptions, camera: str, active: BoolArray) -> None:
         self.options, self.camera, self.active = options, camera, active
+        self._motion = RunningMotion()
         self.imu_samples = self.imu_refused = self.frames_ignored = self.frames_seen = 0
         self.frames = 0
         self.status = Status.WAITING
@@ -69,9 +71,10 @@ class FreeJudge:
         self._quiet = ""
 
     # ------------------------------------------------------------------ what happens
-    def saw_imu(self, t_ns: int, accel: FloatArray) -> None:
+    def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
         """Count one inertial reading."""
         del accel
+        self._motion.add((t_ns - (self._first_ns or t_ns)) * 1e-9, gyro)
         if not self.imu_samples:
             self._first_ns = t_ns
         self.imu_samples += 1
@@ -214,6 +217,8 @@ class FreeJudge:
         camera = None if carry is None else self._camera(carry)
         missing = [] if camera is None else self._gaps(camera)
         self.status, reason, guidance = self._decide(camera is not None, running, missing)
+        if guidance and carry is not None:
+            guidance = shortcoming(self._motion, carry.camera.R_imu_cam, carry.bias[:3]) or guidance
         self._ever_converged |= self.status == Status.CONVERGED
         if camera is not None and self.status == Status.DEGENERATE:
             named = [f"{g.name}: {g.motion}" for g in missing if g.excess > _LOST]

@@ -11,6 +11,7 @@ from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
 from vical_daemon.estimation.gaps import Gap, gaps
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.missing_motion import RunningMotion, shortcoming
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
 from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.state import Layout
@@ -37,6 +38,7 @@ class Judge:
     def __init__(self, options: CalibrationOptions, layout: Layout) -> None:
         self.options = options
         self.layout = layout
+        self._motion = RunningMotion()
         self.imu_samples = 0
         self.imu_refused = 0
         self.frames = 0
@@ -62,12 +64,13 @@ class Judge:
         self._size: deque[float] = deque(maxlen=400)
 
     # ------------------------------------------------------------------ what happens
-    def saw_imu(self, t_ns: int, accel: FloatArray) -> None:
+    def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
         """Count one inertial reading."""
         if not self.imu_samples:
             self._first_ns = t_ns
         self.imu_samples += 1
         self._newest_ns = t_ns
+        self._motion.add((t_ns - self._first_ns) * 1e-9, gyro)
         if self.imu_samples % 16 == 1:
             self._size.append(float(np.sqrt(accel @ accel)))
 
@@ -162,6 +165,9 @@ class Judge:
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._gaps(e, name) for name, e in cameras.items()}
         self.status, reason, guidance = self._decide(f, missing)
+        if guidance and f is not None:
+            first = next(iter(f.state.cameras.values()))
+            guidance = shortcoming(self._motion, first.R_imu_cam, f.state.gyro_bias) or guidance
         self._ever_converged |= self.status == Status.CONVERGED
         if f is not None and self.status == Status.DEGENERATE:
             cameras = {name: _withheld(e, missing[name]) for name, e in cameras.items()}

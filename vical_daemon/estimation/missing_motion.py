@@ -106,7 +106,7 @@ class RunningMotion:
         self._weight = self._changes = 0.0
         self._mean, self._scatter, self._change = np.zeros(3), np.zeros((3, 3)), 0.0
 
-    def add(self, t_s: float, gyro_rps: Sequence[float]) -> None:
+    def add(self, t_s: float, gyro_rps: Sequence[float] | FloatArray) -> None:
         """Take one reading (s; rad/s in the imu frame)."""
         total = self._sum
         total[0] += gyro_rps[0]
@@ -167,6 +167,25 @@ def guidance(
     scatter = motion.scatter(bias_rps)
     found = missing_motion(covariance, R_imu_cam, scatter, motion.rate_change_rps2, limits)
     return sorted(found, key=lambda m: -m.excess)
+
+
+def shortcoming(motion: RunningMotion, R_imu_cam: FloatArray, bias_rps: FloatArray | None = None) -> str:
+    """What is wrong with the motion as a whole, and what to do; empty where it is rich enough.
+
+    Args:
+        motion: How the rig turned of late.
+        R_imu_cam: Present mounting, for naming axes, shape (3, 3).
+        bias_rps: The gyro's bias, shape (3,).
+    """
+    turning = _Turning.of(motion.scatter(bias_rps), R_imu_cam)
+    if turning.rms_rps < _SLOW_RPS:
+        return turning._general()
+    if turning.one_axis:
+        return f"so far it turned about {axis_words(turning.axis_cam)} only; rotate about another axis too"
+    steady = motion.rate_change_rps2
+    if steady is not None and steady < 0.3 * turning.rms_rps:
+        return "the rotation rate hardly changes; turn to and fro instead of steadily round"
+    return ""
 
 
 def axis_words(axis_cam: FloatArray) -> str:

@@ -10,6 +10,7 @@ from vical_daemon.estimation.missing_motion import (
     axis_words,
     guidance,
     missing_motion,
+    shortcoming,
 )
 from vical_daemon.estimation.observability import Motion, Setup, gramian, lost_in_block, pose_sensitivities
 from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
@@ -265,3 +266,21 @@ def test_guidance_of_a_running_calibration_is_worst_first_and_speaks_of_the_moti
     still = guidance(covariance, R_IMU_CAM, 1e-2, _turned(np.zeros((300, 3))), Limits())
     assert still[0].name == "time shift" and "turn the rig" in still[0].motion
     assert guidance(_covariance()[:6, :6], R_IMU_CAM, 1e-4, about_optical, Limits()) == []
+
+
+@pytest.mark.parametrize(
+    ("rate", "said"),
+    [
+        (lambda t: np.array([0.01, 0.0, 0.0]), "hardly turns"),
+        (lambda t: np.array([np.sin(2 * t), 0.0, 0.0]), "about the image's x axis only"),
+        (lambda t: np.array([0.5 * np.cos(0.25 * t), 0.5 * np.sin(0.25 * t), 0.2]), "hardly changes"),
+        (lambda t: np.array([np.sin(2 * t), np.cos(3 * t), np.sin(1.5 * t)]), ""),
+    ],
+)
+def test_a_poor_motion_is_told_as_a_whole(rate, said):
+    motion = RunningMotion()
+    for k in range(1500):
+        motion.add(0.01 * k, rate(0.01 * k))
+    words = shortcoming(motion, np.eye(3))
+    assert said in words
+    assert bool(words) == bool(said)
