@@ -17,7 +17,7 @@ def window_reports(problem: Problem, seen: Seen) -> list[FrameReport]:
         seen: The observations it used.
 
     Returns:
-        One report an image; `predicted_px` is where the adjusted window sees the landmarks.
+        One report an image, without predictions: a window is adjusted after its images.
     """
     window = problem.window
     e, ok, _ = problem.pixel_errors(seen)
@@ -40,8 +40,6 @@ def window_reports(problem: Problem, seen: Seen) -> list[FrameReport]:
                 squares,
                 2 * int(ok[rows].sum()),
                 problem.sigma_px,
-                "",
-                seen.uv[rows] - residual[rows],
             )
         )
     return out

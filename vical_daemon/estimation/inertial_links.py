@@ -15,6 +15,7 @@ from vical_daemon.estimation import so3
 from vical_daemon.estimation.imu_model import ImuBuffer, process_noise, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
+_MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
 _STEP_GYRO, _STEP_ACCEL = 1e-4, 1e-2  # differences by the bias: rad/s, m/s^2
 
 
@@ -51,9 +52,9 @@ def make_link(
     accel_bias: FloatArray,
     noise: ImuNoise,
 ) -> Link | None:
-    """Integrate between two instants of the imu's clock; None where inertial data do not cover them."""
+    """Integrate between two instants of the imu's clock; None where readings are missing."""
     segment = buffer.segment(from_s, to_s)
-    if segment is None or len(segment.t_s) < 2:
+    if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
     steps = np.zeros((7, 6))
     steps[range(1, 4), range(3)] = _STEP_GYRO

@@ -102,6 +102,15 @@ def test_link_carries_the_true_motion(scene):
     assert np.abs(link.root_information[:6, :6] @ e).max() < 4.5
 
 
+def test_a_link_is_not_made_over_a_hole_in_the_readings():
+    buffer = ImuBuffer(0)
+    for t in (0.0, 0.01, 0.02, 0.2, 0.21):
+        buffer.append(t, np.zeros(3), np.zeros(3))
+    assert make_link(buffer, 0.0, 0.02, np.zeros(3), np.zeros(3), ImuNoise()) is not None
+    assert make_link(buffer, 0.01, 0.205, np.zeros(3), np.zeros(3), ImuNoise()) is None
+    assert make_link(buffer, 0.0, 0.3, np.zeros(3), np.zeros(3), ImuNoise()) is None
+
+
 def test_epipolar_fit_finds_mounting_delay_and_bias_without_knowing_any(scene):
     rows = scene.buffer.rows
     start = scene.camera.R_imu_cam @ Rotation.from_rotvec([0.15, -0.1, 0.2]).as_matrix()
