@@ -13,6 +13,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -111,7 +112,7 @@ class CalibrationStore:
             raise StoreError(f"calibration of {camera} is not stored: {problem}")
         path = self.path(imu_serial, camera_serial)
         try:
-            _replace(path, msgspec.json.format(msgspec.json.encode(stored), indent=1))
+            _replace(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
         except OSError as error:
             raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
         return path
@@ -180,6 +181,13 @@ def _problem(stored: StoredCalibration) -> str:
     if [len(row) for row in pose.covariance] != [6] * 6:
         return "the covariance is not 6 x 6"
     return ""
+
+
+def _plain(value: Any) -> Any:
+    """Number of an array library as a plain one: an estimate must never be lost over its type."""
+    if hasattr(value, "item"):
+        return value.item()
+    raise NotImplementedError(f"{type(value).__name__} cannot be stored")
 
 
 def _replace(path: Path, data: bytes) -> None:

@@ -198,7 +198,7 @@ class CalibrationFilter:
         for name, where in self.layout.cameras.items():
             if where.timeshift is not None and where.skew is not None:
                 A[where.timeshift, :n] += dt * self.S[where.skew]
-                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+                self.state.cameras[name].timeshift_s += float(dt) * self.state.cameras[name].skew
         A[:9, n : n + d] = m.curved
         A[:9, n + d : n + d + 9] = np.linalg.cholesky(Q + 1e-30 * np.eye(9))
         at = n + d + 9

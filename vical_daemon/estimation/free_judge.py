@@ -252,7 +252,7 @@ class FreeJudge:
             PoseEstimate(
                 c.p_imu_cam.tolist(), so3.quat_from_matrix(c.R_imu_cam).tolist(), full[:6, :6].tolist()
             ),
-            c.timeshift_s,
+            float(c.timeshift_s),
             float(sigma[6]),
             c.intrinsics.tolist(),
             sigma[7:11].tolist(),
@@ -263,7 +263,7 @@ class FreeJudge:
             * float(np.sqrt(sum(s for s, _ in self._squares) / max(sum(n for _, n in self._squares), 1))),
             self._sigma_px,
             [],
-            c.readout_s,
+            float(c.readout_s),
             0.0,
         )
 

@@ -23,17 +23,17 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
         PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), (spread**2 * pose_covariance(f, where)).tolist()),
-        camera.timeshift_s,
+        float(camera.timeshift_s),
         float(sigma[where.timeshift]) if where.timeshift is not None else 0.0,
         camera.intrinsics.tolist(),
         sigma[where.intrinsics].tolist() if where.intrinsics is not None else [0.0] * 4,
         camera.distortion_model,
         camera.distortion.tolist(),
         sigma[where.distortion].tolist() if where.distortion is not None else [0.0] * 4,
-        reprojection_rms_px,
-        f.corner_noise[name].sigma_px,
+        float(reprojection_rms_px),
+        float(f.corner_noise[name].sigma_px),
         [],
-        camera.readout_s,
+        float(camera.readout_s),
         float(sigma[where.readout]) if where.readout is not None else 0.0,
         [int(size) for size in camera.resolution],
     )

@@ -133,3 +133,8 @@ def test_left_over_temporary_files_do_no_harm(store):
     (store.folder / f".{path.name}.1234.new").write_bytes(b"half of")
     assert store.load("a", "b").saved_ns == 1
     assert len(store.all()) == 1
+
+
+def test_a_number_of_an_array_library_is_a_number(store):
+    store.save("imu", "cam", "cam0", estimate(timeshift_cam_imu_s=np.float64(0.0125)), 1)
+    assert store.load("imu", "cam").estimate.cameras["cam0"].timeshift_cam_imu_s == 0.0125
