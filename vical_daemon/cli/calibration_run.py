@@ -23,7 +23,7 @@ from vical_daemon.publications import publish
 from vical_daemon.recording import Recording, Stream
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.calibration_filter import FrameReport
+    from vical_daemon.estimation.frame_report import FrameReport
 
 Progress = Callable[[float, CalibrationEstimate | None], None]
 PUBLISH_EVERY_S = 1.0  # of the data: often enough for a progress bar

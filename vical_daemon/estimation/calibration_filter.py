@@ -6,124 +6,33 @@ Equations and derivation: docs/math/filter.md. Nothing here decides *whether* to
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import lru_cache
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
-from scipy.stats import chi2
 
 from vical_daemon.estimation import unscented
 from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
-from vical_daemon.estimation.imu_model import ImuSegment, Motion, compose, process_noise, strapdown
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
-from vical_daemon.estimation.retract import camera_points, motion_points, orthonormal, pose_points, retract
-from vical_daemon.estimation.state import (
-    ATTITUDE,
-    MOTION,
-    POSITION,
-    VELOCITY,
-    Layout,
-    State,
-    grp_from_rotation,
-    rotation_from_grp,
+from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.image_update import corner_gate, curved_share, frame_limit, solve
+from vical_daemon.estimation.imu_model import ImuSegment, process_noise
+from vical_daemon.estimation.linearise import (
+    Image,
+    Linear,
+    Straightness,
+    by_derivatives,
+    by_sigma_points,
+    project_errors,
 )
-from vical_daemon.estimation.target_view import Rates, view
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.retract import orthonormal, retract
+from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State
+from vical_daemon.estimation.target_view import Rates
 
-_ITERATIONS = 5
-_CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
-_CORNER_GATE = float(chi2.isf(1e-4, 2))
-_RESIDUAL_GATE = float(chi2.isf(2e-5, 2))
-_FRAME_GATE_P = 1e-9
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
-
-
-@lru_cache(maxsize=256)
-def _frame_limit(dof: int) -> float:
-    """Chi-square limit of a whole frame (scipy takes half a millisecond for it)."""
-    return float(chi2.isf(_FRAME_GATE_P, dof))
-
-
-@dataclass(frozen=True, slots=True)
-class FrameReport:
-    """What one image did.
-
-    Attributes:
-        t_ns: Image stamp, camera clock, ns.
-        camera: Camera name.
-        ids: Point ids, shape (n,).
-        uv_px: Measured pixels, shape (n, 2).
-        residual_px: Measured minus predicted after the update, shape (n, 2); not-a-number if not predicted.
-        accepted: Which points entered, shape (n,).
-        used: Whether the frame entered at all.
-        nis: Normalised innovation squared of what the state can explain.
-        dof: Its degrees of freedom.
-        sigma_px: Corner noise used, px.
-        reason: Why a frame was refused; empty otherwise.
-        predicted_px: Where the points were expected before the update, shape (n, 2); not-a-number where
-            they could not be.
-    """
-
-    t_ns: int
-    camera: str
-    ids: IntArray
-    uv_px: FloatArray
-    residual_px: FloatArray
-    accepted: BoolArray
-    used: bool
-    nis: float = 0.0
-    dof: int = 0
-    sigma_px: float = 0.0
-    reason: str = ""
-    predicted_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-
-
-@dataclass(frozen=True, slots=True)
-class Image:
-    """One image as the update sees it.
-
-    Attributes:
-        camera: Camera name.
-        t_ns: Stamp for the report, camera clock, ns.
-        t_cam_s: The same, s since the base.
-        ids: Point ids, shape (n,).
-        points: Their places in the world, m, shape (n, 3).
-        uv: Measured pixels, shape (n, 2).
-        sigma_px: White noise of each corner per axis, px, shape (n,).
-    """
-
-    camera: str
-    t_ns: int
-    t_cam_s: float
-    ids: IntArray
-    points: FloatArray
-    uv: FloatArray
-    sigma_px: FloatArray
-
-
-@dataclass(slots=True)
-class _Linear:
-    """A statistical linearisation of one image: z + H S e + curved + common, in pixels."""
-
-    z: FloatArray
-    linear: FloatArray
-    curved: FloatArray
-    common: FloatArray | None
-    valid: BoolArray
-
-
-@dataclass(slots=True)
-class _Fit:
-    """Outcome: new root and state step, NIS, who took part, what nothing explains, whitened residuals."""
-
-    S: FloatArray
-    dx: FloatArray
-    nis: float
-    dof: int
-    keep: BoolArray
-    rest: float
-    dof_rest: int
-    left: FloatArray
 
 
 @dataclass(slots=True)
@@ -139,7 +48,6 @@ class CalibrationFilter:
         walk: Variance per second added to each error outside the motion model (drift of the time shift,
             slow change of the mounting), shape (n,).
         consistency: Measured consistency, by camera.
-        stamp_jitter_s: Random error of image stamps, common to all corners of an image, s, by camera.
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
@@ -151,60 +59,59 @@ class CalibrationFilter:
     corner_noise: dict[str, CornerNoise]
     walk: FloatArray
     consistency: dict[str, Consistency] = field(default_factory=dict)
-    stamp_jitter_s: dict[str, float] = field(default_factory=dict)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
+    _motion_straight: Straightness = field(default_factory=Straightness)
+    _view_straight: dict[str, Straightness] = field(default_factory=dict)
 
     # ------------------------------------------------------------------ propagation
     def predict(self, segment: ImuSegment) -> None:
         """Propagate to the end of a segment that starts at the state's instant."""
-        d = self.layout.dynamic
         if len(segment.t_s) < 2 or segment.t_s[-1] <= segment.t_s[0]:
             self._set_rates(segment)
             return
-        errors = unscented.offsets(self.S[:d, :d])
-        points = motion_points(self.state, self.layout, errors)
-        relative = strapdown(
-            segment, points.gyro_bias, points.accel_bias, points.gyro_matrix, points.accel_matrix
-        )
-        end = compose(Motion(points.R, points.p, points.v), relative, points.gravity)
-        values = np.concatenate(
-            [
-                grp_from_rotation(end.R[0].T @ end.R[1:]),
-                end.p[1:] - end.p[0],
-                end.v[1:] - end.v[0],
-            ],
-            axis=1,
-        )
-        m = unscented.moments(values)
-        noise = process_noise(self.state.R_world_imu, relative, self.imu_noise)
-        self._grow(m, noise.covariance, noise.gyro_bias_var, noise.accel_bias_var, relative.t_s[-1])
         state = self.state
-        state.R_world_imu = orthonormal(end.R[0] @ rotation_from_grp(m.shift[ATTITUDE]))
-        state.p_world_imu = end.p[0] + m.shift[POSITION]
-        state.v_world_imu = end.v[0] + m.shift[VELOCITY]
+        moved, Q, gyro_var, accel_var = self._moved(segment)
+        self._grow(moved, Q, gyro_var, accel_var)
+        state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         state.t_s = float(segment.t_s[-1])
         self._set_rates(segment)
 
-    def _grow(
-        self, m: unscented.Moments, Q: FloatArray, gyro_var: float, accel_var: float, dt: float
-    ) -> None:
+    def _moved(self, segment: ImuSegment) -> tuple[Moved, FloatArray, float, float]:
+        """The motion at the end of a segment and the noise gathered on the way."""
+        d = self.layout.dynamic
+        S = self.S[:d, :d]
+        sigmas = np.sqrt((S**2).sum(axis=1))
+        straight = self.layout.gyro_matrix is None and self._motion_straight.holds(sigmas)
+        if straight:
+            moved = move_by_derivatives(self.state, S, segment)
+        else:
+            moved = move_by_sigma_points(self.state, self.layout, S, segment)
+        noise = process_noise(self.state.R_world_imu, moved.relative, self.imu_noise)
+        Q = noise.covariance
+        if not straight:
+            share = np.sqrt((moved.curved**2).sum(axis=1) / np.diag(Q)).max()
+            self._motion_straight.measured(sigmas, float(share))
+        return moved, Q, noise.gyro_bias_var, noise.accel_bias_var
+
+    def _grow(self, moved: Moved, Q: FloatArray, gyro_var: float, accel_var: float) -> None:
         """Assemble the columns of the new square root and make it triangular."""
-        n, d = self.layout.size, self.layout.dynamic
+        n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
+        dt = float(moved.relative.t_s[-1])
         drift = np.flatnonzero(self.walk)
-        A = np.zeros((n, n + d + 9 + 6 + len(drift)))
+        A = np.zeros((n, n + c + 9 + 6 + len(drift)))
         A[:, :n] = self.S
-        A[:9, :d] = m.linear
+        A[:9, :d] = moved.linear
         for name, where in self.layout.cameras.items():
             if where.timeshift is not None and where.skew is not None:
                 A[where.timeshift, :n] += dt * self.S[where.skew]
-                self.state.cameras[name].timeshift_s += float(dt) * self.state.cameras[name].skew
-        A[:9, n : n + d] = m.curved
-        A[:9, n + d : n + d + 9] = np.linalg.cholesky(Q + 1e-30 * np.eye(9))
-        at = n + d + 9
-        A[9:12, at : at + 3] = np.sqrt(gyro_var) * np.eye(3)
-        A[12:15, at + 3 : at + 6] = np.sqrt(accel_var) * np.eye(3)
-        A[drift, at + 6 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
+                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+        A[:9, n : n + c] = moved.curved
+        at = n + c
+        A[:9, at : at + 9] = np.linalg.cholesky(Q + 1e-30 * np.eye(9))
+        A[range(9, 12), range(at + 9, at + 12)] = np.sqrt(gyro_var)
+        A[range(12, 15), range(at + 12, at + 15)] = np.sqrt(accel_var)
+        A[drift, at + 15 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
         self.S = unscented.lower_root(A)
 
     def _set_rates(self, segment: ImuSegment) -> None:
@@ -217,16 +124,15 @@ class CalibrationFilter:
     def update(self, image: Image) -> FrameReport:
         """Correct the state with the points of one image; the verdict says what became of it."""
         noise = self.corner_noise[image.camera]
-        lin = self._linearise(image, np.zeros(self.layout.size), self.S)
+        lin = self._linearise(image)
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
-        keep = lin.valid & self._corner_gate(image, innovation, lin)
+        keep = lin.valid & corner_gate(image, innovation, lin)
         if keep.sum() < 4:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
-        first = lin
-        fit = self._solve(image, lin, keep)
+        fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
-        if fit.nis > _frame_limit(fit.dof) * max(1.0, self.nis_level):
+        if fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
                 image,
@@ -241,7 +147,7 @@ class CalibrationFilter:
         residual = fit.left * image.sigma_px[:, None]
         rows = np.repeat(keep, 2)
         self.consistency[image.camera].learn(
-            first.z[keep], innovation[keep], first.linear[rows], image.sigma_px[keep]
+            lin.z[keep], innovation[keep], lin.linear[rows], image.sigma_px[keep]
         )
         return FrameReport(
             image.t_ns,
@@ -272,8 +178,8 @@ class CalibrationFilter:
 
     def surprise(self, image: Image) -> float | None:
         """Mean squared innovation of an image in the smooth modes, over its prediction."""
-        lin = self._linearise(image, np.zeros(self.layout.size), self.S)
-        keep = lin.valid & self._corner_gate(image, image.uv - lin.z, lin)
+        lin = self._linearise(image)
+        keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)
         if keep.sum() < len(keep) // 2:
             return 36.0
         rows = np.repeat(keep, 2)
@@ -282,102 +188,26 @@ class CalibrationFilter:
 
     def predict_pixels(self, camera: str, t_cam_s: float, points: FloatArray) -> FloatArray:
         """Where points should appear with the nominal state, px, shape (n, 2)."""
-        uv: FloatArray = self._project(camera, t_cam_s, points, None, np.zeros((1, self.layout.size)))[0]
+        nominal = np.zeros((1, self.layout.size))
+        uv: FloatArray = project_errors(
+            self.state, self.layout, self.rates, camera, t_cam_s, points, None, nominal
+        )[0]
         return uv
 
-    def _project(
-        self, camera: str, t_cam_s: float, points: FloatArray, uv: FloatArray | None, errors: FloatArray
-    ) -> FloatArray:
-        state, where = self.state, self.layout.cameras[camera]
-        known = state.cameras[camera]
-        motion = pose_points(state, errors)
-        cam = camera_points(known, self.layout, camera, errors)
-        world: FloatArray = points * state.target_scale
-        if self.layout.target_scale is not None:
-            world = points * (state.target_scale + errors[:, self.layout.target_scale])[:, None, None]
-        ahead = t_cam_s - state.t_s
-        rows = None
-        if where.readout is not None or known.readout_s != 0.0:
-            if uv is None:  # the row at which a global shutter would see the point
-                uv = view(world, motion, cam, self.rates, ahead, known.distortion_model)[0]
-            rows = uv[:, 1] / known.resolution[1] - 0.5
-        return view(world, motion, cam, self.rates, ahead, known.distortion_model, rows)
+    def _linearise(self, image: Image) -> Linear:
+        """The image about the nominal state, with the spread of the prior."""
+        where, known = self.layout.cameras[image.camera], self.state.cameras[image.camera]
+        rolling = where.readout is not None or known.readout_s != 0.0
+        straight = self._view_straight.setdefault(image.camera, Straightness())
+        sigmas = self.sigmas()
+        if not rolling and straight.holds(sigmas):
+            return by_derivatives(self.state, self.layout, self.rates, image, self.S)
+        lin = self._by_points(image, np.zeros(self.layout.size), self.S)
+        straight.measured(sigmas, curved_share(image, lin, lin.valid))
+        return lin
 
-    def _linearise(self, image: Image, dx: FloatArray, S: FloatArray) -> _Linear:
-        """Statistical linearisation about `dx` with spread S (all in the chart of the prior)."""
-        errors = dx + unscented.offsets(S)
-        pixels = self._project(image.camera, image.t_cam_s, image.points, image.uv, errors)
-        valid: BoolArray = np.asarray(np.isfinite(pixels).all(axis=(0, 2)))
-        flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
-        m = unscented.moments(flat[1:] - flat[0])
-        z = (flat[0] + m.shift).reshape(-1, 2)
-        common = None
-        jitter = self.stamp_jitter_s.get(image.camera, 0.0)
-        if jitter > 0.0:
-            h = 1e-4
-            later = self._project(image.camera, image.t_cam_s + h, image.points, image.uv, dx[None])[0]
-            common = ((later.ravel() - flat[0]) * (jitter / h))[:, None]
-        return _Linear(z, m.linear, m.curved, common, valid)
-
-    @staticmethod
-    def _corner_gate(image: Image, innovation: FloatArray, lin: _Linear) -> BoolArray:
-        """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-        var = (lin.linear**2).sum(axis=1) + (lin.curved**2).sum(axis=1)
-        if lin.common is not None:
-            var = var + (lin.common**2).sum(axis=1)
-        var = var.reshape(-1, 2) + image.sigma_px[:, None] ** 2
-        passed: BoolArray = (innovation**2 / var).sum(axis=1) < _CORNER_GATE
-        return passed
-
-    def _solve(self, image: Image, lin: _Linear, keep: BoolArray) -> _Fit:
-        """Iterated posterior linearisation (once is enough when the prior is tight).
-
-        [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
-        """
-        prior = self.S
-        S, dx = prior, np.zeros(self.layout.size)
-        M, offset = lin.linear, np.zeros(2 * len(image.ids))
-        weight = 1.0 / np.repeat(image.sigma_px, 2)
-        for step in range(_ITERATIONS):
-            if step:
-                lin = self._linearise(image, dx, S)
-                keep = keep & lin.valid
-                # H S_prior = (H S) S^-1 S_prior, and the innovation refers to the prior mean
-                H = unscented.solve_lower(S, lin.linear.T, transposed=True).T
-                M, offset = H @ prior, H @ dx
-            r = ((image.uv - lin.z).ravel() + offset) * weight
-            fit = self._correct(prior, M * weight[:, None], r, lin, weight, keep)
-            step_size = unscented.solve_lower(fit.S, fit.dx - dx)
-            S, dx, keep = fit.S, fit.dx, fit.keep
-            curved = (lin.curved * weight[:, None])[np.repeat(keep, 2)]
-            straight = float((curved**2).sum(axis=1).max(initial=0.0)) < _CURVED**2
-            if straight or (step and float(np.linalg.norm(step_size)) < 0.05):
-                break
-        return fit
-
-    @staticmethod
-    def _correct(
-        prior: FloatArray, M: FloatArray, r: FloatArray, lin: _Linear, weight: FloatArray, keep: BoolArray
-    ) -> _Fit:
-        """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
-        n = prior.shape[0]
-        columns = [M]
-        if lin.common is not None:
-            columns.append(lin.common * weight[:, None])
-        curved = lin.curved * weight[:, None]
-        if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
-            columns.append(curved)
-        full = np.concatenate(columns, axis=1)
-        for _ in range(3):
-            rows = np.repeat(keep, 2)
-            small, r_small, rest, dof_rest = unscented.compress(full[rows], r[rows])
-            c = unscented.correct(prior, small[:, :n], r_small, small[:, n:])
-            left = (r - full @ c.solution).reshape(-1, 2)
-            bad = keep & ((left**2).sum(axis=1) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
-            if not bad.any() or (keep & ~bad).sum() < 4:
-                break
-            keep = keep & ~bad
-        return _Fit(c.S, c.dx, c.nis, len(r_small), keep, rest, dof_rest, left)
+    def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
+        return by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
@@ -420,6 +250,16 @@ class CalibrationFilter:
         A[MOTION] = 0.0
         A[MOTION, -9:] = np.diag([0.1] * 3 + [0.1] * 3 + [1.0] * 3)
         self.S = unscented.lower_root(A)
+
+    def copy(self) -> CalibrationFilter:
+        """A filter that can be run ahead of this one; what is measured about the noise stays shared."""
+        return replace(
+            self,
+            state=deepcopy(self.state),
+            S=self.S.copy(),
+            _motion_straight=Straightness(),
+            _view_straight={},
+        )
 
     def sigmas(self) -> FloatArray:
         """Standard deviation of every error, shape (n,)."""

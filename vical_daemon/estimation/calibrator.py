@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation import start
-from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_queue import FrameQueue
+from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_model import ImuBuffer
 from vical_daemon.estimation.judge import Judge

@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
-from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.drift_watch import DriftWatch
+from vical_daemon.estimation.frame_report import FrameReport
 
 _REFUSED_POSE = 10  # images in a row before the pose is taken anew
 _REFUSED_CHANGED = 8  # images in a row, soon after that, before the calibration is

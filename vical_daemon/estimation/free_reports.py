@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.calibration_filter import FrameReport
+from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free_normal import Problem
 from vical_daemon.estimation.free_window import Seen
 

@@ -6,8 +6,7 @@ calibration that only explains its own data fails here.
 
 from __future__ import annotations
 
-from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.imu_model import ImuBuffer
@@ -34,7 +33,7 @@ class HeldBack:
         """
         if self._copy is None:
             if f.state.t_s >= self._next_s:
-                self._copy = replace(f, state=deepcopy(f.state), S=f.S.copy())
+                self._copy = f.copy()
             return None
         held = self._copy
         t_s = t_cam_s + held.state.cameras[frame.camera].timeshift_s

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.calibration_filter import CalibrationFilter, FrameReport
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.gaps import Gap, gaps
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import RunningMotion, shortcoming

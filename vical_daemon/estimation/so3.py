@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
+_NO_ANGLE = 1e-40  # rad^2: keeps sin(a)/a defined at zero, and changes no digit of it anywhere
 _SERIES_BELOW_RAD = 0.3  # below it the closed forms lose digits, and five terms of the series are exact
 
 
@@ -68,10 +69,10 @@ def exp(rotvec: FloatArray) -> FloatArray:
     """
     v = np.asarray(rotvec, dtype=np.float64)
     angle2 = np.einsum("...i,...i->...", v, v)
-    angle = np.sqrt(angle2)
-    half_sinc = np.sinc(angle / (2.0 * np.pi))
+    angle = np.sqrt(angle2 + _NO_ANGLE)
+    half_sinc = np.sin(0.5 * angle) / (0.5 * angle)
     gamma = 0.5 * half_sinc * half_sinc  # (1 - cos) / angle^2 without cancellation
-    return _polynomial(1.0 - gamma * angle2, np.sinc(angle / np.pi), gamma, v)
+    return _polynomial(1.0 - gamma * angle2, np.sin(angle) / angle, gamma, v)
 
 
 def log(R: FloatArray) -> FloatArray:

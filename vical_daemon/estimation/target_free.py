@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.calibration_filter import FrameReport
+from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free_bundle import Bundle, Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, Carry, first_carry, root_of
 from vical_daemon.estimation.free_judge import FreeJudge

@@ -8,6 +8,7 @@ from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.linearise import project_errors
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
 from vical_daemon.estimation.retract import retract
 from vical_daemon.estimation.state import CameraState, State, make_layout
@@ -101,8 +102,9 @@ def test_update_equals_the_linear_kalman_update_with_numeric_jacobians(recording
     H = np.zeros((2 * len(z), layout.size))
     for k in range(layout.size):
         h = 1e-6 * np.eye(layout.size)[k]
-        up = f._project("cam0", image.t_cam_s, image.points, None, h[None])[0]
-        down = f._project("cam0", image.t_cam_s, image.points, None, -h[None])[0]
+        up, down = project_errors(
+            f.state, layout, f.rates, "cam0", image.t_cam_s, image.points, None, np.stack([h, -h])
+        )
         H[:, k] = ((up - down) / 2e-6).ravel()
     P = S @ S.T
     Z = H @ P @ H.T + 0.25 * np.eye(len(H))

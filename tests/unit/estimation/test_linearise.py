@@ -1,0 +1,114 @@
+"""Derivatives of the two models: against differences of the models themselves, and against sigma points."""
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.linearise import (
+    Image,
+    Straightness,
+    by_derivatives,
+    by_sigma_points,
+    project_errors,
+    view_derivatives,
+)
+from vical_daemon.estimation.propagate import move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.state import CameraState, State, make_layout
+from vical_daemon.estimation.target_view import Rates
+
+BOARD = np.stack([*np.meshgrid(np.arange(5) * 0.05, np.arange(4) * 0.05), np.zeros((4, 5))], axis=-1)
+
+
+def scene(model: str, estimate=frozenset({"target_scale"})):
+    """A camera half a metre in front of a board, in motion, with everything estimated."""
+    camera = CameraState(
+        so3.exp(np.array([0.3, -0.2, 0.9])),
+        np.array([0.03, -0.05, 0.02]),
+        0.004,
+        np.array([460.0, 455.0, 325.0, 238.0]),
+        np.array([-0.28, 0.07, 2e-4, -3e-4]),
+        model,
+        (640, 480),
+    )
+    R = so3.exp(np.array([0.1, 3.0, 0.2])) @ camera.R_imu_cam.T
+    state = State(
+        1.0,
+        R,
+        np.array([0.1, 0.1, 0.5]) - R @ camera.p_imu_cam,
+        np.array([0.4, -0.3, 0.2]),
+        np.array([0.01, -0.02, 0.005]),
+        np.array([0.05, 0.02, -0.1]),
+        np.array([1.0, 9.0, -3.7]),
+        {"cam0": camera},
+        target_scale=1.01,
+    )
+    layout = make_layout(["cam0"], fix=frozenset(), estimate=estimate)
+    rates = Rates(np.array([0.7, -1.1, 0.5]), np.array([1.0, 2.0, -1.5]))
+    points = BOARD.reshape(-1, 3)
+    uv = np.zeros((len(points), 2))
+    # the state does not stand at the image's instant: what a late image and a moving shift look like
+    image = Image("cam0", 0, 0.999, np.arange(len(points)), points, uv, np.full(len(points), 0.3))
+    return state, layout, rates, image
+
+
+@pytest.mark.parametrize("model", ["radtan", "equidistant"])
+def test_derivatives_of_the_view_are_those_of_the_projection(model):
+    state, layout, rates, image = scene(model)
+    uv, H = view_derivatives(state, layout, rates, image)
+    steps = 1e-6 * np.eye(layout.size)
+    arguments = (state, layout, rates, "cam0", image.t_cam_s, image.points, None)
+    differences = (project_errors(*arguments, steps) - project_errors(*arguments, -steps)) / 2e-6
+    np.testing.assert_allclose(uv, project_errors(*arguments, np.zeros((1, layout.size)))[0], atol=1e-9)
+    np.testing.assert_allclose(H, np.moveaxis(differences, 0, -1), rtol=1e-5, atol=2e-3)
+    assert np.abs(H[:, :, layout.cameras["cam0"].timeshift]).min(axis=0).max() > 1.0  # it does depend on all
+
+
+def test_both_ways_to_linearise_agree_when_the_spread_is_small():
+    state, layout, rates, image = scene("radtan")
+    S = np.diag(np.full(layout.size, 1e-5))
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
+    straight = by_derivatives(state, layout, rates, image, S)
+    np.testing.assert_allclose(straight.linear, points.linear, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(straight.z, points.z, atol=1e-4)
+    assert straight.curved.shape == (2 * len(image.points), 0)
+
+
+def test_points_behind_the_camera_are_invalid_either_way():
+    state, layout, rates, image = scene("radtan")
+    image.points[3] = state.p_world_imu - 2.0 * (image.points[3] - state.p_world_imu)
+    S = np.diag(np.full(layout.size, 1e-5))
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
+    straight = by_derivatives(state, layout, rates, image, S)
+    np.testing.assert_array_equal(straight.valid, points.valid)
+    assert not straight.valid[3]
+    assert np.isfinite(straight.linear).all()
+
+
+def test_derivatives_of_the_motion_agree_with_sigma_points():
+    state, layout, _, _ = scene("radtan", estimate=frozenset())
+    buffer = ImuBuffer(0)
+    t = np.arange(0.9, 1.3, 0.005)
+    for now in t:
+        w = np.array([np.sin(9 * now), 1.2 * np.cos(7 * now), 0.4])
+        buffer.append(float(now), w, np.array([2 * np.sin(8 * now), -9.0, 3.7 + np.cos(5 * now)]))
+    segment = buffer.segment(1.0, 1.0987)
+    d = layout.dynamic
+    S = np.tril(np.random.default_rng(4).normal(size=(d, d))) * 1e-5
+    points, straight = move_by_sigma_points(state, layout, S, segment), move_by_derivatives(state, S, segment)
+    # trapezoids over the nodes for the derivatives by the biases: a thousandth
+    np.testing.assert_allclose(straight.linear, points.linear, atol=2e-3 * np.abs(points.linear).max())
+    for name in ("R", "p", "v"):
+        np.testing.assert_allclose(getattr(straight, name), getattr(points, name), atol=1e-8)
+
+
+def test_straightness_is_measured_again_when_a_sigma_grows_or_time_passes():
+    s = Straightness()
+    sigmas = np.array([1.0, 2.0])
+    assert not s.holds(sigmas)
+    s.measured(sigmas, 0.001)
+    assert s.holds(1.4 * sigmas)
+    assert not s.holds(1.6 * sigmas)
+    assert sum(s.holds(sigmas) for _ in range(200)) < 100
+    s.measured(sigmas, 0.5)
+    assert not s.holds(sigmas)

@@ -1,0 +1,123 @@
+"""How inertial readings move the motion and its spread: by sigma points, or derivatives where these agree."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation import so3, unscented
+from vical_daemon.estimation.imu_model import ImuSegment, Motion, Strapdown, compose, strapdown
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.retract import motion_points
+from vical_daemon.estimation.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    POSITION,
+    VELOCITY,
+    Layout,
+    State,
+    grp_from_rotation,
+    rotation_from_grp,
+    tilt_basis,
+)
+
+
+class Moved(NamedTuple):
+    """Motion at the end of a segment.
+
+    Attributes:
+        R, p, v: Mean.
+        linear: F S of [attitude, position, velocity], shape (9, d).
+        curved: Square root of the second-order covariance, shape (9, k); k = 0 by derivatives.
+        relative: The nominal's integrals.
+    """
+
+    R: FloatArray
+    p: FloatArray
+    v: FloatArray
+    linear: FloatArray
+    curved: FloatArray
+    relative: Strapdown
+
+
+def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
+    """Statistical linearisation of the strapdown equations over one segment; S of the dynamic errors."""
+    points = motion_points(state, layout, unscented.offsets(S))
+    relative = strapdown(
+        segment, points.gyro_bias, points.accel_bias, points.gyro_matrix, points.accel_matrix
+    )
+    end = compose(Motion(points.R, points.p, points.v), relative, points.gravity)
+    values = np.concatenate(
+        [grp_from_rotation(end.R[0].T @ end.R[1:]), end.p[1:] - end.p[0], end.v[1:] - end.v[0]], axis=1
+    )
+    m = unscented.moments(values)
+    return Moved(
+        end.R[0] @ rotation_from_grp(m.shift[ATTITUDE]),
+        end.p[0] + m.shift[POSITION],
+        end.v[0] + m.shift[VELOCITY],
+        m.linear,
+        m.curved,
+        relative,
+    )
+
+
+def move_by_derivatives(state: State, S: FloatArray, segment: ImuSegment) -> Moved:
+    """The same to first order about the nominal state; without the imu's matrices."""
+    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None])
+    T = float(relative.t_s[-1])
+    dR, dv, dp = relative.dR[0, -1], relative.dv[0, -1], relative.dp[0, -1]
+    R, g = state.R_world_imu, state.gravity
+    F = np.zeros((9, len(S)))
+    tilt = -so3.hat(g) @ tilt_basis(g)
+    F[ATTITUDE, ATTITUDE] = dR.T
+    F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ so3.hat(dp), -R @ so3.hat(dv)
+    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = np.eye(3)
+    F[POSITION, VELOCITY] = T * np.eye(3)
+    F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
+    turn, speed, place = bias_derivatives(segment, relative, state.accel_bias)
+    F[ATTITUDE, GYRO_BIAS] = turn
+    F[VELOCITY, GYRO_BIAS], F[VELOCITY, ACCEL_BIAS] = R @ speed[:, :3], R @ speed[:, 3:]
+    F[POSITION, GYRO_BIAS], F[POSITION, ACCEL_BIAS] = R @ place[:, :3], R @ place[:, 3:]
+    return Moved(
+        R @ dR,
+        state.p_world_imu + T * state.v_world_imu + (0.5 * T * T) * g + R @ dp,
+        state.v_world_imu + T * g + R @ dv,
+        F @ S,
+        np.zeros((9, 0)),
+        relative,
+    )
+
+
+def bias_derivatives(
+    segment: ImuSegment, relative: Strapdown, accel_bias: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives of the relative motion at the end by the biases (trapezoids over the nodes).
+
+    With A(t) = -int R dt (turn in the start frame by gyro bias): dv = int R f has d/d b_a = A and
+    d/d b_g = -int hat(R f) A; the derivatives of dp are the integrals of both. [Forster et al. 2017, (69)]
+
+    Args:
+        segment: Readings.
+        relative: Their integrals for one pair of biases (index 0 is used).
+        accel_bias: m/s^2, shape (3,).
+
+    Returns:
+        Rotation (local) by gyro bias (3, 3), velocity (3, 6) and position (3, 6) by [gyro, accel] bias.
+    """
+    t = relative.t_s
+    half = 0.5 * np.diff(t)[:, None, None]
+    dR = relative.dR[0]
+
+    def integral(x: FloatArray) -> FloatArray:
+        out = np.zeros_like(x)
+        np.cumsum((x[1:] + x[:-1]) * half, axis=0, out=out[1:])
+        return out
+
+    A = -integral(dR)
+    force = np.matmul(dR, (segment.accel - accel_bias)[..., None])[..., 0]
+    speed = np.concatenate([integral(-so3.hat(force) @ A), A], axis=2)
+    place = integral(speed)
+    return dR[-1].T @ A[-1], speed[-1], place[-1]
