@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import CliError
-from vical_daemon.cli.options import add_json
+from vical_daemon.cli.options import add_json, check_port
 
 if TYPE_CHECKING:
     from vical_mocks.live_rig import LiveRig
@@ -73,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
     """Simulate, acquire, detect, estimate, record; 1 if the outcome is not what it should be."""
     if args.seconds is not None and not 5 <= args.seconds <= 3600:
         raise CliError("--seconds: 5 to 3600 are of use", 2)
+    check_port("--web", args.web)
     out = _folder(args.out)
     before = set(out.rglob("*.mcap"))
     for stored in (out / "store").glob("*.json"):  # of an earlier demo: this one is to start from nothing

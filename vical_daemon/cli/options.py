@@ -7,7 +7,7 @@ import difflib
 import sys
 from typing import NoReturn
 
-from vical_daemon.cli.errors import EXIT_USAGE
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
 
 
 class VicalParser(argparse.ArgumentParser):
@@ -46,6 +46,16 @@ def add_config(parser: argparse.ArgumentParser, *, required: bool = True) -> Non
         required=required,
         help="the rig's YAML (see examples/vical.yaml)",
     )
+
+
+def check_port(flag: str, port: int | None) -> None:
+    """Refuse a TCP port that cannot be one.
+
+    Raises:
+        CliError: It lies outside 0 (any free one) to 65535.
+    """
+    if port is not None and not 0 <= port <= 65535:
+        raise CliError(f"{flag} {port}: a port lies between 0 and 65535", EXIT_USAGE)
 
 
 def is_leaf(parser: argparse.ArgumentParser) -> bool:

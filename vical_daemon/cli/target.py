@@ -18,6 +18,17 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "checkerboard": {"cols": 8, "rows": 7, "square": None},
 }
 """Options of each kind of board with their defaults."""
+_FLAGS = {
+    "tagCols": "--tag-cols",
+    "tagRows": "--tag-rows",
+    "tagSize": "--tag-size",
+    "tagSpacing": "--tag-spacing",
+    "targetCols": "--cols",
+    "targetRows": "--rows",
+    "rowSpacingMeters": "--square",
+    "colSpacingMeters": "--square",
+}
+"""The option behind each key of a target file."""
 HELP = "a board to print, to scale, and its target YAML"
 
 EPILOG = """examples:
@@ -94,7 +105,7 @@ def _target(args: argparse.Namespace) -> Target:
         board = AprilGrid(given["tag_cols"], given["tag_rows"], size, given["tag_spacing"])
     else:
         board = Checkerboard(given["cols"], given["rows"], size, size)
-    _check(board, args.out)
+    _check(board)
     return board if wanted is not None else largest_on(board, args.paper)
 
 
@@ -115,11 +126,16 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
     return {k: v if getattr(args, k) is None else getattr(args, k) for k, v in defaults.items()}
 
 
-def _check(board: Target, out: Path) -> None:
-    """Refuse what the target file's reader would refuse, with the same words."""
-    from vical_daemon.vision.target import parse_target
+def _check(board: Target) -> None:
+    """Refuse what the target file's reader would refuse, with the same words but for the option's name."""
+    from vical_daemon.vision.target import TargetError, parse_target
 
-    parse_target(board.to_yaml(), out.with_suffix(".yaml"))
+    try:
+        parse_target(board.to_yaml(), Path("board"))
+    except TargetError as error:
+        raise CliError(
+            f"{_FLAGS[error.key]}: {error.what}" if error.key else str(error), exit_code=2
+        ) from None
 
 
 def parse_length_m(text: str) -> float:

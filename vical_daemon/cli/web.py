@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_config, add_json
+from vical_daemon.cli.options import add_config, add_json, check_port
 
 if TYPE_CHECKING:
     from vical_daemon.bus import Bus
@@ -41,10 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until interrupted."""
-    for name in ("port", "foxglove"):
-        value = getattr(args, name)
-        if value is not None and not 0 <= value <= 65535:
-            raise CliError(f"--{name} {value}: a port lies between 0 and 65535", EXIT_USAGE)
+    check_port("--port", args.port)
+    check_port("--foxglove", args.foxglove)
     from vical_daemon.cli.bus_access import open_client
     from vical_daemon.config import load
     from vical_daemon.roles import web

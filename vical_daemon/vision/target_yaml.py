@@ -13,7 +13,16 @@ MAX_FILE_BYTES = 65536
 
 
 class TargetError(ValueError):
-    """A target file cannot be used; the message is one line for a person."""
+    """A target file cannot be used; the message is one line for a person.
+
+    Attributes:
+        key: The key that is wrong; "" where it is the file as a whole.
+        what: What is wrong with it, without file and line.
+    """
+
+    def __init__(self, message: str, key: str = "", what: str = "") -> None:
+        super().__init__(message)
+        self.key, self.what = key, what
 
 
 @dataclass(frozen=True)
@@ -67,7 +76,7 @@ class TargetFile:
     def error(self, key: str, what: str) -> TargetError:
         """Return a one-line error about `key`."""
         where = f" (line {self.lines[key]})" if key in self.lines else ""
-        return TargetError(f"{self.path}: {key}: {what}{where}")
+        return TargetError(f"{self.path}: {key}: {what}{where}", key, what)
 
     def only(self, *known: str) -> None:
         """Refuse keys that are not in `known`, naming the one that may be meant."""

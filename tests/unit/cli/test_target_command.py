@@ -1,0 +1,49 @@
+"""`vical target`: a board and its YAML; wrong numbers on a command line get one line and exit 2."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from vical_daemon.cli import main
+from vical_daemon.vision.target import load_target
+
+
+@pytest.mark.parametrize("name", ["board.pdf", "board.svg"])
+def test_board_and_its_yaml(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / name
+    wanted = ["--type", "checkerboard", "--cols", "5", "--rows", "4"]
+    assert main(["target", *wanted, "-o", str(out), "--json"]) == 0
+    row = json.loads(capsys.readouterr().out)
+    assert row["points"] == 20
+    assert out.read_bytes()[:4] == (b"%PDF" if name.endswith("pdf") else b"<?xm")
+    board = load_target(Path(row["yaml"]))
+    assert board.kind == row["kind"] == "checkerboard"
+    assert board.points_m.shape == (20, 3)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("target --type checkerboard --cols -3 -o b.pdf", "--cols: -3 is below 3; count inner corners"),
+        ("target --type checkerboard --square 0 -o b.pdf", "--square: 0.0 is below 0.001 m"),
+        ("target --type aprilgrid --tag-spacing -1 -o b.pdf", "--tag-spacing: -1.0 is below 0.02"),
+        ("target --type aprilgrid --cols 5 -o b.pdf", "--cols is for checkerboard, not for aprilgrid"),
+        ("target --type aprilgrid --tag-size 2 -o b.pdf", "a4 has 210 x 297"),
+        ("target --type aprilgrid -o b.png", "must end in .pdf or .svg"),
+        ("demo --web 99999", "--web 99999: a port lies between 0 and 65535"),
+        ("demo --seconds 1", "--seconds: 5 to 3600"),
+    ],
+)
+def test_wrong_numbers_are_one_line_that_names_the_option(
+    line: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(line.split()) == 2
+    out, err = capsys.readouterr()
+    assert words in err
+    assert err.count("\n") == 1
+    assert not out
+    assert not list(tmp_path.iterdir())
