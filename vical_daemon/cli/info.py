@@ -62,7 +62,7 @@ def _as_text(summary: Summary, problem: str) -> str:
     lines = [
         f"{summary.path}  {summary.bytes / 1e6:.1f} MB  {summary.duration_s:.2f} s  "
         + f"{summary.messages} messages"
-        + ("" if summary.complete else "  UNFINISHED"),
+        + ("" if summary.complete else "  UNFINISHED (`vical recover` makes it whole)"),
         f"begins {begin:%Y-%m-%d %H:%M:%S} UTC" if begin else "without date",
         "",
         f"{'topic':<40} {'count':>8} {'Hz':>8} {'missing':>8} {'max gap':>9} {'jitter':>9} "
@@ -92,9 +92,10 @@ def _row(topic: TopicSummary) -> str:
 def _time(seconds: float) -> str:
     """Return a duration in the unit that suits it.
 
-    >>> _time(0.000174), _time(0.2227), _time(9.1)
-    ('174 us', '223 ms', '9.1 s')
+    >>> _time(0.000174), _time(0.2227), _time(9.1), _time(-0.0028)
+    ('174 us', '223 ms', '9.1 s', '-2.8 ms')
     """
-    if seconds >= 1.0:
-        return f"{seconds:.3g} s" if seconds < 1000 else f"{seconds:.0f} s"
-    return f"{1e3 * seconds:.3g} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.0f} us"
+    size = abs(seconds)  # a latency is negative where stamps run ahead of the clock that received them
+    if size >= 1.0:
+        return f"{seconds:.3g} s" if size < 1000 else f"{seconds:.0f} s"
+    return f"{1e3 * seconds:.3g} ms" if size >= 1e-3 else f"{1e6 * seconds:.0f} us"

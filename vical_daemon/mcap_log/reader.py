@@ -96,8 +96,8 @@ class LogReader:
             raise LogError(f"{self.path} is empty; was it copied in full?")
         if head != MAGIC:
             raise LogError(
-                f"{self.path} is no MCAP file (its first bytes are {head!r}); give one of `vical run`, "
-                "or for other kinds of recording the name they have: .bag, or the folder"
+                f"{self.path} is no MCAP file, whatever its name says; give a log of `vical run`, "
+                "a ROS bag under its own name (.bag), or a folder"
             )
 
     @property
@@ -121,11 +121,10 @@ class LogReader:
         except OSError as error:
             raise LogError(f"cannot read {self.path}: {describe(error)}") from None
         if self._damaged:
-            self.warnings.append(f"{self.path.name}: {self._damaged} damaged pieces left out")
+            pieces = "1 damaged piece" if self._damaged == 1 else f"{self._damaged} damaged pieces"
+            self.warnings.append(f"{self.path.name}: {pieces} left out")
         if not self.complete:
-            self.warnings.append(
-                f"{self.path.name}: the end is missing; using what is there (vical recover mends it)"
-            )
+            self.warnings.append(f"{self.path.name}: the end is missing; what is there is used")
 
     def _restart(self) -> None:
         self.metadata.clear()
