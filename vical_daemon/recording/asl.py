@@ -66,8 +66,8 @@ class AslRecording(Recording):
         self.streams = tuple(source.stream for source in self._sources)
         if not self.streams:
             raise RecordingError(
-                f"{folder} is no ASL folder: expected mav0/imu0/data.csv and mav0/cam0/ with data.csv, "
-                "corners.csv[.gz] or tracks.csv[.gz]"
+                f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
+                "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz]"
             )
 
     def imu_arrays(self, name: str) -> ImuArrays:

@@ -26,7 +26,7 @@ class BagRecording(LogRecording):
         except (RecordingError, GeneratorExit):
             raise
         except Exception as error:  # rosbags raises whatever its parsers raise on damaged files
-            first = " ".join(str(error).split()) or type(error).__name__
+            first = " ".join(str(error).split()).rstrip(".") or type(error).__name__
             raise RecordingError(
                 f"{self.path} cannot be read as a bag: {first[:200]}; try rosbag reindex or ros2 bag reindex"
             ) from None
