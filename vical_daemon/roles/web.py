@@ -120,7 +120,8 @@ async def _serve(
         await site.start()
     except OSError as error:
         await runner.cleanup()
-        reason = error.strerror or str(error)
+        code = error.errno or 0  # above 0: of the kernel, whose word is shorter than asyncio's
+        reason = os.strerror(code) if code > 0 else error.strerror or str(error)
         raise WebError(f"cannot serve the page on {host}:{port}: {reason}; set web.port") from error
     address = f"http://{host}:{runner.addresses[0][1]}/"
     _log.info("page at %s", address)
