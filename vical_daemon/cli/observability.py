@@ -111,7 +111,7 @@ def _document(
                 "direction": m.direction,
                 "axis_cam": m.axis_cam.tolist(),
                 "sigma": m.sigma,
-                "advice": m.advice,
+                "advice": m.motion,
             }
             for m in missing
         ],

@@ -10,9 +10,8 @@ from scipy.stats import chi2
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.free_bundle import Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, Carry
-from vical_daemon.estimation.gaps import Gap, gaps
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
-from vical_daemon.estimation.missing_motion import RunningMotion, shortcoming
+from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
@@ -21,6 +20,7 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
+from vical_daemon.estimation.trace import Trace
 
 _PATIENCE_S = 15.0
 _LOST = 3.0
@@ -35,7 +35,6 @@ _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
 _BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
 _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
-_TRACE_MOST = 7200
 
 
 class FreeJudge:
@@ -51,7 +50,6 @@ class FreeJudge:
         self.options, self.camera, self.active = options, camera, active
         self._motion = RunningMotion()
         self.imu_samples = self.imu_refused = self.frames_ignored = self.frames_seen = 0
-        self.frames = 0
         self.status = Status.WAITING
         self.events: list[str] = []
         self.misfit = self.disagreement = ""
@@ -65,15 +63,14 @@ class FreeJudge:
         self._squares: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
         self._sigma_px = 0.0
-        self._trace: list[TracePoint] = []
+        self._trace = Trace()
         self._ever_converged = False
         self._bumped = ""
         self._quiet = ""
 
     # ------------------------------------------------------------------ what happens
-    def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
+    def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
         """Count one inertial reading."""
-        del accel
         self._motion.add((t_ns - (self._first_ns or t_ns)) * 1e-9, gyro)
         if not self.imu_samples:
             self._first_ns = t_ns
@@ -112,9 +109,8 @@ class FreeJudge:
             self._started_s, self._windows = None, 0
             self._agreement.clear()
 
-    def changed(self, why: str, before: Carry) -> None:
+    def changed(self, why: str) -> None:
         """The rig is not what it was."""
-        del before
         self.events.append(f"bumped: {why}" if self._ever_converged else f"started over: {why}")
         self._bumped, self._quiet = why, ""
         self._started_s, self._windows = None, 0
@@ -139,7 +135,8 @@ class FreeJudge:
         self._now_s, self._sigma_px = t_s, fit.sigma_px
         self._squares.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
-        self._maybe_trace(fit.carry)
+        if self._trace.due(t_s):
+            self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
 
     def closed(self) -> None:
         """A window is complete and agreed."""
@@ -185,27 +182,7 @@ class FreeJudge:
     # ------------------------------------------------------------------ what is said
     def trace(self) -> list[TracePoint]:
         """The development of the calibration."""
-        return list(self._trace)
-
-    def _maybe_trace(self, carry: Carry) -> None:
-        if self._trace and self._now_s - self._trace[-1].t_s < 1.0:
-            return
-        e = self._camera(carry)
-        sigma = np.sqrt(np.diag(np.array(e.T_imu_cam.covariance)))
-        point = TracePoint(
-            self._now_s,
-            e.T_imu_cam.p_m,
-            sigma[:3].tolist(),
-            e.T_imu_cam.q_wxyz,
-            sigma[3:].tolist(),
-            e.timeshift_cam_imu_s,
-            e.timeshift_sigma_s,
-            self.nis_per_dof(),
-            str(self.status),
-        )
-        self._trace.append(point)
-        if len(self._trace) > _TRACE_MOST:
-            del self._trace[1 : _TRACE_MOST // 2 : 2]
+        return list(self._trace.points)
 
     def nis_per_dof(self) -> float:
         """Agreement of the windows: squared change over what it should be; 1 when consistent."""
@@ -215,14 +192,13 @@ class FreeJudge:
     def estimate(self, carry: Carry | None, *, running: bool, gravity: list[float]) -> CalibrationEstimate:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
-        missing = [] if camera is None else self._gaps(camera)
-        self.status, reason, guidance = self._decide(camera is not None, running, missing)
-        if guidance and carry is not None:
-            guidance = shortcoming(self._motion, carry.camera.R_imu_cam, carry.bias[:3]) or guidance
+        missing = [] if camera is None or carry is None else self._missing(camera, carry)
+        self.status, reason, advice = self._decide(camera is not None, running, missing)
+        if advice and carry is not None:
+            advice = shortcoming(self._motion, carry.camera.R_imu_cam, carry.bias[:3]) or advice
         self._ever_converged |= self.status == Status.CONVERGED
         if camera is not None and self.status == Status.DEGENERATE:
-            named = [f"{g.name}: {g.motion}" for g in missing if g.excess > _LOST]
-            camera.unobservable.extend(named)
+            camera.unobservable.extend(str(m) for m in missing if m.excess > _LOST)
         events, self.events = self.events, []
         refused, seen = (sum(x) for x in zip(*self._refused, strict=True)) if self._refused else (0, 0)
         return CalibrationEstimate(
@@ -230,7 +206,7 @@ class FreeJudge:
             self.status,
             reason,
             self._progress(camera is not None, missing),
-            guidance,
+            advice,
             (self._newest_ns - self._first_ns) * 1e-9,
             self.frames_seen,
             self.imu_samples,
@@ -273,11 +249,13 @@ class FreeJudge:
             carry.bias[:3].tolist(), carry.bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist()
         )
 
-    def _gaps(self, e: CameraEstimate) -> list[Gap]:
-        R = so3.matrix_from_quat(np.array(e.T_imu_cam.q_wxyz))
-        return gaps(np.array(e.T_imu_cam.covariance), R, e.timeshift_sigma_s, self.options.targets)
+    def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:
+        covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
+        return guidance(
+            covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, carry.bias[:3]
+        )
 
-    def _decide(self, known: bool, running: bool, missing: list[Gap]) -> tuple[Status, str, str]:
+    def _decide(self, known: bool, running: bool, missing: list[Missing]) -> tuple[Status, str, str]:
         """Status, reason and guidance."""
         if not known:
             return self._before_start()
@@ -318,7 +296,7 @@ class FreeJudge:
             )
         return Status.INITIALISING, self._reason or "collecting the first seconds", ""
 
-    def _progress(self, known: bool, missing: list[Gap]) -> float:
+    def _progress(self, known: bool, missing: list[Missing]) -> float:
         if self.status == Status.CONVERGED:
             return 1.0
         if not known:

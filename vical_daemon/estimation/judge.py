@@ -7,15 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.gaps import Gap, gaps
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
-from vical_daemon.estimation.missing_motion import RunningMotion, shortcoming
+from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
 from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.state import Layout
+from vical_daemon.estimation.trace import Trace
 
 _ENOUGH_FRAMES = 60
 _ENOUGH_S = 6.0
@@ -25,7 +24,6 @@ _NIS_BAD = 4.0
 _HELD_BACK_BAD = 9.0
 _HYSTERESIS = 2.0
 _RECENT = 60
-_TRACE_MOST = 7200
 
 
 class Judge:
@@ -61,7 +59,7 @@ class Judge:
         self._recent_used: deque[bool] = deque(maxlen=_RECENT)
         self._held_back: deque[float] = deque(maxlen=40)
         self._square: dict[str, deque[tuple[float, int]]] = {}
-        self._trace: dict[str, list[TracePoint]] = {}
+        self._trace: dict[str, Trace] = {}
         self._size: deque[float] = deque(maxlen=400)
 
     # ------------------------------------------------------------------ what happens
@@ -127,26 +125,9 @@ class Judge:
         self._maybe_trace(report.camera, f)
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
-        trace = self._trace.setdefault(camera, [])
-        t = f.state.t_s
-        if trace and t - trace[-1].t_s < 1.0:
-            return
-        e = self._camera(camera, f)
-        sigma = np.sqrt(np.diag(np.array(e.T_imu_cam.covariance)))
-        point = TracePoint(
-            t,
-            e.T_imu_cam.p_m,
-            sigma[:3].tolist(),
-            e.T_imu_cam.q_wxyz,
-            sigma[3:].tolist(),
-            e.timeshift_cam_imu_s,
-            e.timeshift_sigma_s,
-            self.nis_per_dof(),
-            str(self.status),
-        )
-        trace.append(point)
-        if len(trace) > _TRACE_MOST:
-            del trace[1 : _TRACE_MOST // 2 : 2]
+        trace = self._trace.setdefault(camera, Trace())
+        if trace.due(f.state.t_s):
+            trace.add(f.state.t_s, self._camera(camera, f), self.nis_per_dof(), self.status)
 
     # ------------------------------------------------------------------ what is said
     def nis_per_dof(self) -> float:
@@ -156,7 +137,7 @@ class Judge:
 
     def trace(self, camera: str) -> list[TracePoint]:
         """The development of one camera."""
-        return list(self._trace.get(camera, []))
+        return list(self._trace[camera].points) if camera in self._trace else []
 
     def estimate(
         self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
@@ -164,21 +145,21 @@ class Judge:
         """Put everything together; `stale`: what was known before a change, shown while starting anew."""
         shown = f or stale
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
-        missing = {} if f is None else {name: self._gaps(e, name) for name, e in cameras.items()}
-        self.status, reason, guidance = self._decide(f, missing)
-        if guidance and f is not None:
+        missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
+        self.status, reason, advice = self._decide(f, missing)
+        if advice and f is not None:
             first = next(iter(f.state.cameras.values()))
-            guidance = shortcoming(self._motion, first.R_imu_cam, f.state.gyro_bias) or guidance
+            advice = shortcoming(self._motion, first.R_imu_cam, f.state.gyro_bias) or advice
         self._ever_converged |= self.status == Status.CONVERGED
         if f is not None and self.status == Status.DEGENERATE:
-            cameras = {name: _withheld(e, missing[name]) for name, e in cameras.items()}
+            cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
         events, self.events = self.events, []
         return CalibrationEstimate(
             self._newest_ns,
             self.status,
             reason,
             self._progress(missing),
-            guidance,
+            advice,
             (self._newest_ns - self._first_ns) * 1e-9,
             self.frames,
             self.imu_samples,
@@ -196,13 +177,22 @@ class Judge:
         rms = float(np.sqrt(sum(s for s, _ in square) / count)) if count else 0.0
         return camera_estimate(f, name, rms)
 
-    def _gaps(self, e: CameraEstimate, name: str) -> list[Gap]:
-        if self.layout.cameras[name].position is None and self.layout.cameras[name].timeshift is None:
+    def _missing(self, e: CameraEstimate, name: str, f: CalibrationFilter) -> list[Missing]:
+        where = self.layout.cameras[name]
+        if where.position is None and where.timeshift is None:
             return []
-        R = so3.matrix_from_quat(np.array(e.T_imu_cam.q_wxyz))
-        return gaps(np.array(e.T_imu_cam.covariance), R, e.timeshift_sigma_s, self.options.targets)
+        covariance, R = np.array(e.T_imu_cam.covariance), f.state.cameras[name].R_imu_cam
+        return guidance(
+            covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, f.state.gyro_bias
+        )
 
-    def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[Gap]]) -> tuple[Status, str, str]:
+    @staticmethod
+    def _withheld(e: CameraEstimate, missing: list[Missing]) -> CameraEstimate:
+        return replace(e, unobservable=[str(m) for m in missing if m.excess > _LOST])
+
+    def _decide(
+        self, f: CalibrationFilter | None, missing: dict[str, list[Missing]]
+    ) -> tuple[Status, str, str]:
         """Status, reason and guidance."""
         if f is None:
             return self._before_start()
@@ -210,10 +200,10 @@ class Judge:
         if trouble:
             return Status.INCONSISTENT, trouble, ""
         span = f.state.t_s - (self._started_s or 0.0)
-        all_gaps = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
+        lacking = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
         if self.status == Status.CONVERGED:
-            all_gaps = [g for g in all_gaps if g.excess > _HYSTERESIS]
-        if not all_gaps:
+            lacking = [g for g in lacking if g.excess > _HYSTERESIS]
+        if not lacking:
             if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
                 return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
             if self.clocks_in_doubt:
@@ -225,9 +215,9 @@ class Judge:
             if not self._held_back_fine():
                 return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
             return Status.CONVERGED, "", ""
-        worst = all_gaps[0]
+        worst = lacking[0]
         if span > _PATIENCE_S and worst.excess > _LOST:
-            names = "; ".join(g.said for g in all_gaps[:3])
+            names = "; ".join(g.said for g in lacking[:3])
             return Status.DEGENERATE, f"the motion does not show: {names}", worst.motion
         return Status.CONVERGING, f"{worst.said}", worst.motion
 
@@ -268,14 +258,10 @@ class Judge:
     def _held_back_fine(self) -> bool:
         return len(self._held_back) >= 2 and float(np.median(self._held_back)) < _HELD_BACK_BAD
 
-    def _progress(self, missing: dict[str, list[Gap]]) -> float:
+    def _progress(self, missing: dict[str, list[Missing]]) -> float:
         if self.status == Status.CONVERGED:
             return 1.0
         if not missing:
             return min(0.1, 0.001 * self.frames_seen)
         worst = max((g.excess for gs in missing.values() for g in gs), default=1.0)
         return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
-
-
-def _withheld(e: CameraEstimate, missing: list[Gap]) -> CameraEstimate:
-    return replace(e, unobservable=[f"{g.name}: {g.motion}" for g in missing if g.excess > _LOST])

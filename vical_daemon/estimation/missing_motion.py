@@ -14,9 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import ConvergenceTargets
+
 FloatArray = npt.NDArray[np.float64]
 
 _DEG = np.pi / 180.0
+WIDE = ConvergenceTargets(0.005, 0.5 * _DEG, 0.5e-3)  # beyond: a direction counts as not observed at all
 _STILL_RPS = 3.0 * _DEG
 _SLOW_RPS = 12.0 * _DEG
 _ONE_AXIS = (
@@ -24,15 +27,8 @@ _ONE_AXIS = (
 )
 _BLOCK_S = 0.1
 _ALONG = 0.85  # cosine above which two directions are called the same
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Sigmas above which a direction counts as unknown."""
-
-    lever_arm_m: float = 0.005
-    rotation_rad: float = 0.5 * _DEG
-    timeshift_s: float = 0.5e-3
+_TURNS = ("the image's x axis (nod)", "the image's y axis (shake)", "the optical axis (roll)")
+_STEADY = "the rotation rate hardly changes; turn to and fro instead of steadily round"
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ class Missing:
         direction: In words, e.g. "the optical axis"; empty for the time shift.
         axis_cam: The direction in the camera frame, unit length, shape (3,); zeros for the time shift.
         sigma: Standard deviation along it, m, rad or s.
-        advice: The motion to make.
+        motion: The motion that would reveal it.
         limit: Above which sigma it counts as unknown.
     """
 
@@ -52,7 +48,7 @@ class Missing:
     direction: str
     axis_cam: FloatArray
     sigma: float
-    advice: str
+    motion: str
     limit: float
 
     @property
@@ -79,14 +75,9 @@ class Missing:
         }[self.block]
         return f"{self.name}: +-{figure}"
 
-    @property
-    def motion(self) -> str:
-        """The motion that would reveal it."""
-        return self.advice
-
     def __str__(self) -> str:
         """One line for a person."""
-        return f"{self.name}: {self.advice}"
+        return f"{self.name}: {self.motion}"
 
 
 class RunningMotion:
@@ -146,7 +137,7 @@ def guidance(
     R_imu_cam: FloatArray,
     timeshift_sigma_s: float,
     motion: RunningMotion,
-    limits: Limits,
+    limits: ConvergenceTargets,
     bias_rps: FloatArray | None = None,
 ) -> list[Missing]:
     """Name what is not known well enough, worst first, with the motion that would reveal it.
@@ -184,7 +175,7 @@ def shortcoming(motion: RunningMotion, R_imu_cam: FloatArray, bias_rps: FloatArr
         return f"so far it turned about {axis_words(turning.axis_cam)} only; rotate about another axis too"
     steady = motion.rate_change_rps2
     if steady is not None and steady < 0.3 * turning.rms_rps:
-        return "the rotation rate hardly changes; turn to and fro instead of steadily round"
+        return _STEADY
     return ""
 
 
@@ -207,7 +198,7 @@ def missing_motion(
     R_imu_cam: FloatArray,
     rate_scatter: FloatArray,
     rate_change_rps2: float | None = None,
-    limits: Limits | None = None,
+    limits: ConvergenceTargets = WIDE,
 ) -> list[Missing]:
     """Say which directions of a calibration are not known, and what motion would reveal them.
 
@@ -222,13 +213,12 @@ def missing_motion(
     Returns:
         The directions, worst first within each block; empty when all is known.
     """
-    limits = limits or Limits()
     turning = _Turning.of(rate_scatter, R_imu_cam)
     found: list[Missing] = []
     in_cam = R_imu_cam.T @ covariance[:3, :3] @ R_imu_cam
-    for sigma, axis in _beyond(in_cam, limits.lever_arm_m):
+    for sigma, axis in _beyond(in_cam, limits.position_m):
         advice = turning.advice_lever_arm(axis)
-        found.append(Missing("lever_arm", axis_words(axis), axis, sigma, advice, limits.lever_arm_m))
+        found.append(Missing("lever_arm", axis_words(axis), axis, sigma, advice, limits.position_m))
     for sigma, axis in _beyond(covariance[3:6, 3:6], limits.rotation_rad):
         advice = turning.advice_rotation(axis)
         found.append(Missing("rotation", axis_words(axis), axis, sigma, advice, limits.rotation_rad))
@@ -267,7 +257,12 @@ class _Turning:
         if self.rms_rps < _SLOW_RPS:
             rate = f"{self.rms_rps / _DEG:.0f} deg/s"
             return f"it turns at only {rate}; turn faster, 20 to 60 deg/s, about two axes"
-        return "keep turning to and fro about all axes"
+        return ""
+
+    def _about_others(self, axis: FloatArray) -> str:
+        """Rotations across a direction: those that show what lies along it."""
+        along = int(np.argmax(np.abs(axis)))
+        return " and ".join(f"about {_TURNS[i]}" for i in range(3) if i != along)
 
     def advice_lever_arm(self, axis: FloatArray) -> str:
         if self.one_axis and self.rms_rps >= _STILL_RPS:
@@ -275,16 +270,16 @@ class _Turning:
             if abs(float(axis @ self.axis_cam)) > _ALONG:
                 return f"so far it turned about {about} only; rotate about another axis"
             return f"so far it turned about {about} only; rotate about another axis too, and faster"
-        return self._general()
+        return self._general() or f"rotate {self._about_others(axis)}"
 
     def advice_rotation(self, axis: FloatArray) -> str:
         if self.one_axis and self.rms_rps >= _STILL_RPS and abs(float(axis @ self.axis_cam)) > 0.5:
             return f"so far it turned about {axis_words(self.axis_cam)} only; rotate about another axis"
-        return self._general()
+        return self._general() or f"rotate {self._about_others(axis)}"
 
     def advice_timeshift(self, rate_change_rps2: float | None) -> str:
         if self.rms_rps < _STILL_RPS:
             return "without rotation the delay hardly shows; turn the rig to and fro"
         if rate_change_rps2 is not None and rate_change_rps2 < 0.3 * self.rms_rps:
-            return "the rotation rate hardly changes; turn to and fro instead of steadily round"
-        return self._general()
+            return _STEADY
+        return self._general() or "turn the rig back and forth faster, changing direction"

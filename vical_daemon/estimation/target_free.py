@@ -89,7 +89,7 @@ class TargetFreeCalibrator:
         gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
         fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
         if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
-            self.judge.saw_imu(t_imu_ns, gyro, accel)
+            self.judge.saw_imu(t_imu_ns, gyro)
         else:
             self.judge.imu_refused += 1
 
@@ -314,7 +314,7 @@ class TargetFreeCalibrator:
         self.starter = Starter(self.options, self.prior)
         self.latest = None
         self._closed = 0
-        self.judge.changed(why, carry)
+        self.judge.changed(why)
         self.window = self.carry = None
 
     def _lost(self, why: str, *, keep: bool = False) -> None:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.measurements import ConvergenceTargets
 from vical_daemon.estimation.missing_motion import (
-    Limits,
+    WIDE,
     RunningMotion,
     axis_words,
     guidance,
@@ -211,16 +212,16 @@ def test_guidance_says_nothing_when_all_is_known():
 
 def test_guidance_for_standing_still_slow_and_steady_motion():
     still = missing_motion(_covariance((1, 1, 1), (1, 1, 1), 1.0), R_IMU_CAM, 1e-6 * np.eye(3))
-    assert len(still) == 7 and all("turn" in m.advice for m in still)
+    assert len(still) == 7 and all("turn" in m.motion for m in still)
     slow = missing_motion(_covariance(arm=(0.01, 1e-3, 1e-3)), R_IMU_CAM, 0.005 * np.eye(3))
-    assert "faster" in slow[0].advice and slow[0].direction == "the image's x axis"
+    assert "faster" in slow[0].motion and slow[0].direction == "the image's x axis"
     steady = missing_motion(_covariance(shift=0.01), R_IMU_CAM, _scatter((0, 0.7, 0)), rate_change_rps2=0.01)
     assert "to and fro" in str(steady[0]) and steady[0].block == "timeshift"
     tilted = missing_motion(
         _covariance(rotation=(1e-3, 0.2, 1e-3)),
         R_IMU_CAM,
         _scatter((0, 0.7, 0)),
-        limits=Limits(rotation_rad=0.01),
+        limits=ConvergenceTargets(rotation_rad=0.01),
     )
     assert "image's y axis" in str(tilted[0])
 
@@ -256,16 +257,30 @@ def test_guidance_of_a_running_calibration_is_worst_first_and_speaks_of_the_moti
     t = np.arange(0, 20, 0.01)
     about_optical = _turned(np.outer(0.7 * np.sin(2 * t), R_IMU_CAM[:, 2]))
     covariance = _covariance(arm=(1e-3, 1e-3, 0.05), rotation=(0.02, 1e-3, 1e-3))[:6, :6]
-    found = guidance(covariance, R_IMU_CAM, 1e-4, about_optical, Limits())
+    found = guidance(covariance, R_IMU_CAM, 1e-4, about_optical, WIDE)
     assert [g.name for g in found] == [
         "lever arm along the optical axis",
         "rotation about the image's x axis",
     ]
     assert found[0].excess == pytest.approx(10.0) and found[0].said.endswith("+-50.0 mm")
     assert found[0].motion == "so far it turned about the optical axis only; rotate about another axis"
-    still = guidance(covariance, R_IMU_CAM, 1e-2, _turned(np.zeros((300, 3))), Limits())
+    still = guidance(covariance, R_IMU_CAM, 1e-2, _turned(np.zeros((300, 3))), WIDE)
     assert still[0].name == "time shift" and "turn the rig" in still[0].motion
-    assert guidance(_covariance()[:6, :6], R_IMU_CAM, 1e-4, about_optical, Limits()) == []
+    assert guidance(_covariance()[:6, :6], R_IMU_CAM, 1e-4, about_optical, WIDE) == []
+
+
+def test_a_rich_motion_is_told_which_turns_show_the_missing_direction():
+    t = np.arange(0, 20, 0.01)
+    rich = _turned(np.stack([np.sin(2 * t), np.cos(3 * t), np.sin(1.5 * t)], axis=1))
+    (arm,) = guidance(_covariance(arm=(1e-3, 1e-3, 0.2))[:6, :6], R_IMU_CAM, 1e-4, rich, WIDE)
+    assert arm.name == "lever arm along the optical axis"
+    assert arm.excess == pytest.approx(40.0) and "200.0 mm" in arm.said
+    assert arm.motion == "rotate about the image's x axis (nod) and about the image's y axis (shake)"
+    (turn,) = guidance(_covariance(rotation=(1e-3, 1e-3, 0.1))[:6, :6], R_IMU_CAM, 1e-4, rich, WIDE)
+    assert turn.name == "rotation about the optical axis" and "roll" not in turn.motion
+    late = guidance(_covariance(arm=(1e-3, 1e-3, 0.01))[:6, :6], R_IMU_CAM, 0.05, rich, WIDE)
+    assert [g.name for g in late] == ["time shift", "lever arm along the optical axis"]
+    assert "back and forth" in late[0].motion
 
 
 @pytest.mark.parametrize(
