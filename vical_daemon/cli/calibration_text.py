@@ -21,7 +21,7 @@ def describe(result: dict[str, Any]) -> str:
         lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
     lines += [
         "",
-        f"  NIS per degree of freedom {result['nis_per_dof']:.2f} (1 when consistent), "
+        f"  NIS per degree of freedom {result['nis_per_dof']:.2f} (1 when consistent, less when cautious), "
         f"{100 * result['rejected_fraction']:.2f} % of the points refused",
     ]
     return "\n".join(lines)
