@@ -209,9 +209,10 @@ def _print_text(result: dict[str, Any], table: str) -> None:
     truth = result["truth"]
     late_ms, wander_ms = 1e3 * truth["imu_stamp_error_s"], 1e3 * truth["imu_stamp_wander_s"]
     print(
-        f"\nThe emulated IMU knows that its samples were stamped {late_ms:+.2f} ± {wander_ms:.2f} ms off on this\n"
-        "machine. The time shift between the stamps, which a calibration finds, contains that;\n"
-        "its error/sigma below allows for the ±."
+        "\nThe emulated IMU knows that its samples were stamped "
+        f"{late_ms:+.2f} ± {wander_ms:.2f} ms off on this machine.\n"
+        "The time shift between the stamps, which a calibration finds, contains that; its error/sigma below\n"
+        "allows for the ±."
     )
     print(f"\n{CAMERA} in the imu frame, beside the truth\n{table}")
 
