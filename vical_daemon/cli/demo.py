@@ -106,8 +106,11 @@ def run(args: argparse.Namespace) -> int:
     (out / "result.json").write_text(text + "\n", encoding="utf-8")
     if args.json:
         print(text)
+    busy = _busy(result)
     if problem:
-        raise CliError(f"the demo failed: {problem}{_busy(result)}")
+        raise CliError(f"the demo failed: {problem}" + (f" ({busy})" if busy else ""))
+    if busy and not args.quiet:
+        _say(f"\n{busy}")
     return 0
 
 
@@ -147,13 +150,13 @@ def _run_roles(
 
 
 def _busy(result: dict[str, Any]) -> str:
-    """Name the usual cause of a failure: a machine that cannot do it in real time."""
+    """Name the usual cause of a late or failed end: a machine that cannot do it in real time; or ""."""
     expected = result["duration_s"] * RATE_HZ
     if result["frames"] > 0.6 * expected:
         return ""
     return (
-        f" (only {result['frames']} of {expected:.0f} frames were used in time: this machine is busy; "
-        "end other programs or try again)"
+        f"only {result['frames']} of {expected:.0f} frames were used in time: this machine is busy; "
+        "end other programs or try again"
     )
 
 
