@@ -18,6 +18,7 @@ from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.image_update import corner_gate, curved_share, frame_limit, solve
 from vical_daemon.estimation.imu_model import ImuSegment, process_noise
+from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.linearise import (
     Image,
     Linear,
@@ -26,7 +27,7 @@ from vical_daemon.estimation.linearise import (
     by_sigma_points,
     project_errors,
 )
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.retract import orthonormal, retract
 from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State
@@ -48,6 +49,7 @@ class CalibrationFilter:
         walk: Variance per second added to each error outside the motion model (drift of the time shift,
             slow change of the mounting), shape (n,).
         consistency: Measured consistency, by camera.
+        agreement: How far stretches of the data agree about the lens, by camera.
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
@@ -59,6 +61,7 @@ class CalibrationFilter:
     corner_noise: dict[str, CornerNoise]
     walk: FloatArray
     consistency: dict[str, Consistency] = field(default_factory=dict)
+    agreement: dict[str, LensAgreement] = field(default_factory=dict)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
     _motion_straight: Straightness = field(default_factory=Straightness)
@@ -141,6 +144,7 @@ class CalibrationFilter:
                 f"innovation of the image is {level:.1f} times what it should be",
             )
         self.nis_level += 0.05 * (level - self.nis_level)
+        self._compare_lens(image, lin, fit.keep)
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
@@ -161,6 +165,25 @@ class CalibrationFilter:
             fit.dof,
             noise.sigma_px,
             predicted_px=predicted,
+        )
+
+    def _compare_lens(self, image: Image, lin: Linear, keep: BoolArray) -> None:
+        """Let the image say what it would have the lens be."""
+        where, agreement = self.layout.cameras[image.camera], self.agreement.get(image.camera)
+        if agreement is None or where.intrinsics is None or where.distortion is None:
+            return
+        rows = np.repeat(keep, 2)
+        whitened = lin.linear[rows] / np.repeat(image.sigma_px[keep], 2)[:, None]
+        H = unscented.solve_lower(self.S, whitened.T, transposed=True).T
+        innovation = (image.uv - lin.z)[keep] / image.sigma_px[keep][:, None]
+        lens = slice(where.intrinsics.start, where.distortion.stop)
+        camera = self.state.cameras[image.camera]
+        agreement.learn(
+            self.state.t_s,
+            innovation.ravel(),
+            H[:, :6],
+            H[:, lens],
+            np.concatenate([camera.intrinsics, camera.distortion]),
         )
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
@@ -259,6 +282,7 @@ class CalibrationFilter:
             S=self.S.copy(),
             _motion_straight=Straightness(),
             _view_straight={},
+            agreement={},
         )
 
     def sigmas(self) -> FloatArray:

@@ -22,6 +22,7 @@ from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_model import ImuBuffer
 from vical_daemon.estimation.judge import Judge
+from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import (
     BoolArray,
     CalibrationOptions,
@@ -210,7 +211,10 @@ class Calibrator:
         consistency = {name: Consistency() for name in self.priors}
         walk = np.zeros(self.layout.size)
         root = np.diag(self._start_sigmas(state))
-        return CalibrationFilter(state, self.layout, root, self.options.imu_noise, noise, walk, consistency)
+        agreement = {name: LensAgreement() for name in self.priors}
+        return CalibrationFilter(
+            state, self.layout, root, self.options.imu_noise, noise, walk, consistency, agreement
+        )
 
     def _start_sigmas(self, state: State) -> FloatArray:
         """Standard deviations the filter starts with: many times what the start is really worth.

@@ -15,21 +15,24 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     """One camera as it is known now.
 
     Sigmas are the filter's times the square root of the measured correlation factor: errors that last for
-    several images count less than the filter thinks (see `consistency`).
+    several images count less than the filter thinks (see `consistency`); those of the lens at least as
+    much as stretches of the data disagree about it (see `lens_agreement`).
     """
     camera, where = f.state.cameras[name], f.layout.cameras[name]
     spread = float(np.sqrt(f.consistency[name].factor))
-    sigma = spread * f.sigmas()
+    raw = f.sigmas()
+    sigma = spread * raw
+    lens = np.maximum(np.sqrt(f.agreement[name].factors), spread)
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
         PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), (spread**2 * pose_covariance(f, where)).tolist()),
         float(camera.timeshift_s),
         float(sigma[where.timeshift]) if where.timeshift is not None else 0.0,
         camera.intrinsics.tolist(),
-        sigma[where.intrinsics].tolist() if where.intrinsics is not None else [0.0] * 4,
+        (lens[:4] * raw[where.intrinsics]).tolist() if where.intrinsics is not None else [0.0] * 4,
         camera.distortion_model,
         camera.distortion.tolist(),
-        sigma[where.distortion].tolist() if where.distortion is not None else [0.0] * 4,
+        (lens[4:] * raw[where.distortion]).tolist() if where.distortion is not None else [0.0] * 4,
         float(reprojection_rms_px),
         float(f.corner_noise[name].sigma_px),
         [],
