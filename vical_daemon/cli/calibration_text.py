@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from vical_daemon.euler import euler_deg, euler_sigma_deg
+
 
 def describe(result: dict[str, Any]) -> str:
     """Return the text of a result document (see `vical calibrate --json`)."""
@@ -27,19 +29,6 @@ def describe(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def euler_deg(q_wxyz: list[float]) -> tuple[float, float, float]:
-    """Return roll, pitch, yaw in degrees (R = Rz(yaw) Ry(pitch) Rx(roll)); for reading only.
-
-    >>> [round(a) for a in euler_deg([math.cos(0.5), 0.0, 0.0, math.sin(0.5)])]
-    [0, 0, 57]
-    """
-    w, x, y, z = q_wxyz
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
-
-
 def _headline(result: dict[str, Any]) -> str:
     reason = f": {result['reason']}" if result["reason"] else ""
     return (
@@ -51,12 +40,13 @@ def _headline(result: dict[str, Any]) -> str:
 def _camera_lines(camera: dict[str, Any]) -> list[str]:
     pose = camera["T_imu_cam"]
     sigma = [math.sqrt(max(row[i], 0.0)) for i, row in enumerate(pose["covariance"])]
+    angle_sigmas = euler_sigma_deg(pose["q_wxyz"], pose["covariance"])
     shift_ms = 1e3 * camera["timeshift_cam_imu_s"]
     lines = [
         _row("position", [1e3 * p for p in pose["p_m"]], [1e3 * s for s in sigma[:3]], "mm", 2),
         _row("quaternion w x y z", pose["q_wxyz"], None, "", 6),
-        _row("roll pitch yaw", list(euler_deg(pose["q_wxyz"])), None, "deg", 3),
-        _row("rotation sigma x y z", [math.degrees(s) for s in sigma[3:]], None, "deg", 4),
+        _row("roll pitch yaw", list(euler_deg(pose["q_wxyz"])), angle_sigmas, "deg", 3),
+        _row("sigma about cam x y z", [math.degrees(s) for s in sigma[3:]], None, "deg", 4),
         _row("time shift", [shift_ms], [1e3 * camera["timeshift_sigma_s"]], "ms", 3)
         + "  (t_imu = t_cam + shift)",
         _row("fx fy cx cy", camera["intrinsics"], camera["intrinsics_sigma"], "px", 2),

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from vical_daemon.cli.calibration_text import euler_deg
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
+from vical_daemon.euler import euler_deg, euler_sigma_deg
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -16,7 +16,6 @@ Row = tuple[str, str, str, str]  # name, estimate, sigma, unit
 Estimates = Mapping[tuple[str, str], CalibrationEstimate]  # by rig and camera
 Health = Mapping[tuple[str, str], tuple[str, str]]  # by rig and component: level and message
 _LEVELS = {"ok": "green", "warn": "yellow", "error": "red", "stale": "red"}
-_STEP_RAD = 1e-6
 
 
 def rows(camera: CameraEstimate) -> list[Row]:
@@ -27,10 +26,10 @@ def rows(camera: CameraEstimate) -> list[Row]:
         (f"position {axis}", f"{1e3 * p:.2f}", f"{1e3 * s:.2f}", "mm")
         for axis, p, s in zip("xyz", pose.p_m, sigma[:3], strict=True)
     ]
-    angles = euler_deg(pose.q_wxyz)
+    angles, angle_sigmas = euler_deg(pose.q_wxyz), euler_sigma_deg(pose.q_wxyz, pose.covariance)
     table += [
         (name, f"{angle:.3f}", f"{s:.3f}", "deg")
-        for name, angle, s in zip(("roll", "pitch", "yaw"), angles, euler_sigma_deg(camera), strict=True)
+        for name, angle, s in zip(("roll", "pitch", "yaw"), angles, angle_sigmas, strict=True)
     ]
     shift, shift_sigma = camera.timeshift_cam_imu_s, camera.timeshift_sigma_s
     table.append(("time shift", f"{1e3 * shift:.3f}", f"{1e3 * shift_sigma:.3f}", "ms"))
@@ -40,26 +39,6 @@ def rows(camera: CameraEstimate) -> list[Row]:
         ):
             table.append((name, f"{value:.2f}", f"{s:.2f}", "px"))
     return table
-
-
-def euler_sigma_deg(camera: CameraEstimate) -> list[float]:
-    """Return the sigmas of roll, pitch and yaw, deg: J C J^T with J by differences (large near pitch 90)."""
-    w, x, y, z = camera.T_imu_cam.q_wxyz
-    h = 0.5 * _STEP_RAD
-    turned = ([w - x * h, x + w * h, y + z * h, z - y * h],
-              [w - y * h, x - z * h, y + w * h, z + x * h],
-              [w - z * h, x + y * h, y - x * h, z + w * h])  # fmt: skip
-    angles = euler_deg(camera.T_imu_cam.q_wxyz)
-    rows = [[_wrapped(b - a) / _STEP_RAD for a, b in zip(angles, euler_deg(q), strict=True)] for q in turned]
-    cov = [row[3:] for row in camera.T_imu_cam.covariance[3:]]
-    variances = [
-        sum(rows[i][k] * cov[i][j] * rows[j][k] for i in range(3) for j in range(3)) for k in range(3)
-    ]
-    return [math.sqrt(max(variance, 0.0)) for variance in variances]
-
-
-def _wrapped(angle_deg: float) -> float:
-    return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def one_line(camera: str, estimate: CalibrationEstimate) -> str:

@@ -21,7 +21,8 @@ section,.card{padding:14px 18px;margin:12px 0}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
 th,td{text-align:left;padding:5px 10px 5px 0;border-bottom:1px solid var(--line);vertical-align:top}
 th{font-weight:600;color:var(--soft);font-size:13px}
-td.n,th.n{text-align:right}th{white-space:nowrap}
+td.n,th.n{text-align:right}
+.pair td,th{white-space:nowrap}
 .warn{border-left:4px solid #b35c00;background:#fff7ec}
 .bad{border-left:4px solid #b3261e;background:#fdf0ef}
 ul{margin:4px 0;padding-left:20px}

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation import so3
+from vical_daemon.euler import euler_deg, euler_sigma_deg
 
 Row = tuple[str, str, str, str]
 HEAD = ("quantity", "value", "1 sigma", "unit")
@@ -33,20 +32,18 @@ def camera_rows(camera: dict[str, Any]) -> list[Row]:
     """Rows for extrinsics and time shift: lever arm in mm, rotation in degrees, shift in ms."""
     pose = camera["T_imu_cam"]
     sigma = np.sqrt(np.maximum(np.diag(np.array(pose["covariance"], dtype=np.float64)), 0.0))
-    q = np.array(pose["q_wxyz"], dtype=np.float64)
-    angles = Rotation.from_matrix(so3.matrix_from_quat(q)).as_euler("ZYX", degrees=True)
+    q = [float(v) for v in pose["q_wxyz"]]
     rows: list[Row] = []
     for i, axis in enumerate("xyz"):
         rows.append((f"lever arm {axis}", *value(1e3 * pose["p_m"][i], 1e3 * sigma[i]), "mm"))
-    local = np.degrees(sigma[3:])
-    for name, angle in zip(("yaw (Z)", "pitch (Y)", "roll (X)"), angles, strict=True):
-        digits = min(max(1 - math.floor(math.log10(max(float(local.min()), 1e-6))), 1), 6)
-        rows.append((f"rotation {name}", f"{angle:.{digits}f}", "", "deg"))
-    for i, axis in enumerate("xyz"):
-        rows.append((f"rotation about cam {axis}", "", f"{local[i]:.2g}", "deg"))
-    rows.append(("quaternion w x y z", " ".join(f"{v:+.7f}" for v in q), "", ""))
+    angles = zip(euler_deg(q), euler_sigma_deg(q, pose["covariance"]), strict=True)
+    for name, (angle, spread) in zip(("roll (X)", "pitch (Y)", "yaw (Z)"), angles, strict=True):
+        rows.append((f"rotation {name}", *value(angle, spread), "deg"))
+    rows.append(("quaternion w x y z", " ".join(f"{v:+.6f}" for v in q), "", ""))
+    about = " ".join(f"{s:.2g}" for s in np.degrees(sigma[3:]))
+    rows.append(("sigma about cam x y z", about, "", "deg"))
     shift = value(1e3 * camera["timeshift_cam_imu_s"], 1e3 * camera["timeshift_sigma_s"])
-    rows.append(("time shift: t_imu = t_cam + shift", *shift, "ms"))
+    rows.append(("time shift (t_imu - t_cam)", *shift, "ms"))
     if camera.get("readout_s"):
         rows.append(
             ("readout", *value(1e3 * camera["readout_s"], 1e3 * camera.get("readout_sigma_s", 0)), "ms")
