@@ -132,7 +132,7 @@ function drawWords() {
   setText("sentence", latest ? latest.sentence : "No estimate yet: is the calibrate process running?");
   setText("guidance", latest ? latest.guidance : "");
   $("bar").style.width = `${Math.round(100 * ((latest && latest.progress) || 0))}%`;
-  setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples` : "");
+  setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples · ± is 3 sigma` : "");
   const withheld = latest ? latest.withheld : [];
   $("withheld").replaceChildren(...withheld.map((line) => element("li", "", line)));
   const motion = latest ? latest.motion : { rotate: [], translate: [] };
