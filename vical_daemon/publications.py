@@ -103,7 +103,7 @@ def _delay_words(verdict: DelayVerdict) -> str:
     report = verdict.report
     if report is None:
         return verdict.why_refused or "waiting for motion"
-    return f"{1e3 * report.timeshift_s:+.2f} +- {1e3 * report.timeshift_sigma_s:.2f} ms from rotations alone"
+    return f"{1e3 * report.timeshift_s:+.2f} ± {1e3 * report.timeshift_sigma_s:.2f} ms from rotations alone"
 
 
 def publish(bus: Bus, messages: Iterable[Message]) -> None:

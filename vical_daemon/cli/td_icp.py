@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(TUM, EuRoC). The imu's gyro is the reference, or without one the fastest stream",
     )
     parser.add_argument(
-        "--search", metavar="S", type=float, default=5.0, help="look for delays up to +-S seconds (5)"
+        "--search", metavar="S", type=float, default=5.0, help="look for delays up to ± S seconds (5)"
     )
     parser.add_argument(
         "--watch",

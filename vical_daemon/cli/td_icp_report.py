@@ -35,18 +35,16 @@ def print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[st
     print(
         f"{camera} against {imu} ({result.status}), {result.pairs} orientations, {result.rejected} rejected"
     )
-    print(
-        f"  time shift   {1e3 * result.timeshift_cam_imu_s:+.3f} +- {1e3 * result.timeshift_sigma_s:.3f} ms"
-    )
+    print(f"  time shift   {1e3 * result.timeshift_cam_imu_s:+.3f} ± {1e3 * result.timeshift_sigma_s:.3f} ms")
     print("               t_imu = t_cam + shift")
     print(f"  R_imu_cam    q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f}")
-    print(f"               +- {sigma_deg[0]:.3f} {sigma_deg[1]:.3f} {sigma_deg[2]:.3f} deg")
+    print(f"               ± {sigma_deg[0]:.3f} {sigma_deg[1]:.3f} {sigma_deg[2]:.3f} deg")
     print(f"  gyro bias    {bias[0]:+.3f} {bias[1]:+.3f} {bias[2]:+.3f} deg/s")
     print(f"  noise of one sighting  {np.rad2deg(result.camera_noise_rad):.3f} deg")
     for row in watch:
         jump = "  jumped" if row["jumped"] else ""
-        delay = f"{1e3 * row['timeshift_s']:+.3f} +- {1e3 * row['timeshift_sigma_s']:.3f} ms"
-        drift = f"{row['drift_ppm']:+.1f} +- {row['drift_sigma_ppm']:.1f} ppm"
+        delay = f"{1e3 * row['timeshift_s']:+.3f} ± {1e3 * row['timeshift_sigma_s']:.3f} ms"
+        drift = f"{row['drift_ppm']:+.1f} ± {row['drift_sigma_ppm']:.1f} ppm"
         print(f"  {row['t_s']:8.1f} s  {delay}  drift {drift}{jump}")
 
 
@@ -60,12 +58,12 @@ def print_joint(result: JointResult) -> None:
     for pair in result.pairs:
         print(
             f"  {pair.a:>12s} -> {pair.b:<12s} {1e3 * pair.timeshift_s:+10.3f} "
-            f"+- {1e3 * pair.timeshift_sigma_s:.3f} ms"
+            f"± {1e3 * pair.timeshift_sigma_s:.3f} ms"
         )
     for name, sensor in result.sensors.items():
         q = quat_from_matrix(sensor.R_ref_sensor)
         sigma = np.rad2deg(sensor.rotation_sigma_rad).max()
         print(
             f"  {name}: R_{result.reference}_{name} q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f} "
-            f"+- {sigma:.3f} deg, {sensor.pairs} orientations, {sensor.rejected} rejected"
+            f"± {sigma:.3f} deg, {sensor.pairs} orientations, {sensor.rejected} rejected"
         )
