@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         from vical_daemon.export.kalibr import write_imu
 
-        hours = samples.duration_s / 3600.0
-        note = f"vical allan {Path(args.input).name}: {hours:.2f} h at {samples.rate_hz:.2f} Hz"
+        length = _length(samples.duration_s)
+        note = f"vical allan {Path(args.input).name}: {length} at {samples.rate_hz:.2f} Hz"
         Path(args.output).write_text(write_imu(combined, note=note), encoding="utf-8")
     if args.plots:
         from vical_daemon.cli.allan_plots import write_plots
@@ -132,9 +132,20 @@ _ROWS = (
 )
 
 
+def _length(duration_s: float) -> str:
+    """Return the length of a recording for people.
+
+    >>> _length(46.1), _length(14400.0)
+    ('46 s', '4.00 h')
+    """
+    return f"{duration_s:.0f} s" if duration_s < 600.0 else f"{duration_s / 3600.0:.2f} h"
+
+
 def _print_tables(samples: EvenSamples, fits: dict[str, list[NoiseFit]]) -> None:
-    hours = samples.duration_s / 3600.0
-    print(f"{samples.name}: {hours:.2f} h at {samples.rate_hz:.3f} Hz, {len(samples.gyro_rps)} samples")
+    print(
+        f"{samples.name}: {_length(samples.duration_s)} at {samples.rate_hz:.3f} Hz, "
+        f"{len(samples.gyro_rps)} samples"
+    )
     for sensor, title in (("gyro", "Gyroscope"), ("accel", "Accelerometer")):
         print(f"\n{title:<27} {'x':>20} {'y':>20} {'z':>20}  unit")
         for name, attribute, units in _ROWS:

@@ -141,7 +141,7 @@ def _print(document: dict[str, Any], missing: list[Missing]) -> None:
     print("bound on sigma for a perfect imu:")
     for name, values in document["sigma"].items():
         factor, unit = units.get(name, (1.0, ""))
-        words = "  ".join("lost" if v is None else f"{factor * v:.4f}" for v in values)
+        words = "  ".join("lost" if v is None else f"{factor * v:.2g}" for v in values)
         print(f"  {name:13s} {words} {unit}")
     for lost in document["lost"]:
         parts = ", ".join(f"{name} {share:.2f}" for name, share in lost["parts"].items())
