@@ -18,6 +18,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from vical_drivers.closing import Closing
+
 from vical_daemon import topics
 from vical_daemon.bus import Bus, Sample, Subscription
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
@@ -65,7 +67,7 @@ class Update:
         return self.estimate.status is Status.CONVERGED and self.camera in self.estimate.cameras
 
 
-class Client:
+class Client(Closing):
     """The calibrations on a bus, for threads; made by `connect`."""
 
     def __init__(self, bus: Bus, rig: str = "*", *, owns_bus: bool = True) -> None:
@@ -161,14 +163,6 @@ class Client:
         """Leave the bus; may be called twice."""
         if self._owns_bus:
             self._bus.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class AsyncClient:

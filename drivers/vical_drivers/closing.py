@@ -1,17 +1,18 @@
-"""Sources as context managers: leaving the block closes them."""
+"""What is closed when the block ends that opened it."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import Self
 
 
-class Closing:
-    """Base of what has a `close` that may be called twice."""
+class Closing(ABC):
+    """Base of what has a `close` that may be called twice: a context manager."""
 
+    @abstractmethod
     def close(self) -> None:
         """Free everything."""
-        raise NotImplementedError
 
     def __enter__(self) -> Self:
         return self

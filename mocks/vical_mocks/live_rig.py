@@ -16,6 +16,7 @@ from types import SimpleNamespace, TracebackType
 from typing import Any, Self
 
 import numpy as np
+from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceLostError, DeviceTimeoutError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
@@ -151,7 +152,7 @@ class LiveRig:
         return LiveCamera(self._pipes["camera"])
 
 
-class LiveCamera:
+class LiveCamera(Closing):
     """The receiving end of the simulated camera: a `FrameSource`."""
 
     def __init__(self, pipe: Connection) -> None:
@@ -201,14 +202,6 @@ class LiveCamera:
 
     def close(self) -> None:
         """The pipe belongs to the rig."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _run_imu(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
+
+from vical_drivers.closing import Closing
 
 from vical_daemon.mcap_log.files import PART_SUFFIX, LockedFile, LogError, describe, publish
 from vical_daemon.messages import ros2_schema
@@ -16,7 +17,7 @@ CHUNK_BYTES = 1_048_576
 _ROS_TOPIC = re.compile(r"/[A-Za-z0-9_/]+")
 
 
-class LogWriter:
+class LogWriter(Closing):
     """One MCAP file; not thread-safe but for `sync`.
 
     While it grows it is called ``NAME.mcap.part``; `close` gives it its name. A crash leaves the part,
@@ -161,11 +162,3 @@ class LogWriter:
             publish(self.part_path, self.path)
         finally:
             self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

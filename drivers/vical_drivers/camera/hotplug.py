@@ -12,8 +12,8 @@ import socket
 import struct
 import time
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self
+
+from vical_drivers.closing import Closing
 
 _NETLINK_KOBJECT_UEVENT = 15
 _UDEV_GROUP = 2
@@ -62,7 +62,7 @@ def parse_event(message: bytes) -> DeviceEvent | None:
     return DeviceEvent(properties["ACTION"], properties.get("SUBSYSTEM", ""), path, properties)
 
 
-class HotplugMonitor:
+class HotplugMonitor(Closing):
     """Listens to udev.
 
     Raises:
@@ -99,14 +99,6 @@ class HotplugMonitor:
     def close(self) -> None:
         """Free the socket; may be called twice."""
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def wait_for_camera(timeout_s: float, subsystems: tuple[str, ...] = ("video4linux", "firewire")) -> None:
