@@ -95,22 +95,12 @@ class SourceStats:
     extra: dict[str, float] = field(default_factory=dict)
 
 
-@runtime_checkable
-class ImuSource(Protocol):
-    """Anything that yields inertial samples: driver, emulation or replay."""
+class Source(Protocol):
+    """What every source of samples has; leaving its `with` block closes it."""
 
     @property
     def info(self) -> DeviceInfo:
         """Who the device is."""
-        ...
-
-    def read(self, timeout_s: float) -> list[ImuSample]:
-        """Return the samples that arrived, in order; [] after `timeout_s` without any.
-
-        Raises:
-            DeviceLostError: The device went away; `read` may be called again after a pause, and the
-                source tries to come back by itself.
-        """
         ...
 
     def stats(self) -> SourceStats:
@@ -129,13 +119,22 @@ class ImuSource(Protocol):
 
 
 @runtime_checkable
-class FrameSource(Protocol):
-    """Anything that yields frames: camera driver, simulated camera or replay."""
+class ImuSource(Source, Protocol):
+    """Anything that yields inertial samples: driver, emulation or replay."""
 
-    @property
-    def info(self) -> DeviceInfo:
-        """Who the device is."""
+    def read(self, timeout_s: float) -> list[ImuSample]:
+        """Return the samples that arrived, in order; [] after `timeout_s` without any.
+
+        Raises:
+            DeviceLostError: The device went away; `read` may be called again after a pause, and the
+                source tries to come back by itself.
+        """
         ...
+
+
+@runtime_checkable
+class FrameSource(Source, Protocol):
+    """Anything that yields frames: camera driver, simulated camera or replay."""
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next frame, or None after `timeout_s` without one.
@@ -144,17 +143,3 @@ class FrameSource(Protocol):
             DeviceLostError: The camera went away; `read` may be called again after a pause.
         """
         ...
-
-    def stats(self) -> SourceStats:
-        """Counters since the source was opened."""
-        ...
-
-    def close(self) -> None:
-        """Stop streaming and free the device; may be called twice."""
-        ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
