@@ -16,10 +16,10 @@ import numpy as np
 
 from vical_drivers.camera.aravis_process import OPEN_TIMEOUT_S, GrabberProcess
 from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Layout, PixelFormat
+from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, SequenceCounter
-from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.v4l2_stamp import SIGMA_NS, ExposureStamper, RawStamp
+from vical_drivers.camera.v4l2_stamp import SIGMA_NS, RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.envelope import LowerEnvelope
 from vical_drivers.errors import (
@@ -70,9 +70,7 @@ class AravisCamera(Closing):
             "pixel_format": s.pixel_format, "exposure_s": s.exposure_s, "controls": dict(s.controls),
             "interfaces": list(interfaces),
         }  # fmt: skip
-        self._statistics = FrameStatistics()
-        self._stamper = ExposureStamper(s)
-        self._pending_loss = 0
+        self._frames = FrameMaker(s)
         self._closed = False
         self._grabber: GrabberProcess | None = None
         self._open()
@@ -88,7 +86,7 @@ class AravisCamera(Closing):
         except BaseException:
             self._drop()
             raise
-        self._stamper.set_exposure(_ns(answer[0]["exposure_s"]), 0)
+        self._frames.stamper.set_exposure(_ns(answer[0]["exposure_s"]), 0)
         self._counter = SequenceCounter(16, skips_zero=True)
         self._sequence = 0
         self._envelope = LowerEnvelope()
@@ -171,7 +169,7 @@ class AravisCamera(Closing):
             self._open()  # searching the network takes its time: no further wait is needed
         except DriverError as error:
             raise DeviceLostError(f"{self._info.details['uri']}: not back yet ({error})") from error
-        self._statistics.restart()
+        self._frames.statistics.restart()
 
     def _next(self, timeout_s: float) -> Frame | None:
         assert self._grabber is not None
@@ -180,15 +178,15 @@ class AravisCamera(Closing):
             return None
         fields, data = message
         if fields["kind"] == "exposure":
-            self._stamper.set_exposure(_ns(fields["exposure_s"]), fields["t_ns"])
+            self._frames.stamper.set_exposure(_ns(fields["exposure_s"]), fields["t_ns"])
             self._first = None  # the way from the camera's stamp to its first packet is another now
             return None
         missing = self._counter.missing_before(fields["frame_id"])
         self._sequence += missing + 1
-        self._pending_loss += missing
+        self._frames.lost(missing)
         if not fields["whole"]:
-            self._statistics.count(f"buffers_{fields['status'].replace('-', '_')}")
-            self._pending_loss += 1
+            self._frames.statistics.count(f"buffers_{fields['status'].replace('-', '_')}")
+            self._frames.lost()
             return None
         return self._finish(fields, data)
 
@@ -198,24 +196,10 @@ class AravisCamera(Closing):
             image = self._decode(np.frombuffer(data, dtype=np.uint8))
         except CorruptImageError as error:
             _log.debug("corrupt image: %s", error)
-            self._statistics.corrupt += 1
-            self._pending_loss += 1
+            self._frames.spoilt("corrupt_images")
+            self._frames.lost()
             return None
-        stamp, exposure_ns = self._stamper.stamp(raw)
-        dropped, self._pending_loss = self._pending_loss, 0
-        self._statistics.add(stamp.t_exposure_mid_ns, dropped)
-        return Frame(
-            t_exposure_mid_ns=stamp.t_exposure_mid_ns,
-            t_arrival_ns=fields["arrival_ns"],
-            sequence=self._sequence,
-            image=image,
-            encoding=self._settings.encoding,
-            stamp_rule=stamp.rule,
-            exposure_ns=exposure_ns,
-            readout_ns=self._settings.shutter.row_spread_ns,
-            t_sigma_ns=raw.t_sigma_ns,
-            dropped_before=dropped,
-        )
+        return self._frames.frame(image, raw, sequence=self._sequence, t_arrival_ns=fields["arrival_ns"])
 
     def _raw_stamp(self, device_ns: int, first_packet_ns: int) -> RawStamp:
         packet = RawStamp(first_packet_ns, Anchor.FIRST_PACKET, None, SIGMA_NS[Anchor.FIRST_PACKET])
@@ -238,7 +222,7 @@ class AravisCamera(Closing):
 
     def stats(self) -> SourceStats:
         """Counters since the source was opened."""
-        return self._statistics.snapshot(clock_skew_ppm=-self._envelope.skew * 1e6)
+        return self._frames.statistics.snapshot(clock_skew_ppm=-self._envelope.skew * 1e6)
 
     def close(self) -> None:
         """Stop the camera and end its process; may be called twice."""

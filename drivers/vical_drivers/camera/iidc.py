@@ -20,12 +20,12 @@ from vical_drivers.camera.cycle_clock import CycleClock, image_cycle_time_ns
 from vical_drivers.camera.embedded import EmbeddedInfo, parse_embedded
 from vical_drivers.camera.firewire import BusClock, find_node
 from vical_drivers.camera.formats import Bytes, CorruptImageError, FrameDecoder, Image
+from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
 from vical_drivers.camera.iidc_device import IidcDevice, IidcMode, frame_bytes, list_devices, pixel_format
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, SequenceCounter
-from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.v4l2_stamp import SIGMA_NS, ExposureStamper, RawStamp
+from vical_drivers.camera.v4l2_stamp import SIGMA_NS, RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
@@ -57,13 +57,11 @@ class IidcCamera(Closing):
     def __init__(self, name: str, settings: CameraSettings | None = None) -> None:
         self._settings = settings or CameraSettings()
         self._guid = _parse_guid(name)
-        self._statistics = FrameStatistics()
-        self._stamper = ExposureStamper(self._settings)
+        self._frames = FrameMaker(self._settings)
         self._clock = CycleClock()
         self._device: IidcDevice | None = None
         self._bus: BusClock | None = None
         self._closed = False
-        self._pending_loss = 0
         self._open()
         self._info = self._describe()
 
@@ -100,7 +98,7 @@ class IidcCamera(Closing):
         for name, value in wanted.controls.items():
             register = _parse_register(device, name)
             device.set_register(register, int(value))
-        self._stamper.set_exposure(self._read_exposure(device), 0)
+        self._frames.stamper.set_exposure(self._read_exposure(device), 0)
 
     def _read_exposure(self, device: IidcDevice) -> int | None:
         """Exposure in force, ns; None where the camera cannot tell it in seconds."""
@@ -126,7 +124,7 @@ class IidcCamera(Closing):
             wait_for_camera(timeout_s, ("firewire",))
             raise DeviceLostError(f"iidc:{self._guid:016x}: the camera is not back yet ({error})") from error
         self._clock = CycleClock()
-        self._statistics.restart()
+        self._frames.statistics.restart()
         _log.info("camera back guid=%016x", self._guid)
 
     def close(self) -> None:
@@ -143,7 +141,7 @@ class IidcCamera(Closing):
 
     def _describe(self) -> DeviceInfo:
         device, bus = self._need()
-        exposure_ns = self._stamper.exposure_ns
+        exposure_ns = self._frames.stamper.exposure_ns
         return DeviceInfo(
             kind="camera",
             model=device.vendor_and_model,
@@ -172,12 +170,12 @@ class IidcCamera(Closing):
         device, _ = self._need()
         obtained_s = device.set_absolute(abi.FEATURE_SHUTTER, exposure_s, "shutter", "s")
         if not self._frame_info:  # else the image itself says when the new shutter is in force
-            self._stamper.set_exposure(round(obtained_s * 1e9), time.monotonic_ns())
+            self._frames.stamper.set_exposure(round(obtained_s * 1e9), time.monotonic_ns())
         return obtained_s
 
     def stats(self) -> SourceStats:
         """Counters since the source was opened; `clock_skew_ppm` is the bus clock's."""
-        return self._statistics.snapshot(
+        return self._frames.statistics.snapshot(
             clock_skew_ppm=self._clock.skew_ppm,
             bus_clock_restarts=float(self._clock.restarts),
             bus_clock_sigma_us=self._clock.sigma_ns * 1e-3,
@@ -255,26 +253,12 @@ class IidcCamera(Closing):
     ) -> Frame | None:
         raw = self._raw_stamp(info, t_packet_ns, t_arrival_ns)
         self._update_exposure(device, info)
-        self._pending_loss += self._missing(info, raw.t_raw_ns)
+        self._frames.lost(self._missing(info, raw.t_raw_ns))
         image = self._image(data, depth_bits)
         if image is None:
-            self._pending_loss += 1
+            self._frames.lost()
             return None
-        stamp, exposure_ns = self._stamper.stamp(raw)
-        dropped, self._pending_loss = self._pending_loss, 0
-        self._statistics.add(stamp.t_exposure_mid_ns, dropped)
-        return Frame(
-            t_exposure_mid_ns=stamp.t_exposure_mid_ns,
-            t_arrival_ns=t_arrival_ns,
-            sequence=self._sequence,
-            image=image,
-            encoding=self._settings.encoding,
-            stamp_rule=stamp.rule,
-            exposure_ns=exposure_ns,
-            readout_ns=self._settings.shutter.row_spread_ns,
-            t_sigma_ns=raw.t_sigma_ns,
-            dropped_before=dropped,
-        )
+        return self._frames.frame(image, raw, sequence=self._sequence, t_arrival_ns=t_arrival_ns)
 
     def _raw_stamp(self, info: EmbeddedInfo, t_packet_ns: int, t_arrival_ns: int) -> RawStamp:
         forced = self._settings.stamp
@@ -283,7 +267,7 @@ class IidcCamera(Closing):
             t_ns = self._clock.to_host_ns(image_cycle_time_ns(info.cycle_time))
             if not 0 <= t_arrival_ns - t_ns < OLDEST_NS:
                 # exposed before a bus reset gave the bus another time, and read after it
-                self._statistics.count("implausible_stamps")
+                self._frames.statistics.count("implausible_stamps")
                 return RawStamp(t_arrival_ns, Anchor.ARRIVAL, None, SIGMA_NS[Anchor.ARRIVAL])
             sigma_ns = round(self._clock.sigma_ns) + 200  # and the masked bits
             return RawStamp(t_ns, anchor or Anchor.SHUTTER_CLOSED, "embedded-cycle-timer", sigma_ns)
@@ -295,7 +279,7 @@ class IidcCamera(Closing):
             return
         self._shutter_raw = info.shutter
         exposure_ns = self._read_exposure(device)
-        self._stamper.set_exposure(exposure_ns, 0)
+        self._frames.stamper.set_exposure(exposure_ns, 0)
 
     def _missing(self, info: EmbeddedInfo, t_raw_ns: int) -> int:
         if info.frame_counter is not None:
@@ -317,8 +301,7 @@ class IidcCamera(Closing):
         try:
             return self._decode(data)
         except CorruptImageError as error:
-            self._statistics.count("corrupt_images")
-            self._statistics.corrupt += 1
+            self._frames.spoilt("corrupt_images")
             _log.debug("corrupt image: %s", error)
             return None
 

@@ -19,69 +19,25 @@ import select
 from collections.abc import Callable
 
 from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.discovery import NodeEntry, find_again, find_node
-from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Image
+from vical_drivers.camera.discovery import find_again, find_node
+from vical_drivers.camera.formats import CorruptImageError, Image
+from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
 from vical_drivers.camera.kernel import Kernel, LinuxKernel
-from vical_drivers.camera.negotiate import negotiate
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import SequenceCounter
-from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.uvc_stream import UvcMetadata, hwtimestamps
 from vical_drivers.camera.v4l2_controls import Controls
-from vical_drivers.camera.v4l2_exposure import apply_settings, read_exposure_ns, set_exposure
-from vical_drivers.camera.v4l2_node import DequeuedBuffer, NodeIdentity, ObtainedFormat, VideoNode
-from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp, kernel_stamp
+from vical_drivers.camera.v4l2_exposure import read_exposure_ns, set_exposure
+from vical_drivers.camera.v4l2_node import DequeuedBuffer
+from vical_drivers.camera.v4l2_session import V4l2Session
+from vical_drivers.camera.v4l2_stamp import RawStamp, kernel_stamp
 from vical_drivers.closing import Closing
-from vical_drivers.errors import DeviceLostError, DeviceRefusedError, DriverError
+from vical_drivers.errors import DeviceLostError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
 _log = logging.getLogger(__name__)
 
 _GONE = select.POLLERR | select.POLLHUP | select.POLLNVAL
-_UVC_DRIVER = "uvcvideo"
-
-
-class _Session:
-    """One opening of the device: everything that is made anew after a replug."""
-
-    def __init__(self, kernel: Kernel, entry: NodeEntry, settings: CameraSettings) -> None:
-        self.metadata: UvcMetadata | None = None
-        self.node = VideoNode(kernel, entry.path)
-        try:
-            self.identity: NodeIdentity = self.node.identity()
-            if not self.identity.captures_video:
-                raise DeviceRefusedError(_no_capture(entry.path, self.identity))
-            self.format: ObtainedFormat
-            self.format, self.rate_hz = negotiate(self.node, settings)
-            self.decode = _decoder(entry.path, self.format, settings)
-            self.controls = Controls(kernel, self.node)
-            apply_settings(self.controls, settings)
-            self.exposure_ns = read_exposure_ns(self.controls)
-            self._watch_exposure()
-            self.uvc_hwtimestamps = False
-            if self.identity.driver == _UVC_DRIVER and settings.stamp == "auto":
-                self.uvc_hwtimestamps = hwtimestamps(kernel)
-                self.metadata = UvcMetadata.open(kernel, entry)
-            self.buffers = self.node.start(settings.ring_size(self.rate_hz))
-        except BaseException:
-            self.close()
-            raise
-
-    def _watch_exposure(self) -> None:
-        """Ask to be told when somebody else changes the exposure; not every driver can."""
-        for control_id in (abi.CID_EXPOSURE_ABSOLUTE, abi.CID_EXPOSURE_AUTO):
-            if self.controls.find(control_id) is not None:
-                try:
-                    subscription = abi.EventSubscription(type=abi.EVENT_CTRL, id=control_id)
-                    self.node.request(abi.VIDIOC_SUBSCRIBE_EVENT, subscription, "report changes")
-                except DriverError as error:
-                    _log.debug("no control events: %s", error)
-
-    def close(self) -> None:
-        if self.metadata is not None:
-            self.metadata.close()
-        self.node.close()
 
 
 class V4l2Camera(Closing):
@@ -110,21 +66,19 @@ class V4l2Camera(Closing):
         self._wait = wait or wait_for_camera
         self._entry = find_node(self._kernel, name)
         self._sequence = SequenceCounter()
-        self._statistics = FrameStatistics()
-        self._stamper = ExposureStamper(self._settings)
+        self._frames = FrameMaker(self._settings)
         self._borrowed: int | None = None
         self._rule = ""
-        self._pending_loss = 0
         self._closed = False
-        self._session: _Session | None = None
+        self._session: V4l2Session | None = None
         self._open()
         self._info = self._describe()
 
     # -- life ---------------------------------------------------------------------------------------
 
     def _open(self) -> None:
-        self._session = _Session(self._kernel, self._entry, self._settings)
-        self._stamper.set_exposure(self._session.exposure_ns, 0)
+        self._session = V4l2Session(self._kernel, self._entry, self._settings)
+        self._frames.stamper.set_exposure(self._session.exposure_ns, 0)
         self._sequence.restart()
         self._borrowed = None
 
@@ -146,7 +100,7 @@ class V4l2Camera(Closing):
         except DriverError as error:
             self._wait(timeout_s)  # udev may not have set the permissions yet
             raise DeviceLostError(f"{entry.path}: the camera is not back yet ({error})") from error
-        self._statistics.restart()
+        self._frames.statistics.restart()
         _log.info("camera back path=%s", entry.path)
 
     def close(self) -> None:
@@ -163,7 +117,7 @@ class V4l2Camera(Closing):
 
     def _describe(self) -> DeviceInfo:
         session = self._need_session()
-        fmt, exposure_ns = session.format, self._stamper.exposure_ns
+        fmt, exposure_ns = session.format, self._frames.stamper.exposure_ns
         return DeviceInfo(
             kind="camera",
             model=session.identity.card,
@@ -183,7 +137,7 @@ class V4l2Camera(Closing):
             },
         )
 
-    def _need_session(self) -> _Session:
+    def _need_session(self) -> V4l2Session:
         if self._closed:
             raise DeviceLostError(f"{self._entry.path}: the camera is closed")
         if self._session is None:
@@ -202,16 +156,16 @@ class V4l2Camera(Closing):
         """
         session = self._need_session()
         obtained_ns = set_exposure(session.controls, exposure_s)
-        self._stamper.set_exposure(obtained_ns, self._kernel.monotonic_ns())
+        self._frames.stamper.set_exposure(obtained_ns, self._kernel.monotonic_ns())
         return obtained_ns * 1e-9
 
     def stats(self) -> SourceStats:
         """Counters since the source was opened; `extra` counts faults by kind and the UVC clock fit."""
         metadata = self._session.metadata if self._session is not None else None
         if metadata is None:
-            return self._statistics.snapshot()
+            return self._frames.statistics.snapshot()
         health = metadata.health()
-        return self._statistics.snapshot(
+        return self._frames.statistics.snapshot(
             clock_skew_ppm=health.skew_ppm,
             uvc_fit_residual_us=health.residual_sigma_ns * 1e-3,
             uvc_fit_used=float(health.usable),
@@ -246,12 +200,12 @@ class V4l2Camera(Closing):
             self._drop_session()
             raise
 
-    def _return_borrowed(self, session: _Session) -> None:
+    def _return_borrowed(self, session: V4l2Session) -> None:
         if self._borrowed is not None:
             index, self._borrowed = self._borrowed, None
             session.node.queue(index)
 
-    def _next_buffer(self, session: _Session, timeout_s: float) -> DequeuedBuffer | None:
+    def _next_buffer(self, session: V4l2Session, timeout_s: float) -> DequeuedBuffer | None:
         """Wait for a buffer; None on timeout or when only an event came."""
         fd = session.node.fd
         events = self._kernel.poll([(fd, select.POLLIN | select.POLLPRI)], max(0.0, timeout_s)).get(fd, 0)
@@ -264,17 +218,17 @@ class V4l2Camera(Closing):
             return buffer
         return None
 
-    def _take_event(self, session: _Session) -> None:
+    def _take_event(self, session: V4l2Session) -> None:
         session.node.request(abi.VIDIOC_DQEVENT, abi.Event(), "tell what changed")
-        self._stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
+        self._frames.stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
 
-    def _frame(self, session: _Session, buffer: DequeuedBuffer) -> Frame | None:
+    def _frame(self, session: V4l2Session, buffer: DequeuedBuffer) -> Frame | None:
         # Both clocks at once, and before anything takes time: a stamp of the wall clock is moved by the pair.
         t_arrival_ns, t_realtime_ns = self._kernel.monotonic_ns(), self._kernel.realtime_ns()
-        self._pending_loss += self._sequence.missing_before(buffer.sequence)
+        self._frames.lost(self._sequence.missing_before(buffer.sequence))
         image = self._image(session, buffer)
         if image is None:
-            self._pending_loss += 1
+            self._frames.lost()
             session.node.queue(buffer.index)
             return None
         if self._settings.borrow:
@@ -284,42 +238,27 @@ class V4l2Camera(Closing):
                 image = image.copy()
             session.node.queue(buffer.index)
         raw = self._raw_stamp(session, buffer, t_arrival_ns, t_realtime_ns)
-        stamp, exposure_ns = self._stamper.stamp(raw)
-        self._say_rule(stamp.rule)
-        dropped, self._pending_loss = self._pending_loss, 0
-        self._statistics.add(stamp.t_exposure_mid_ns, dropped)
-        return Frame(
-            t_exposure_mid_ns=stamp.t_exposure_mid_ns,
-            t_arrival_ns=t_arrival_ns,
-            sequence=buffer.sequence,
-            image=image,
-            encoding=self._settings.encoding,
-            stamp_rule=stamp.rule,
-            exposure_ns=exposure_ns,
-            readout_ns=self._settings.shutter.row_spread_ns,
-            t_sigma_ns=raw.t_sigma_ns,
-            dropped_before=dropped,
-        )
+        frame = self._frames.frame(image, raw, sequence=buffer.sequence, t_arrival_ns=t_arrival_ns)
+        self._say_rule(frame.stamp_rule)
+        return frame
 
-    def _image(self, session: _Session, buffer: DequeuedBuffer) -> Image | None:
+    def _image(self, session: V4l2Session, buffer: DequeuedBuffer) -> Image | None:
         """Decode a buffer; None, with the reason counted, where it holds no good image."""
         if buffer.bytes_used == 0:
-            self._statistics.count("empty_buffers")
+            self._frames.statistics.count("empty_buffers")
             return None
         if buffer.flags & abi.BUF_FLAG_ERROR:
-            self._statistics.count("flagged_buffers")
-            self._statistics.corrupt += 1
+            self._frames.spoilt("flagged_buffers")
             return None
         try:
             return session.decode(session.node.mappings[buffer.index].array[: buffer.bytes_used])
         except CorruptImageError as error:
-            self._statistics.count("corrupt_images")
-            self._statistics.corrupt += 1
+            self._frames.spoilt("corrupt_images")
             _log.debug("corrupt image sequence=%d: %s", buffer.sequence, error)
             return None
 
     def _raw_stamp(
-        self, session: _Session, buffer: DequeuedBuffer, t_arrival_ns: int, t_realtime_ns: int
+        self, session: V4l2Session, buffer: DequeuedBuffer, t_arrival_ns: int, t_realtime_ns: int
     ) -> RawStamp:
         if session.metadata is not None:
             fitted = session.metadata.stamp(buffer)
@@ -338,24 +277,3 @@ class V4l2Camera(Closing):
         if rule != self._rule:
             _log.info("stamp rule path=%s rule=%s", self._entry.path, rule)
             self._rule = rule
-
-
-def _decoder(path: str, fmt: ObtainedFormat, settings: CameraSettings) -> FrameDecoder:
-    try:
-        return FrameDecoder(
-            FORMATS[fmt.pixel_format],
-            fmt.width,
-            fmt.height,
-            stride=fmt.stride,
-            encoding=settings.encoding,
-            decoder=settings.decoder,
-        )
-    except ValueError as error:
-        raise DeviceRefusedError(f"{path}: {error}") from error
-
-
-def _no_capture(path: str, identity: NodeIdentity) -> str:
-    if identity.capabilities & abi.CAP_VIDEO_CAPTURE_MPLANE:
-        return f"{path}: {identity.card} has multi-planar buffers only, which are not supported"
-    what = "metadata" if identity.captures_metadata else "no pictures"
-    return f"{path}: this node of {identity.card} delivers {what}; try the camera's other /dev/video node"

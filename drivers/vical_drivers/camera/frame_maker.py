@@ -1,0 +1,61 @@
+"""The last step of every camera driver: from an image and its raw stamp to a `Frame`, with losses told."""
+
+from __future__ import annotations
+
+from vical_drivers.camera.formats import Image
+from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.statistics import FrameStatistics
+from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp
+from vical_drivers.samples import Frame
+
+
+class FrameMaker:
+    """Moves stamps to the middle of the exposure, and tells losses with the next good frame.
+
+    Args:
+        settings: Shutter, encoding and stamp rule.
+
+    Attributes:
+        stamper: Knows the exposure in force.
+        statistics: Counters of the source, over all its openings.
+    """
+
+    def __init__(self, settings: CameraSettings) -> None:
+        self._settings = settings
+        self.stamper = ExposureStamper(settings)
+        self.statistics = FrameStatistics()
+        self._lost = 0
+
+    def lost(self, frames: int = 1) -> None:
+        """Frames that never came, or came spoilt; `Frame.dropped_before` of the next good one."""
+        self._lost += frames
+
+    def spoilt(self, reason: str) -> None:
+        """Count a frame that came, but not whole, under its reason."""
+        self.statistics.count(reason)
+        self.statistics.corrupt += 1
+
+    def frame(self, image: Image, raw: RawStamp, *, sequence: int, t_arrival_ns: int) -> Frame:
+        """Make the frame.
+
+        Args:
+            image: Pixels in the encoding of the settings.
+            raw: When the driver says that it was taken.
+            sequence: The source's own number.
+            t_arrival_ns: When it reached this process, CLOCK_MONOTONIC, ns.
+        """
+        stamp, exposure_ns = self.stamper.stamp(raw)
+        dropped, self._lost = self._lost, 0
+        self.statistics.add(stamp.t_exposure_mid_ns, dropped)
+        return Frame(
+            t_exposure_mid_ns=stamp.t_exposure_mid_ns,
+            t_arrival_ns=t_arrival_ns,
+            sequence=sequence,
+            image=image,
+            encoding=self._settings.encoding,
+            stamp_rule=stamp.rule,
+            exposure_ns=exposure_ns,
+            readout_ns=self._settings.shutter.row_spread_ns,
+            t_sigma_ns=raw.t_sigma_ns,
+            dropped_before=dropped,
+        )
