@@ -3,7 +3,8 @@
     python -m benchmarks pictures --out docs/_static
 
 A browser looks at the live page of a running `vical demo`; afterwards `vical calibrate --report` makes the
-report from the log of that demo, and what `vical watch` shows is drawn from the messages in it.
+report from the log of that demo, and what `vical watch` shows is drawn from the messages in it. Where the
+real recording lies beside the checkout, its report is taken as well.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from vical_daemon.cli.watch import View
 from vical_daemon.mcap_log import LogReader
 
 ROOT = Path(__file__).resolve().parents[1]
+EUROC = ROOT.parent / "shared" / "data" / "euroc_imu_april"
 _VICAL = [sys.executable, "-m", "vical_daemon"]
 
 
@@ -41,7 +43,12 @@ def main(argv: list[str]) -> int:
         work = Path(name)
         log = live_page(browser, work, args.out, args.seconds)
         terminal(browser, work, log, args.out / "terminal.png")
-        report(browser, work, log, args.out / "demo_report.png")
+        board = ["--target", str(log.with_name("target.yaml"))]
+        report(browser, work, [str(log), *board], args.out / "demo_report.png")
+        if EUROC.is_dir():
+            known = ["--target", str(EUROC / "target.yaml"), "--initial", str(EUROC / "initial.yaml")]
+            fixed = [*known, "--fix", "intrinsics"]
+            report(browser, work, [str(EUROC), *fixed], args.out / "report.png")
     print("\n".join(str(path) for path in sorted(args.out.glob("*.png"))))
     return 0
 
@@ -101,11 +108,11 @@ def picture(browser: Any, work: Path, svg: str, path: Path) -> None:
     browser.drive(script, work / "profile")
 
 
-def report(browser: Any, work: Path, log: Path, path: Path) -> None:
-    """Make the report of the log and look at its first page."""
+def report(browser: Any, work: Path, arguments: list[str], path: Path) -> None:
+    """Make the report of a calibration and look at its first page."""
     html = work / "report.html"
-    command = [*_VICAL, "calibrate", str(log), "--target", str(work / "demo" / "target.yaml"), "--report"]
-    subprocess.run([*command, str(html)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    command = [*_VICAL, "calibrate", *arguments, "--report", str(html)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     async def script(page: Any) -> None:
         await page.open(html.as_uri(), 1100, 1400)
