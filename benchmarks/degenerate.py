@@ -10,6 +10,7 @@ import numpy as np
 from vical_mocks import trajectory
 from vical_mocks.points import simulate
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
+from vical_mocks.tracks import simulate_tracks
 from vical_mocks.trajectory import Trajectory
 
 from benchmarks import runner
@@ -26,6 +27,7 @@ MOTIONS: dict[str, Callable[[int], Trajectory]] = {
     "one axis (optical)": lambda seed: trajectory.one_axis(seed, [0, 0, 1], T_imu_cam=_MOUNT),
     "constant rate": lambda _: trajectory.constant_rate(T_imu_cam=_MOUNT),
     "fronto-parallel": lambda seed: trajectory.fronto_parallel(seed, T_imu_cam=_MOUNT),
+    "planar": lambda seed: trajectory.planar(seed, T_imu_cam=_MOUNT),
     "slow 1 deg/s": lambda seed: trajectory.hand_motion(seed, 1.0, T_imu_cam=_MOUNT),
     "hand (control)": lambda seed: trajectory.hand_motion(seed, T_imu_cam=_MOUNT),
 }
@@ -33,19 +35,21 @@ MOTIONS: dict[str, Callable[[int], Trajectory]] = {
 _LOST = np.array([5e-3] * 3 + [np.deg2rad(0.3)] * 3 + [1e-3])
 
 
-def trial(motion: str, lens_known: bool, given: bool, seconds: float, seed: int) -> runner.Result:
+def trial(
+    motion: str, lens_known: bool, given: bool, target_free: bool, seconds: float, seed: int
+) -> runner.Result:
     """One recording of a degenerate motion; `given`: mounting and shift are given roughly."""
     rig = reference_rig(seed, timeshift_cam_imu_s=0.02, trajectory=MOTIONS[motion](seed))
-    run = simulate(seed, seconds, rig=rig)
+    run = (simulate_tracks if target_free else simulate)(seed, seconds, rig=rig)
     start = (
         StartErrors(extrinsics=(float(np.deg2rad(3.0)), 0.03), timeshift_s=0.005) if given else StartErrors()
     )
     prior = camera_prior(run, seed, start, exact_lens=lens_known)
     fix = frozenset({"intrinsics"}) if lens_known else frozenset[str]()
-    record = feed(
-        run, CalibratorSubject(CalibrationOptions(fix=fix, imu_noise=imu_noise(run)), prior, run.points_m)
-    )
-    limit: Bound = bounds(run, BoundOptions(intrinsics=not lens_known, distortion=not lens_known))[0]
+    options = CalibrationOptions(fix=fix, imu_noise=imu_noise(run), target_free=target_free)
+    record = feed(run, CalibratorSubject(options, prior, None if target_free else run.points_m))
+    free = not lens_known
+    limit: Bound = bounds(run, BoundOptions(intrinsics=free, distortion=free, target_free=target_free))[0]
     lost = [name for name, s, most in zip(PARAMETERS, bound_sigmas(limit), _LOST, strict=False) if s > most]
     last = record.snapshots[-1] if record.snapshots else None
     z = None if last is None else last.error[:7] / np.sqrt(np.diag(last.covariance))[:7]
@@ -68,6 +72,7 @@ def main(argv: list[str]) -> int:
     runner.add_arguments(parser, trials=3, seconds=40.0)
     parser.add_argument("--lens-known", action="store_true")
     parser.add_argument("--given", action="store_true", help="mounting and shift are given roughly")
+    parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
     args = parser.parse_args(argv)
     code = runner.fingerprint(
         "vical_daemon/estimation", "benchmarks/feed.py", "benchmarks/degenerate.py", "mocks/vical_mocks"
@@ -80,9 +85,10 @@ def main(argv: list[str]) -> int:
     for name in args.case or MOTIONS:
         slug = "".join(c if c.isalnum() else "_" for c in name)
         kind = f"{'known' if args.lens_known else 'unknown'}_{'given' if args.given else 'nothing'}"
+        kind += "_free" if args.target_free else ""
         results = runner.run_trials(
             f"degenerate_{slug}_{kind}_{args.seconds:g}s",
-            partial(trial, name, args.lens_known, args.given, args.seconds),
+            partial(trial, name, args.lens_known, args.given, args.target_free, args.seconds),
             runner.seeds_of(args),
             args,
             code,

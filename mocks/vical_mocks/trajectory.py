@@ -306,3 +306,31 @@ def fronto_parallel(
         rng.uniform(0, 6, (3, 3)),
     )
     return Trajectory(turn, sway, _viewing_base(side), _imu_in_camera(T_imu_cam))
+
+
+def planar(
+    seed: int,
+    *,
+    T_imu_cam: Pose | None = None,
+    board_size_m: tuple[float, float] = BOARD_SIZE_M,
+    distance_m: float = 0.6,
+    side: int = -1,
+) -> Trajectory:
+    """A robot on a floor that looks ahead: turns about the camera's y axis and moves in its x-z plane only.
+
+    The lever arm across the floor is lost.
+    """
+    rng = np.random.default_rng([seed, 15])
+    turn = Sinusoids(
+        np.zeros(3),
+        np.deg2rad([[0.0, 6.0, 0.0]] * 3),
+        rng.uniform(0.4, 1.3, (3, 3)),
+        rng.uniform(0, 6, (3, 3)),
+    )
+    drive = Sinusoids(
+        _viewpoint(board_size_m, distance_m, side),
+        distance_m * np.array([[0.08, 0.0, 0.1]] * 3),
+        rng.uniform(0.3, 1.2, (3, 3)),
+        rng.uniform(0, 6, (3, 3)),
+    )
+    return Trajectory(turn, drive, _viewing_base(side), _imu_in_camera(T_imu_cam))
