@@ -75,6 +75,7 @@ class Grabber:
     def __init__(self, aravis: Any, wanted: dict[str, Any]) -> None:
         self.aravis = aravis
         self.wanted = wanted
+        self.refusal: type[Exception] = importlib.import_module("gi.repository.GLib").Error
         devices = list_devices(aravis)  # without it a camera opens but never delivers
         ids = [d["id"] for d in devices]
         name = wanted["id"] or (ids[0] if len(ids) == 1 else "")
@@ -84,7 +85,7 @@ class Grabber:
             self.camera = aravis.Camera.new(name)
             self.device = next(d for d in devices if name in (d["id"], d["address"]))
             self.configure()
-        except Exception as error:  # GLib.Error, whose class is only known at run time
+        except Exception as error:  # of the camera (`refusal`), or of values that the bindings do not take
             text = getattr(error, "message", str(error))
             busy = "controlled" in text or "denied" in text.lower()
             fail("busy" if busy else "refused", f"aravis:{name}: {text}")
@@ -117,8 +118,8 @@ class Grabber:
             try:
                 self.camera.set_integer(name, int(value))
                 return
-            except Exception:  # noqa: S110 - it is a float feature: written below
-                pass
+            except self.refusal:
+                pass  # it is a float feature: written below, where a refusal counts
         self.camera.set_float(name, float(value))
 
     def set_exposure(self, exposure_s: float) -> None:
