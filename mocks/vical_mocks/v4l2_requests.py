@@ -10,6 +10,7 @@ import ctypes
 import errno
 import struct
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -93,7 +94,7 @@ class OpenNode:
     subscribed: set[int] = field(default_factory=set)
 
 
-class Requests:
+class Requests(ABC):
     """What a kernel answers; `FakeKernel` adds the descriptors and the time.
 
     Args:
@@ -110,8 +111,9 @@ class Requests:
             75: self._rates, 89: self._dqevent, 90: self._subscribe, 103: self._query_ctrl,
         }  # fmt: skip
 
+    @abstractmethod
     def _run(self, plugged: PluggedCamera) -> None:
-        raise NotImplementedError
+        """Let the camera do what it did until now."""
 
     def _note_control(self, camera: FakeCamera) -> None:
         camera.note_control(self.clock.now_ns)
