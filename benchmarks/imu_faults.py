@@ -75,7 +75,7 @@ def _replug(times: int) -> str:
             try:
                 _collect(imu, 10**9)
             except DeviceLostError:
-                pass
+                pass  # noticed: now it comes back
             emulator.plug()
             start_s = time.monotonic()
             _collect(imu, 1)

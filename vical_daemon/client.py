@@ -207,7 +207,7 @@ class AsyncClient:
                     if update.converged:
                         return update
         except TimeoutError:
-            pass
+            pass  # what was last heard says why, below
         finally:
             await updates.aclose()  # type: ignore[attr-defined]
         raise ClientError(_why_not(last, timeout_s))

@@ -238,7 +238,7 @@ class Recorder:
         try:
             values["disk_free_bytes"] = str(self._folder.free_bytes())
         except OSError:
-            pass
+            pass  # the folder is away: `problem` says so
         if self._problem:
             return DiagnosticStatus(Level.ERROR, "record", self._problem, values=values)
         if queue.dropped or lost:

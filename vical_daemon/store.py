@@ -184,7 +184,11 @@ def _problem(stored: StoredCalibration) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Number of an array library as a plain one: an estimate must never be lost over its type."""
+    """Number of an array library as a plain one: an estimate must never be lost over its type.
+
+    Raises:
+        NotImplementedError: Anything else; so msgspec's `enc_hook` wants to be told.
+    """
     if hasattr(value, "item"):
         return value.item()
     raise NotImplementedError(f"{type(value).__name__} cannot be stored")

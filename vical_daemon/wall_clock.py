@@ -83,7 +83,7 @@ def shared_clock(folder: Path) -> WallClock:
         if clock is not None and clock.boot_id == boot_id():
             return clock
         if clock is not None or path.exists():
-            with contextlib.suppress(FileNotFoundError):
+            with contextlib.suppress(FileNotFoundError):  # another role was faster
                 path.unlink()
         _create(path, private_clock())
     raise PermissionError(13, "cannot agree on the clock offset; is the folder writable?", str(path))
@@ -104,7 +104,7 @@ def _create(path: Path, clock: WallClock) -> None:
     try:
         os.link(temporary, path)
     except FileExistsError:
-        pass
+        pass  # another role was faster: its clock is the one that counts
     finally:
         temporary.unlink()
 

@@ -154,6 +154,6 @@ class Ros2Bus:
 
     def close(self) -> None:
         """Leave; may be called twice."""
-        with suppress(zenoh.ZError):
+        with suppress(zenoh.ZError):  # closed before
             self._outlet.close()
         self._bus.close()

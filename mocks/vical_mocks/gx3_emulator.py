@@ -160,7 +160,7 @@ class Gx3Emulator:
         self._folder.cleanup()
 
     def _wake(self) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # closing: nobody is asleep
             os.write(self._wake_w, b"x")
 
     def _run(self) -> None:
@@ -168,7 +168,7 @@ class Gx3Emulator:
             with self._lock:
                 wait_s, master = self._step(), self._master
             watched = [self._wake_r] if master < 0 else [self._wake_r, master]
-            with contextlib.suppress(OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError):  # unplugged meanwhile: the next step sees it
                 ready, _, _ = select.select(watched, [], [], wait_s)
                 if self._wake_r in ready:
                     os.read(self._wake_r, 64)

@@ -65,6 +65,6 @@ def _reset_wanted(commands: Subscription) -> bool:
     """Read the commands that have come; other words than ``reset`` are not for us."""
     wanted = False
     while (sample := commands.recv(0.0)) is not None:
-        with suppress(MessageError):
+        with suppress(MessageError):  # of somebody else, and no command
             wanted |= decode_string(sample.payload).strip() == "reset"
     return wanted

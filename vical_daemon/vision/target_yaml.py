@@ -129,7 +129,7 @@ class TargetFile:
             if float(self.text(key)) > high_m:
                 hint = f"lengths are in metres: {float(self.text(key)) / 1000:g} if millimetres were meant"
         except ValueError:
-            pass
+            pass  # no number at all: said below
         return self.number(key, low_m, high_m, unit="m", hint=hint)
 
 

@@ -148,7 +148,7 @@ class PageServer:
         try:
             await self._send_events(response)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
-            pass
+            pass  # the viewer left, or is too slow: it asks again
         finally:
             self._listeners -= 1
         return response
@@ -192,7 +192,7 @@ class PageServer:
                 seen, picture = await show.after(seen)
                 await asyncio.wait_for(response.write(wrap(picture)), SLOW_S)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
-            pass
+            pass  # the viewer left, or is too slow: it asks again
         finally:
             self._look(name, show, -1)
         return response

@@ -52,7 +52,7 @@ class GrabberProcess:
         assert self._process.stdout is not None and self._process.stdin is not None
         self._out = self._process.stdout.fileno()
         self._in = self._process.stdin
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # above the limit for users: then writes take more turns
             fcntl.fcntl(self._out, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
 
     def receive(self, timeout_s: float) -> tuple[dict[str, Any], memoryview] | None:
@@ -115,7 +115,7 @@ class GrabberProcess:
 
     def close(self) -> None:
         """End the process; may be called twice."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # it has ended already
             self._in.close()  # the end of its input ends it
         try:
             self._process.wait(2.0)

@@ -309,7 +309,7 @@ class IidcDevice:
         """Free what libdc1394 leaves behind when the camera is gone: it returns before it frees."""
         if self._ring is not None:
             ctypes.CDLL(None).munmap(ctypes.c_void_p(self._ring[0]), ctypes.c_size_t(self._ring[1]))
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # it had closed it after all
             os.close(self._ring_fd)
 
 

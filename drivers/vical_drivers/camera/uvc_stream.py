@@ -146,6 +146,6 @@ def _frequency(kernel: Kernel, camera: NodeEntry) -> float | None:
     # the descriptors are a file of the USB device, above the interface that the node belongs to
     device = (kernel.sysfs / "class/video4linux" / Path(camera.path).name / "device").resolve()
     for folder in (device, *list(device.parents)[:2]):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # not this one: one further up
             return clock_frequency_hz((folder / "descriptors").read_bytes())
     return None

@@ -109,7 +109,7 @@ def _holders(path: str) -> str:
     target = os.path.realpath(path)
     found = []
     for link in Path("/proc").glob("[0-9]*/fd/*"):
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # it ended meanwhile, or belongs to somebody else
             pid = link.parent.parent.name
             if str(link.readlink()) == target and int(pid) != os.getpid():
                 name = (link.parent.parent / "comm").read_text(encoding="ascii", errors="replace").strip()
@@ -281,17 +281,17 @@ class VideoNode:
             return
         if self.streaming:
             self.streaming = False
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # unplugged: the kernel has stopped it
                 self._kernel.ioctl(self.fd, abi.VIDIOC_STREAMOFF, abi.BufferType(self._buf_type))
         for mapping in self.mappings:
             mapping.close()
         if self.mappings:
             self.mappings = []
             none = abi.RequestBuffers(count=0, type=self._buf_type, memory=abi.MEMORY_MMAP)
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # unplugged: they went with it
                 self._kernel.ioctl(self.fd, abi.VIDIOC_REQBUFS, none)
         fd, self.fd = self.fd, -1
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # free in any case; what close says of an unplugged device is moot
             self._kernel.close(fd)
 
 
