@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from vical_daemon.config import Config
 from vical_daemon.estimation.measurements import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from vical_daemon.vision.flow_prediction import FlowPredictor
 
 Detect = Callable[[Any, int], "Found | None"]
 """Image and its stamp (ns) -> the points, or None where nothing was found."""
@@ -31,8 +34,12 @@ class Found(Protocol):
         ...
 
 
-def make_detector(config: Config) -> Detect:
+def make_detector(config: Config, predictor: FlowPredictor | None = None) -> Detect:
     """Make the detector of one camera (it may remember the image before).
+
+    Args:
+        config: The rig.
+        predictor: Foretells the flow of natural features; a board needs none.
 
     Raises:
         ConfigError: The target file is missing or wrong.
@@ -40,7 +47,7 @@ def make_detector(config: Config) -> Detect:
     if config.calibration.mode == "target_free":
         from vical_daemon.vision.tracks import FeatureTracker
 
-        return FeatureTracker().detect
+        return FeatureTracker(predictor=predictor).detect
     from vical_daemon.vision.detector import BoardDetector
     from vical_daemon.vision.target import load_target
 

@@ -175,10 +175,11 @@ def _attach_detectors(bus: LocalBus, job: Job) -> None:
     images = {name for name, stream in job.cameras.items() if stream.kind in ("image", "compressed")}
     if not images:
         return
-    from vical_daemon.roles.detect import DetectRole
+    from vical_daemon.roles.detect import DetectRole, attach_aid
 
     for name in images:
-        detect = DetectRole(job.config, name)
+        detect = DetectRole(job.config, name, prior=job.priors[name])
+        attach_aid(bus, detect)
 
         def on_image(sample: Sample, detect: DetectRole = detect) -> None:
             publish(bus, detect.points(sample))

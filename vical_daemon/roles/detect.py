@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from vical_daemon import topics
-from vical_daemon.bus import Bus, Sample
+from vical_daemon.bus import Bus, Sample, Subscription
 from vical_daemon.config import Config
 from vical_daemon.detectors import Detect, make_detector
+from vical_daemon.estimation.measurements import CameraPrior
+from vical_daemon.gyro_aid import GyroAid
 from vical_daemon.health import StatusSender
 from vical_daemon.messages import (
     DiagnosticStatus,
@@ -22,6 +24,7 @@ from vical_daemon.messages import (
     encode_points,
 )
 from vical_daemon.places import make_private, runtime_directory
+from vical_daemon.priors import camera_prior
 from vical_daemon.publications import Message, publish
 from vical_daemon.wall_clock import WallClock, shared_clock
 
@@ -37,13 +40,23 @@ class DetectRole:
         config: The rig.
         camera: Name of the camera.
         detector: Finds points in one image; None: what the config asks for.
+        prior: What is known about the camera; None: what the config says.
     """
 
-    def __init__(self, config: Config, camera: str, detector: Detect | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        camera: str,
+        detector: Detect | None = None,
+        prior: CameraPrior | None = None,
+    ) -> None:
         self.camera = camera
         free = config.calibration.mode == "target_free"
         self.key = (topics.tracks_key if free else topics.points_key)(config.rig, camera)
-        self._detect = detector or make_detector(config)
+        self.aid: GyroAid | None = None
+        if free and config.imus:
+            self.aid = GyroAid(config, camera, prior or camera_prior(config, camera))
+        self._detect = detector or make_detector(config, self.aid.predictor if self.aid else None)
         self._period_ns = 1e9 / config.calibration.detect_rate_hz
         self._next_ns = 0.0
         self._images = self._found = self._malformed = self._skipped = 0
@@ -58,6 +71,8 @@ class DetectRole:
                 self._skipped += 1
                 return []
             self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
+            if self.aid is not None:
+                self.aid.prepare()
             found = self._detect(image, stamp_ns)
         except (MessageError, ValueError):
             self._malformed += 1
@@ -88,6 +103,16 @@ class DetectRole:
         return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)
 
 
+def attach_aid(bus: Bus, role: DetectRole) -> list[Subscription]:
+    """Let a role that follows natural features hear gyro and calibration; nothing for the others."""
+    if role.aid is None:
+        return []
+    return [
+        bus.subscribe(role.aid.imu_key, role.aid.take_imu),
+        bus.subscribe(role.aid.calibration_key, role.aid.take_calibration),
+    ]
+
+
 def _decode(sample: Sample) -> tuple[int, Any]:
     """Return the stamp and the pixels of a raw or compressed image."""
     parsed = topics.parse_key(sample.key)
@@ -115,8 +140,7 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
         worker.thread.start()
     StatusSender(config.rig, "detect", bus, clock).run_until(stop, lambda: [w.status() for w in workers])
     for worker in workers:
-        worker.subscription.close()
-        worker.thread.join(JOIN_S)
+        worker.close()
 
 
 class _Worker:
@@ -124,9 +148,16 @@ class _Worker:
 
     def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
         self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
+        self._aid = attach_aid(bus, self._role)
         key = topics.image_key(config.rig, camera)
         self.subscription = bus.subscribe(key, depth=QUEUE_DEPTH, newest_wins=True)
         self.thread = threading.Thread(target=self._run, name=f"detect/{camera}", daemon=True)
+
+    def close(self) -> None:
+        """End the subscriptions and wait for the thread."""
+        for subscription in (self.subscription, *self._aid):
+            subscription.close()
+        self.thread.join(JOIN_S)
 
     def status(self) -> DiagnosticStatus:
         return self._role.status(self.subscription.dropped)

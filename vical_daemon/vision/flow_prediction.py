@@ -14,7 +14,9 @@ import numpy as np
 
 from vical_daemon.vision.detection import FloatArray
 
-HISTORY_SAMPLES = 4000
+HISTORY_SAMPLES = 400  # two seconds at 200 Hz
+_TOLERATED_PX = 2.0  # translation moves pixels too, and only the flow knows
+_FOLLOW = 0.2
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class FlowPredictor:
         self._gyro: deque[tuple[int, FloatArray]] = deque(maxlen=HISTORY_SAMPLES)
         self._affine: FloatArray | None = None
         self._step_s = 0.0
+        self._gyro_error_px = self._flow_error_px = 0.0
 
     def add_imu(self, t_imu_ns: int, gyro_rps: tuple[float, float, float]) -> None:
         """Take one gyro sample (rad/s, imu frame); samples that go back in time are ignored."""
@@ -85,12 +88,21 @@ class FlowPredictor:
 
     def predict(self, uv_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None) -> FloatArray:
         """Where points of the last frame will be, shape (n, 2), px."""
+        by_flow = self._by_flow(uv_px, t_before_ns, t_now_ns)
+        by_gyro = self._by_gyro(uv_px, t_before_ns, t_now_ns)
+        if by_gyro is None or self._gyro_error_px > self._flow_error_px + _TOLERATED_PX:
+            return by_flow
+        return by_gyro
+
+    def _by_gyro(self, uv_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None) -> FloatArray | None:
         rotation = self.rotation(t_before_ns, t_now_ns)
-        if rotation is not None and self.camera is not None:
-            rays = self.camera.rays(uv_px)
-            turned = np.column_stack([rays, np.ones(len(rays))]) @ rotation.T
-            if np.all(turned[:, 2] > 0.1):
-                return self.camera.pixels(turned)
+        if rotation is None or self.camera is None:
+            return None
+        rays = self.camera.rays(uv_px)
+        turned = np.column_stack([rays, np.ones(len(rays))]) @ rotation.T
+        return self.camera.pixels(turned) if np.all(turned[:, 2] > 0.1) else None
+
+    def _by_flow(self, uv_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None) -> FloatArray:
         if self._affine is None:
             return uv_px.copy()
         share = 1.0
@@ -102,7 +114,8 @@ class FlowPredictor:
     def learn(
         self, before_px: FloatArray, now_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None
     ) -> None:
-        """Remember the mean (affine) flow of a frame for the next one."""
+        """Remember the mean (affine) flow of a frame for the next one, and which foretelling was right."""
+        self._compare(before_px, now_px, t_before_ns, t_now_ns)
         self._affine = None
         if len(before_px) >= 8:
             design = np.column_stack([before_px, np.ones(len(before_px))])
@@ -113,6 +126,18 @@ class FlowPredictor:
                 self._affine = np.linalg.lstsq(design[near], now_px[near], rcond=None)[0].T
         if t_before_ns is not None and t_now_ns is not None:
             self._step_s = (t_now_ns - t_before_ns) * 1e-9
+
+    def _compare(
+        self, before_px: FloatArray, now_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None
+    ) -> None:
+        """A mounting or a delay that is wrong must not lead astray: the gyro is used while it does better."""
+        by_gyro = self._by_gyro(before_px, t_before_ns, t_now_ns)
+        if by_gyro is None or self._affine is None or len(before_px) < 8:
+            return
+        by_flow = self._by_flow(before_px, t_before_ns, t_now_ns)
+        gyro, flow = (float(np.median(np.linalg.norm(x - now_px, axis=1))) for x in (by_gyro, by_flow))
+        self._gyro_error_px += _FOLLOW * (gyro - self._gyro_error_px)
+        self._flow_error_px += _FOLLOW * (flow - self._flow_error_px)
 
     def linear_flow(self) -> FloatArray:
         """Turn and scale of the last frame's mean flow, shape (2, 2)."""

@@ -110,7 +110,7 @@ def test_something_that_moves_by_itself_is_dropped(pictures):
         left = 200 + 6 * k
         picture[140 : 140 + 192, left : left + 192] = patch
         found = tracker.detect(picture, stamp(k))
-    assert tracker.stats.lost_epipolar > 0
+    assert tracker.lost_epipolar > 0
     on_patch = (np.abs(found.uv_px - [left + 96, 236]) < 96).all(axis=1)
     assert on_patch.sum() <= 5
 
@@ -123,3 +123,26 @@ def test_darkness_and_another_size_start_anew(pictures):
     assert not np.isin(after.ids, before.ids).any()
     smaller = tracker.detect(np.ascontiguousarray(pictures[3][::2, ::2]), stamp(3))
     assert smaller.ids.min() > after.ids.max()
+
+
+def test_a_gyro_that_misleads_is_left_out_of_it(rig):
+    """A mounting that is 120 degrees off foretells flow the wrong way: after a few frames it is not asked."""
+    right, wrong = with_gyro(rig), with_gyro(rig)
+    turned = cv2.Rodrigues(np.array([0.0, 0.0, 2.1]))[0]
+    wrong.camera = FlowCamera(
+        rig.lens.intrinsics, rig.lens.distortion, rig.lens.model, rig.R_imu_cam @ turned
+    )
+    u, v = np.meshgrid(np.linspace(60, 580, 6), np.linspace(60, 420, 5))
+    grid = np.column_stack([u.ravel(), v.ravel()])
+    rays = rig.lens.unproject(grid)
+    errors = {"right": [], "wrong": []}
+    for k in range(12):
+        R, _ = rig.camera_pose_target(np.array([k, k + 1]) * STEP_S)
+        truth, _ = rig.lens.project(rays @ R[0].T @ R[1])
+        for name, predictor in (("right", right), ("wrong", wrong)):
+            foretold = predictor.predict(grid, stamp(k), stamp(k + 1))
+            errors[name].append(np.median(np.linalg.norm(foretold - truth, axis=1)))
+            predictor.learn(grid, truth, stamp(k), stamp(k + 1))
+    assert max(errors["right"]) < 1.0
+    assert errors["wrong"][0] > 5.0
+    assert np.median(errors["wrong"][6:]) < 0.5 * np.median(errors["wrong"][:3])
