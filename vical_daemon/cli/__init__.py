@@ -1,7 +1,7 @@
 """The `vical` command: one module per subcommand; importing this package imports nothing heavy.
 
-A subcommand is a module `vical_daemon.cli.<name>` with `HELP`, `add_arguments(parser)` and
-`run(args) -> int`, listed in `table`. Only the module of the command that was typed is imported.
+A subcommand is a module `vical_daemon.cli.<name>` with `add_arguments(parser)` and `run(args) -> int`,
+listed in `table` with its one line of help. Only the module of the command that was typed is imported.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from vical_daemon.cli.imu_data import EvenSamples
     from vical_daemon.estimation.noise import AllanCurve, NoiseFit
 
-HELP = "noise densities of an IMU from a recording at rest"
 _EPILOG = """\
 Leave the IMU alone on a heavy table, warmed up, for two hours or more (four is good), then:
 

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from vical_daemon.cli.calibration_run import Job, Outcome
     from vical_daemon.estimation.result import CalibrationEstimate
 
-HELP = "the online filter over a recording: extrinsics and time shift"
 FIX = ("intrinsics", "timeshift", "extrinsics")
 ESTIMATE = ("imu_intrinsics", "readout", "target_scale")
 _EXAMPLES = """\

@@ -18,7 +18,6 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_drivers.samples import Frame, FrameSource
 
-HELP = "talk to a camera: list, stream, snapshot"
 _READ_S = 0.5
 _WARM_UP_FRAMES = 5
 

@@ -17,7 +17,6 @@ from vical_daemon.cli.options import add_config, add_json
 if TYPE_CHECKING:
     from vical_daemon.config import CameraConfig, Config, ImuConfig
 
-HELP = "read config and devices, say what is wrong"
 _IMU_SECONDS = 2.5
 
 

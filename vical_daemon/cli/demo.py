@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from vical_daemon.config import Config
     from vical_daemon.estimation.result import CalibrationEstimate
 
-HELP = "the whole system without hardware, truth beside the estimate at the end"
 CAMERA, IMU = "cam0", "imu0"
 RATE_HZ = 12.5
 MOST, AFTER_CONVERGENCE = 80.0, 10.0  # seconds of data

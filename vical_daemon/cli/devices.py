@@ -13,8 +13,6 @@ from vical_drivers.samples import DeviceInfo
 
 from vical_daemon.cli.options import add_json
 
-HELP = "serial ports with an IMU behind them, and cameras, with how to name them in the config"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""

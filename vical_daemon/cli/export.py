@@ -15,7 +15,6 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_daemon.export import ExportFile, Rig
 
-HELP = "the result in the form that other software reads"
 FORMATS = ("kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json")
 _EPILOG = """\
   vical calibrate log.mcap --target target.yaml -o result.json

@@ -16,7 +16,6 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_drivers.microstrain.session import Session
 
-HELP = "talk to the IMU: info, stream, decode, gyro bias, self test"
 _LINKS = ("auto", "usb", "ftdi", "uart")
 
 

@@ -14,7 +14,6 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_daemon.estimation.imu_static import ImuCalibration, SensorCalibration
 
-HELP = "scale, misalignment and biases of the IMU itself"
 _EPILOG = """\
 Record 20 or more rests of 3 s, each in another position (all six faces, edges, corners), turned by hand in
 between, about all axes; wait until the IMU is warm. Then:

@@ -14,8 +14,6 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_daemon.recording.summary import Summary, TopicSummary
 
-HELP = "topics, rates, gaps, drops, jitter and duration of a recording"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""

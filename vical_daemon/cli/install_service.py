@@ -15,7 +15,6 @@ from pathlib import Path
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
 
-HELP = "install systemd units, udev rules and the user, or remove them"
 _UNITS = Path("etc/systemd/system")
 _HOMES = ("/home", "/root", "/run/user")
 _CONFIG = Path("etc/vical/vical.yaml")

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from vical_daemon.estimation.observability import Motion, Observability, Setup
     from vical_daemon.estimation.observability_model import ModelRank
 
-HELP = "which parameters the motion made observable, and what motion is missing"
 BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
 
 

@@ -10,8 +10,6 @@ from pathlib import Path
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
 
-HELP = "make an unfinished or damaged MCAP whole"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""

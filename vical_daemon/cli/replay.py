@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from vical_daemon.bus import Bus
     from vical_daemon.recording import Recording
 
-HELP = "put a recording back on the bus in real time"
 _PROGRESS_S = 1.0
 
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from vical_daemon.cli.process_sets import RoleThreads
     from vical_daemon.config import Config
 
-HELP = "the daemon, or single roles of it"
 _log = logging.getLogger(__name__)
 _TICK_S = 1.0
 _CHILD_STOP_S = 45.0  # longer than any role may take

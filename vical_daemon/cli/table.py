@@ -22,7 +22,7 @@ class Command:
 
     @property
     def module(self) -> str:
-        """Dotted name of the module with HELP, add_arguments and run."""
+        """Dotted name of the module with add_arguments and run."""
         return "vical_daemon.cli." + self.name.replace("-", "_")
 
     @property

@@ -29,7 +29,6 @@ _FLAGS = {
     "colSpacingMeters": "--square",
 }
 """The option behind each key of a target file."""
-HELP = "a board to print, to scale, and its target YAML"
 
 EPILOG = """examples:
   vical target --type aprilgrid -o board.pdf                      6 x 6 tags, as large as A4 takes

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from vical_daemon.priors import Initial
     from vical_daemon.recording import Recording
 
-HELP = "the delay between imu, cameras and other sensors, from their rotations alone"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""

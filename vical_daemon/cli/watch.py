@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from vical_daemon.bus import Bus, Sample
     from vical_daemon.estimation.result import CalibrationEstimate
 
-HELP = "subscribe to calibration updates and show them live"
 _REFRESH_S = 0.25
 
 

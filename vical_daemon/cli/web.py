@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from vical_daemon.bus import Bus
     from vical_daemon.config import Config
 
-HELP = "a page with the live calibration, on loopback"
 _EPILOG = """\
   vical web -c vical.yaml                 page at http://127.0.0.1:8080/
   vical web --port 0 --foxglove 8765      no settings needed: asks the bus what there is; Foxglove as well

@@ -39,7 +39,7 @@ def command(monkeypatch: pytest.MonkeyPatch):
     def install(run, add_arguments=lambda parser: None) -> None:
         entry = table.Command("probe", "Tests", "for this test only")
         module = types.ModuleType(entry.module)
-        module.HELP, module.run, module.add_arguments = "for this test only", run, add_arguments
+        module.run, module.add_arguments = run, add_arguments
         monkeypatch.setitem(sys.modules, entry.module, module)
         monkeypatch.setattr(table, "available", lambda: {"probe": entry})
 
@@ -195,5 +195,5 @@ def test_table_names_are_unique_and_each_module_keeps_the_convention() -> None:
     for name in table.available():
         _, commands = cli.build_parser(name)
         module = sys.modules[commands[name].module]
-        assert isinstance(module.HELP, str) and "\n" not in module.HELP
-        assert callable(module.run)
+        assert callable(module.add_arguments) and callable(module.run)
+    assert all(c.summary and "\n" not in c.summary for c in table.COMMANDS)
