@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -312,6 +312,3 @@ def imu_noise(run: SimulatedRun) -> ImuNoise:
     """The densities that the data were made with."""
     d = run.rig.densities
     return ImuNoise(d.gyro, d.gyro_walk, d.accel, d.accel_walk, run.options.imu_rate_hz)
-
-
-MakeSubject = Callable[[SimulatedRun, int], Subject]

@@ -20,7 +20,6 @@ __all__ = ["Config", "ConfigError", "load", "loads"]
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,62}"  # as `topics.check_name`
 URI = r"(v4l2|iidc|aravis|folder):.+|/.+|\d+"
 Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
-Positive = Annotated[float, Bound(above=0)]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
 Pixels = Annotated[int, Bound(low=16, high=16384)]
 Matrix4 = tuple[

@@ -30,10 +30,6 @@ class WallClock:
         """Turn a monotonic stamp into the stamp that travels."""
         return t_host_ns + self.offset_ns
 
-    def host_ns(self, stamp_ns: int) -> int:
-        """Turn a stamp that travelled into this host's CLOCK_MONOTONIC."""
-        return stamp_ns - self.offset_ns
-
     def now_ns(self) -> int:
         """UNIX time by this clock: never steps."""
         return time.monotonic_ns() + self.offset_ns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from vical_mocks.imu import FloatArray, ImuModel
 G_MPS2 = 9.80665
 TICKS_PER_BASE_SAMPLE = 62.5
 BAUDS = (115_200, 230_400, 460_800, 921_600)
-Magnetic = Callable[[float], tuple[float, float, float]]
 
 
 @dataclass(slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -243,8 +243,3 @@ def add_pixel_noise(
     outlier = rng.random(uv.shape[:2]) < options.outlier_fraction
     wrong = rng.uniform(-options.outlier_px, options.outlier_px, uv.shape)
     return np.where(outlier[..., None], noisy + wrong, noisy), outlier
-
-
-def with_frames(run: SimulatedRun, frames: list[SimulatedFrame]) -> SimulatedRun:
-    """The same run with other frames (for tests that cut or spoil them)."""
-    return replace(run, frames=frames)

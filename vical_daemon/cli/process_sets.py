@@ -24,9 +24,6 @@ PROCESSES: dict[str, tuple[str, ...]] = {
 }
 """Process (`vical run NAME`, unit `vical-NAME.service`) -> its roles."""
 
-HOSTS_BUS = "imu"
-"""The process with this role hosts the bus; the others are its clients."""
-
 
 def role_names(words: Sequence[str]) -> list[str]:
     """Turn process and role names, as typed, into roles in the order of the table.

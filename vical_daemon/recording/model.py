@@ -15,7 +15,6 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFra
 from vical_daemon.messages import decode_imu, decode_points
 
 Kind = Literal["imu", "image", "compressed", "points", "tracks"]
-KINDS: tuple[Kind, ...] = ("imu", "image", "compressed", "points", "tracks")
 # What a camera is calibrated from where it has several: what is detected already comes first.
 _PREFERENCE: tuple[Kind, ...] = ("points", "tracks", "image", "compressed")
 _WINDOW_NS = 2_000_000_000

@@ -54,18 +54,6 @@ class TrackOptions:
 
 
 @dataclass
-class TrackStats:
-    """Counters: frames, features begun, and why tracks ended."""
-
-    frames: int = 0
-    begun: int = 0
-    lost_flow: int = 0
-    lost_back: int = 0
-    lost_epipolar: int = 0
-    anchored: int = 0
-
-
-@dataclass
 class _Features:
     """The features alive, as columns."""
 
@@ -105,12 +93,15 @@ class FeatureTracker:
     Args:
         options: Settings.
         predictor: Foretells flow from gyro rates; None: from the flow of the last frames only.
+
+    Attributes:
+        lost_epipolar: Features given up because they moved against the rest of the scene.
     """
 
     def __init__(self, options: TrackOptions | None = None, predictor: FlowPredictor | None = None) -> None:
         self.options = options or TrackOptions()
         self.predictor = predictor or FlowPredictor()
-        self.stats = TrackStats()
+        self.lost_epipolar = 0
         self._features = _Features()
         self._last: tuple[Gray, int | None] | None = None
         self._frame = 0
@@ -134,7 +125,6 @@ class FeatureTracker:
         smooth = cv2.GaussianBlur(gray, (5, 5), SMOOTHING_PX).astype(np.float32)
         if self._last is not None and self._last[0].shape != gray.shape:
             self._features, self._last = _Features(), None
-        self.stats.frames += 1
         self._frame += 1
         if self._last is not None and len(self._features.ids):
             self._follow(self._last[0], gray, self._last[1], t_ns)
@@ -155,10 +145,8 @@ class FeatureTracker:
         uv, good = self._flow(before, now, features.uv, guess, options.levels)
         border = options.border_px
         good &= ((uv > border) & (uv < np.array([width, height]) - 1 - border)).all(axis=1)
-        self.stats.lost_flow += int(np.sum(~good))
         back, returned = self._flow(now, before, uv, features.uv, 1)
         returned &= np.linalg.norm(back - features.uv, axis=1) < options.back_px
-        self.stats.lost_back += int(np.sum(good & ~returned))
         good &= returned
         self.predictor.learn(features.uv[good], uv[good], t_before, t_now)
         features.uv = uv
@@ -203,7 +191,6 @@ class FeatureTracker:
             features.templates = kept.joined(fresh).take(order)
             features.warp[stale] = np.eye(2)
             features.drift[stale] = np.hypot(features.drift[stale], self.options.sigma_floor_px)
-            self.stats.anchored += len(stale)
 
     def _check_epipolar(self) -> None:
         """Compare with the picture of `EPIPOLAR_EVERY` frames ago; drop what moved against the rest."""
@@ -219,7 +206,7 @@ class FeatureTracker:
             if inlier is not None and inlier.sum() >= 0.5 * len(inlier):
                 keep = np.ones(len(known), bool)
                 keep[known] = inlier.ravel() > 0
-                self.stats.lost_epipolar += int(np.sum(~keep))
+                self.lost_epipolar += int(np.sum(~keep))
                 features.keep(keep)
         features.old_uv = features.uv.copy()
 
@@ -249,7 +236,6 @@ class FeatureTracker:
             ids = np.arange(self._next_id, self._next_id + len(chosen), dtype=np.int64)
             self._next_id += len(chosen)
             features.add(ids, uv[chosen], Templates.cut(smooth, uv[chosen]), options.sigma_floor_px)
-            self.stats.begun += len(chosen)
 
 
 def _best_of_empty_cells(

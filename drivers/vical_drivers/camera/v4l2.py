@@ -168,6 +168,7 @@ class V4l2Camera(Closing):
         return self._frames.statistics.snapshot(
             clock_skew_ppm=health.skew_ppm,
             uvc_fit_residual_us=health.residual_sigma_ns * 1e-3,
+            uvc_arrival_jitter_us=health.jitter_ns * 1e-3,
             uvc_fit_used=float(health.usable),
         )
 
