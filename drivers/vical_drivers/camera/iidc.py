@@ -22,7 +22,8 @@ from vical_drivers.camera.firewire import BusClock, find_node
 from vical_drivers.camera.formats import Bytes, CorruptImageError, FrameDecoder, Image
 from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
-from vical_drivers.camera.iidc_device import IidcDevice, IidcMode, frame_bytes, list_devices, pixel_format
+from vical_drivers.camera.iidc_device import IidcDevice, frame_bytes, list_devices, pixel_format
+from vical_drivers.camera.iidc_modes import IidcMode, set_mode
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, SequenceCounter
 from vical_drivers.camera.v4l2_stamp import SIGMA_NS, RawStamp
@@ -75,7 +76,7 @@ class IidcCamera(Closing):
             if path is None:
                 raise DeviceLostError(f"{device.name}: the camera went away")
             self._bus = BusClock(path)
-            self._mode: IidcMode = device.set_mode(self._settings)
+            self._mode: IidcMode = set_mode(device, self._settings)
             self._frame_info = device.embed()
             self._apply(device)
             self._fd = device.start(self._settings.ring_size(self._mode.rate_hz))

@@ -1,13 +1,11 @@
-"""An open IIDC camera: libdc1394's calls with errors a person understands, video mode, features."""
+"""An open IIDC camera: libdc1394's calls with errors a person understands, features, frames."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import math
 import os
 from ctypes import byref, c_float, c_uint32
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,28 +14,10 @@ import numpy.typing as npt
 from vical_drivers.camera import embedded, firewire
 from vical_drivers.camera import iidc_abi as abi
 from vical_drivers.camera.formats import FORMATS, Layout, PixelFormat
-from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo
 
 _CODING_FORMATS = {"mono8": "GREY", "mono16": "Y16", "yuv422": "UYVY", "rgb8": "RGB3"}
-_PREFERENCE = {
-    "mono8": ("mono8", "raw8", "yuv422", "rgb8"),
-    "mono16": ("mono16",),
-    "bgr8": ("rgb8", "yuv422", "raw8"),
-}
-_CYCLES_HZ = 8000.0
-
-
-@dataclass(frozen=True, slots=True)
-class IidcMode:
-    """What was set: libdc1394's mode number, pixels, coding and rate (0.0: unknown)."""
-
-    number: int
-    width: int
-    height: int
-    coding: str
-    rate_hz: float
 
 
 class IidcDevice:
@@ -91,6 +71,11 @@ class IidcDevice:
         camera = self._camera.contents
         return " ".join(t.decode("latin-1").strip() for t in (camera.vendor, camera.model) if t)
 
+    @property
+    def fast(self) -> bool:
+        """Whether the camera speaks 1394b, 800 Mbit/s."""
+        return bool(self._camera.contents.bmode_capable)
+
     def call(self, function: str, *arguments: object, doing: str) -> None:
         """Run a function of libdc1394 on this camera; `doing` completes "cannot ..."."""
         code = getattr(self._library, f"dc1394_{function}")(self._camera, *arguments)
@@ -116,101 +101,6 @@ class IidcDevice:
         """Write a control register."""
         word = c_uint32(value)
         self.call("set_control_registers", offset, byref(word), 1, doing=f"write register {offset:#x}")
-
-    # -- mode ----------------------------------------------------------------------------------------
-
-    def set_mode(self, settings: CameraSettings) -> IidcMode:
-        """Set speed, video mode and rate; a size without a fixed mode takes Format7."""
-        fast = bool(self._camera.contents.bmode_capable)
-        if fast:
-            self.call("video_set_operation_mode", abi.OPERATION_MODE_1394B, doing="use 1394b")
-        speed = abi.ISO_SPEED_800 if fast else abi.ISO_SPEED_400
-        self.call("video_set_iso_speed", speed, doing="set the bus speed")
-        wanted = self._codings(settings)
-        modes = abi.VideoModes()
-        self.call("video_get_supported_modes", byref(modes), doing="list its video modes")
-        offered = list(modes.modes[: modes.num])
-        fixed = self._fixed_mode(settings, offered, wanted)
-        if fixed is not None:
-            return fixed
-        scalable = [m for m in offered if abi.FORMAT7_FIRST <= m <= abi.FORMAT7_LAST]
-        if not scalable:
-            raise DeviceRefusedError(f"{self.name}: no such video mode; it offers: {_modes_text(offered)}")
-        return self._format7(settings, scalable[0], wanted)
-
-    def _codings(self, settings: CameraSettings) -> tuple[str, ...]:
-        if settings.pixel_format is None:
-            return _PREFERENCE[settings.encoding]
-        if settings.pixel_format not in abi.CODINGS:
-            known = ", ".join(abi.CODINGS)
-            raise DeviceRefusedError(
-                f"{self.name}: pixel format {settings.pixel_format!r} is none of {known}"
-            )
-        return (settings.pixel_format,)
-
-    def _fixed_mode(
-        self, settings: CameraSettings, offered: list[int], wanted: tuple[str, ...]
-    ) -> IidcMode | None:
-        known = [(m, *abi.MODES[m]) for m in offered if m in abi.MODES]
-        size = (settings.width, settings.height)
-        if settings.width is None:
-            current = self.number("video_get_mode", doing="tell its video mode")
-            size = abi.MODES[current][:2] if current in abi.MODES else (0, 0)
-        for coding in wanted:
-            for mode, width, height, its_coding in known:
-                if (width, height) != size or its_coding != coding:
-                    continue
-                rate = self._fixed_rate(mode, settings.rate_hz)
-                if rate is not None:
-                    self.call("video_set_mode", mode, doing=f"set {width}x{height} {coding}")
-                    self.call("video_set_framerate", rate, doing="set the frame rate")
-                    return IidcMode(mode, width, height, coding, abi.FRAMERATES_HZ[rate])
-        return None
-
-    def _fixed_rate(self, mode: int, rate_hz: float | None) -> int | None:
-        rates = abi.Framerates()
-        self.call("video_get_supported_framerates", mode, byref(rates), doing="list its frame rates")
-        offered = [r for r in rates.framerates[: rates.num] if r in abi.FRAMERATES_HZ]
-        if rate_hz is None:
-            current = self.number("video_get_framerate", doing="tell its frame rate")
-            return current if current in offered else max(offered, default=None)
-        return next((r for r in offered if abs(abi.FRAMERATES_HZ[r] - rate_hz) < 0.01 * rate_hz), None)
-
-    def _format7(self, settings: CameraSettings, mode: int, wanted: tuple[str, ...]) -> IidcMode:
-        coding = next((c for c in wanted if c in abi.CODINGS), "mono8")
-        self.call("video_set_mode", mode, doing="use Format7")
-        widest, tallest = self._pair("format7_get_max_image_size", mode)
-        unit_w, unit_h = self._pair("format7_get_unit_size", mode)
-        width, height = settings.width or widest, settings.height or tallest
-        if width > widest or height > tallest or width % max(unit_w, 1) or height % max(unit_h, 1):
-            raise DeviceRefusedError(
-                f"{self.name}: {width}x{height} is not to be had: at most {widest}x{tallest} "
-                f"in steps of {unit_w}x{unit_h}"
-            )
-        packet = abi.USE_RECOMMENDED
-        if settings.rate_hz is not None:
-            unit, largest = self._pair("format7_get_packet_parameters", mode)
-            depth = 2 if coding in ("mono16", "yuv422") else 3 if coding == "rgb8" else 1
-            bytes_per_cycle = width * height * depth * settings.rate_hz / _CYCLES_HZ
-            packet = min(math.ceil(bytes_per_cycle / max(unit, 1)) * max(unit, 1), largest)
-        left, top = (widest - width) // 2, (tallest - height) // 2
-        left, top = left - left % max(unit_w, 1), top - top % max(unit_h, 1)
-        self.call(
-            "format7_set_roi", mode, abi.CODINGS[coding], packet, left, top, width, height,
-            doing=f"set {width}x{height} {coding} in Format7",
-        )  # fmt: skip
-        rate_hz = self._feature_rate(settings.rate_hz)
-        return IidcMode(mode, width, height, coding, rate_hz)
-
-    def _feature_rate(self, rate_hz: float | None) -> float:
-        if rate_hz is None or not self.has_absolute(abi.FEATURE_FRAME_RATE):
-            return rate_hz or 0.0
-        return self.set_absolute(abi.FEATURE_FRAME_RATE, rate_hz, "frame rate", "Hz")
-
-    def _pair(self, function: str, mode: int) -> tuple[int, int]:
-        one, two = c_uint32(), c_uint32()
-        self.call(function, mode, byref(one), byref(two), doing="describe Format7")
-        return one.value, two.value
 
     # -- features ------------------------------------------------------------------------------------
 
@@ -337,11 +227,6 @@ def _choose(found: list[int], guid: int | None) -> int:
     there = ", ".join(f"iidc:{g:016x}" for g in found) or "none"
     asked = "one camera" if guid is None else f"iidc:{guid:016x}"
     raise DeviceNotFoundError(f"{asked} was asked for; on the bus: {there}")
-
-
-def _modes_text(offered: list[int]) -> str:
-    texts = ["{}x{} {}".format(*abi.MODES[m]) for m in offered if m in abi.MODES]
-    return ", ".join(texts) or "nothing that is understood"
 
 
 def list_devices() -> list[DeviceInfo]:
