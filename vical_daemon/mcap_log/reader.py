@@ -2,13 +2,12 @@
 
 Records are taken from front to back, never through the index, so that a file without its end reads
 like any other. Nothing is believed: lengths must lie in the file, chunks must match their checksum,
-and no chunk may unpack to more than `CHUNK_LIMIT`.
+and no chunk may unpack to more than `chunks.CHUNK_LIMIT`.
 """
 
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -20,11 +19,10 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
+from vical_daemon.mcap_log.chunks import unpack_chunk
 from vical_daemon.mcap_log.files import LogError, describe
 
 MAGIC = b"\x89MCAP0\r\n"
-CHUNK_LIMIT = 256 * 2**20
-_PIECE = 2**20
 # What the parsers of the mcap package and of lz4 raise on damaged input.
 _DAMAGE = (ValueError, RuntimeError, KeyError, OverflowError, EOFError, struct.error, McapError)
 _OP_MESSAGE = int(Opcode.MESSAGE)
@@ -32,7 +30,6 @@ _LENGTH = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _END = struct.Struct("<BQQQI8s")  # footer and magic
 _SUMMARY_LIMIT = 64 * 2**20
-_CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,74 +239,3 @@ class LogReader:
         name, encoding = (known.name, known.encoding) if known else ("", "")
         text = known.data.decode("utf-8", "replace") if known else ""
         self._channels[channel.id] = LogChannel(channel.topic, name, channel.message_encoding, text, encoding)
-
-
-def unpack_chunk(content: bytes, *, whole: bool = True) -> bytes:
-    """Return the records of a chunk.
-
-    Args:
-        content: The chunk record.
-        whole: Checksum and sizes must be right; False: the chunk was never finished, give what unpacks.
-
-    Raises:
-        ValueError: It is damaged or unpacks to more than it may.
-    """
-    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
-    begin = _CHUNK.size + name_length
-    compression = content[_CHUNK.size : begin]
-    length = struct.unpack_from("<Q", content, begin)[0]
-    packed = memoryview(content)[begin + 8 :]
-    if whole and (length > len(packed) or size > CHUNK_LIMIT):
-        raise ValueError("chunk with impossible sizes")
-    data = _decompress(compression, packed[:length], size if whole else CHUNK_LIMIT)
-    if whole and (len(data) != size or (crc and zlib.crc32(data) != crc)):
-        raise ValueError("chunk that does not match its checksum")
-    return data
-
-
-def _decompress(compression: bytes, packed: memoryview, limit: int) -> bytes:
-    if not compression:
-        return bytes(packed[:limit])
-    if compression == b"lz4":
-        return _decompress_lz4(packed, limit)
-    if compression == b"zstd":
-        return _decompress_zstd(packed, limit)
-    raise ValueError(f"chunk compression {compression!r} is not known")
-
-
-def _decompress_lz4(packed: memoryview, limit: int) -> bytes:
-    """Unpack piece by piece: lz4 would reserve the whole limit at once."""
-    import lz4.frame
-
-    unpacker = lz4.frame.LZ4FrameDecompressor()
-    first = min(_PIECE, max(65536, 2 * len(packed)), limit)
-    pieces = [unpacker.decompress(packed, max_length=first)]
-    total = len(pieces[0])
-    while total < limit and not unpacker.eof and not unpacker.needs_input:
-        piece = unpacker.decompress(b"", max_length=min(_PIECE, limit - total))
-        if not piece:
-            break
-        pieces.append(piece)
-        total += len(piece)
-    return b"".join(pieces)
-
-
-def _decompress_zstd(packed: memoryview, limit: int) -> bytes:
-    """Unpack piece by piece: the size that a frame states is not believed."""
-    import zstandard
-
-    pieces: list[bytes] = []
-    total = 0
-    with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed) as reader:
-        while total < limit:
-            try:
-                piece = reader.read(min(_PIECE, limit - total))
-            except zstandard.ZstdError:
-                if pieces:
-                    break  # a chunk without its end: keep what came out; the caller compares sizes
-                raise ValueError("chunk that does not unpack") from None
-            if not piece:
-                break
-            pieces.append(piece)
-            total += len(piece)
-    return b"".join(pieces)

@@ -1,0 +1,81 @@
+"""Unpacks chunks of MCAP files, damaged or hostile ones too: what they say of themselves is not believed."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+CHUNK_LIMIT = 256 * 2**20
+_PIECE = 2**20
+_CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length of the compression's name
+
+
+def unpack_chunk(content: bytes, *, whole: bool = True) -> bytes:
+    """Return the records of a chunk.
+
+    Args:
+        content: The chunk record.
+        whole: Checksum and sizes must be right; False: the chunk was never finished, give what unpacks.
+
+    Raises:
+        ValueError: It is damaged or unpacks to more than it may.
+    """
+    _, _, size, crc, name_length = _CHUNK.unpack_from(content)
+    begin = _CHUNK.size + name_length
+    compression = content[_CHUNK.size : begin]
+    length = struct.unpack_from("<Q", content, begin)[0]
+    packed = memoryview(content)[begin + 8 :]
+    if whole and (length > len(packed) or size > CHUNK_LIMIT):
+        raise ValueError("chunk with impossible sizes")
+    data = _decompress(compression, packed[:length], size if whole else CHUNK_LIMIT)
+    if whole and (len(data) != size or (crc and zlib.crc32(data) != crc)):
+        raise ValueError("chunk that does not match its checksum")
+    return data
+
+
+def _decompress(compression: bytes, packed: memoryview, limit: int) -> bytes:
+    if not compression:
+        return bytes(packed[:limit])
+    if compression == b"lz4":
+        return _decompress_lz4(packed, limit)
+    if compression == b"zstd":
+        return _decompress_zstd(packed, limit)
+    raise ValueError(f"chunk compression {compression!r} is not known")
+
+
+def _decompress_lz4(packed: memoryview, limit: int) -> bytes:
+    """Unpack piece by piece: lz4 would reserve the whole limit at once."""
+    import lz4.frame
+
+    unpacker = lz4.frame.LZ4FrameDecompressor()
+    first = min(_PIECE, max(65536, 2 * len(packed)), limit)
+    pieces = [unpacker.decompress(packed, max_length=first)]
+    total = len(pieces[0])
+    while total < limit and not unpacker.eof and not unpacker.needs_input:
+        piece = unpacker.decompress(b"", max_length=min(_PIECE, limit - total))
+        if not piece:
+            break
+        pieces.append(piece)
+        total += len(piece)
+    return b"".join(pieces)
+
+
+def _decompress_zstd(packed: memoryview, limit: int) -> bytes:
+    """Unpack piece by piece: the size that a frame states is not believed."""
+    import zstandard
+
+    pieces: list[bytes] = []
+    total = 0
+    with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed) as reader:
+        while total < limit:
+            try:
+                piece = reader.read(min(_PIECE, limit - total))
+            except zstandard.ZstdError:
+                if pieces:
+                    break  # a chunk without its end: keep what came out; the caller compares sizes
+                raise ValueError("chunk that does not unpack") from None
+            if not piece:
+                break
+            pieces.append(piece)
+            total += len(piece)
+    return b"".join(pieces)
