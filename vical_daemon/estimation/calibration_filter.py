@@ -17,7 +17,8 @@ from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.image_update import corner_gate, curved_share, frame_limit, solve
-from vical_daemon.estimation.imu_model import ImuSegment, process_noise
+from vical_daemon.estimation.imu_buffer import ImuSegment
+from vical_daemon.estimation.imu_model import process_noise
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.linearise import (
     Image,

@@ -22,7 +22,7 @@ from vical_daemon.estimation.free_carry import (
 )
 from vical_daemon.estimation.free_normal import HUBER, Normal, Problem
 from vical_daemon.estimation.free_window import Landmarks, Seen, Window
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial_links import Links
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.state import CameraState

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from vical_daemon.estimation.free_window import Landmarks, Seen, Window, rays_of
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial_links import Link, make_link
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.state import CameraState

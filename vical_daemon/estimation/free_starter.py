@@ -9,7 +9,7 @@ from vical_daemon.estimation.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.free_carry import Carry
 from vical_daemon.estimation.free_start import free_start
 from vical_daemon.estimation.free_window import Window
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.td_icp import td_icp

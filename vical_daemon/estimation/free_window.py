@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import unproject
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial_links import Link, Links, make_link
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.state import CameraState

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 
 _EVERY_S = 1.5

@@ -1,4 +1,4 @@
-"""Inertial measurements: a bounded buffer with exact end points, and strapdown integration of a batch.
+"""Strapdown integration of inertial readings for a batch of biases, its derivatives and its noise.
 
 Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by central
 differences), with the coning term for the attitude; velocity and position are integrated exactly for a
@@ -13,147 +13,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
-
-
-class ImuSegment(NamedTuple):
-    """Consecutive inertial readings that start and end exactly where asked.
-
-    Attributes:
-        t_s: Instants, s since the buffer's base, shape (n + 1,).
-        gyro: Measured rates, rad/s, shape (n + 1, 3).
-        accel: Measured specific forces, m/s^2, shape (n + 1, 3).
-        gap_s: Longest interval between two real samples used, s.
-        gyro_slope: Their derivatives by time, rad/s^2, shape (n + 1, 3); None: straight lines.
-        accel_slope: m/s^3, shape (n + 1, 3).
-    """
-
-    t_s: FloatArray
-    gyro: FloatArray
-    accel: FloatArray
-    gap_s: float
-    gyro_slope: FloatArray | None = None
-    accel_slope: FloatArray | None = None
-
-
-class ImuBuffer:
-    """Time-ordered inertial readings of the recent past, in one growing array that is trimmed.
-
-    Args:
-        base_ns: All float times are seconds since this stamp.
-    """
-
-    def __init__(self, base_ns: int) -> None:
-        self.base_ns = base_ns
-        self._rows = np.empty((4096, 7))
-        self._start = 0
-        self._stop = 0
-
-    def __len__(self) -> int:
-        return self._stop - self._start
-
-    @property
-    def rows(self) -> FloatArray:
-        """All readings held: columns t_s, gyro xyz, accel xyz; shape (n, 7)."""
-        return self._rows[self._start : self._stop]
-
-    @property
-    def newest_s(self) -> float:
-        """Time of the newest reading, s; -inf when empty."""
-        return float(self._rows[self._stop - 1, 0]) if len(self) else -np.inf
-
-    @property
-    def oldest_s(self) -> float:
-        """Time of the oldest reading held, s; +inf when empty."""
-        return float(self._rows[self._start, 0]) if len(self) else np.inf
-
-    def append(self, t_s: float, gyro: FloatArray, accel: FloatArray) -> bool:
-        """Add a reading; False (and nothing done) when it is not newer than the last."""
-        if t_s <= self.newest_s:
-            return False
-        if self._stop == len(self._rows):
-            self._make_room()
-        row = self._rows[self._stop]
-        row[0] = t_s
-        row[1:4] = gyro
-        row[4:7] = accel
-        self._stop += 1
-        return True
-
-    def _make_room(self) -> None:
-        live = self.rows
-        if len(live) > len(self._rows) // 2:
-            grown = np.empty((2 * len(self._rows), 7))
-            grown[: len(live)] = live
-            self._rows = grown
-        else:
-            self._rows[: len(live)] = live.copy()
-        self._start, self._stop = 0, len(live)
-
-    def trim(self, before_s: float) -> None:
-        """Forget readings older than `before_s`, but for the last one before it."""
-        index = int(np.searchsorted(self.rows[:, 0], before_s)) - 1
-        self._start += max(index, 0)
-
-    def segment(self, from_s: float, to_s: float) -> ImuSegment | None:
-        """Return the readings between two instants with interpolated ends; None where not covered."""
-        rows = self.rows
-        if not len(rows) or from_s < rows[0, 0] or to_s > rows[-1, 0] or to_s < from_s:
-            return None
-        t = rows[:, 0]
-        low = int(np.searchsorted(t, from_s, side="right"))
-        high = int(np.searchsorted(t, to_s, side="left"))
-        first, last = max(low - 1, 0), min(max(high, 1), len(rows) - 1)
-        if last == first:
-            only = np.repeat(rows[first][None], 2, axis=0)
-            return ImuSegment(np.array([from_s, to_s]), only[:, 1:4], only[:, 4:], 0.0)
-        inside = rows[first : last + 1]
-        slope = _slopes(rows[max(first - 1, 0) : last + 2], first - max(first - 1, 0), len(inside))
-        ends = np.array([from_s, to_s])
-        k = np.array([0, len(inside) - 2])
-        value, change = _hermite(inside, slope, ends, k)
-        middle = slice(low - first, high - first)
-        cut = np.concatenate([value[:1], inside[middle, 1:], value[1:]])
-        rise = np.concatenate([change[:1], slope[middle], change[1:]])
-        times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
-        gap = float(np.max(np.diff(t[first : high + 1]), initial=0.0))
-        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:])
-
-
-def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:
-    """Derivatives of the readings at `count` rows from `begin` on, by central differences, shape (count, 6).
-
-    Next to a hole (four times the usual step and more) the difference over the hole says nothing about the
-    slope: the chord of the other side is taken, or none.
-    """
-    dt = np.diff(rows[:, 0])
-    chord = np.diff(rows[:, 1:], axis=0) / dt[:, None]
-    usual = float(np.min(dt))
-    weight = np.where(dt > 4.0 * usual, 0.0, 1.0)
-    left = np.concatenate([[0.0], weight])
-    right = np.concatenate([weight, [0.0]])
-    before = np.concatenate([chord[:1], chord])
-    after = np.concatenate([chord, chord[-1:]])
-    total = left + right
-    out = (left[:, None] * before + right[:, None] * after) / np.maximum(total, 1.0)[:, None]
-    return np.asarray(out[begin : begin + count])
-
-
-def _hermite(
-    rows: FloatArray, slope: FloatArray, t_s: FloatArray, k: npt.NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Value and derivative of the cubic through rows k and k + 1 at instants `t_s`, shapes (m, 6)."""
-    h = (rows[k + 1, 0] - rows[k, 0])[:, None]
-    u = (t_s[:, None] - rows[k, :1]) / h
-    a, b = rows[k, 1:], rows[k + 1, 1:]
-    A, B = slope[k] * h, slope[k + 1] * h
-    d = b - a
-    value = a + u * (A + u * (3.0 * d - 2.0 * A - B + u * (A + B - 2.0 * d)))
-    change = (A + u * (2.0 * (3.0 * d - 2.0 * A - B) + u * 3.0 * (A + B - 2.0 * d))) / h
-    return value, change
 
 
 class Motion(NamedTuple):
@@ -239,6 +102,38 @@ def strapdown(
     np.cumsum(gained, axis=1, out=dv[:, 1:])
     np.cumsum(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
     return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0])
+
+
+def bias_derivatives(
+    segment: ImuSegment, relative: Strapdown, accel_bias: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives of the relative motion at the end by the biases (trapezoids over the nodes).
+
+    With A(t) = -int R dt (turn in the start frame by gyro bias): dv = int R f has d/d b_a = A and
+    d/d b_g = -int hat(R f) A; the derivatives of dp are the integrals of both. [Forster et al. 2017, (69)]
+
+    Args:
+        segment: Readings.
+        relative: Their integrals for one pair of biases (index 0 is used).
+        accel_bias: m/s^2, shape (3,).
+
+    Returns:
+        Rotation (local) by gyro bias (3, 3), velocity (3, 6) and position (3, 6) by [gyro, accel] bias.
+    """
+    t = relative.t_s
+    half = 0.5 * np.diff(t)[:, None, None]
+    dR = relative.dR[0]
+
+    def integral(x: FloatArray) -> FloatArray:
+        out = np.zeros_like(x)
+        np.cumsum((x[1:] + x[:-1]) * half, axis=0, out=out[1:])
+        return out
+
+    A = -integral(dR)
+    force = np.matmul(dR, (segment.accel - accel_bias)[..., None])[..., 0]
+    speed = np.concatenate([integral(-so3.hat(force) @ A), A], axis=2)
+    place = integral(speed)
+    return dR[-1].T @ A[-1], speed[-1], place[-1]
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

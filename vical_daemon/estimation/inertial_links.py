@@ -1,7 +1,7 @@
 """Inertial constraints between consecutive images: relative motion, its derivatives by the biases, its noise.
 
 Preintegration after Forster et al., "On-manifold preintegration for real-time visual-inertial odometry",
-2017, eq. (35)-(38) and (44), on top of our own strapdown (rates linear between samples).
+2017, eq. (35)-(38) and (44), on top of our own strapdown.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.imu_model import ImuBuffer, process_noise, strapdown
+from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_model import bias_derivatives, process_noise, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
-_STEP_GYRO, _STEP_ACCEL = 1e-4, 1e-2  # differences by the bias: rad/s, m/s^2
 
 
 @dataclass(slots=True)
@@ -56,22 +56,17 @@ def make_link(
     segment = buffer.segment(from_s, to_s)
     if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
-    steps = np.zeros((7, 6))
-    steps[range(1, 4), range(3)] = _STEP_GYRO
-    steps[range(4, 7), range(3, 6)] = _STEP_ACCEL
-    motion = strapdown(segment, gyro_bias + steps[:, :3], accel_bias + steps[:, 3:])
-    R, v, p = motion.dR[:, -1], motion.dv[:, -1], motion.dp[:, -1]
-    by_bias = np.concatenate([so3.log(R[0].T @ R[1:]), v[1:] - v[0], p[1:] - p[0]], axis=1).T
-    by_bias[:, :3] /= _STEP_GYRO
-    by_bias[:, 3:] /= _STEP_ACCEL
+    motion = strapdown(segment, gyro_bias[None], accel_bias[None])
+    turn, speed, place = bias_derivatives(segment, motion, accel_bias)
+    by_bias = np.concatenate([np.concatenate([turn, np.zeros((3, 3))], axis=1), speed, place])
     covariance = process_noise(np.eye(3), motion, noise).covariance
     order = [0, 1, 2, 6, 7, 8, 3, 4, 5]
     root = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(order, order)]))
     return Link(
         float(motion.t_s[-1]),
-        R[0],
-        v[0],
-        p[0],
+        motion.dR[0, -1],
+        motion.dv[0, -1],
+        motion.dp[0, -1],
         by_bias,
         root,
         gyro_bias.copy(),

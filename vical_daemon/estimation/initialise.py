@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.imu_model import ImuBuffer, strapdown
+from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_model import strapdown
 from vical_daemon.estimation.measurements import FloatArray
 
 _ACCEL_BIAS_PRIOR = 0.3  # m/s^2, the datasheet's worst turn-on bias several times over

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation import so3, unscented
-from vical_daemon.estimation.imu_model import ImuSegment, Motion, Strapdown, compose, strapdown
+from vical_daemon.estimation.imu_buffer import ImuSegment
+from vical_daemon.estimation.imu_model import Motion, Strapdown, bias_derivatives, compose, strapdown
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.retract import motion_points
 from vical_daemon.estimation.state import (
@@ -89,35 +90,3 @@ def move_by_derivatives(state: State, S: FloatArray, segment: ImuSegment) -> Mov
         np.zeros((9, 0)),
         relative,
     )
-
-
-def bias_derivatives(
-    segment: ImuSegment, relative: Strapdown, accel_bias: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Derivatives of the relative motion at the end by the biases (trapezoids over the nodes).
-
-    With A(t) = -int R dt (turn in the start frame by gyro bias): dv = int R f has d/d b_a = A and
-    d/d b_g = -int hat(R f) A; the derivatives of dp are the integrals of both. [Forster et al. 2017, (69)]
-
-    Args:
-        segment: Readings.
-        relative: Their integrals for one pair of biases (index 0 is used).
-        accel_bias: m/s^2, shape (3,).
-
-    Returns:
-        Rotation (local) by gyro bias (3, 3), velocity (3, 6) and position (3, 6) by [gyro, accel] bias.
-    """
-    t = relative.t_s
-    half = 0.5 * np.diff(t)[:, None, None]
-    dR = relative.dR[0]
-
-    def integral(x: FloatArray) -> FloatArray:
-        out = np.zeros_like(x)
-        np.cumsum((x[1:] + x[:-1]) * half, axis=0, out=out[1:])
-        return out
-
-    A = -integral(dR)
-    force = np.matmul(dR, (segment.accel - accel_bias)[..., None])[..., 0]
-    speed = np.concatenate([integral(-so3.hat(force) @ A), A], axis=2)
-    place = integral(speed)
-    return dR[-1].T @ A[-1], speed[-1], place[-1]

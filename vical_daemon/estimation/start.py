@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.camera_model import unproject
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.initialise import LinearStart, linear_start
 from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame

@@ -21,7 +21,7 @@ from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.free_reports import window_reports
 from vical_daemon.estimation.free_starter import Starter, start_sigmas
 from vical_daemon.estimation.free_window import KNOT_S, Landmarks, Window
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 

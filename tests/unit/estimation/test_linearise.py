@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.linearise import (
     Image,
     Straightness,

@@ -11,7 +11,7 @@ from vical_daemon.estimation.free_bundle import Bundle, _correlation
 from vical_daemon.estimation.free_carry import calibration_difference, first_carry, moved, tangents
 from vical_daemon.estimation.free_start import free_start
 from vical_daemon.estimation.free_starter import start_sigmas
-from vical_daemon.estimation.imu_model import ImuBuffer
+from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial_links import Links, make_link
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
 from vical_daemon.estimation.state import CameraState

@@ -1,0 +1,79 @@
+"""The inertial buffer: exact ends, holes, and bounded memory."""
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_model import strapdown
+
+
+def rates(t):
+    t = np.asarray(t)[..., None]
+    return np.concatenate([0.9 * np.sin(3 * t), 0.7 * np.cos(2 * t), 0.5 * np.sin(4 * t + 1)], axis=-1)
+
+
+def forces(t):
+    t = np.asarray(t)[..., None]
+    return np.concatenate([np.sin(2 * t), 9.8 + np.cos(3 * t), 0.5 * np.sin(5 * t)], axis=-1)
+
+
+def filled(n=500, base=0):
+    buffer = ImuBuffer(base)
+    for k in range(n):
+        t = 0.01 * k
+        assert buffer.append(t, rates(t), forces(t))
+    return buffer
+
+
+def test_segment_starts_and_ends_exactly_where_asked():
+    seg = filled().segment(0.123, 0.456)
+    assert seg.t_s[0] == 0.123
+    assert seg.t_s[-1] == 0.456
+    straight = rates(0.12) + 0.3 * (rates(0.13) - rates(0.12))
+    assert np.abs(seg.gyro[0] - rates(0.123)).max() < 0.02 * np.abs(straight - rates(0.123)).max()
+    assert (np.diff(seg.t_s) > 0).all()
+
+
+def test_a_quick_shake_is_not_shortened_by_straight_lines_between_samples():
+    w, dt = 2 * np.pi * 3.0, 0.01
+    buffer = ImuBuffer(0)
+    for k in range(60):
+        shake = np.array([np.sin(w * k * dt), 0.0, 0.0])
+        buffer.append(k * dt, np.zeros(3), shake)
+    seg = buffer.segment(0.1033, 0.1533)
+    gained = strapdown(seg, np.zeros((1, 3)), np.zeros((1, 3))).dv[0, -1, 0]
+    exact = (np.cos(w * 0.1033) - np.cos(w * 0.1533)) / w
+    assert gained == pytest.approx(exact, rel=2e-4)
+    plain = strapdown(seg._replace(gyro_slope=None, accel_slope=None), np.zeros((1, 3)), np.zeros((1, 3)))
+    assert abs(plain.dv[0, -1, 0] / exact - 1.0) > 1.5e-3
+
+
+def test_a_hole_in_the_data_is_bridged_by_straight_lines():
+    buffer = ImuBuffer(0)
+    for t in (0.0, 0.01, 0.02, 0.2, 0.21, 0.22):
+        buffer.append(t, np.full(3, 1.0 + t), np.full(3, 5.0 * t))
+    seg = buffer.segment(0.015, 0.205)
+    np.testing.assert_allclose(seg.gyro_slope, 1.0, atol=1e-9)
+    np.testing.assert_allclose(seg.accel[:, 0], 5.0 * seg.t_s, atol=1e-9)
+
+
+@pytest.mark.parametrize(("a", "b"), [(-0.1, 0.2), (0.2, 5.2), (0.3, 0.2)])
+def test_segment_outside_the_data_is_none(a, b):
+    assert filled().segment(a, b) is None
+
+
+def test_segment_on_sample_instants_has_no_empty_interval():
+    seg = filled().segment(0.1, 0.2)
+    assert (np.diff(seg.t_s) > 0).all()
+    np.testing.assert_allclose(seg.gyro[-1], rates(0.2), atol=1e-12)
+
+
+def test_buffer_refuses_what_is_not_newer_and_stays_bounded_when_trimmed():
+    buffer = ImuBuffer(0)
+    for k in range(30_000):
+        buffer.append(0.01 * k, np.zeros(3), np.zeros(3))
+        buffer.trim(0.01 * k - 1.0)
+    assert len(buffer) < 110
+    assert len(buffer._rows) <= 4096
+    assert not buffer.append(buffer.newest_s, np.zeros(3), np.zeros(3))
+    assert buffer.segment(buffer.newest_s - 0.5, buffer.newest_s) is not None
