@@ -27,6 +27,8 @@ FOOTER_MM = 17.0
 TEXT_MM = 2.6
 RULER_MM = 100.0
 """Length of the ruler where the page is wide enough."""
+LINE_MM = 0.3
+"""More than a pixel of 1/96 inch, or a screen leaves some marks of the ruler out."""
 Rectangle = tuple[float, float, float, float]
 
 
@@ -206,10 +208,10 @@ def _footer(target: Target, width: float) -> tuple[list[Rectangle], list[Text]]:
     """A ruler of whole centimetres and what the board is."""
     length = min(RULER_MM, math.floor((width - 2 * MARGIN_MM) / 10) * 10)
     y = MARGIN_MM + TEXT_MM + 2.0
-    ruler: list[Rectangle] = [(MARGIN_MM, y, length, 0.25)]
+    ruler: list[Rectangle] = [(MARGIN_MM, y, length, LINE_MM)]
     for mark in range(int(length) // 5 + 1):
         tall = 3.0 if mark % 2 == 0 else 1.8
-        ruler.append((MARGIN_MM + 5.0 * mark - 0.1, y, 0.2, tall))
+        ruler.append((MARGIN_MM + 5.0 * mark - LINE_MM / 2, y, LINE_MM, tall))
     notes = [
         Text(MARGIN_MM, y + 4.0, f"Print at 100 % (no scaling): this ruler is {length:.0f} mm"),
         Text(MARGIN_MM, MARGIN_MM, describe(target)),

@@ -13,6 +13,7 @@ from vical_mocks.lens import Lens
 from vical_daemon.cli import target as command
 from vical_daemon.cli.errors import CliError
 from vical_daemon.vision.board_sheet import (
+    LINE_MM,
     RULER_MM,
     SheetError,
     board_extent_mm,
@@ -82,7 +83,9 @@ def test_everything_lies_on_the_page_and_the_ruler_is_true():
         black = np.array(sheet.black)
         assert black[:, :2].min() > 5
         assert np.all(black[:, :2] + black[:, 2:] < np.array(sheet.size_mm) - 5)
-        assert max(w for _, _, w, h in sheet.black if h == 0.25) == RULER_MM
+        (ruler,) = (r for r in sheet.black if r[2:] == (RULER_MM, LINE_MM))
+        marks = [x + w / 2 for x, y, w, _ in sheet.black if w == LINE_MM and y == ruler[1]]
+        np.testing.assert_allclose(marks, ruler[0] + np.arange(0.0, RULER_MM + 1, 5.0), atol=1e-9)
         x0, y0, x1, y1 = board_extent_mm(board)
         points = board.points_m[:, :2] * 1e3 * [1, 1 if board.kind == "aprilgrid" else -1]
         assert np.all(points >= [x0, y0]) and np.all(points <= [x1, y1])
