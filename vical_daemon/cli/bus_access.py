@@ -20,6 +20,7 @@ _log = logging.getLogger(__name__)
 SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
 _HOSTS = {"imu", "camera"}
 _RETRY_S = 0.5
+_QUIET_S = 2.0
 _PATIENCE_S = 20.0
 
 
@@ -95,9 +96,9 @@ def _wait_for_router(config: Config, stop: threading.Event) -> ZenohBus | None:
         try:
             return open_bus(mode="client", socket=path, **_credentials(config.bus))
         except BusError as error:
-            if not told:
+            if not told and time.monotonic() - begin_s > _QUIET_S:  # the host may start beside us
                 _log.info("waiting for the bus: %s", error)
-            told = True
+                told = True
         if time.monotonic() - begin_s > _PATIENCE_S:  # or systemd takes a late router for our failure
             notify.ready("waiting for the bus")
             notify.watchdog()
