@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
+
+import msgspec
 
 from vical_drivers.envelope import EnvelopeOptions, LowerEnvelope
 
 _NS = 1e9
+_SURELY_POSSIBLE_S = 0.02
+"""A sample that is not earlier than this, compared with the luckiest ones, may be true."""
+_LEAST_STEP = 0.5 * _NS
+"""Stamps go on by at least half of what the device's clock did, ns per device second."""
 
 
 class TickUnwrapper:
@@ -40,19 +45,21 @@ class TickUnwrapper:
         self._last = None
 
 
-class DeviceTime(NamedTuple):
+class DeviceTime(msgspec.Struct, frozen=True, gc=False):
     """When one sample was taken, on the device's clock.
 
     Attributes:
         ticks: Unwrapped ticks, as the device said.
-        fine: The same with the fraction of a tick that its rounding took away, as far as it is known.
+        x_s: Device seconds since the mapping began, with the fraction of a tick that rounding took away.
+        lost_before: Samples missing just before.
     """
 
     ticks: int
-    fine: float
+    x_s: float
+    lost_before: int = 0
 
 
-class Stamp(NamedTuple):
+class Stamp(msgspec.Struct, frozen=True, gc=False):
     """What the clock says of one sample.
 
     Attributes:
@@ -95,7 +102,7 @@ class DeviceClock:
         self.repeats = 0
         self.lost = 0
         self._tick_sigma_s = 0.5 / tick_hz
-        self._period = tick_hz / rate_hz if rate_hz > 0.0 else 0.0
+        self._period = tick_hz / rate_hz if rate_hz > 0.0 else 1.0
         self._options = options
         self._modulus = 0 if tick_bits is None else 1 << tick_bits
         self._suspect: tuple[int, int] | None = None
@@ -108,8 +115,9 @@ class DeviceClock:
         self._last_ticks = 0
         self._fine = 0.0
         self._t0_ns = 0
-        self._last_t_ns: int | None = None
-        self._stamped_ticks = 0
+        self._last_t_ns = -(1 << 62)
+        self._last_x_s = 0.0
+        self._sigma_s, self._t_sigma_ns = math.inf, int(_NS)
 
     @property
     def age_s(self) -> float:
@@ -122,60 +130,56 @@ class DeviceClock:
         A value from the future is either damage or a restarted (or newly set) device timer. One such
         value is dropped; a second one that fits the first is a restart, and the mapping begins anew.
         """
+        if not self._running:
+            return self._start(ticks, t_arrival_ns)
         step = ticks - self._last_ticks
         if self._modulus:
             step %= self._modulus  # the counter wrapped: the step is still forward
-        if not self._running:
-            self._start(ticks, t_arrival_ns)
-            step = 0
-        elif not self._possible(step, t_arrival_ns):
-            if not self._continues_suspect(ticks, t_arrival_ns):
-                self._suspect = (ticks, t_arrival_ns)
-                self.outliers += 1
-                return None
-            self.restarts += 1
-            self.outliers -= 1
-            self._begin()
-            self._start(ticks, t_arrival_ns)
-            step = 0
-        elif step == 0:
+        unwrapped = self._last_ticks + step
+        # Samples come every 62.5 ticks at 1000 Hz, so the counter alternates between steps of 62 and 63. The
+        # instants themselves are evenly spaced by the same crystal: go on by whole periods, within the tick.
+        periods = round(step / self._period)
+        fine = self._fine + periods * self._period
+        if not unwrapped <= fine <= unwrapped + 1:
+            fine = float(unwrapped if fine < unwrapped else unwrapped + 1)
+        x_s = (fine - self._first_ticks) / self.tick_hz
+        d_s = (t_arrival_ns - self._t0_ns) / _NS - x_s
+        envelope = self.envelope
+        # The line is spelt out, here and in `stamp`: 1000 times a second on a small computer.
+        early = d_s < envelope.offset_s + envelope.skew * x_s - _SURELY_POSSIBLE_S
+        if step <= 0 or (early and not self._possible(step, t_arrival_ns)):
+            return self._doubt(ticks, step, t_arrival_ns)
+        self._last_ticks, self._fine, self._suspect = unwrapped, fine, None
+        envelope.add(x_s, d_s)
+        return DeviceTime(unwrapped, x_s, periods - 1 if periods > 1 and self.rate_hz > 0.0 else 0)
+
+    def _start(self, ticks: int, t_arrival_ns: int) -> DeviceTime:
+        self._running, self._first_ticks, self._last_ticks = True, ticks, ticks
+        self._fine, self._t0_ns, self._suspect = float(ticks), t_arrival_ns, None
+        self.envelope.add(0.0, 0.0)
+        return DeviceTime(ticks, 0.0)
+
+    def _doubt(self, ticks: int, step: int, t_arrival_ns: int) -> DeviceTime | None:
+        """Tell a repeated time, one that cannot be true, and a timer that began anew from one another."""
+        if step == 0:
             self._suspect = None
             self.repeats += 1
             return None
-        self._suspect = None
-        unwrapped = self._last_ticks + step
-        self._fine = fine = self._refined(unwrapped, step)
-        x_s = (fine - self._first_ticks) / self.tick_hz
-        self.envelope.add(x_s, (t_arrival_ns - self._t0_ns) / _NS - x_s)
-        self._last_ticks = unwrapped
-        return DeviceTime(unwrapped, fine)
-
-    def _start(self, ticks: int, t_arrival_ns: int) -> None:
-        self._running, self._first_ticks, self._last_ticks = True, ticks, ticks
-        self._fine, self._t0_ns = float(ticks), t_arrival_ns
-
-    def _refined(self, unwrapped: int, step: int) -> float:
-        """Ticks with the fraction that rounding took away.
-
-        Samples come every 62.5 ticks at 1000 Hz, so the counter alternates between steps of 62 and 63. The
-        instants themselves are evenly spaced by the same crystal: go on by whole periods, within the tick.
-        """
-        period = self._period
-        if period <= 0.0:
-            return float(unwrapped)
-        fine = self._fine + round(step / period) * period
-        if fine < unwrapped:
-            return float(unwrapped)
-        return fine if fine < unwrapped + 1.0 else unwrapped + 1.0
+        if not self._continues_suspect(ticks, t_arrival_ns):
+            self._suspect = (ticks, t_arrival_ns)
+            self.outliers += 1
+            return None
+        self.restarts += 1
+        self.outliers -= 1
+        self._begin()
+        return self._start(ticks, t_arrival_ns)
 
     def _possible(self, step: int, t_arrival_ns: int) -> bool:
-        """Tell whether an arrival may be that of a sample `step` ticks after the last one."""
-        if step < 0:
-            return False
+        """Tell whether an early arrival may be that of a sample `step` ticks after the last one."""
         x_s = (self._last_ticks + step - self._first_ticks) / self.tick_hz
         earliness_s = x_s + self.envelope.line(x_s) - (t_arrival_ns - self._t0_ns) / _NS
         # Before the envelope has settled an arrival may lie well below the first guess.
-        allowed_s = 0.02 + 1e-3 * step / self.tick_hz + (1.0 if x_s < 5.0 else 0.0)
+        allowed_s = _SURELY_POSSIBLE_S + 1e-3 * step / self.tick_hz + (1.0 if x_s < 5.0 else 0.0)
         return earliness_s < allowed_s
 
     def _continues_suspect(self, ticks: int, t_arrival_ns: int) -> bool:
@@ -190,23 +194,19 @@ class DeviceClock:
 
         Stamps never go back: where the envelope just moved, the step is spread over some samples.
         """
-        x_s = (device.fine - self._first_ticks) / self.tick_hz
-        t_ns = self._t0_ns + round((x_s + self.envelope.line(x_s)) * _NS)
-        lost = 0
-        if self._last_t_ns is not None:
-            step_s = (device.ticks - self._stamped_ticks) / self.tick_hz
-            earliest_ns = self._last_t_ns + int(0.5e9 * step_s) + 1
-            if t_ns < earliest_ns:
-                t_ns = earliest_ns
-            # Half a period of tolerance swallows the 62/63 tick alternation at 1000 Hz.
-            lost = round(step_s * self.rate_hz) - 1
-            if lost > 0:
-                self.lost += lost
-            else:
-                lost = 0
-        self._last_t_ns, self._stamped_ticks = t_ns, device.ticks
-        sigma_s = math.hypot(self.envelope.sigma_s, self._tick_sigma_s)
-        return Stamp(t_ns, int(sigma_s * _NS) if sigma_s < 1.0 else int(_NS), device.ticks, lost)
+        envelope, x_s, lost = self.envelope, device.x_s, device.lost_before
+        t_ns = self._t0_ns + round((x_s + (envelope.offset_s + envelope.skew * x_s)) * _NS)
+        earliest_ns = self._last_t_ns + int(_LEAST_STEP * (x_s - self._last_x_s)) + 1
+        if t_ns < earliest_ns:
+            t_ns = earliest_ns
+        self._last_t_ns, self._last_x_s = t_ns, x_s
+        if lost:
+            self.lost += lost
+        if envelope.sigma_s != self._sigma_s:
+            self._sigma_s = envelope.sigma_s
+            sigma_s = math.hypot(self._sigma_s, self._tick_sigma_s)
+            self._t_sigma_ns = int(min(sigma_s, 1.0) * _NS)
+        return Stamp(t_ns, self._t_sigma_ns, device.ticks, lost)
 
 
 class SampleCounter:

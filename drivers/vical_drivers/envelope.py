@@ -45,6 +45,11 @@ class LowerEnvelope:
     Keeps the luckiest point per block, forgets blocks older than a window chosen from the jitter, and
     supports the convex hull of the rest by a line. Cost: O(window / block) when a block ends or a point
     falls below the line, O(1) otherwise.
+
+    Attributes:
+        offset_s: Of the line `offset_s + skew * x`, host minus device at x = 0, s.
+        skew: Relative rate error: host seconds per device second, minus one.
+        sigma_s: One-sigma uncertainty of the line at the newest point, s.
     """
 
     def __init__(self, options: EnvelopeOptions | None = None) -> None:
@@ -52,30 +57,22 @@ class LowerEnvelope:
         self._block_s = self.options.block_s
         self._blocks: deque[tuple[float, float]] = deque()
         self._best: tuple[float, float] | None = None
-        self._block_start_s = 0.0
+        self._best_delay_s = math.inf
+        self._block_end_s = 0.0
         self._newest_s = 0.0
-        self._offset_s = 0.0
-        self._skew = 0.0
+        self.offset_s = 0.0
+        self.skew = 0.0
         self._delay_mean_s = 0.0
         self._delay_square_s2 = 0.0
         self._points = 0
-        self._sigma_s = math.inf
+        self._new, self._new_sum_s, self._new_sum_s2 = 0, 0.0, 0.0  # not yet in the mean
+        self.sigma_s = math.inf
         self._skew_sigma = self.options.skew_prior
-
-    @property
-    def skew(self) -> float:
-        """Relative rate error: host seconds per device second, minus one."""
-        return self._skew
 
     @property
     def jitter_s(self) -> float:
         """Standard deviation of the arrival delay, s (recent samples weigh most)."""
         return math.sqrt(max(0.0, self._delay_square_s2 - self._delay_mean_s**2))
-
-    @property
-    def sigma_s(self) -> float:
-        """One-sigma uncertainty of the line at the newest point, s."""
-        return self._sigma_s
 
     @property
     def window_s(self) -> float:
@@ -88,28 +85,45 @@ class LowerEnvelope:
 
     def line(self, x_s: float) -> float:
         """Offset (host - device) at device time `x_s`, s."""
-        return self._offset_s + self._skew * x_s
+        return self.offset_s + self.skew * x_s
 
     def add(self, x_s: float, d_s: float) -> None:
         """Take one arrival; `x_s` must not decrease."""
-        # 1000 times a second on a small computer: `line` is spelt out, and nothing is made anew.
-        self._newest_s = x_s
-        self._points += 1
-        best, skew = self._best, self._skew
-        if best is None:
-            self._best, self._block_start_s = (x_s, d_s), x_s
-        elif d_s - skew * x_s < best[1] - skew * best[0]:
+        # 1000 times a second on a small computer: what most samples do not need is elsewhere.
+        delay_s = d_s - (self.offset_s + self.skew * x_s)
+        if delay_s < self._best_delay_s or x_s >= self._block_end_s:
+            delay_s = self._note_luckiest(x_s, d_s, delay_s)
+        self._new += 1
+        self._new_sum_s += delay_s
+        self._new_sum_s2 += delay_s * delay_s
+
+    def _note_luckiest(self, x_s: float, d_s: float, delay_s: float) -> float:
+        """Take the luckiest of its block so far, or its last; return its delay by the line as it is then."""
+        if self._best is None:
+            self._best, self._block_end_s = (x_s, d_s), x_s + self._block_s
+        elif delay_s < self._best_delay_s:
             self._best = (x_s, d_s)
-        delay_s = d_s - (self._offset_s + skew * x_s)
-        ends = x_s - self._block_start_s >= self._block_s
-        if ends or delay_s < 0.0 or self._points < 2:
+        ends = x_s >= self._block_end_s
+        if ends or delay_s < 0.0 or not self._points:
+            self._newest_s = x_s
+            self._update_mean()
             if ends:
                 self._close_block()
             self._fit()
-            delay_s = d_s - (self._offset_s + self._skew * x_s)
-        gain = 1.0 / self._points if self._points < _DELAY_MEMORY else 1.0 / _DELAY_MEMORY
-        self._delay_mean_s += gain * (delay_s - self._delay_mean_s)
-        self._delay_square_s2 += gain * (delay_s * delay_s - self._delay_square_s2)
+            delay_s = d_s - self.line(x_s)
+        best = self._best
+        self._best_delay_s = math.inf if best is None else best[1] - self.line(best[0])
+        return delay_s
+
+    def _update_mean(self) -> None:
+        """Let the samples since the last time into the mean delay: equal weights at first, then a memory."""
+        count = self._new
+        self._points += count
+        if count:
+            gain = count / max(count, min(self._points, _DELAY_MEMORY))
+            self._delay_mean_s += gain * (self._new_sum_s / count - self._delay_mean_s)
+            self._delay_square_s2 += gain * (self._new_sum_s2 / count - self._delay_square_s2)
+            self._new, self._new_sum_s, self._new_sum_s2 = 0, 0.0, 0.0
 
     def _close_block(self) -> None:
         assert self._best is not None
@@ -132,16 +146,16 @@ class LowerEnvelope:
         prior = self.options.skew_prior
         weight = 1.0 / (1.0 + (skew_sigma / prior) ** 2)
         bound = self.options.max_skew
-        self._skew = min(max(slope * weight, -bound), bound)
-        self._offset_s = min(d - self._skew * x for x, d in hull)
+        self.skew = min(max(slope * weight, -bound), bound)
+        self.offset_s = min(d - self.skew * x for x, d in hull)
         self._skew_sigma = prior * math.sqrt(1.0 - weight)
-        self._sigma_s = self._uncertainty_s(points, spread_s)
+        self.sigma_s = self._uncertainty_s(points, spread_s)
 
     def _spread_s(self, points: list[tuple[float, float]]) -> float:
         """How far block minima typically lie above the luckiest ones, s (upper decile of the lowest)."""
         residuals = sorted(d - self.line(x) for x, d in points)
         # A few points may agree by chance: their number bounds what can be believed.
-        believable_s = self._delay_mean_s / math.sqrt(self._points)
+        believable_s = self._delay_mean_s / math.sqrt(max(1, self._points))
         return max(residuals[len(residuals) // 10] - residuals[0], believable_s, 1e-6)
 
     def _uncertainty_s(self, points: list[tuple[float, float]], spread_s: float) -> float:

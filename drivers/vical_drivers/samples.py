@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import NamedTuple, Protocol, Self, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 
-class ImuSample(NamedTuple):
-    """One inertial sample; a tuple, because it is made 1000 times a second.
+class ImuSample(msgspec.Struct, frozen=True, gc=False):
+    """One inertial sample; a struct in C, because it is made 1000 times a second.
 
     Attributes:
         t_host_ns: Instant the sensor *measured* (device clock mapped to CLOCK_MONOTONIC, wire time

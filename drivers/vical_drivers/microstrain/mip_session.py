@@ -210,7 +210,11 @@ class MipSession:
         if self._backlog:
             out, self._backlog = self._backlog, []
             return out
-        return [s for p in self._link.stream.receive(timeout_s) if (s := self._sample(p)) is not None]
+        out = []
+        for packet in self._link.stream.receive(timeout_s):
+            if (sample := self._sample(packet)) is not None:
+                out.append(sample)
+        return out
 
     def _sample(self, packet: mip.Packet) -> RawSample | None:
         if packet.descriptor_set != mip.SET_SENSOR:

@@ -35,6 +35,7 @@ BITS_PER_BYTE = 10
 """Start, eight data, stop."""
 _CHUNK = 65_536
 _WRITE_TIMEOUT_S = 1.0
+_CHUNKS_KEPT = 512  # a record waits for its end for 261 bytes at most
 
 
 class BytePort(Protocol):
@@ -185,7 +186,7 @@ class SerialPort:
     def read(self, timeout_s: float) -> tuple[bytes, int]:
         """See `BytePort.read`."""
         try:
-            events = self._poll.poll(max(0.0, timeout_s) * 1e3)
+            events = self._poll.poll(timeout_s * 1e3 if timeout_s > 0.0 else 0)
             data = os.read(self._fd, _CHUNK) if events else b""
             now_ns = time.monotonic_ns()
         except OSError as error:
@@ -264,16 +265,21 @@ class ArrivalLog:
 
     A record is dated by its last byte: the bytes read after it in the same call were on the wire later,
     so on a real UART their wire time is taken off.
+
+    Attributes:
+        end: Stream offset after the newest read.
+        t_read_ns: When that was, ns.
     """
 
     def __init__(self) -> None:
-        self._chunks: deque[tuple[int, int]] = deque()
-        self._end = 0
+        self._chunks: deque[tuple[int, int]] = deque(maxlen=_CHUNKS_KEPT)
+        self.end = self.t_read_ns = 0
 
     def add(self, size: int, t_read_ns: int) -> None:
         """Note that `size` bytes arrived by a read at `t_read_ns`."""
-        self._end = end = self._end + size
-        self._chunks.append((end, t_read_ns))
+        self.t_read_ns = t_read_ns
+        self.end += size
+        self._chunks.append((self.end, t_read_ns))
 
     def arrival_ns(self, offset: int, wire_byte_ns: float) -> int:
         """When the byte that ends at stream offset `offset` was there, ns; offsets must not decrease."""

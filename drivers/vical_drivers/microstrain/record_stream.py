@@ -58,6 +58,9 @@ class RecordStream(Generic[R]):
 
     def arrival_ns(self, end: int) -> int:
         """CLOCK_MONOTONIC of the byte that ends at stream offset `end`, ns; offsets must not decrease."""
+        arrivals = self._arrivals
+        if end == arrivals.end:  # nearly always a record ends with its read
+            return arrivals.t_read_ns
         return self._arrivals.arrival_ns(end, self._port.wire_byte_ns)
 
     def restart(self) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
+
+import msgspec
 
 from vical_drivers.errors import DriverError
 from vical_drivers.microstrain.port import BytePort
@@ -65,7 +67,7 @@ class Applied:
     filter_width: int | None = None
 
 
-class RawSample(NamedTuple):
+class RawSample(msgspec.Struct, frozen=True, gc=False):
     """One sample as decoded, in SI units, with the device's own time.
 
     Attributes:

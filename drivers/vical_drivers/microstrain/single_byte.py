@@ -17,6 +17,8 @@ import struct
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import msgspec
+
 STANDARD_GRAVITY_MPS2 = 9.80665
 """One g in the device's unit of specific force, m/s^2."""
 TICK_HZ = 62_500
@@ -111,7 +113,7 @@ DATA_COMMANDS = frozenset(
 """Commands that may be streamed by 0xC4."""
 
 
-class Record(NamedTuple):
+class Record(msgspec.Struct, frozen=True, gc=False):
     """One reply whose checksum was right.
 
     Attributes:
@@ -205,7 +207,6 @@ class Decoder:
         self.records = 0
         self._tail = b""
         self._consumed = 0
-        self._record_bytes = 0
         # A capture may begin inside a record: that is no damage.
         self._in_step = False
 
@@ -223,16 +224,16 @@ class Decoder:
         """Take the next bytes of the stream and return the records they complete, in order."""
         if self._in_step and data and not self._tail and not self.little_endian_floats:
             # Nearly always one read brings one whole record: no need to look for anything.
-            entry, size = _ENTRIES[data[0]], len(data)
+            kind, size = data[0], len(data)
+            entry = _ENTRIES[kind]
             if (
                 entry is not None
                 and entry.length == size
                 and sum(data[:-2]) & 0xFFFF == data[-2] << 8 | data[-1]
             ):
                 self._consumed += size
-                self._record_bytes += size
                 self.records += 1
-                return [Record(data[0], entry.unpack.unpack_from(data, 1), self._consumed)]
+                return [Record(kind, entry.unpack.unpack_from(data, 1), self._consumed)]
         return self._parse(self._tail + data if self._tail else data, waiting=True)
 
     def finish(self) -> list[Record]:
@@ -271,14 +272,14 @@ class Decoder:
             position = end
             kept = None
             self._in_step = True
-        self._record_bytes += good_bytes
-        return self._keep(buffer, position if kept is None else kept, out)
+        consumed = position if kept is None else kept
+        self.skipped_bytes += consumed - good_bytes
+        return self._keep(buffer, consumed, out)
 
     def _keep(self, buffer: bytes, position: int, out: list[Record]) -> list[Record]:
         self._tail = buffer[position:]
         self._consumed += position
         self.records += len(out)
-        self.skipped_bytes = self._consumed - self._record_bytes
         return out
 
     def _decode(self, buffer: bytes, position: int, end: int, entry: _Entry) -> tuple[Any, ...] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import time
 
 from vical_drivers.errors import DeviceRefusedError, DriverError
@@ -161,19 +162,19 @@ class SingleByteSession:
         if self._backlog:
             out, self._backlog = self._backlog, []
             return out
-        return [s for r in self._stream.receive(timeout_s) if (s := self._sample(r)) is not None]
+        out = []
+        for record in self._stream.receive(timeout_s):
+            if (sample := self._sample(record)) is not None:
+                out.append(sample)
+        return out
 
     def _sample(self, record: sb.Record) -> RawSample | None:
-        kind, values, end = record
-        if kind != _STREAMED:
+        # NaN or infinity: the device is idle or over range
+        if record.kind != _STREAMED or not math.isfinite(sum(record.values)):
             return None
-        ax, ay, az, wx, wy, wz, ticks = values
-        total = ax + ay + az + wx + wy + wz
-        if total - total != 0.0:  # NaN or infinity: the device is idle or over range
-            return None
-        g = _G
-        arrival_ns = self._stream.arrival_ns(end)
-        return RawSample(ticks, (wx, wy, wz), (ax * g, ay * g, az * g), arrival_ns)
+        ax, ay, az, wx, wy, wz, ticks = record.values
+        force = (ax * _G, ay * _G, az * _G)
+        return RawSample(ticks, (wx, wy, wz), force, self._stream.arrival_ns(record.end))
 
     def _transact(
         self, command: bytes, kind: int, timeout_s: float | None = None, tries: int = _TRIES

@@ -81,26 +81,36 @@ class SampleStamper:
                 self._restarts, self._warm = self.clock.restarts, False
                 self._held.clear()
             self._held.append((sample, device_time))
-        held = self._held
-        if not held or not (self._warm or self.clock.age_s >= self._warm_up_s):
+        if not self._held or not (self._warm or self.clock.age_s >= self._warm_up_s):
             return []
-        self._warm, self._held = True, []
-        out = [self._to_sample(sample, device_time) for sample, device_time in held]
+        self._warm = True
+        return self._release()
+
+    def _release(self) -> list[ImuSample]:
+        """Date what is held."""
+        stamp, delay_ns, last_ns = self.clock.stamp, self._delay_ns, self._last_stamp_ns
+        out = []
+        for raw, device_time in self._held:
+            s = stamp(device_time)
+            t_host_ns = s.t_device_event_ns - delay_ns
+            if t_host_ns <= last_ns:  # a new clock (restart, reconnect) may begin before the old one ended
+                t_host_ns = last_ns + 1
+            last_ns = t_host_ns
+            if s.lost_before:
+                self.lost += s.lost_before
+            out.append(
+                ImuSample(
+                    t_host_ns, raw.t_arrival_ns, s.device_ticks, raw.gyro_rps, raw.specific_force_mps2,
+                    s.t_sigma_ns, s.lost_before,
+                )
+            )  # fmt: skip
+        self._held = []
         if not self._span_samples:
             self._span_start_ns = out[0].t_host_ns
-        self.samples += len(out)
+        self._last_stamp_ns = last_ns
         self._span_samples += len(out)
+        self.samples += len(out)
         return out
-
-    def _to_sample(self, raw: RawSample, device_time: DeviceTime) -> ImuSample:
-        t_event_ns, t_sigma_ns, ticks, lost = self.clock.stamp(device_time)
-        self.lost += lost
-        # A new clock (restart, reconnect) may begin a little before the old one ended.
-        t_host_ns = max(t_event_ns - self._delay_ns, self._last_stamp_ns + 1)
-        self._last_stamp_ns = t_host_ns
-        return ImuSample(
-            t_host_ns, raw.t_arrival_ns, ticks, raw.gyro_rps, raw.specific_force_mps2, t_sigma_ns, lost
-        )
 
     def _counted(self, t_arrival_ns: int) -> int:
         """Tick of a sample that its device did not date."""
