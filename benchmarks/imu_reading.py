@@ -146,7 +146,7 @@ class _Noted(MicrostrainImu):
     arrivals: list[int]
 
     def read(self, timeout_s: float) -> list[ImuSample]:
-        samples = super().read(timeout_s)
+        samples = MicrostrainImu.read(self, timeout_s)
         for sample in samples:
             self.arrivals.append(sample.t_arrival_ns)
         return samples

@@ -10,6 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from vical_daemon.bus import Bus
 from vical_daemon.device_loop import DeviceLoop, Source
+from vical_daemon.direct_outbox import DirectOutbox, StandIn
 from vical_daemon.health import StatusSender, device_status
 from vical_daemon.messages import DiagnosticStatus
 from vical_daemon.outbox import Outbox
@@ -40,11 +41,11 @@ class MessageMaker(Protocol[T_contra]):
 
 @dataclass(frozen=True, slots=True)
 class Line(Generic[T]):
-    """One device on its way to the bus; make it with `start_line`."""
+    """One device on its way to the bus; make it with `start_line` or `start_direct_line`."""
 
     maker: MessageMaker[T]
     loop: DeviceLoop[T]
-    outbox: Outbox
+    outbox: Outbox | DirectOutbox
     rate_hz: float
 
     def status(self) -> DiagnosticStatus:
@@ -75,15 +76,38 @@ def start_line(
         depth: Messages that may wait for the bus.
     """
     outbox = Outbox(bus, depth, f"{name} out")
-
-    def deliver(item: T) -> None:
-        payload = maker.message(item)
-        if payload is not None:
-            outbox.put(maker.key, payload)
-
-    loop = DeviceLoop(name, open_source, deliver, stop)
+    loop = DeviceLoop(name, open_source, _delivery(maker, outbox), stop)
     loop.start()
     return Line(maker, loop, outbox, rate_hz)
+
+
+def start_direct_line(
+    name: str,
+    maker: MessageMaker[T],
+    open_source: Callable[[], AbstractContextManager[Source[T]]],
+    bus: Bus,
+    stop: threading.Event,
+    *,
+    rate_hz: float,
+    depth: int,
+) -> Line[T]:
+    """As `start_line`, for small messages at a high rate: whoever reads publishes, see `direct_outbox`."""
+    outbox = DirectOutbox(bus, depth)
+    loop = DeviceLoop(name, open_source, _delivery(maker, outbox), stop, flush=outbox.flush)
+    loop.start()
+    StandIn(outbox, loop.read_on, stop, f"{name} stand-in").start()
+    return Line(maker, loop, outbox, rate_hz)
+
+
+def _delivery(maker: MessageMaker[T], outbox: Outbox | DirectOutbox) -> Callable[[T], None]:
+    make, put, key = maker.message, outbox.put, maker.key
+
+    def deliver(item: T) -> None:
+        payload = make(item)
+        if payload is not None:
+            put(key, payload)
+
+    return deliver
 
 
 def run_lines(

@@ -103,6 +103,7 @@ class DeviceLoop(Generic[T]):
         open_source: Opens the device; raises `DriverError` when it cannot.
         deliver: Called with each item, in this thread; must return at once.
         stop: Ends the loop.
+        flush: Called after each read, in this thread; may take its time if a `StandIn` calls `read_on`.
         read_timeout_s: Longest blocking read; how fast `stop` is noticed.
         silence_s: Without data for so long the device is closed and opened again.
         longest_pause_s: Pauses between attempts to open grow up to this.
@@ -115,16 +116,19 @@ class DeviceLoop(Generic[T]):
         deliver: Callable[[T], None],
         stop: threading.Event,
         *,
+        flush: Callable[[], None] | None = None,
         read_timeout_s: float = 0.2,
         silence_s: float = 20.0,
         longest_pause_s: float = 5.0,
     ) -> None:
         self.name = name
         self._open_source, self._deliver, self._stop = open_source, deliver, stop
+        self._flush = flush or (lambda: None)
         self._read_timeout_s, self._silence_s = read_timeout_s, silence_s
         self._longest_pause_s = longest_pause_s
         self._health = DeviceHealth()
         self._source: Source[T] | None = None
+        self._turn = threading.Lock()  # of whoever reads: samples are put in the order of their reading
         self._t_data_s = -float("inf")
         self._t_loop_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -153,35 +157,46 @@ class DeviceLoop(Generic[T]):
             try:
                 with self._open_source() as source:
                     self._opened(source)
-                    if self._stream(source):
+                    if self._stream():
                         pause_s = 0.1
             except DriverError as error:
                 self._failed(error)
-            finally:
-                self._source = None
             pause_s = min(2 * pause_s, self._longest_pause_s)
             self._stop.wait(pause_s)
 
-    def _stream(self, source: Source[T]) -> bool:
+    def _stream(self) -> bool:
         """Read until `stop`, or until nothing came for `silence_s`; True if anything came."""
-        t_alive_s, delivered = time.monotonic(), False
-        while not self._stop.is_set():
+        t_open_s = time.monotonic()
+        try:
+            while not self._stop.is_set():
+                self.read_on()
+                self._flush()
+                if self._t_loop_s - max(self._t_data_s, t_open_s) > self._silence_s:
+                    self._failed(DriverError(f"no data for {self._silence_s:g} s, opening it again"))
+                    break
+        finally:
+            with self._turn:
+                self._source = None
+        return self._t_data_s > t_open_s
+
+    def read_on(self) -> None:
+        """Read once and deliver; for another thread while the loop's own is held up in `flush`."""
+        with self._turn:
+            source = self._source
+            if source is None:  # closed while another thread waited for its turn
+                return
             try:
                 items = source.read(self._read_timeout_s)
             except DriverError as error:
                 self._failed(error)
                 items = []
             self._t_loop_s = time.monotonic()
-            for item in items:
-                self._deliver(item)
             if items:
-                self._t_data_s = t_alive_s = self._t_loop_s
-                delivered = True
-                self._streams(source)
-            elif self._t_loop_s - t_alive_s > self._silence_s:
-                self._failed(DriverError(f"no data for {self._silence_s:g} s, opening it again"))
-                break
-        return delivered
+                for item in items:
+                    self._deliver(item)
+                self._t_data_s = self._t_loop_s
+                if self._health.state != "streaming":
+                    self._streams(source)
 
     def _opened(self, source: Source[T]) -> None:
         info = source.info
@@ -194,8 +209,7 @@ class DeviceLoop(Generic[T]):
         if self._health.state == "lost":
             _log.info("%s: back", self.name)
             notify.event("device_back", f"{self.name} is back", device=self.name)
-        if self._health.state != "streaming":
-            self._health = replace(self._health, state="streaming", problem="", info=source.info)
+        self._health = replace(self._health, state="streaming", problem="", info=source.info)
 
     def _failed(self, error: DriverError) -> None:
         problem = " ".join(str(error).split())

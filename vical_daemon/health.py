@@ -9,6 +9,7 @@ from collections.abc import Callable
 from vical_daemon import topics
 from vical_daemon.bus import Bus
 from vical_daemon.device_loop import DeviceHealth
+from vical_daemon.direct_outbox import DirectOutbox
 from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics
 from vical_daemon.outbox import Outbox
 from vical_daemon.wall_clock import WallClock
@@ -53,7 +54,7 @@ class StatusSender:
 def device_status(
     name: str,
     health: DeviceHealth,
-    outbox: Outbox,
+    outbox: Outbox | DirectOutbox,
     nominal_rate_hz: float,
     extra: dict[str, str] | None = None,
 ) -> DiagnosticStatus:
@@ -86,7 +87,7 @@ def device_status(
     return DiagnosticStatus(level, name, message, info.serial_number if info else "", values)
 
 
-def _judge(health: DeviceHealth, outbox: Outbox, nominal_rate_hz: float) -> tuple[Level, str]:
+def _judge(health: DeviceHealth, outbox: Outbox | DirectOutbox, nominal_rate_hz: float) -> tuple[Level, str]:
     if health.loop_age_s > STUCK_S:
         return Level.STALE, f"its thread is stuck for {health.loop_age_s:.0f} s"
     if health.state != "streaming":

@@ -7,6 +7,7 @@ settings are listed in docs/bus.md.
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import os
@@ -259,7 +260,7 @@ class _Outlet:
         self._key = key
         self._publisher_id = publisher_id
         self._lock = threading.Lock()
-        self._next = 0
+        self._numbers = itertools.count()  # its `next` needs no lock
         self._last: tuple[bytes, bytes] | None = None
         self._keep = topic is not None and topic.keep_last
         self._publisher = session.declare_publisher(
@@ -274,11 +275,12 @@ class _Outlet:
         self._queryable = session.declare_queryable(key, self._answer) if self._keep else None
 
     def put(self, payload: bytes) -> None:
-        with self._lock:
-            number = _NUMBER.pack(_MARK, self._publisher_id, self._next)
-            self._next += 1
-            if self._keep:
+        if self._keep:
+            with self._lock:  # the last one is that with the highest number
+                number = _NUMBER.pack(_MARK, self._publisher_id, next(self._numbers))
                 self._last = (payload, number)
+        else:
+            number = _NUMBER.pack(_MARK, self._publisher_id, next(self._numbers))
         self._publisher.put(payload, attachment=number)
 
     def _answer(self, query: Any) -> None:

@@ -37,7 +37,7 @@ from vical_daemon.messages.image import (
     encode_compressed_image,
     encode_image,
 )
-from vical_daemon.messages.imu import IMU_TYPE, ImuMessage, decode_imu, encode_imu
+from vical_daemon.messages.imu import IMU_TYPE, ImuMessage, decode_imu, encode_imu, imu_encoder
 from vical_daemon.messages.points import POINTS_TYPE, TRACKS_TYPE, PointsMessage, decode_points, encode_points
 from vical_daemon.messages.poses import (
     POSE_TYPE,
@@ -95,6 +95,7 @@ __all__ = [
     "encode_pose",
     "encode_string",
     "encode_transforms",
+    "imu_encoder",
     "merge_calibrations",
     "ros2_schema",
 ]

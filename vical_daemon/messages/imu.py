@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,6 +15,8 @@ _NS_PER_S = 1_000_000_000
 _BODY = struct.Struct(
     "<104x3d72x3d72x"
 )  # orientation and its covariance skipped, then value, covariance, ...
+ImuEncoder = Callable[[int, Sequence[float], Sequence[float]], bytes]
+"""Stamp (UNIX ns), angular rate (rad/s), specific force (m/s^2) to a message; see `encode_imu`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,17 +37,29 @@ class ImuMessage:
 
 
 @lru_cache(maxsize=64)
-def _template(frame_id: str) -> tuple[struct.Struct, bytes, bytes]:
-    """Return the packer of a whole message and its two constant parts.
+def imu_encoder(frame_id: str) -> ImuEncoder:
+    """Return `encode_imu` for one imu: all that stays the same is packed once.
 
-    The parts: frame id, an orientation that is declared unknown (covariance[0] = -1, REP 145), and a
-    covariance of zeros (unknown).
+    Constant are the frame id, an orientation that is declared unknown (covariance[0] = -1, REP 145), and
+    covariances of zeros (unknown).
     """
     raw = frame_id.encode()
     name = struct.pack("<I", len(raw) + 1) + raw + b"\0"
     name += bytes(-(8 + len(name)) % 8)
     front = name + struct.pack("<13d", 0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
-    return struct.Struct(f"<4siI{len(front)}s3d72s3d72s"), front, bytes(72)
+    unknown = bytes(72)
+    pack = struct.Struct(f"<4siI{len(front)}s3d72s3d72s").pack
+
+    def encode(stamp_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> bytes:
+        seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
+        try:
+            return pack(
+                LITTLE_ENDIAN, seconds, nanoseconds, front, *gyro_rps, unknown, *specific_force_mps2, unknown
+            )
+        except struct.error as error:
+            raise MessageError(f"no Imu message can hold these values: {error}") from None
+
+    return encode
 
 
 def encode_imu(
@@ -62,14 +76,7 @@ def encode_imu(
     Raises:
         MessageError: Not 3 numbers each, or a stamp that ROS 2 cannot express.
     """
-    packer, front, unknown = _template(frame_id)
-    seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
-    try:
-        return packer.pack(
-            LITTLE_ENDIAN, seconds, nanoseconds, front, *gyro_rps, unknown, *specific_force_mps2, unknown
-        )
-    except struct.error as error:
-        raise MessageError(f"no Imu message can hold these values: {error}") from None
+    return imu_encoder(frame_id)(stamp_ns, gyro_rps, specific_force_mps2)
 
 
 def decode_imu(data: bytes) -> ImuMessage:

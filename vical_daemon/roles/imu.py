@@ -1,4 +1,7 @@
-"""Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> bounded queue -> bus."""
+"""Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> bounded queue -> bus.
+
+The same thread publishes; another one reads on where the bus holds it up (`direct_outbox`).
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,10 @@ from collections.abc import Callable
 from vical_drivers.samples import ImuSample, ImuSource
 
 from vical_daemon import topics
-from vical_daemon.acquisition import Line, clock_of_the_service, run_lines, start_line
+from vical_daemon.acquisition import Line, clock_of_the_service, run_lines, start_direct_line
 from vical_daemon.bus import Bus
 from vical_daemon.config import Config, ImuConfig
-from vical_daemon.messages import encode_imu
+from vical_daemon.messages import imu_encoder
 from vical_daemon.wall_clock import WallClock
 
 QUEUE_DEPTH = 8192  # 8 s at 1000 Hz
@@ -30,7 +33,7 @@ class ImuRole:
 
     def __init__(self, rig: str, name: str, clock: WallClock) -> None:
         self.key = topics.imu_key(rig, name)
-        self._name, self._clock = name, clock
+        self._encode, self._offset_ns = imu_encoder(name), clock.unix_ns(0)
         self._t_last_ns = 0
         self._backwards = 0
         self._worst_sigma_ns = 0
@@ -40,13 +43,14 @@ class ImuRole:
 
         The stamp is that of the measurement: wire time and filter delay were taken off by the driver.
         """
-        if sample.t_host_ns <= self._t_last_ns:  # the device clock restarted: wait until time goes on
+        t_host_ns = sample.t_host_ns
+        if t_host_ns <= self._t_last_ns:  # the device clock restarted: wait until time goes on
             self._backwards += 1
             return None
-        self._t_last_ns = sample.t_host_ns
-        self._worst_sigma_ns = max(self._worst_sigma_ns, sample.t_sigma_ns)
-        stamp_ns = self._clock.unix_ns(sample.t_host_ns)
-        return encode_imu(stamp_ns, self._name, sample.gyro_rps, sample.specific_force_mps2)
+        self._t_last_ns = t_host_ns
+        if sample.t_sigma_ns > self._worst_sigma_ns:
+            self._worst_sigma_ns = sample.t_sigma_ns
+        return self._encode(t_host_ns + self._offset_ns, sample.gyro_rps, sample.specific_force_mps2)
 
     def counters(self) -> dict[str, str]:
         """Return what the driver's counters do not say; the worst sigma is that since the last call."""
@@ -94,7 +98,7 @@ def run(
     def start(name: str) -> Line[ImuSample]:
         imu = config.imus[name]
         maker = ImuRole(config.rig, name, clock)
-        return start_line(
+        return start_direct_line(
             f"imu/{name}", maker, lambda: open_source(imu), bus, stop,
             rate_hz=imu.rate_hz, depth=QUEUE_DEPTH,
         )  # fmt: skip

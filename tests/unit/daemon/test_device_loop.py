@@ -13,6 +13,7 @@ from vical_drivers.samples import DeviceInfo, SourceStats
 
 from vical_daemon.bus import LocalBus
 from vical_daemon.device_loop import DeviceLoop
+from vical_daemon.direct_outbox import DirectOutbox, StandIn
 from vical_daemon.health import STUCK_S, _judge, device_status
 from vical_daemon.messages import Level
 from vical_daemon.outbox import Outbox
@@ -167,6 +168,82 @@ def test_a_bus_that_raises_does_not_end_acquisition() -> None:
     outbox.put("vical/a", b"1")
     _wait_for(lambda: outbox.dropped == 2)
     outbox.close()
+
+
+class HeldUpBus(LocalBus):
+    """Takes everything at once, but for one message, which it holds up until the gate opens."""
+
+    def __init__(self, held: bytes) -> None:
+        super().__init__()
+        self.held, self.gate, self.got = held, threading.Event(), []
+
+    def publish(self, key: str, payload: bytes) -> None:
+        if payload == self.held:
+            self.gate.wait(10)
+        self.got.append((payload, threading.current_thread().name))
+
+
+def test_a_direct_outbox_publishes_in_order_and_drops_the_oldest() -> None:
+    bus = HeldUpBus(b"")
+    outbox = DirectOutbox(bus, 3)
+    for i in range(5):
+        outbox.put("vical/a", b"%d" % i)
+    assert (outbox.waiting, outbox.dropped, outbox.progress) == (3, 2, None)
+    outbox.flush()
+    assert [payload for payload, _ in bus.got] == [b"2", b"3", b"4"]
+    assert (outbox.waiting, outbox.published) == (0, 3)
+
+
+def test_a_direct_outbox_survives_a_bus_that_raises() -> None:
+    class Broken(LocalBus):
+        def publish(self, key: str, payload: bytes) -> None:
+            raise RuntimeError("no link")
+
+    outbox = DirectOutbox(Broken(), 3)
+    outbox.put("vical/a", b"0")
+    outbox.close()
+    assert (outbox.dropped, outbox.published, outbox.progress) == (1, 0, None)
+
+
+def test_while_the_bus_holds_the_reading_thread_up_another_one_reads_on(stop) -> None:
+    bus = HeldUpBus(b"3")
+    outbox = DirectOutbox(bus, 1000)
+    source = ScriptedSource([[i] for i in range(8)])
+    loop: DeviceLoop[int] = DeviceLoop(
+        "imu/imu0", lambda: source, lambda i: outbox.put("vical/a", b"%d" % i), stop,
+        flush=outbox.flush, read_timeout_s=0.02,
+    )  # fmt: skip
+    loop.start()
+    StandIn(outbox, loop.read_on, stop, "stand-in").start()
+    _wait_for(lambda: not source.script)  # all was read, though 3 is not out yet
+    assert [payload for payload, _ in bus.got] == [b"0", b"1", b"2"]
+    assert loop.health().data_age_s < 5.0
+    bus.gate.set()
+    _wait_for(lambda: len(bus.got) == 8)
+    source.script += [[8], [9]]
+    _wait_for(lambda: len(bus.got) == 10)
+    assert bus.got == [(b"%d" % i, "imu/imu0") for i in range(10)]
+    assert outbox.dropped == 0
+
+
+def test_a_loop_held_up_by_the_bus_still_ends_and_closes_its_device(stop) -> None:
+    bus = HeldUpBus(b"0")
+    outbox = DirectOutbox(bus, 1000)
+    source = ScriptedSource([[0], [1]])
+    loop: DeviceLoop[int] = DeviceLoop(
+        "imu/imu0", lambda: source, lambda i: outbox.put("vical/a", b"%d" % i), stop,
+        flush=outbox.flush, read_timeout_s=0.02,
+    )  # fmt: skip
+    loop.start()
+    StandIn(outbox, loop.read_on, stop, "stand-in").start()
+    _wait_for(lambda: not source.script)
+    stop.set()
+    assert not loop.join(0.05)
+    bus.gate.set()
+    assert loop.join(5.0) and source.closed
+    loop.read_on()  # a stand-in that comes too late finds nothing to read
+    outbox.close()
+    assert [payload for payload, _ in bus.got] == [b"0", b"1"]
 
 
 def _streaming():
