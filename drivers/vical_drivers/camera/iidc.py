@@ -16,17 +16,15 @@ from typing import Any
 import numpy as np
 
 from vical_drivers.camera import iidc_abi as abi
-from vical_drivers.camera.cycle_clock import CycleClock, image_cycle_time_ns
 from vical_drivers.camera.embedded import EmbeddedInfo, parse_embedded
 from vical_drivers.camera.firewire import BusClock, find_node
 from vical_drivers.camera.formats import Bytes, CorruptImageError, FrameDecoder, Image
 from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
+from vical_drivers.camera.iidc_dating import FrameDating
 from vical_drivers.camera.iidc_device import IidcDevice, frame_bytes, list_devices, pixel_format
 from vical_drivers.camera.iidc_modes import IidcMode, set_mode
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.stamps import Anchor, SequenceCounter
-from vical_drivers.camera.v4l2_stamp import SIGMA_NS, RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
@@ -37,10 +35,6 @@ list_iidc_cameras = list_devices
 
 MIN_SILENCE_S = 1.0
 SILENT_PERIODS = 5.0
-OLDEST_NS = 2_000_000_000
-"""No frame waits longer in the ring."""
-PACKET_STAMP_SIGMA_NS = 36_000
-"""The first packet is dated by its bus cycle of 125 us: a uniform error of 125 us / sqrt(12)."""
 
 
 class IidcCamera(Closing):
@@ -59,7 +53,6 @@ class IidcCamera(Closing):
         self._settings = settings or CameraSettings()
         self._guid = _parse_guid(name)
         self._frames = FrameMaker(self._settings)
-        self._clock = CycleClock()
         self._device: IidcDevice | None = None
         self._bus: BusClock | None = None
         self._closed = False
@@ -84,10 +77,8 @@ class IidcCamera(Closing):
             self._drop()
             raise
         self._decode: FrameDecoder | None = None
-        self._counter = SequenceCounter(32)
+        self._dating = FrameDating(self._settings.stamp, self._mode.rate_hz, self._frames.statistics)
         self._shutter_raw: int | None = None
-        self._sequence = 0
-        self._t_last_ns: int | None = None
         self._t_alive_ns = time.monotonic_ns()
 
     def _apply(self, device: IidcDevice) -> None:
@@ -124,7 +115,6 @@ class IidcCamera(Closing):
         except DriverError as error:
             wait_for_camera(timeout_s, ("firewire",))
             raise DeviceLostError(f"iidc:{self._guid:016x}: the camera is not back yet ({error})") from error
-        self._clock = CycleClock()
         self._frames.statistics.restart()
         _log.info("camera back guid=%016x", self._guid)
 
@@ -177,9 +167,9 @@ class IidcCamera(Closing):
     def stats(self) -> SourceStats:
         """Counters since the source was opened; `clock_skew_ppm` is the bus clock's."""
         return self._frames.statistics.snapshot(
-            clock_skew_ppm=self._clock.skew_ppm,
-            bus_clock_restarts=float(self._clock.restarts),
-            bus_clock_sigma_us=self._clock.sigma_ns * 1e-3,
+            clock_skew_ppm=self._dating.clock.skew_ppm,
+            bus_clock_restarts=float(self._dating.clock.restarts),
+            bus_clock_sigma_us=self._dating.clock.sigma_ns * 1e-3,
         )
 
     # -- frames ----------------------------------------------------------------------------------------
@@ -223,7 +213,7 @@ class IidcCamera(Closing):
         image_format = pixel_format(self._mode.coding, frame)
         depth_bits = frame.data_depth
         device.enqueue(held)
-        self._clock.add(*bus.read())
+        self._dating.clock.add(*bus.read())
         if self._decode is None or self._decode.pixel_format != image_format:
             self._decode = self._make_decoder(device, image_format)
         info = parse_embedded(data[:64].tobytes(), self._frame_info)
@@ -252,27 +242,14 @@ class IidcCamera(Closing):
         t_packet_ns: int,
         t_arrival_ns: int,
     ) -> Frame | None:
-        raw = self._raw_stamp(info, t_packet_ns, t_arrival_ns)
+        raw = self._dating.raw_stamp(info, t_packet_ns, t_arrival_ns)
         self._update_exposure(device, info)
-        self._frames.lost(self._missing(info, raw.t_raw_ns))
+        self._frames.lost(self._dating.missing(info, raw.t_raw_ns))
         image = self._image(data, depth_bits)
         if image is None:
             self._frames.lost()
             return None
-        return self._frames.frame(image, raw, sequence=self._sequence, t_arrival_ns=t_arrival_ns)
-
-    def _raw_stamp(self, info: EmbeddedInfo, t_packet_ns: int, t_arrival_ns: int) -> RawStamp:
-        forced = self._settings.stamp
-        anchor = None if forced in ("auto", "raw") else Anchor(forced)
-        if info.cycle_time is not None:
-            t_ns = self._clock.to_host_ns(image_cycle_time_ns(info.cycle_time))
-            if not 0 <= t_arrival_ns - t_ns < OLDEST_NS:
-                # exposed before a bus reset gave the bus another time, and read after it
-                self._frames.statistics.count("implausible_stamps")
-                return RawStamp(t_arrival_ns, Anchor.ARRIVAL, None, SIGMA_NS[Anchor.ARRIVAL])
-            sigma_ns = round(self._clock.sigma_ns) + 200  # and the masked bits
-            return RawStamp(t_ns, anchor or Anchor.SHUTTER_CLOSED, "embedded-cycle-timer", sigma_ns)
-        return RawStamp(t_packet_ns, anchor or Anchor.FIRST_PACKET, None, PACKET_STAMP_SIGMA_NS)
+        return self._frames.frame(image, raw, sequence=self._dating.sequence, t_arrival_ns=t_arrival_ns)
 
     def _update_exposure(self, device: IidcDevice, info: EmbeddedInfo) -> None:
         """Read the shutter in seconds again whenever the image says that its raw value changed."""
@@ -281,18 +258,6 @@ class IidcCamera(Closing):
         self._shutter_raw = info.shutter
         exposure_ns = self._read_exposure(device)
         self._frames.stamper.set_exposure(exposure_ns, 0)
-
-    def _missing(self, info: EmbeddedInfo, t_raw_ns: int) -> int:
-        if info.frame_counter is not None:
-            missing = self._counter.missing_before(info.frame_counter)
-        elif self._t_last_ns is None or self._mode.rate_hz <= 0:
-            missing = 0
-        else:
-            periods = (t_raw_ns - self._t_last_ns) * 1e-9 * self._mode.rate_hz
-            missing = max(0, round(periods) - 1)
-        self._t_last_ns = t_raw_ns
-        self._sequence += missing + 1
-        return missing
 
     def _image(self, data: Bytes, depth_bits: int) -> Image | None:
         assert self._decode is not None
