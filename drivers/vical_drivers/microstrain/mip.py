@@ -15,6 +15,8 @@ import struct
 from itertools import accumulate
 from typing import NamedTuple
 
+import msgspec
+
 SYNC = b"\x75\x65"
 SET_BASE, SET_3DM, SET_SYSTEM = 0x01, 0x0C, 0x7F
 """Command sets; replies come in the same set."""
@@ -35,30 +37,30 @@ NACK_REASONS = {
 
 
 class Field(NamedTuple):
-    """One field: descriptor and raw data."""
+    """One field: descriptor and raw data; the decoder returns it as a plain tuple."""
 
     descriptor: int
     data: bytes
 
 
-class Packet(NamedTuple):
+class Packet(msgspec.Struct, frozen=True, gc=False):
     """One packet whose checksum and field lengths were right.
 
     Attributes:
         descriptor_set: What kind of packet; 0x80 is inertial data.
-        fields: Its fields in order.
+        fields: Its fields in order, each (descriptor, data).
         end: Number of stream bytes up to and including its last one; dates the packet.
     """
 
     descriptor_set: int
-    fields: tuple[Field, ...]
+    fields: tuple[tuple[int, bytes], ...]
     end: int = 0
 
     def field(self, descriptor: int) -> bytes | None:
         """Data of the first field with this descriptor, None where there is none."""
-        for field in self.fields:
-            if field.descriptor == descriptor:
-                return field.data
+        for found, data in self.fields:
+            if found == descriptor:
+                return data
         return None
 
 
@@ -136,45 +138,34 @@ class Decoder:
 
     def _parse(self, buffer: bytes, *, waiting: bool) -> list[Packet]:
         out: list[Packet] = []
-        position, base = 0, self._consumed
+        position, size, base = 0, len(buffer), self._consumed
         kept: int | None = None
         while True:
             start = buffer.find(SYNC, position)
             if start != position:
-                if position == len(buffer):
+                if position == size:
                     break
                 if start < 0:
-                    position = len(buffer) - buffer.endswith(b"\x75")
+                    position = size - buffer.endswith(b"\x75")
                     self._in_step = self._in_step and not position
                     break
                 self._in_step = False
-            end = _end_of(buffer, start)
-            if end is None:
-                if waiting:
-                    position = start
-                    break
-                kept = start if kept is None else kept
-            elif (fields := self._fields(buffer, start, end)) is not None:
+            end = start + 6 + buffer[start + 3] if start + 4 <= size else size + 1
+            if end <= size and (fields := _fields(buffer, start, end)) is not None:
                 out.append(Packet(buffer[start + 2], fields, base + end))
                 self._packet_bytes += end - start
                 position, kept, self._in_step = end, None, True
                 continue
+            if end > size and _may_go_on(buffer, start):
+                if waiting:
+                    position = start
+                    break
+                kept = start if kept is None else kept
+            else:
+                self.checksum_errors += self._in_step
             self._in_step = False
             position = start + 1
         return self._keep(buffer, position if kept is None else kept, out)
-
-    def _fields(self, buffer: bytes, start: int, end: int) -> tuple[Field, ...] | None:
-        """Fields of the candidate packet; None where it is none (end 0: lengths already contradict)."""
-        if not end or fletcher(buffer[start : end - 2]) != buffer[end - 2] << 8 | buffer[end - 1]:
-            self.checksum_errors += self._in_step
-            return None
-        fields = []
-        at = start + 4
-        while at < end - 2:
-            length = buffer[at]
-            fields.append(Field(buffer[at + 1], buffer[at + 2 : at + length]))
-            at += length
-        return tuple(fields)
 
     def _keep(self, buffer: bytes, position: int, out: list[Packet]) -> list[Packet]:
         self._tail = buffer[position:]
@@ -184,16 +175,32 @@ class Decoder:
         return out
 
 
-def _end_of(buffer: bytes, start: int) -> int | None:
-    """Where the candidate packet ends; None: more bytes are needed; 0: its field lengths contradict."""
+def _fields(buffer: bytes, start: int, end: int) -> tuple[tuple[int, bytes], ...] | None:
+    """Fields of the candidate packet; None where its checksum or its lengths say that it is none."""
+    payload_end = end - 2
+    if fletcher(buffer[start:payload_end]) != buffer[payload_end] << 8 | buffer[payload_end + 1]:
+        return None
+    fields = []
+    at = start + 4
+    while at < payload_end:
+        length = buffer[at]
+        if length < 2 or at + length > payload_end:
+            return None
+        fields.append((buffer[at + 1], buffer[at + 2 : at + length]))
+        at += length
+    return tuple(fields)
+
+
+def _may_go_on(buffer: bytes, start: int) -> bool:
+    """Tell whether an incomplete candidate may be a packet: the fields that are there fit its length."""
     size = len(buffer)
     if size < start + 4:
-        return None
+        return True
     payload_end = start + 4 + buffer[start + 3]
     at = start + 4
     while at < payload_end and at < size:
         length = buffer[at]
         if length < 2 or at + length > payload_end:
-            return 0
+            return False
         at += length
-    return payload_end + 2 if size >= payload_end + 2 else None
+    return True

@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 
 from vical_drivers.microstrain import single_byte as sb
-from vical_drivers.microstrain.mip import ACK, NACK_REASONS, SET_3DM, SET_BASE, SET_SENSOR, Field, Packet
+from vical_drivers.microstrain.mip import ACK, NACK_REASONS, SET_3DM, SET_BASE, SET_SENSOR, Packet
 
 STANDARD_GRAVITY_MPS2 = sb.STANDARD_GRAVITY_MPS2
 GAUSS = 1e-4
@@ -98,7 +98,7 @@ def describe(packet: Packet) -> dict[str, object]:
     return out
 
 
-def _describe_field(descriptor_set: int, field: Field) -> dict[str, object]:
+def _describe_field(descriptor_set: int, field: tuple[int, bytes]) -> dict[str, object]:
     descriptor, data = field
     if descriptor_set < SET_SENSOR:
         if descriptor == ACK and len(data) == 2:
