@@ -33,7 +33,7 @@ from vical_drivers.errors import (
 _log = logging.getLogger(__name__)
 BITS_PER_BYTE = 10
 """Start, eight data, stop."""
-_CHUNK = 65_536
+_CHUNK = 4096  # more than a terminal holds; larger ones cost the allocator more than the read
 _WRITE_TIMEOUT_S = 1.0
 _CHUNKS_KEPT = 512  # a record waits for its end for 261 bytes at most
 
