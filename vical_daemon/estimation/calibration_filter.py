@@ -31,6 +31,7 @@ from vical_daemon.estimation.linearise import (
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.retract import orthonormal, retract
+from vical_daemon.estimation.stamp_jitter import StampJitter
 from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State
 from vical_daemon.estimation.target_view import Rates
 
@@ -51,6 +52,7 @@ class CalibrationFilter:
             slow change of the mounting), shape (n,).
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
+        jitter: Measured random error of the stamps, by camera.
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
@@ -63,6 +65,7 @@ class CalibrationFilter:
     walk: FloatArray
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
+    jitter: dict[str, StampJitter] = field(default_factory=dict)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
     _motion_straight: Straightness = field(default_factory=Straightness)
@@ -129,6 +132,8 @@ class CalibrationFilter:
         """Correct the state with the points of one image; the verdict says what became of it."""
         noise = self.corner_noise[image.camera]
         lin = self._linearise(image)
+        H = unscented.solve_lower(self.S, lin.linear.T, transposed=True).T
+        image = self._shared_noise(image, H)
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
         keep = lin.valid & corner_gate(image, innovation, lin)
@@ -145,15 +150,14 @@ class CalibrationFilter:
                 f"innovation of the image is {level:.1f} times what it should be",
             )
         self.nis_level += 0.05 * (level - self.nis_level)
-        self._compare_lens(image, lin, fit.keep)
+        self._measure(image, lin, H, fit.keep)
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None]
         rows = np.repeat(keep, 2)
-        self.consistency[image.camera].learn(
-            lin.z[keep], innovation[keep], lin.linear[rows], image.sigma_px[keep]
-        )
+        expected = np.concatenate([lin.linear, image.common_px], axis=1)[rows]
+        self.consistency[image.camera].learn(lin.z[keep], innovation[keep], expected, image.sigma_px[keep])
         return FrameReport(
             image.t_ns,
             image.camera,
@@ -168,30 +172,34 @@ class CalibrationFilter:
             predicted_px=predicted,
         )
 
-    def _compare_lens(self, image: Image, lin: Linear, keep: BoolArray) -> None:
-        """Let the image say what it would have the lens be."""
-        where, agreement = self.layout.cameras[image.camera], self.agreement.get(image.camera)
-        if agreement is None or where.intrinsics is None or where.distortion is None:
-            return
-        rows = np.repeat(keep, 2)
-        whitened = lin.linear[rows] / np.repeat(image.sigma_px[keep], 2)[:, None]
-        H = unscented.solve_lower(self.S, whitened.T, transposed=True).T
-        innovation = (image.uv - lin.z)[keep] / image.sigma_px[keep][:, None]
-        lens = slice(where.intrinsics.start, where.distortion.stop)
-        camera = self.state.cameras[image.camera]
-        agreement.learn(
-            self.state.t_s,
-            innovation.ravel(),
-            H[:, :6],
-            H[:, lens],
-            np.concatenate([camera.intrinsics, camera.distortion]),
-        )
+    def _shared_noise(self, image: Image, H: FloatArray) -> Image:
+        """The image with the noise that its corners share: the jitter of its stamp."""
+        index, jitter = self.layout.cameras[image.camera].timeshift, self.jitter.get(image.camera)
+        if index is None or jitter is None or not jitter.sigma_s:
+            return image
+        return replace(image, common_px=H[:, index, None] * jitter.sigma_s)
+
+    def _measure(self, image: Image, lin: Linear, H: FloatArray, keep: BoolArray) -> None:
+        """What an image says about stamps and lens before it is used."""
+        where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
+        rows, sigma = np.repeat(keep, 2), image.sigma_px[keep]
+        innovation = ((image.uv - lin.z)[keep] / sigma[:, None]).ravel()
+        weight = 1.0 / np.repeat(sigma, 2)[:, None]
+        whitened = H[rows] * weight
+        jitter, agreement = self.jitter.get(image.camera), self.agreement.get(image.camera)
+        if jitter is not None and where.timeshift is not None:
+            jitter.learn(innovation, whitened[:, where.timeshift], lin.linear[rows] * weight)
+        if agreement is not None and where.intrinsics is not None and where.distortion is not None:
+            lens = slice(where.intrinsics.start, where.distortion.stop)
+            values = np.concatenate([camera.intrinsics, camera.distortion])
+            agreement.learn(self.state.t_s, innovation, whitened[:, :6], whitened[:, lens], values)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""
         sigma = self.corner_noise[frame.camera].sigmas(frame.sigma_px, len(frame.ids))
         sigma = sigma * np.sqrt(self.consistency[frame.camera].scale)
-        return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma)
+        alone = np.zeros((2 * len(frame.ids), 0))
+        return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma, alone)
 
     @staticmethod
     def _refused(image: Image, residual: FloatArray, predicted: FloatArray, why: str) -> FrameReport:
@@ -207,7 +215,9 @@ class CalibrationFilter:
         if keep.sum() < len(keep) // 2:
             return 36.0
         rows = np.repeat(keep, 2)
-        normal = normalised(lin.z[keep], (image.uv - lin.z)[keep], lin.linear[rows], image.sigma_px[keep])
+        H = unscented.solve_lower(self.S, lin.linear.T, transposed=True).T
+        expected = np.concatenate([lin.linear, self._shared_noise(image, H).common_px], axis=1)[rows]
+        normal = normalised(lin.z[keep], (image.uv - lin.z)[keep], expected, image.sigma_px[keep])
         return None if normal is None else float(normal @ normal) / len(normal)
 
     def predict_pixels(self, camera: str, t_cam_s: float, points: FloatArray) -> FloatArray:
@@ -284,6 +294,7 @@ class CalibrationFilter:
             _motion_straight=Straightness(),
             _view_straight={},
             agreement={},
+            jitter=dict(self.jitter),
         )
 
     def sigmas(self) -> FloatArray:

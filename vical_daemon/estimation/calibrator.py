@@ -31,6 +31,7 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.stamp_jitter import StampJitter
 from vical_daemon.estimation.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -47,6 +48,7 @@ _ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must co
 _MAX_GAP_S = 0.5
 _KEEP_S = 5.0
 _LATE_S = 2e-3  # an image this little before the state is used by moving the pose back
+_TOLD_JITTER_S = 3e-4  # worth a word to the user
 _SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
 _REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
 _SKEW_OPEN = 1e-4  # s/s: two bad crystals
@@ -84,6 +86,7 @@ class Calibrator:
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
+        self._jitter_told: set[str] = set()
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -216,6 +219,7 @@ class Calibrator:
         fresh.S = np.diag(sigmas)
         for name, noise in trial.corner_noise.items():
             fresh.corner_noise[name].sigma_px = noise.sigma_px
+            fresh.jitter[name] = trial.jitter[name]
             fresh.consistency[name] = trial.consistency[name]
             fresh.consistency[name].settle()
         return fresh
@@ -226,8 +230,9 @@ class Calibrator:
         walk = np.zeros(self.layout.size)
         root = np.diag(self._start_sigmas(state))
         agreement = {name: LensAgreement() for name in self.priors}
+        jitter = {name: StampJitter() for name in self.priors}
         return CalibrationFilter(
-            state, self.layout, root, self.options.imu_noise, noise, walk, consistency, agreement
+            state, self.layout, root, self.options.imu_noise, noise, walk, consistency, agreement, jitter
         )
 
     def _start_sigmas(self, state: State) -> FloatArray:
@@ -300,8 +305,18 @@ class Calibrator:
             self._restart(f)
             return report
         self.judge.saw_frame(report, f)
+        self._tell_jitter(frame.camera, f)
         self._act(self.watch.look(report, f), frame, t_cam_s)
         return report
+
+    def _tell_jitter(self, camera: str, f: CalibrationFilter) -> None:
+        """Say once that stamps jitter: what to do about it is often a setting of the camera's driver."""
+        sigma_s = f.jitter[camera].sigma_s
+        if sigma_s > _TOLD_JITTER_S and camera not in self._jitter_told:
+            self._jitter_told.add(camera)
+            self.judge.announce(
+                f"{camera}: the stamps of the images jitter by {1e3 * sigma_s:.1f} ms; allowed for"
+            )
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
         """How well an image was predicted that the held-back copy of the filter has not used."""

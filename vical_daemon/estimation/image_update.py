@@ -55,7 +55,7 @@ class ImageFit:
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-    var = (lin.linear**2).sum(axis=1)
+    var = (lin.linear**2).sum(axis=1) + (image.common_px**2).sum(axis=1)
     if lin.curved.size:
         var += (lin.curved**2).sum(axis=1)
     var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]
@@ -95,7 +95,7 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
             H = unscented.solve_lower(S, lin.linear.T, transposed=True).T
             M, offset = H @ prior, H @ dx
         r = ((image.uv - lin.z).ravel() + offset) * weight
-        fit = _correct(prior, M * weight[:, None], r, lin, weight, keep)
+        fit = _correct(image, prior, M * weight[:, None], r, lin, weight, keep)
         if curved_share(image, lin, fit.keep) < _CURVED:
             break
         step_size = unscented.solve_lower(fit.S, fit.dx - dx)
@@ -106,15 +106,22 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
 
 
 def _correct(
-    prior: FloatArray, M: FloatArray, r: FloatArray, lin: Linear, weight: FloatArray, keep: BoolArray
+    image: Image,
+    prior: FloatArray,
+    M: FloatArray,
+    r: FloatArray,
+    lin: Linear,
+    weight: FloatArray,
+    keep: BoolArray,
 ) -> ImageFit:
     """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
     n = prior.shape[0]
-    full = M
+    columns = [M, image.common_px * weight[:, None]]
     if lin.curved.size:
         curved = lin.curved * weight[:, None]
         if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
-            full = np.concatenate([M, curved], axis=1)
+            columns.append(curved)
+    full = np.concatenate(columns, axis=1)
     for _ in range(3):
         rows = np.repeat(keep, 2)
         small, r_small, rest, dof_rest = unscented.compress(full[rows], r[rows])

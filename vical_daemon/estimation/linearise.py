@@ -36,6 +36,8 @@ class Image:
         points: Their places in the world, m, shape (n, 3).
         uv: Measured pixels, shape (n, 2).
         sigma_px: White noise of each corner per axis, px, shape (n,).
+        common_px: Square root of the noise that all corners share (a late stamp moves them all), px,
+            shape (2n, k).
     """
 
     camera: str
@@ -45,6 +47,7 @@ class Image:
     points: FloatArray
     uv: FloatArray
     sigma_px: FloatArray
+    common_px: FloatArray
 
 
 @dataclass(slots=True)

@@ -48,7 +48,16 @@ def scene(model: str, estimate=frozenset({"target_scale"})):
     points = BOARD.reshape(-1, 3)
     uv = np.zeros((len(points), 2))
     # the state does not stand at the image's instant: what a late image and a moving shift look like
-    image = Image("cam0", 0, 0.999, np.arange(len(points)), points, uv, np.full(len(points), 0.3))
+    image = Image(
+        "cam0",
+        0,
+        0.999,
+        np.arange(len(points)),
+        points,
+        uv,
+        np.full(len(points), 0.3),
+        np.zeros((2 * len(points), 0)),
+    )
     return state, layout, rates, image
 
 

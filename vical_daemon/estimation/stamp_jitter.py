@@ -1,0 +1,71 @@
+"""Random errors of a camera's stamps, measured: each moves all corners of an image along their motion.
+
+A stamp that is late by e shifts every corner by e times its speed in the image. From one image e is known as
+well as corners and predicted pose are; how much it varies beyond that, over many images, is the jitter. It is
+0 until it is significant, so that good stamps pay nothing. [docs/math/filter.md, eq. (12)]
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray
+
+_MEMORY = 400  # images
+_LEAST = 20
+_EVERY = 5  # images between two looks at all that is remembered
+_SIGNIFICANT = 5.0  # standard deviations above what stamps without jitter would give
+_CLIP = 36.0  # squared standard deviations: outliers are not jitter
+_FLOOR_S = 2e-5
+_ROUNDS = 8
+
+
+@dataclass(slots=True)
+class StampJitter:
+    """Running estimate of one camera.
+
+    Attributes:
+        sigma_s: Standard deviation of a stamp, s; 0 while it cannot be told from none.
+        images: Images taken in.
+    """
+
+    sigma_s: float = 0.0
+    images: int = 0
+    _pairs: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MEMORY))
+
+    def learn(self, innovation: FloatArray, by_shift: FloatArray, linear: FloatArray) -> None:
+        """Take in one image before it is used.
+
+        Args:
+            innovation: Measured minus predicted, over the corner noise, shape (2n,).
+            by_shift: Derivative of the whitened pixels by the time shift, 1/s, shape (2n,).
+            linear: H S of the whitened pixels (state uncertainty), shape (2n, c).
+        """
+        size = float(by_shift @ by_shift)
+        if not size > 0.0:
+            return
+        self.images += 1
+        part = by_shift @ linear / size
+        error = float(by_shift @ innovation) / size
+        self._pairs.append((error * error, 1.0 / size + float(part @ part)))
+        if len(self._pairs) >= _LEAST and self.images % _EVERY == 0:
+            square, usual = np.array(self._pairs).T
+            self.sigma_s = _excess(square, usual)
+
+
+def _excess(square: FloatArray, usual: FloatArray) -> float:
+    """Standard deviation, s, that squared errors show beyond their usual variances; 0 if by chance."""
+    ratio = np.minimum(square / usual, _CLIP)
+    if ratio.mean() < 1.0 + _SIGNIFICANT * np.sqrt(2.0 / len(ratio)):
+        return 0.0
+    # maximum likelihood by scoring; 0.455 is the median of a chi-square variable
+    variance = max(float(np.median(square)) / 0.455 - float(np.median(usual)), 0.0)
+    for _ in range(_ROUNDS):
+        expected = usual + variance
+        weight = expected**-2
+        excess = np.minimum(square, _CLIP * expected) - usual
+        variance = max(float(weight @ excess / weight.sum()), 0.0)
+    return float(np.sqrt(variance)) if variance > _FLOOR_S**2 else 0.0
