@@ -34,6 +34,7 @@ _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
 _BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
+_TURN_AND_MOVE = "turn the rig about all three axes while moving it to and fro"
 _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
 
 
@@ -289,11 +290,8 @@ class FreeJudge:
             return Status.WAITING, "no features have been followed yet: is the picture dark or blurred?", ""
         seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
         if self._motion_missing and seen_for > _PATIENCE_S:
-            return (
-                Status.DEGENERATE,
-                self._reason,
-                "turn the rig about all three axes while moving it to and fro",
-            )
+            advice = shortcoming(self._motion, None) or _TURN_AND_MOVE
+            return Status.DEGENERATE, self._reason, advice
         return Status.INITIALISING, self._reason or "collecting the first seconds", ""
 
     def _progress(self, known: bool, missing: list[Missing]) -> float:

@@ -233,7 +233,8 @@ class Judge:
             return Status.WAITING, "the target has not been seen yet: show the whole board to the camera", ""
         seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
         if self._motion_missing and seen_for > _PATIENCE_S:
-            return Status.DEGENERATE, self._start_reason, "turn the rig about all three axes while moving it"
+            advice = shortcoming(self._motion, None) or "turn the rig about all three axes while moving it"
+            return Status.DEGENERATE, self._start_reason, advice
         return Status.INITIALISING, self._start_reason or "collecting the first seconds", ""
 
     def _unit_trouble(self) -> str:

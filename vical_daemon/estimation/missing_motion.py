@@ -160,19 +160,22 @@ def guidance(
     return sorted(found, key=lambda m: -m.excess)
 
 
-def shortcoming(motion: RunningMotion, R_imu_cam: FloatArray, bias_rps: FloatArray | None = None) -> str:
+def shortcoming(
+    motion: RunningMotion, R_imu_cam: FloatArray | None, bias_rps: FloatArray | None = None
+) -> str:
     """What is wrong with the motion as a whole, and what to do; empty where it is rich enough.
 
     Args:
         motion: How the rig turned of late.
-        R_imu_cam: Present mounting, for naming axes, shape (3, 3).
+        R_imu_cam: Present mounting, for naming axes, shape (3, 3); None: not known yet.
         bias_rps: The gyro's bias, shape (3,).
     """
-    turning = _Turning.of(motion.scatter(bias_rps), R_imu_cam)
+    turning = _Turning.of(motion.scatter(bias_rps), np.eye(3) if R_imu_cam is None else R_imu_cam)
     if turning.rms_rps < _SLOW_RPS:
         return turning._general()
     if turning.one_axis:
-        return f"so far it turned about {axis_words(turning.axis_cam)} only; rotate about another axis too"
+        about = "one axis" if R_imu_cam is None else axis_words(turning.axis_cam)
+        return f"so far it turned about {about} only; rotate about another axis too"
     steady = motion.rate_change_rps2
     if steady is not None and steady < 0.3 * turning.rms_rps:
         return _STEADY

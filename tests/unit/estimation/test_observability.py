@@ -298,4 +298,7 @@ def test_a_poor_motion_is_told_as_a_whole(rate, said):
         motion.add(0.01 * k, rate(0.01 * k))
     words = shortcoming(motion, np.eye(3))
     assert said in words
+    unnamed = shortcoming(motion, None)  # before the mounting is known no axis of the image can be named
+    assert bool(unnamed) == bool(words)
+    assert "image" not in unnamed
     assert bool(words) == bool(said)
