@@ -26,7 +26,7 @@ import numpy as np
 from vical_daemon import messages as m
 from vical_daemon import topics
 
-IMU, IMAGE = topics.imu_key("rig0", "imu0"), topics.image_key("rig0", "cam0")
+IMU, IMAGE = topics.IMU.key("rig0", "imu0"), topics.IMAGE.key("rig0", "cam0")
 JUNK = 1_000_000
 _CONTEXT = mp.get_context("spawn")
 

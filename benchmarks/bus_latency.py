@@ -31,9 +31,9 @@ def main(argv: list[str]) -> int:
     pixels = np.zeros((480, 752), np.uint8)
     large = np.zeros((1024, 1280), np.uint8)
     kinds: list[tuple[str, str, float, Any]] = [
-        ("Imu, 324 B, 1000 Hz", topics.imu_key("rig0", "imu0"), 1000.0, _imu),
-        ("Image 752 x 480, 30 Hz", topics.image_key("rig0", "cam0"), 30.0, lambda t: _image(t, pixels)),
-        ("Image 1280 x 1024, 30 Hz", topics.image_key("rig0", "cam0"), 30.0, lambda t: _image(t, large)),
+        ("Imu, 324 B, 1000 Hz", topics.IMU.key("rig0", "imu0"), 1000.0, _imu),
+        ("Image 752 x 480, 30 Hz", topics.IMAGE.key("rig0", "cam0"), 30.0, lambda t: _image(t, pixels)),
+        ("Image 1280 x 1024, 30 Hz", topics.IMAGE.key("rig0", "cam0"), 30.0, lambda t: _image(t, large)),
     ]
     for name, key, rate_hz, build in kinds:
         print(row(name, key, rate_hz, build, args.seconds), flush=True)

@@ -25,7 +25,7 @@ from vical_daemon.record_queue import RecordQueue, arrival
 from vical_daemon.recorder import Recorder
 from vical_daemon.wall_clock import WallClock, private_clock
 
-_IMU = topics.imu_key("rig0", "imu0")
+_IMU = topics.IMU.key("rig0", "imu0")
 
 
 def main(argv: list[str]) -> int:

@@ -68,9 +68,9 @@ def cases(folder: Path) -> dict[str, list[Case]]:
     path = folder / "a.mcap"
     with LogWriter(path, {"vical": {"version": "1"}}) as writer:
         for i in range(60):
-            writer.write(topics.imu_key("rig0", "imu0"), m.encode_imu(i, "imu0", (0, 0, 0), (0, 0, 9.8)), i)
+            writer.write(topics.IMU.key("rig0", "imu0"), m.encode_imu(i, "imu0", (0, 0, 0), (0, 0, 9.8)), i)
             points = m.encode_points(i, "c", np.arange(9), np.ones((9, 2)))
-            writer.write(topics.points_key("rig0", "cam0"), points, i)
+            writer.write(topics.POINTS.key("rig0", "cam0"), points, i)
             if i % 20 == 0:
                 writer.flush()
         writer.attach("config.yaml", "text/yaml", b"rig: rig0", 1)

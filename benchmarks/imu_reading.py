@@ -7,6 +7,7 @@ import gc
 import json
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from vical_drivers.microstrain.device import MicrostrainImu, open_imu
@@ -43,17 +44,22 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling, as the service has it")
     parser.add_argument("--protocol", choices=("single-byte", "mip"), default="single-byte")
     parser.add_argument("--no-bus", action="store_true", help="the bus in memory: the driver's part alone")
+    parser.add_argument("--floor", action="store_true", help="beside each case: only read and publish")
+    parser.add_argument("--freeze", action="store_true", help="stop the subscriber (SIGSTOP) after 8 s")
+    parser.add_argument("--only-floor", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--acquire", default="", help=argparse.SUPPRESS)  # the process under test: a port
     parser.add_argument("--subscribe", default="", help=argparse.SUPPRESS)  # the recorder's place: a socket
     parser.add_argument("--socket", default="", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.acquire:
-        return _acquire(args.acquire, args.rate, args.seconds, args.socket, fifo=args.fifo)
+        return _acquire(args)
     if args.subscribe:
         return _subscribe(args.subscribe)
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     for busy in (0, os.cpu_count() or 2):
         print(_case(busy, args), flush=True)
+        if args.floor:
+            print(_case(busy, argparse.Namespace(**vars(args) | {"only_floor": True})), flush=True)
     return 0
 
 
@@ -82,7 +88,7 @@ def _case(busy: int, args: argparse.Namespace) -> str:
             emulator.wait()
             emulator.stdout.close()
     cells = [
-        f"{busy} busy processes" if busy else "idle",
+        (f"{busy} busy processes" if busy else "idle") + ", floor" * args.only_floor,
         *(f"{r[k]}" for k in ("samples", "lost", "missed", "bunch")),
         *_spread(r["to_bus_us"]), *_spread(r["to_subscriber_us"])[:2], f"{100 * r['cpu']:.1f}",
         *_spread(r["wake_up_us"]),
@@ -97,6 +103,7 @@ def _measure(port: str, socket: str, args: argparse.Namespace) -> dict[str, Any]
         [
             *me, "--acquire", port, "--rate", str(args.rate), "--seconds", str(args.seconds),
             "--socket", socket, *(["--fifo"] if args.fifo else []),
+            *(["--only-floor"] if args.only_floor else []),
         ],
         stdout=subprocess.PIPE,
         text=True,
@@ -104,9 +111,16 @@ def _measure(port: str, socket: str, args: argparse.Namespace) -> dict[str, Any]
     received: dict[int, int] = {}
     if socket:
         command = [*_realtime(40, args.fifo), *me, "--subscribe", socket]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        received = dict(json.loads(done.stdout.splitlines()[-1]))
+        subscriber = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        if args.freeze:
+            time.sleep(8.0)
+            subscriber.send_signal(signal.SIGSTOP)
+        else:
+            received = dict(json.loads(subscriber.communicate()[0].splitlines()[-1]))
     answer, _ = acquire.communicate()
+    if args.freeze:
+        subscriber.kill()
+        subscriber.communicate()
     r: dict[str, Any] = json.loads(answer.splitlines()[-1])
     # The first second is held back on purpose, until the clock is known; then the subscriber arrives.
     skip = max(int(1.5 * args.rate), min(received, default=0))
@@ -116,7 +130,7 @@ def _measure(port: str, socket: str, args: argparse.Namespace) -> dict[str, Any]
     return r | {
         "samples": count - skip,
         "lost": r["lost"] + len(arrivals) - len(published),
-        "missed": count - skip - len(numbers) if socket else "-",
+        "missed": count - skip - len(numbers) if received else "-",
         # Bunches are the device's and the machine's: they wait for one another on their way to the bus.
         "bunch": int(np.unique(arrivals[skip:count], return_counts=True)[1].max()),
         "to_bus_us": (published[skip:count] - arrivals[skip:count]) * 1e-3,
@@ -165,11 +179,23 @@ class _NotedBus:
             self.published.append(time.monotonic_ns())
 
 
-def _acquire(port: str, rate_hz: float, seconds: float, socket: str, *, fifo: bool) -> int:
-    """The process `acquire` as the service runs it: bus router, device thread, queue, encoder."""
+def _read_and_publish(source: _Noted, bus: _NotedBus, stop: threading.Event) -> None:
+    """The floor: for each sample one read and one publication of 324 bytes, and nothing in between."""
+    port, payload = cast("Any", source)._session._port, bytes(324)
+    while not stop.is_set():
+        data, t_read_ns = port.read(0.2)
+        for _ in range(len(data) // 31):
+            source.arrivals.append(t_read_ns)
+            bus.publish(KEY, payload)
+    source.close()
+
+
+def _acquire(args: argparse.Namespace) -> int:
+    """The process `acquire` as the service runs it: bus router, device thread, encoder."""
     from vical_daemon.zenoh_bus import open_bus
 
-    if fifo:
+    port, rate_hz, seconds, socket = args.acquire, args.rate, args.seconds, args.socket
+    if args.fifo:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
     rig = config_module.loads(f"rig: bench\nimus:\n  imu0:\n    port: {port}\n    rate_hz: {rate_hz:g}\n")
     sources: list[_Noted] = []
@@ -188,6 +214,8 @@ def _acquire(port: str, rate_hz: float, seconds: float, socket: str, *, fifo: bo
         target=imu_role.run, args=(rig, bus, stop),
         kwargs={"clock": WallClock(0), "open_source": open_source},
     )  # fmt: skip
+    if args.only_floor:
+        role = threading.Thread(target=_read_and_publish, args=(open_source(rig.imus["imu0"]), bus, stop))
     gc.collect()
     gc.freeze()  # as `vical run` does
     role.start()

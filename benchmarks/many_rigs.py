@@ -103,15 +103,15 @@ def run_rigs(socket: str, names: list[str], seconds: float, sent: Any, slot: int
             continue
         for name, bus in buses.items():
             payload = m.encode_imu(time.monotonic_ns(), "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
-            bus.publish(topics.imu_key(name, "imu0"), payload)
+            bus.publish(topics.IMU.key(name, "imu0"), payload)
             sent[slot] += 1
             if step % 20 == 0:
-                bus.publish(topics.calibration_key(name, "cam0"), calibration)
+                bus.publish(topics.CALIBRATION.key(name, "cam0"), calibration)
                 sent[slot] += 1
             if step % 100 == 0:
                 for role in ("imu", "camera", "estimate"):
                     status = m.encode_diagnostics(1, role, [m.DiagnosticStatus(m.Level.OK, role)])
-                    bus.publish(topics.status_key(name, role), status)
+                    bus.publish(topics.STATUS.key(name, role), status)
                     sent[slot] += 1
         step += 1
     time.sleep(0.5)

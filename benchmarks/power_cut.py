@@ -97,7 +97,7 @@ def write_for_ever(folder: Path, shared: mmap.mmap) -> None:
         logs, "rig0", time.time_ns(), rotate_s=2.0, rotate_bytes=10**9, metadata=dict, attachments=list
     )
     store = CalibrationStore(folder / "store")
-    imu, points = topics.imu_key("rig0", "imu0"), topics.points_key("rig0", "cam0")
+    imu, points = topics.IMU.key("rig0", "imu0"), topics.POINTS.key("rig0", "cam0")
     begin_s, number, saved = time.monotonic(), 0, -1
     while True:
         due = int((time.monotonic() - begin_s) * _RATE_HZ)

@@ -50,7 +50,7 @@ def _feed(rig: LiveRig, bus: ZenohBus, runtime: Path) -> None:
     truth, clock = rig.rig, shared_clock(runtime)
     points = board_points()
     rng = np.random.default_rng(5)
-    key, status_key = topics.points_key("rig0", "cam0"), topics.status_key("rig0", "camera")
+    key, status_key = topics.POINTS.key("rig0", "cam0"), topics.STATUS.key("rig0", "camera")
     number = int((time.monotonic() - rig.t_start_s) * RATE_HZ) + 1
     lonely_s = 0.0
     while lonely_s < 3.0:

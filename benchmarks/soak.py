@@ -25,7 +25,7 @@ from vical_daemon import topics
 from vical_daemon.mcap_log import LogReader
 
 _CONTEXT = mp.get_context("spawn")
-_IMU, _IMAGE = topics.imu_key("rig0", "imu0"), topics.image_key("rig0", "cam0")
+_IMU, _IMAGE = topics.IMU.key("rig0", "imu0"), topics.IMAGE.key("rig0", "cam0")
 _KEYS = {"inertial": _IMU, "images": _IMAGE, "statuses": "vical/rig0/status/*"}
 _SETTLE_S = 60.0
 
@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
         recorder = _CONTEXT.Process(target=record, args=(str(folder), done))
         recorder.start()
         status: dict[str, str] = {}
-        bus.subscribe(topics.status_key("rig0", "record"), lambda sample: status.update(_values(sample)))
+        bus.subscribe(topics.STATUS.key("rig0", "record"), lambda sample: status.update(_values(sample)))
         while not status:
             time.sleep(0.1)
         seen, sent = publish_and_watch(bus, recorder.pid or 0, args.minutes * 60)

@@ -129,7 +129,7 @@ class _Daemon:
         force = force + self.rig.densities.accel * root * self.rng.standard_normal(force.shape)
         for k, t in enumerate(t_s):
             payload = m.encode_imu(_T0_NS + round(t * 1e9), "imu0", tuple(gyro[k]), tuple(force[k]))
-            self.bus.publish(topics.imu_key("rig0", "imu0"), payload)
+            self.bus.publish(topics.IMU.key("rig0", "imu0"), payload)
             if k % (_IMU_HZ // _POINTS_HZ) == 0:
                 self._image(float(t), with_pixels=k % _IMU_HZ == 0)
                 publish(self.bus, self.role.step())
@@ -140,12 +140,12 @@ class _Daemon:
         stamp_ns = _T0_NS + round(float(self.rig.t_cam(t_s)) * 1e9)
         ids = np.nonzero(seen)[0].astype(np.int64)
         points = m.encode_points(stamp_ns, "cam0", ids, uv[seen], None, self.rig.lens.resolution)
-        self.bus.publish(topics.points_key("rig0", "cam0"), points)
+        self.bus.publish(topics.POINTS.key("rig0", "cam0"), points)
         status = m.encode_diagnostics(stamp_ns, "estimate", self.role.statuses())
-        self.bus.publish(topics.status_key("rig0", "estimate"), status)
+        self.bus.publish(topics.STATUS.key("rig0", "estimate"), status)
         if with_pixels:
             image = m.encode_image(stamp_ns, "cam0", self.image, "mono8")
-            self.bus.publish(topics.image_key("rig0", "cam0"), image)
+            self.bus.publish(topics.IMAGE.key("rig0", "cam0"), image)
 
     def _errors(self, t_s: float) -> tuple[str, float, float]:
         estimate = self.role.latest
