@@ -20,7 +20,10 @@ from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.vision.detector import BoardDetector
 from vical_daemon.vision.target import Target
 
-BOARDS: dict[str, tuple[Target, float, int]] = {"aprilgrid": (APRILGRID, 0.8, 1), "checkerboard": (CHECKERBOARD, 0.6, -1)}
+BOARDS: dict[str, tuple[Target, float, int]] = {  # distance m, printed side
+    "aprilgrid": (APRILGRID, 0.8, 1),
+    "checkerboard": (CHECKERBOARD, 0.6, -1),
+}
 _UNITS = np.array([1e3] * 3 + [180.0 / np.pi] * 3 + [1e6])
 
 

@@ -45,8 +45,7 @@ def main(argv: list[str]) -> int:
     prior = camera_prior(run, args.seed, StartErrors(0.05, 5.0), exact_lens=False)
     subject = CalibratorSubject(CalibrationOptions(imu_noise=imu_noise(run), target_free=True), prior, None)
     heads = ["after min", "resident MB", "CPU ms an image", "status", "largest z", "arm mm", "turn deg"]
-    print(f"| {' | '.join(heads)} |
-{'|---' * len(heads)}|")
+    print(f"| {' | '.join(heads)} |\n{'|---' * len(heads)}|")
     record, due, frames = Record(), np.linspace(args.seconds / 60.0, args.seconds, _REPORTS).tolist(), 0
     begin = time.process_time()
     for t_s, event in events_in_order(run):
