@@ -63,7 +63,7 @@ class EstimateRole:
         self._period_s, self._keep, self._inspect = period_s, keep, inspect
         self._watch = watch
         self._predictions = Predictions(config.rig)
-        self._imu_key = topics.imu_key(config.rig, config.calibration_imu)
+        self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
         self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
         self._next_s = self._next_companion_s = -float("inf")
         self._malformed = 0

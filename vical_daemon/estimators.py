@@ -80,8 +80,8 @@ def make_watch(config: Config) -> DelayWatch | None:
 
 def input_keys(config: Config) -> list[str]:
     """Return the keys that the estimator reads: one IMU, and points or tracks of each camera."""
-    key_of = topics.tracks_key if config.calibration.mode == "target_free" else topics.points_key
-    imu = topics.imu_key(config.rig, config.calibration_imu)
+    key_of = topics.TRACKS.key if config.calibration.mode == "target_free" else topics.POINTS.key
+    imu = topics.IMU.key(config.rig, config.calibration_imu)
     return [imu, *(key_of(config.rig, camera) for camera in config.calibration_cameras)]
 
 

@@ -36,8 +36,8 @@ class GyroAid:
         self.camera = camera
         self.predictor = FlowPredictor(_from_prior(prior))
         imu = config.calibration.imu or next(iter(config.imus))
-        self.imu_key = topics.imu_key(config.rig, imu)
-        self.calibration_key = topics.calibration_key(config.rig, camera)
+        self.imu_key = topics.IMU.key(config.rig, imu)
+        self.calibration_key = topics.CALIBRATION.key(config.rig, camera)
         self._every = max(1, int(config.imus[imu].rate_hz / ENOUGH_HZ))
         self._count = 0
         self._samples: deque[bytes] = deque(maxlen=_WAITING)

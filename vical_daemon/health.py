@@ -30,7 +30,7 @@ class StatusSender:
     """
 
     def __init__(self, rig: str, role: str, bus: Bus, clock: WallClock) -> None:
-        self._key = topics.status_key(rig, role)
+        self._key = topics.STATUS.key(rig, role)
         self._role, self._bus, self._clock = role, bus, clock
         self._next_s = 0.0
 

@@ -30,11 +30,11 @@ def calibration_messages(config: Config, estimate: CalibrationEstimate) -> list[
     messages: list[Message] = []
     imu = config.calibration_imu
     for name in config.calibration_cameras:
-        messages.append((topics.calibration_key(config.rig, name), encode_calibration(estimate, name)))
+        messages.append((topics.CALIBRATION.key(config.rig, name), encode_calibration(estimate, name)))
         camera = estimate.cameras.get(name)
         if camera is not None:
             pose = encode_pose(estimate.t_ns, imu, camera.T_imu_cam)
-            messages.append((topics.pose_key(config.rig, name), pose))
+            messages.append((topics.POSE.key(config.rig, name), pose))
     return messages
 
 
@@ -57,13 +57,13 @@ def companion_messages(config: Config, estimate: CalibrationEstimate) -> list[Me
             camera.distortion_model,
             camera.distortion,
         )
-        messages.append((topics.camera_info_key(config.rig, name), info))
+        messages.append((topics.CAMERA_INFO.key(config.rig, name), info))
         pose = camera.T_imu_cam
         x, y, z = pose.p_m
         qw, qx, qy, qz = pose.q_wxyz
         transforms.append(Transform(estimate.t_ns, config.calibration_imu, name, (x, y, z), (qw, qx, qy, qz)))
     if transforms and estimate.status is Status.CONVERGED:
-        messages.append((topics.tf_static_key(config.rig), encode_transforms(transforms)))
+        messages.append((topics.TF_STATIC.key(config.rig), encode_transforms(transforms)))
     return messages
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from vical_daemon.config import Config
 from vical_daemon.messages import MessageError, decode_image, encode_compressed_image
-from vical_daemon.topics import IMAGE, compressed_key, parse_key
+from vical_daemon.topics import COMPRESSED, IMAGE, parse_key
 
 _ENCODINGS = ("mono8", "mono16", "bgr8")
 
@@ -32,7 +32,7 @@ class ImageCompressor:
         if kind is None:
             return key, payload
         try:
-            return compressed_key(parsed.rig, parsed.name), self._compressed(payload, kind)
+            return COMPRESSED.key(parsed.rig, parsed.name), self._compressed(payload, kind)
         except (MessageError, ValueError):
             self.failures += 1
             return key, payload

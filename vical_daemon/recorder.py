@@ -20,7 +20,7 @@ from vical_daemon.messages import (
 )
 from vical_daemon.record_images import ImageCompressor
 from vical_daemon.record_queue import Arrival, RecordQueue
-from vical_daemon.topics import CALIBRATION, STATUS, Topic, command_key
+from vical_daemon.topics import CALIBRATION, COMMAND, STATUS, Topic
 from vical_daemon.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class Recorder:
         self._session: LogSession | None = None
         self._problem = ""
         self._retry_ns = 0
-        self._command_key = command_key(config.rig, "record")
+        self._command_key = COMMAND.key(config.rig, "record")
         self._serials: dict[str, str] = {}
         self._calibrations: dict[str, bytes] = {}
         self._latched: dict[str, bytes] = {}

@@ -159,61 +159,6 @@ def parse_key(key: str) -> ParsedKey | None:
     return None
 
 
-def imu_key(rig: str, name: str) -> str:
-    """Key of inertial samples."""
-    return IMU.key(rig, name)
-
-
-def image_key(rig: str, camera: str) -> str:
-    """Key of raw images."""
-    return IMAGE.key(rig, camera)
-
-
-def compressed_key(rig: str, camera: str) -> str:
-    """Key of compressed images."""
-    return COMPRESSED.key(rig, camera)
-
-
-def camera_info_key(rig: str, camera: str) -> str:
-    """Key of the intrinsics in ROS' form."""
-    return CAMERA_INFO.key(rig, camera)
-
-
-def points_key(rig: str, camera: str) -> str:
-    """Key of target points."""
-    return POINTS.key(rig, camera)
-
-
-def tracks_key(rig: str, camera: str) -> str:
-    """Key of feature tracks."""
-    return TRACKS.key(rig, camera)
-
-
-def calibration_key(rig: str, camera: str) -> str:
-    """Key of calibration estimates."""
-    return CALIBRATION.key(rig, camera)
-
-
-def pose_key(rig: str, camera: str) -> str:
-    """Key of `T_imu_cam` in ROS' form."""
-    return POSE.key(rig, camera)
-
-
-def tf_static_key(rig: str) -> str:
-    """Key of the transform tree in ROS' form."""
-    return TF_STATIC.key(rig)
-
-
-def status_key(rig: str, role: str) -> str:
-    """Key of the health of a role."""
-    return STATUS.key(rig, role)
-
-
-def command_key(rig: str, role: str) -> str:
-    """Key of commands to a role, e.g. ``start`` and ``stop`` to the recorder."""
-    return COMMAND.key(rig, role)
-
-
 def rig_expression(rig: str) -> str:
     """Key expression of everything of one rig."""
     return f"{ROOT}/{check_name(rig)}/**"

@@ -12,8 +12,8 @@ from vical_daemon.bus import Bus, LocalBus, key_matches
 from vical_daemon.zenoh_bus import BusError, open_bus
 
 pytestmark = pytest.mark.system
-IMU = topics.imu_key("rig0", "imu0")
-CALIBRATION = topics.calibration_key("rig0", "cam0")
+IMU = topics.IMU.key("rig0", "imu0")
+CALIBRATION = topics.CALIBRATION.key("rig0", "cam0")
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ class TestBusContract:
 
     def test_order_and_numbers(self, ends):
         sender, receiver = ends
-        key = topics.imu_key("rig0", "contract1")
+        key = topics.IMU.key("rig0", "contract1")
         subscription = receiver.subscribe(key, depth=1000)
         probe(sender, receiver, key)
         for i in range(500):
@@ -81,7 +81,7 @@ class TestBusContract:
 
     def test_handler_gets_every_sample(self, ends):
         sender, receiver = ends
-        key = topics.points_key("rig0", "contract2")
+        key = topics.POINTS.key("rig0", "contract2")
         got: list[bytes] = []
         subscription = receiver.subscribe(key, lambda sample: got.append(sample.payload))
         probe(sender, receiver, key)
@@ -94,7 +94,7 @@ class TestBusContract:
     @pytest.mark.parametrize("newest_wins", [True, False])
     def test_full_queue_drops_and_counts(self, ends, newest_wins):
         sender, receiver = ends
-        key = topics.points_key("rig0", f"contract3{newest_wins}")
+        key = topics.POINTS.key("rig0", f"contract3{newest_wins}")
         probe(sender, receiver, key)
         subscription = receiver.subscribe(key, depth=4, newest_wins=newest_wins)
         time.sleep(0.1)
@@ -109,18 +109,18 @@ class TestBusContract:
 
     def test_latest_is_kept_where_the_table_says_so(self, ends):
         sender, receiver = ends
-        key, fleeting = topics.calibration_key("rig0", "contract4"), topics.imu_key("rig0", "contract4")
+        key, fleeting = topics.CALIBRATION.key("rig0", "contract4"), topics.IMU.key("rig0", "contract4")
         for i in range(3):
             sender.publish(key, str(i).encode())
             sender.publish(fleeting, str(i).encode())
         assert until(lambda: [s.payload for s in receiver.latest(key)] == [b"2"])
         assert [s.key for s in receiver.latest("vical/rig0/*/contract4")] == [key]
-        assert receiver.latest(topics.calibration_key("rig9", "cam0")) == []
+        assert receiver.latest(topics.CALIBRATION.key("rig9", "cam0")) == []
         assert [s.payload for s in sender.latest(key)] == [b"2"]  # one's own value as well
 
     def test_recv_waits_and_gives_up(self, ends):
         _, receiver = ends
-        subscription = receiver.subscribe(topics.imu_key("rig0", "silent"))
+        subscription = receiver.subscribe(topics.IMU.key("rig0", "silent"))
         begin = time.monotonic()
         assert subscription.recv(0) is None
         assert subscription.recv(0.1) is None
@@ -129,7 +129,7 @@ class TestBusContract:
 
     def test_close_wakes_whoever_waits(self, ends):
         _, receiver = ends
-        subscription = receiver.subscribe(topics.imu_key("rig0", "silent"))
+        subscription = receiver.subscribe(topics.IMU.key("rig0", "silent"))
         result: list[object] = ["nothing"]
         thread = threading.Thread(target=lambda: result.append(subscription.recv(None)))
         thread.start()
@@ -140,7 +140,7 @@ class TestBusContract:
 
     def test_large_payloads(self, ends):
         sender, receiver = ends
-        key = topics.image_key("rig0", "contract5")
+        key = topics.IMAGE.key("rig0", "contract5")
         probe(sender, receiver, key)
         subscription = receiver.subscribe(key)
         time.sleep(0.1)
@@ -158,7 +158,7 @@ class TestBusContract:
 
     def test_many_threads_may_publish(self, ends):
         sender, receiver = ends
-        key = topics.imu_key("rig0", "contract6")
+        key = topics.IMU.key("rig0", "contract6")
         probe(sender, receiver, key)
         subscription = receiver.subscribe(key, depth=5000)
         time.sleep(0.1)
@@ -178,7 +178,7 @@ class TestBusContract:
 
 def test_handler_that_fails_does_not_end_the_subscription(zenoh_pair, caplog):
     router, client = zenoh_pair
-    key = topics.imu_key("rig0", "fails")
+    key = topics.IMU.key("rig0", "fails")
     seen = []
 
     def handler(sample):
@@ -198,7 +198,7 @@ def test_handler_that_fails_does_not_end_the_subscription(zenoh_pair, caplog):
 def test_messages_of_strangers_are_taken(zenoh_pair):
     """Plain zenoh without our numbers, and with a forged attachment."""
     router, client = zenoh_pair
-    key = topics.imu_key("rig0", "stranger")
+    key = topics.IMU.key("rig0", "stranger")
     probe(client, router, key)
     subscription = router.subscribe(key)
     time.sleep(0.1)
@@ -282,14 +282,14 @@ def test_robot_works_without_its_site_and_joins_it_later(tmp_path):
     ]
     assert time.monotonic() - begin < 5  # does not wait for the site
     role = open_bus(mode="client", socket=tmp_path / "robot1.sock")
-    role.publish(topics.calibration_key("robot1", "cam0"), b"1")
-    robots[1].publish(topics.calibration_key("robot2", "cam0"), b"2")
+    role.publish(topics.CALIBRATION.key("robot1", "cam0"), b"1")
+    robots[1].publish(topics.CALIBRATION.key("robot2", "cam0"), b"2")
     assert until(lambda: len(robots[0].latest("vical/robot1/calibration/*")) == 1)
     site = open_bus(mode="router", tcp_port=port)
     assert until(lambda: {s.payload for s in site.latest("vical/*/calibration/*")} == {b"1", b"2"}, 10)
     got: list[str] = []
     subscription = site.subscribe("vical/**", lambda sample: got.append(sample.key))
-    key = topics.imu_key("robot1", "imu0")
+    key = topics.IMU.key("robot1", "imu0")
     assert until(lambda: role.publish(key, b"x") or key in got)
     subscription.close()
     for bus in (role, *robots, site):

@@ -14,7 +14,7 @@ from vical_daemon import topics
 from vical_daemon.zenoh_bus import BusError, open_bus
 
 pytestmark = pytest.mark.system
-KEY = topics.calibration_key("rig0", "cam0")
+KEY = topics.CALIBRATION.key("rig0", "cam0")
 
 
 def free_port() -> int:
@@ -135,7 +135,7 @@ def test_passwords_and_read_only_users(tmp_path):
     assert [s.payload for s in viewer.latest(KEY)] == [b"from robot"]
     for _ in range(20):
         viewer.publish(KEY, b"forged")
-        viewer.publish(topics.command_key("rig0", "record"), b"stop")
+        viewer.publish(topics.COMMAND.key("rig0", "record"), b"stop")
         time.sleep(0.01)
     robot.publish(KEY, b"end")
     assert until(lambda: b"end" in heard)

@@ -17,7 +17,7 @@ from vical_daemon.mcap_log import LogReader
 from vical_daemon.zenoh_bus import open_bus
 
 pytestmark = pytest.mark.system
-IMU = topics.imu_key("rig0", "imu0")
+IMU = topics.IMU.key("rig0", "imu0")
 
 
 def start_recorder(folder: Path) -> subprocess.Popen[bytes]:
@@ -50,7 +50,7 @@ def until(condition, timeout_s: float = 30.0) -> bool:
 def test_killed_recorder_loses_a_second_and_its_successor_goes_on(tmp_path):
     tmp_path.chmod(0o750)
     bus = open_bus(mode="router", socket=tmp_path / "zenoh.sock")
-    status = topics.status_key("rig0", "record")
+    status = topics.STATUS.key("rig0", "record")
     sent = 0
 
     def send(seconds: float) -> None:

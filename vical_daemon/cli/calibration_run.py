@@ -192,7 +192,7 @@ def _points_key(job: Job, camera: str) -> str:
     if stream.kind in ("points", "tracks"):
         return stream.key
     free = job.config.calibration.mode == "target_free"
-    return (topics.tracks_key if free else topics.points_key)(job.config.rig, camera)
+    return (topics.TRACKS if free else topics.POINTS).key(job.config.rig, camera)
 
 
 def _choose(what: str, streams: dict[str, Stream], name: str | None) -> Stream:

@@ -23,7 +23,7 @@ class Watch:
         self.health: dict[str, str] = {}
         self._camera = camera
         self._t_unsure_s = 0.0
-        bus.subscribe(topics.calibration_key(rig, camera), self._on_estimate)
+        bus.subscribe(topics.CALIBRATION.key(rig, camera), self._on_estimate)
         bus.subscribe(topics.STATUS.pattern.format(rig=rig, name="*"), self._on_status)
 
     @property

@@ -24,7 +24,7 @@ from vical_daemon.recording.model import (
     Stream,
     stream_statistics,
 )
-from vical_daemon.topics import TopicError, compressed_key, imu_key, points_key, tracks_key
+from vical_daemon.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
@@ -180,11 +180,11 @@ class AslRecording(Recording):
         return kept
 
     def _stream(self, kind: Kind, name: str, path: Path, t_ns: IntArray) -> Stream:
-        keys = {"imu": imu_key, "points": points_key, "tracks": tracks_key, "compressed": compressed_key}
+        keys = {"imu": IMU, "points": POINTS, "tracks": TRACKS, "compressed": COMPRESSED}
         if not len(t_ns):
             raise RecordingError(f"{path}: no data")
         try:
-            key = keys[kind](RIG, name)
+            key = keys[kind].key(RIG, name)
         except TopicError as error:
             raise RecordingError(f"{path}: {error}") from None
         resolution = None if kind == "imu" else _resolution(path.parent)

@@ -34,7 +34,7 @@ class CameraRole:
     """
 
     def __init__(self, rig: str, name: str, clock: WallClock) -> None:
-        self.key = topics.image_key(rig, name)
+        self.key = topics.IMAGE.key(rig, name)
         self._name, self._clock = name, clock
         self._t_last_ns = 0
         self._backwards = 0

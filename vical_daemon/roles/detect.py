@@ -52,7 +52,7 @@ class DetectRole:
     ) -> None:
         self.camera = camera
         free = config.calibration.mode == "target_free"
-        self.key = (topics.tracks_key if free else topics.points_key)(config.rig, camera)
+        self.key = (topics.TRACKS if free else topics.POINTS).key(config.rig, camera)
         self.aid: GyroAid | None = None
         if free and config.imus:
             self.aid = GyroAid(config, camera, prior or camera_prior(config, camera))
@@ -149,7 +149,7 @@ class _Worker:
     def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
         self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
         self._aid = attach_aid(bus, self._role)
-        key = topics.image_key(config.rig, camera)
+        key = topics.IMAGE.key(config.rig, camera)
         self.subscription = bus.subscribe(key, depth=QUEUE_DEPTH, newest_wins=True)
         self.thread = threading.Thread(target=self._run, name=f"detect/{camera}", daemon=True)
 

@@ -40,7 +40,7 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     role = EstimateRole(
         config, make_estimator(config, priors), inspect=memory.watch, watch=make_watch(config)
     )
-    commands = bus.subscribe(topics.command_key(config.rig, "estimate"), depth=8)
+    commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
     status = StatusSender(config.rig, "estimate", bus, clock)
     while not stop.is_set():
         inbox.wait(PUBLISH_S / 2)

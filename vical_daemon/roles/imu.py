@@ -32,7 +32,7 @@ class ImuRole:
     """
 
     def __init__(self, rig: str, name: str, clock: WallClock) -> None:
-        self.key = topics.imu_key(rig, name)
+        self.key = topics.IMU.key(rig, name)
         self._encode, self._offset_ns = imu_encoder(name), clock.unix_ns(0)
         self._t_last_ns = 0
         self._backwards = 0

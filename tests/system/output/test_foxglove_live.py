@@ -66,8 +66,8 @@ async def advertised(channel_socket):
 
 
 def test_a_viewer_gets_the_bytes_of_the_bus_and_only_while_it_looks(bus, server):
-    imu = topics.imu_key("rig0", "imu0")
-    points = topics.points_key("rig0", "cam0")
+    imu = topics.IMU.key("rig0", "imu0")
+    points = topics.POINTS.key("rig0", "cam0")
     payload = encode_imu(10**18, "imu0", (0.1, 0.2, 0.3), (0.0, 0.0, 9.8))
     corners = encode_points(10**18, "cam0", np.arange(3), np.arange(6.0).reshape(3, 2))
     assert bus.open == set()

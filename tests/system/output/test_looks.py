@@ -39,10 +39,10 @@ def report(tmp_path):
     with LogWriter(log) as writer:
         for t, gyro, force in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True):
             payload = m.encode_imu(int(t), "imu0", tuple(gyro), tuple(force))
-            writer.write(topics.imu_key("rig0", "imu0"), payload, int(t))
+            writer.write(topics.IMU.key("rig0", "imu0"), payload, int(t))
         for frame in run.frames:
             points = m.encode_points(frame.t_cam_ns, "cam0", frame.ids, frame.uv_px, None, (640, 480))
-            writer.write(topics.points_key("rig0", "cam0"), points, frame.t_cam_ns)
+            writer.write(topics.POINTS.key("rig0", "cam0"), points, frame.t_cam_ns)
     assert main(["calibrate", str(log), "--target", str(board), "--report", str(html), "--quiet"]) == 0
     return html
 

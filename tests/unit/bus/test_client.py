@@ -25,7 +25,7 @@ def payload(status: Status = Status.CONVERGED, camera: str = "cam0", frames: int
     return encode_calibration(estimate, camera)
 
 
-KEY = topics.calibration_key("rig0", "cam0")
+KEY = topics.CALIBRATION.key("rig0", "cam0")
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_latest(bus):
     assert client.latest() == []
     bus.publish(KEY, payload(frames=1))
     bus.publish(KEY, payload(frames=2))
-    bus.publish(topics.calibration_key("rig1", "cam0"), payload(Status.CONVERGING))
+    bus.publish(topics.CALIBRATION.key("rig1", "cam0"), payload(Status.CONVERGING))
     assert [(u.rig, u.camera, u.estimate.frames, u.converged) for u in client.latest()] == [
         ("rig0", "cam0", 2, True),
         ("rig1", "cam0", 1, False),

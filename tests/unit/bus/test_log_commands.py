@@ -104,7 +104,7 @@ def test_replay_publishes_in_time_and_order(asl_folder):
     got.clear()
     result = replay(recording, bus, threading.Event(), speed=40, rig="robot7")
     assert 0.29 < result["duration_s"] < 5
-    assert got[0].key == topics.imu_key("robot7", "imu0")
+    assert got[0].key == topics.IMU.key("robot7", "imu0")
     stop = threading.Event()
     stop.set()
     assert replay(recording, bus, stop)["messages"] == 0

@@ -19,8 +19,8 @@ from vical_daemon import topics
 from vical_daemon.mcap_log import LogError, LogReader, LogWriter, is_being_written, recover, recover_folder
 from vical_daemon.mcap_log.files import LockedFile
 
-IMU = topics.imu_key("rig0", "imu0")
-POINTS = topics.points_key("rig0", "cam0")
+IMU = topics.IMU.key("rig0", "imu0")
+POINTS = topics.POINTS.key("rig0", "cam0")
 T0 = 1_600_000_000_000_000_000
 
 

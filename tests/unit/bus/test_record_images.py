@@ -75,7 +75,7 @@ def test_the_log_holds_what_can_be_opened_and_says_what_failed(tmp_path) -> None
     )
     recorder = Recorder(config, LogFolder(tmp_path), private_clock())
     recorder.tick()
-    key = topics.image_key("rig0", "cam0")
+    key = topics.IMAGE.key("rig0", "cam0")
     for payload in (m.encode_image(STAMP_NS, "cam0", SMOOTH, "mono8"), b"junk"):
         recorder.write(arrival(Sample(key, payload, 0), private_clock()))
     recorder.close()

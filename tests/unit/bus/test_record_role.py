@@ -21,8 +21,8 @@ from vical_daemon.recording import open_recording
 from vical_daemon.roles import record
 from vical_daemon.wall_clock import private_clock
 
-IMU = topics.imu_key("rig0", "imu0")
-COMMAND = topics.command_key("rig0", "record")
+IMU = topics.IMU.key("rig0", "imu0")
+COMMAND = topics.COMMAND.key("rig0", "record")
 
 
 def settings(folder: Path, more: str = ""):
@@ -71,7 +71,7 @@ def run_role(config, bus, during):
     thread.start()
     try:
         end = time.monotonic() + 5
-        while not bus.latest(topics.status_key("rig0", "record")) and time.monotonic() < end:
+        while not bus.latest(topics.STATUS.key("rig0", "record")) and time.monotonic() < end:
             time.sleep(0.01)
         during()
     finally:
@@ -83,7 +83,7 @@ def run_role(config, bus, during):
 def test_role_records_what_travels(tmp_path, asl_folder):
     bus = LocalBus()
     bus.publish(
-        topics.camera_info_key("rig0", "cam0"),
+        topics.CAMERA_INFO.key("rig0", "cam0"),
         m.encode_camera_info(1, "cam0", (8, 6), [1, 2, 3, 4], "radtan", []),
     )
     recording = open_recording(asl_folder)
@@ -104,7 +104,7 @@ def test_role_records_what_travels(tmp_path, asl_folder):
     assert reader.complete
     assert dict(reader.metadata)["vical"]["rig"] == "rig0"
     assert "wall_minus_monotonic_ns" in dict(reader.metadata)["vical"]
-    (status,) = bus.latest(topics.status_key("rig0", "record"))
+    (status,) = bus.latest(topics.STATUS.key("rig0", "record"))
     assert m.decode_diagnostics(status.payload).statuses[0].values["state"] in ("recording", "waiting")
     # what was recorded is bit for bit what the folder gives
     assert list(open_recording(path).messages()) == sent
@@ -134,7 +134,7 @@ def test_segments_repeat_what_each_needs(make, tmp_path):
     recorder = make()
     recorder.tick()
     info = m.encode_camera_info(1, "cam0", (8, 6), [1, 2, 3, 4], "radtan", [])
-    key = topics.camera_info_key("rig0", "cam0")
+    key = topics.CAMERA_INFO.key("rig0", "cam0")
     recorder.write(arrival(Sample(key, info, 0), private_clock()))
     command(recorder, "split")
     recorder.close()
@@ -292,14 +292,14 @@ def test_calibration_and_serials_are_in_the_log(make, tmp_path):
     status = m.DiagnosticStatus(m.Level.OK, "imu/imu0", hardware_id="6223.42")
     recorder.write(
         arrival(
-            Sample(topics.status_key("rig0", "imu"), m.encode_diagnostics(1, "imu", [status]), 0),
+            Sample(topics.STATUS.key("rig0", "imu"), m.encode_diagnostics(1, "imu", [status]), 0),
             private_clock(),
         )
     )
     recorder.tick()
     estimate = CalibrationEstimate(1, Status.WAITING, "", 0.0, "", 0.0, 0, 0, {}, None, [], 0.0, 0.0)
     payload = m.encode_calibration(estimate, "cam0")
-    recorder.write(arrival(Sample(topics.calibration_key("rig0", "cam0"), payload, 0), private_clock()))
+    recorder.write(arrival(Sample(topics.CALIBRATION.key("rig0", "cam0"), payload, 0), private_clock()))
     recorder.close()
     (path,) = LogFolder(tmp_path / "log").segments()
     reader = LogReader(path)
@@ -356,6 +356,6 @@ def test_invented_keys_fill_neither_memory_nor_log(make, tmp_path):
     recorder = make()
     recorder.tick()
     for i in range(600):
-        feed(recorder, 1, i, key=topics.imu_key("rig0", f"junk{i}"))
+        feed(recorder, 1, i, key=topics.IMU.key("rig0", f"junk{i}"))
     assert recorder.messages == 512
     assert recorder.status(RecordQueue(), 0).values["refused"] == "88"

@@ -25,9 +25,9 @@ def test_every_key_says_what_it_is(topic):
 )
 def test_names_that_could_leave_their_key_are_refused(name):
     with pytest.raises(TopicError, match="valid name"):
-        topics.imu_key(name, "imu0")
+        topics.IMU.key(name, "imu0")
     with pytest.raises(TopicError, match="valid name"):
-        topics.imu_key("rig0", name)
+        topics.IMU.key("rig0", name)
 
 
 @pytest.mark.parametrize(
@@ -38,9 +38,9 @@ def test_foreign_keys_are_nobodys(key):
 
 
 def test_key_functions_agree_with_the_table():
-    assert topics.imu_key("rig0", "imu0") == "vical/rig0/imu/imu0"
-    assert topics.image_key("rig0", "cam0") == "vical/rig0/camera/cam0/image"
-    assert topics.points_key("rig0", "cam0") == "vical/rig0/camera/cam0/points"
-    assert topics.calibration_key("rig0", "cam0") == "vical/rig0/calibration/cam0"
-    assert topics.status_key("rig0", "record") == "vical/rig0/status/record"
-    assert topics.tf_static_key("rig0") == "vical/rig0/tf_static"
+    assert topics.IMU.key("rig0", "imu0") == "vical/rig0/imu/imu0"
+    assert topics.IMAGE.key("rig0", "cam0") == "vical/rig0/camera/cam0/image"
+    assert topics.POINTS.key("rig0", "cam0") == "vical/rig0/camera/cam0/points"
+    assert topics.CALIBRATION.key("rig0", "cam0") == "vical/rig0/calibration/cam0"
+    assert topics.STATUS.key("rig0", "record") == "vical/rig0/status/record"
+    assert topics.TF_STATIC.key("rig0") == "vical/rig0/tf_static"

@@ -37,7 +37,7 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> LocalBus:
 
 
 def _publish(bus: LocalBus, rig: str, status: Status) -> None:
-    bus.publish(topics.calibration_key(rig, "cam0"), encode_calibration(_estimate(status), "cam0"))
+    bus.publish(topics.CALIBRATION.key(rig, "cam0"), encode_calibration(_estimate(status), "cam0"))
 
 
 def test_a_late_joiner_gets_the_last_state_at_once(bus: LocalBus, capsys) -> None:
@@ -76,7 +76,7 @@ def test_junk_on_the_bus_is_ignored(bus: LocalBus, capsys) -> None:
     bus.publish("vical/rover/calibration/cam0", b"junk")
     bus.publish("vical/rover/status/imu", b"junk")
     bus.publish(
-        topics.status_key("rover", "imu"),
+        topics.STATUS.key("rover", "imu"),
         encode_diagnostics(1, "imu", [DiagnosticStatus(Level.OK, "imu/imu0")]),
     )
     assert main(["watch", "--timeout", "0.3"]) == 1

@@ -39,7 +39,7 @@ CONFIG = loads(
 
 def _messages(run: SimulatedRun) -> Iterator[tuple[int, str, bytes]]:
     """Everything recorded as messages, in the order of their stamps."""
-    imu, points = topics.imu_key("rover", "imu0"), topics.points_key("rover", "cam0")
+    imu, points = topics.IMU.key("rover", "imu0"), topics.POINTS.key("rover", "cam0")
     out = [
         (int(t), imu, encode_imu(int(t), "imu0", tuple(w), tuple(f)))
         for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True)
@@ -53,7 +53,7 @@ def _messages(run: SimulatedRun) -> Iterator[tuple[int, str, bytes]]:
 
 def _play(bus: Bus, run: SimulatedRun, role: EstimateRole, config: Config = CONFIG) -> None:
     """Put a recording on the bus and let the role answer there."""
-    keys = (topics.imu_key(config.rig, "imu0"), topics.points_key(config.rig, "cam0"))
+    keys = (topics.IMU.key(config.rig, "imu0"), topics.POINTS.key(config.rig, "cam0"))
     for key in keys:
         bus.subscribe(key, role.take)
     for _, key, payload in _messages(run):
@@ -75,7 +75,7 @@ def test_the_estimator_starts_without_knowing_delay_or_mounting(shift: float) ->
     options = CalibrationOptions(fix=frozenset({"intrinsics"}))
     role = EstimateRole(CONFIG, Calibrator(options, {"cam0": prior}, board_points()))
     bus, heard = LocalBus(), []
-    bus.subscribe(topics.calibration_key("rover", "cam0"), heard.append)
+    bus.subscribe(topics.CALIBRATION.key("rover", "cam0"), heard.append)
     _play(bus, run, role)
     estimate = decode_calibration(heard[-1].payload).estimate
     assert estimate.status in (Status.CONVERGING, Status.CONVERGED, Status.DEGENERATE), estimate.reason
@@ -127,7 +127,7 @@ def _watched(run: SimulatedRun, wrong_s: float) -> DiagnosticStatus:
     role = EstimateRole(CONFIG, Believer(run, wrong_s), watch=watch)
     bus = LocalBus()
     heard: list[Sample] = []
-    bus.subscribe(topics.status_key("rover", "estimate"), heard.append)
+    bus.subscribe(topics.STATUS.key("rover", "estimate"), heard.append)
     _play(bus, run, role)
     StatusSender("rover", "estimate", bus, WallClock(0)).tick(role.statuses, force=True)
     by_name = {s.name: s for s in decode_diagnostics(heard[-1].payload).statuses}

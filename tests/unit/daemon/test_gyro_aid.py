@@ -57,12 +57,12 @@ def test_gyro_and_calibration_reach_the_predictor():
     predictor = role.aid.predictor
     assert predictor.camera.R_imu_cam is None  # the config gives a lens and no mounting
     believed = encode_calibration(estimate(Status.CONVERGING, rig), "cam0")
-    bus.publish(topics.calibration_key("rig0", "cam0"), believed)
+    bus.publish(topics.CALIBRATION.key("rig0", "cam0"), believed)
     np.testing.assert_allclose(predictor.camera.R_imu_cam, rig.R_imu_cam, atol=1e-9)
     assert predictor.camera.timeshift_cam_imu_s == 0.004
     for k in range(200):
         turning = encode_imu(START_NS + k * STEP_NS, "imu0", (0.0, 0.0, 0.5), (0.0, 0.0, 9.8))
-        bus.publish(topics.imu_key("rig0", "imu0"), turning)
+        bus.publish(topics.IMU.key("rig0", "imu0"), turning)
     assert predictor.rotation(START_NS + 20 * STEP_NS, START_NS + 70 * STEP_NS) is None  # decoded on demand
     role.aid.prepare()
     turned = predictor.rotation(START_NS + 20 * STEP_NS, START_NS + 70 * STEP_NS)
@@ -72,13 +72,13 @@ def test_gyro_and_calibration_reach_the_predictor():
 
 def test_an_answer_that_is_not_believed_itself_changes_nothing():
     bus, role, _ = listening()
-    key = topics.calibration_key("rig0", "cam0")
+    key = topics.CALIBRATION.key("rig0", "cam0")
     for status in (Status.INCONSISTENT, Status.DEGENERATE, Status.INITIALISING):
         bus.publish(key, encode_calibration(estimate(status, reference_rig(1)), "cam0"))
     nothing = replace(estimate(Status.CONVERGED, reference_rig(1)), cameras={})
     bus.publish(key, encode_calibration(nothing, "cam0"))
     bus.publish(key, b"\x00\x01\x00\x00rubbish")
-    bus.publish(topics.imu_key("rig0", "imu0"), b"rubbish")
+    bus.publish(topics.IMU.key("rig0", "imu0"), b"rubbish")
     role.aid.prepare()
     assert role.aid.predictor.camera.R_imu_cam is None
 

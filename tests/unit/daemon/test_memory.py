@@ -36,7 +36,7 @@ def _estimate(camera: CameraEstimate, status: Status = Status.CONVERGED) -> Cali
 def _announce(bus: LocalBus, camera_serial: str = "C1") -> None:
     for role, name, serial in (("imu", "imu/imu0", "I1"), ("camera", "camera/cam0", camera_serial)):
         payload = encode_diagnostics(1, role, [DiagnosticStatus(Level.OK, name, "", serial)])
-        bus.publish(topics.status_key("rig0", role), payload)
+        bus.publish(topics.STATUS.key("rig0", role), payload)
 
 
 @pytest.fixture

@@ -79,12 +79,12 @@ def test_a_recording_takes_predictions_for_no_measurement(tmp_path: Path) -> Non
         for k in range(200):
             t = 10**18 + 10_000_000 * k
             log.write(
-                topics.imu_key("rover", "imu0"), m.encode_imu(t, "imu0", (0.0,) * 3, (0.0, 0.0, 9.8)), t
+                topics.IMU.key("rover", "imu0"), m.encode_imu(t, "imu0", (0.0,) * 3, (0.0, 0.0, 9.8)), t
             )
             points = m.encode_points(t, "cam0", np.arange(3), np.full((3, 2), float(k)))
             log.write(topics.PREDICTED.key("rover", "cam0"), points, t)
             if k % 10 == 0:
-                log.write(topics.points_key("rover", "cam0"), points, t)
+                log.write(topics.POINTS.key("rover", "cam0"), points, t)
     recording = open_recording(path, check=False)
     assert [stream.kind for stream in recording.streams] == ["imu", "points"]
     assert sum(1 for _ in recording.points_frames("cam0")) == 20

@@ -100,10 +100,10 @@ def test_log_gives_its_last_calibration(tmp_path, capsys):
     t0 = 1_700_000_000_000_000_000
     with LogWriter(path) as log:
         info = encode_camera_info(t0, "cam0", (640, 480), [500.0, 500, 320, 240], "radtan", [0.0] * 4)
-        log.write(topics.camera_info_key("rig0", "cam0"), info, t0)
+        log.write(topics.CAMERA_INFO.key("rig0", "cam0"), info, t0)
         for k, shift in enumerate((0.001, 0.002)):
             payload = encode_calibration(estimate(t0 + k, "cam0", shift), "cam0")
-            log.write(topics.calibration_key("rig0", "cam0"), payload, t0 + k)
+            log.write(topics.CALIBRATION.key("rig0", "cam0"), payload, t0 + k)
     assert main(["export", str(path), "--format", "kalibr"]) == 0
     chain = yaml.safe_load(capsys.readouterr().out)
     assert chain["cam0"]["timeshift_cam_imu"] == pytest.approx(0.002)

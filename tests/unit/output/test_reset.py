@@ -24,7 +24,7 @@ def test_reset_forgets_everything(tmp_path):
     )
     bus, stop, counts = LocalBus(), threading.Event(), []
     bus.subscribe(
-        topics.calibration_key("rig0", "cam0"),
+        topics.CALIBRATION.key("rig0", "cam0"),
         lambda sample: counts.append(decode_calibration(sample.payload).estimate.imu_samples),
     )
     options = {"clock": private_clock()}
@@ -44,9 +44,9 @@ def test_reset_forgets_everything(tmp_path):
         for _ in range(5):
             t_ns[0] += 4_000_000
             payload = encode_imu(t_ns[0], "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
-            bus.publish(topics.imu_key("rig0", "imu0"), payload)
+            bus.publish(topics.IMU.key("rig0", "imu0"), payload)
 
-    command = topics.command_key("rig0", "estimate")
+    command = topics.COMMAND.key("rig0", "estimate")
     try:
         wait_until(lambda: counts and counts[-1] > 100)
         bus.publish(command, encode_string("dance"))
