@@ -87,6 +87,7 @@ class Calibrator:
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
         self._jitter_told: set[str] = set()
+        self._imu_noise_told = False
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -300,6 +301,7 @@ class Calibrator:
         ratio = self._held_back_ratio(frame, t_cam_s)
         if ratio is not None:
             self.judge.held_back(ratio)
+            self._tell_imu_noise(f.consistency[frame.camera].scale)
         if not f.plausible():
             self.watch.why = "the estimate left the range of what a rig can be"
             self._restart(f)
@@ -317,6 +319,13 @@ class Calibrator:
             self.judge.announce(
                 f"{camera}: the stamps of the images jitter by {1e3 * sigma_s:.1f} ms; allowed for"
             )
+
+    def _tell_imu_noise(self, scale: float) -> None:
+        """Say once that the imu's densities do not fit what is seen."""
+        doubt = "" if self._imu_noise_told else self._held_back.imu_noise_doubt(scale)
+        if doubt:
+            self._imu_noise_told = True
+            self.judge.announce(f"{doubt}: measure them with `vical allan`")
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
         """How well an image was predicted that the held-back copy of the filter has not used."""

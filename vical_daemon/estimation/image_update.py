@@ -18,6 +18,7 @@ _CURVED = 0.1  # iterate while the second-order part exceeds this share of the c
 _CORNER_GATE = float(chi2.isf(1e-4, 2))
 _RESIDUAL_GATE = float(chi2.isf(2e-5, 2))
 _FRAME_GATE_P = 1e-9
+_ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
 Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
 
@@ -131,4 +132,18 @@ def _correct(
         if not bad.any() or (keep & ~bad).sum() < 4:
             break
         keep = keep & ~bad
-    return ImageFit(c.S, c.dx, c.nis, len(r_small), keep, rest, dof_rest, left)
+    # A compressed image has as many rows as there are states, though it shows but some of them: rows that no
+    # state moves are residuals like the rest, and say nothing about whether the innovations fit.
+    alone = (small**2).sum(axis=1) < _ALONE if dof_rest else np.zeros(len(r_small), bool)
+    apart = float((r_small[alone] ** 2).sum())
+    count = int(alone.sum())
+    return ImageFit(
+        c.S,
+        c.dx,
+        max(c.nis - apart, 0.0),
+        max(len(r_small) - count, 1),
+        keep,
+        rest + apart,
+        dof_rest + count,
+        left,
+    )

@@ -1,0 +1,37 @@
+"""The held-back check: predictions by the imu alone, and what they say about its noise."""
+
+import pytest
+from vical_mocks.points import simulate
+
+from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+
+
+def events_with(density_factor):
+    """Calibrate half a minute with densities that are wrong by a factor; the events and the last answer."""
+    run = simulate(2, 36.0, timeshift_cam_imu_s=0.01)
+    lens, true, k = run.rig.lens, run.rig.densities, density_factor
+    noise = ImuNoise(k * true.gyro, true.gyro_walk, k * true.accel, true.accel_walk)
+    prior = CameraPrior(lens.resolution, tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=noise)
+    c = Calibrator(options, {"cam0": prior}, run.points_m)
+    events, frames = [], iter(run.frames)
+    frame = next(frames)
+    for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True):
+        while frame is not None and frame.t_cam_ns <= t:
+            c.add_points(PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px))
+            c.process()
+            frame = next(frames, None)
+        c.add_imu(int(t), w, f)
+    c.finish()
+    estimate = c.estimate()
+    return [*events, *estimate.events], estimate
+
+
+@pytest.mark.parametrize(("factor", "said"), [(0.2, "worse"), (1.0, ""), (6.0, "better")])
+def test_wrong_noise_densities_are_told_once(factor, said):
+    events, estimate = events_with(factor)
+    assert estimate.nis_per_dof > 0.5
+    told = [e for e in events if "noise densities" in e]
+    assert len(told) == (1 if said else 0)
+    assert all(said in e and "vical allan" in e for e in told)
