@@ -188,7 +188,8 @@ class CalibrationFilter:
         whitened = H[rows] * weight
         jitter, agreement = self.jitter.get(image.camera), self.agreement.get(image.camera)
         if jitter is not None and where.timeshift is not None:
-            jitter.learn(innovation, whitened[:, where.timeshift], lin.linear[rows] * weight)
+            level = self.consistency[image.camera].level
+            jitter.learn(innovation, whitened[:, where.timeshift], lin.linear[rows] * weight, level)
         if agreement is not None and where.intrinsics is not None and where.distortion is not None:
             lens = slice(where.intrinsics.start, where.distortion.stop)
             values = np.concatenate([camera.intrinsics, camera.distortion])

@@ -111,6 +111,11 @@ class Consistency:
         """The innovations have jumped: allowed for by how long this rig's errors usually last."""
         return self.images > _LAGS and self.alarm > _CUSUM_LIMIT * self.factor
 
+    @property
+    def level(self) -> float:
+        """Usual squared innovation in a mode over its prediction, >= 1."""
+        return max(1.0, self._lagged[0] / (MODES * self._weight)) if self._weight else 1.0
+
     def learn(self, uv: FloatArray, innovation: FloatArray, linear: FloatArray, sigma: FloatArray) -> None:
         """Take in the innovation of one image.
 
@@ -130,8 +135,7 @@ class Consistency:
         ratio = float(normal @ normal) / MODES
         # One-sided CUSUM: at the usual level it drifts down by 0.8 an image; the chance that eight
         # degrees of freedom drive it to 8 is below 1e-10 an image.
-        usual = max(1.0, self._lagged[0] / (MODES * self._weight)) if self._weight else 1.0
-        self.alarm = max(0.0, self.alarm + min(ratio / usual, 5.0) - _CUSUM_DRIFT)
+        self.alarm = max(0.0, self.alarm + min(ratio / self.level, 5.0) - _CUSUM_DRIFT)
         self._move_scale(ratio)
         self._remember(normal)
 

@@ -36,13 +36,17 @@ class StampJitter:
     images: int = 0
     _pairs: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MEMORY))
 
-    def learn(self, innovation: FloatArray, by_shift: FloatArray, linear: FloatArray) -> None:
+    def learn(
+        self, innovation: FloatArray, by_shift: FloatArray, linear: FloatArray, level: float = 1.0
+    ) -> None:
         """Take in one image before it is used.
 
         Args:
             innovation: Measured minus predicted, over the corner noise, shape (2n,).
             by_shift: Derivative of the whitened pixels by the time shift, 1/s, shape (2n,).
             linear: H S of the whitened pixels (state uncertainty), shape (2n, c).
+            level: By how much innovations of any kind exceed their variances: where the model does not fit,
+                that along the motion of the corners is no jitter.
         """
         size = float(by_shift @ by_shift)
         if not size > 0.0:
@@ -50,7 +54,7 @@ class StampJitter:
         self.images += 1
         part = by_shift @ linear / size
         error = float(by_shift @ innovation) / size
-        self._pairs.append((error * error, 1.0 / size + float(part @ part)))
+        self._pairs.append((error * error, level * (1.0 / size + float(part @ part))))
         if len(self._pairs) >= _LEAST and self.images % _EVERY == 0:
             square, usual = np.array(self._pairs).T
             self.sigma_s = _excess(square, usual)
