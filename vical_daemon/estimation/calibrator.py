@@ -7,22 +7,19 @@ lag (so that inertial data always bracket each image) -> `judge` says how far to
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from vical_daemon.estimation import start
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
-from vical_daemon.estimation.consistency import Consistency
-from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.judge import Judge
-from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import (
     BoolArray,
     CalibrationOptions,
@@ -30,17 +27,9 @@ from vical_daemon.estimation.measurements import (
     FloatArray,
     PointsFrame,
 )
+from vical_daemon.estimation.rehearsal import rehearsed, wide_filter
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
-from vical_daemon.estimation.stamp_jitter import StampJitter
 from vical_daemon.estimation.state import (
-    ACCEL_BIAS,
-    ATTITUDE,
-    GRAVITY,
-    GYRO_BIAS,
-    MOTION,
-    POSITION,
-    VELOCITY,
-    State,
     make_layout,
 )
 
@@ -49,8 +38,6 @@ _MAX_GAP_S = 0.5
 _KEEP_S = 5.0
 _LATE_S = 2e-3  # an image this little before the state is used by moving the pose back
 _TOLD_JITTER_S = 3e-4  # worth a word to the user
-_SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
-_REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
 _SKEW_OPEN = 1e-4  # s/s: two bad crystals
 
 
@@ -175,7 +162,8 @@ class Calibrator:
             (t, f) for w in self._waiting.values() for t, f in w if t + shifts[f.camera] > begin - _LATE_S
         ]
         frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
-        self.filter = self._rehearsed(result.state, frames)
+        make = partial(wide_filter, layout=self.layout, options=self.options)
+        self.filter = rehearsed(result.state, frames, make, self._step)
         if self.filter is None:
             self.judge.waiting("the first seconds do not fit together yet: keep the board in view and moving")
             return
@@ -187,78 +175,6 @@ class Calibrator:
             self._pending.push(t, frame)
         for waiting in self._waiting.values():
             waiting.clear()
-
-    def _rehearsed(self, state: State, frames: list[tuple[float, PointsFrame]]) -> CalibrationFilter | None:
-        """Run over the start once to learn its noise, then start again from the same place.
-
-        The second start takes what the first run found as its mean, and five times its sigmas: so wide that
-        the data, counted again, add 4 % of information; so narrow that the model is straight from the first
-        image on, and nothing is lost to its curvature.
-        """
-        trial = self._new_filter(deepcopy(state))
-        used = refused = 0
-        for t_cam_s, frame in frames:
-            report = self._step(trial, frame, t_cam_s)
-            used += report is not None and report.used
-            refused += report is not None and not report.used
-            if not trial.plausible():
-                return None
-        if refused > used:
-            return None
-        begin = replace(
-            trial.state,
-            t_s=state.t_s,
-            R_world_imu=state.R_world_imu,
-            p_world_imu=state.p_world_imu,
-            v_world_imu=state.v_world_imu,
-            cameras={name: replace(camera, skew=0.0) for name, camera in trial.state.cameras.items()},
-        )
-        fresh = self._new_filter(begin)
-        sigmas = np.diag(fresh.S).copy()
-        constant = slice(MOTION.stop, None)
-        sigmas[constant] = np.minimum(sigmas[constant], _REHEARSED * trial.sigmas()[constant])
-        fresh.S = np.diag(sigmas)
-        for name, noise in trial.corner_noise.items():
-            fresh.corner_noise[name].sigma_px = noise.sigma_px
-            fresh.jitter[name] = trial.jitter[name]
-            fresh.consistency[name] = trial.consistency[name]
-            fresh.consistency[name].settle()
-        return fresh
-
-    def _new_filter(self, state: State) -> CalibrationFilter:
-        noise = {name: CornerNoise(self.options.corner_sigma_px) for name in self.priors}
-        consistency = {name: Consistency() for name in self.priors}
-        walk = np.zeros(self.layout.size)
-        root = np.diag(self._start_sigmas(state))
-        agreement = {name: LensAgreement() for name in self.priors}
-        jitter = {name: StampJitter() for name in self.priors}
-        return CalibrationFilter(
-            state, self.layout, root, self.options.imu_noise, noise, walk, consistency, agreement, jitter
-        )
-
-    def _start_sigmas(self, state: State) -> FloatArray:
-        """Standard deviations the filter starts with: many times what the start is really worth.
-
-        The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
-        """
-        s = np.zeros(self.layout.size)
-        s[ATTITUDE], s[POSITION], s[VELOCITY] = 0.1, 0.1, 0.5
-        s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
-        if self.layout.gyro_matrix is not None and self.layout.accel_matrix is not None:
-            s[self.layout.gyro_matrix], s[self.layout.accel_matrix] = 0.01, 0.01
-        if self.layout.target_scale is not None:
-            s[self.layout.target_scale] = 0.002
-        for name, where in self.layout.cameras.items():
-            focal = float(state.cameras[name].intrinsics[0])
-            if where.position is not None and where.rotation is not None:
-                s[where.position], s[where.rotation] = 0.15, 0.1
-            if where.timeshift is not None and where.skew is not None:
-                s[where.timeshift], s[where.skew] = 5e-3, _SKEW_CLOSED
-            if where.intrinsics is not None and where.distortion is not None:
-                s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
-            if where.readout is not None:
-                s[where.readout] = 0.01
-        return s
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""

@@ -1,0 +1,123 @@
+"""From a start to a running filter: wide sigmas, one run to learn, and the run that counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.consistency import Consistency
+from vical_daemon.estimation.corner_noise import CornerNoise
+from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.lens_agreement import LensAgreement
+from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
+from vical_daemon.estimation.stamp_jitter import StampJitter
+from vical_daemon.estimation.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    MOTION,
+    POSITION,
+    VELOCITY,
+    Layout,
+    State,
+)
+
+REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
+SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
+
+Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
+
+
+def rehearsed(
+    state: State,
+    frames: list[tuple[float, PointsFrame]],
+    make: Callable[[State], CalibrationFilter],
+    step: Step,
+) -> CalibrationFilter | None:
+    """Run over the start once to learn its noise; return a filter that starts again from the same place.
+
+    The second start takes what the first run found as its mean, and five times its sigmas: so wide that
+    the data, counted again, add 4 % of information; so narrow that the model is straight from the first
+    image on, and nothing is lost to its curvature.
+
+    Args:
+        state: Where the start thinks the rig is, and its calibration.
+        frames: (stamp in the camera's clock in s, points) of the start, in order.
+        make: Builds a filter with wide sigmas.
+        step: Propagates a filter to an image and corrects it.
+
+    Returns:
+        The filter, or None where the start does not hold together.
+    """
+    trial = make(deepcopy(state))
+    used = refused = 0
+    for t_cam_s, frame in frames:
+        report = step(trial, frame, t_cam_s)
+        used += report is not None and report.used
+        refused += report is not None and not report.used
+        if not trial.plausible():
+            return None
+    if refused > used:
+        return None
+    begin = replace(
+        trial.state,
+        t_s=state.t_s,
+        R_world_imu=state.R_world_imu,
+        p_world_imu=state.p_world_imu,
+        v_world_imu=state.v_world_imu,
+        cameras={name: replace(camera, skew=0.0) for name, camera in trial.state.cameras.items()},
+    )
+    fresh = make(begin)
+    sigmas = np.diag(fresh.S).copy()
+    constant = slice(MOTION.stop, None)
+    sigmas[constant] = np.minimum(sigmas[constant], REHEARSED * trial.sigmas()[constant])
+    fresh.S = np.diag(sigmas)
+    for name, noise in trial.corner_noise.items():
+        fresh.corner_noise[name].sigma_px = noise.sigma_px
+        fresh.jitter[name] = trial.jitter[name]
+        fresh.consistency[name] = trial.consistency[name]
+        fresh.consistency[name].settle()
+    return fresh
+
+
+def wide_filter(state: State, layout: Layout, options: CalibrationOptions) -> CalibrationFilter:
+    """Build a filter about a start, with sigmas many times what the start is worth."""
+    noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
+    consistency = {name: Consistency() for name in layout.cameras}
+    walk = np.zeros(layout.size)
+    root = np.diag(start_sigmas(state, layout))
+    agreement = {name: LensAgreement() for name in layout.cameras}
+    jitter = {name: StampJitter() for name in layout.cameras}
+    return CalibrationFilter(
+        state, layout, root, options.imu_noise, noise, walk, consistency, agreement, jitter
+    )
+
+
+def start_sigmas(state: State, layout: Layout) -> FloatArray:
+    """Standard deviations the filter starts with: many times what the start is really worth.
+
+    The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
+    """
+    s = np.zeros(layout.size)
+    s[ATTITUDE], s[POSITION], s[VELOCITY] = 0.1, 0.1, 0.5
+    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        s[layout.gyro_matrix], s[layout.accel_matrix] = 0.01, 0.01
+    if layout.target_scale is not None:
+        s[layout.target_scale] = 0.002
+    for name, where in layout.cameras.items():
+        focal = float(state.cameras[name].intrinsics[0])
+        if where.position is not None and where.rotation is not None:
+            s[where.position], s[where.rotation] = 0.15, 0.1
+        if where.timeshift is not None and where.skew is not None:
+            s[where.timeshift], s[where.skew] = 5e-3, SKEW_CLOSED
+        if where.intrinsics is not None and where.distortion is not None:
+            s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
+        if where.readout is not None:
+            s[where.readout] = 0.01
+    return s
