@@ -45,7 +45,7 @@ def scene(model: str, estimate=frozenset({"target_scale"})):
     )
     layout = make_layout(["cam0"], fix=frozenset(), estimate=estimate)
     rates = Rates(np.array([0.7, -1.1, 0.5]), np.array([1.0, 2.0, -1.5]))
-    points = BOARD.reshape(-1, 3)
+    points = BOARD.reshape(-1, 3).copy()
     uv = np.zeros((len(points), 2))
     # the state does not stand at the image's instant: what a late image and a moving shift look like
     image = Image(
