@@ -17,7 +17,7 @@ from vical_daemon.estimation.state import Layout
 from vical_daemon.estimation.trace import Trace
 
 _ENOUGH_FRAMES = 60
-_ENOUGH_S = 6.0
+_ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _PATIENCE_S = 15.0
 _LOST = 3.0  # a direction this far above its target after the patience is called unobservable
 _NIS_BAD = 4.0
