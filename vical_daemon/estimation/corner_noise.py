@@ -8,13 +8,17 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 
+_GUESS_DOF, _GUESS_FADES = 100.0, 300.0  # degrees of freedom
+_LEAST_PX = 0.005
+
 
 @dataclass(slots=True)
 class CornerNoise:
     """Running estimate of the noise per axis of one camera's corners.
 
-    The first guess weighs as much as one well-filled frame; afterwards the estimate forgets slowly, so that
-    a change of light or focus is followed within some hundred frames.
+    The first guess weighs as much as one well-filled frame, and nothing after some more: corners fifty times
+    better than it would otherwise never be believed. The estimate forgets slowly, so that a change of light
+    or focus is followed within some hundred frames.
 
     Attributes:
         sigma_px: Present estimate, px.
@@ -30,8 +34,6 @@ class CornerNoise:
 
     def __post_init__(self) -> None:
         self.sigma_px = self.guess_px
-        self._dof = 100.0
-        self._sum = self._dof * self.guess_px**2
 
     def sigmas(self, stated_px: FloatArray | None, n: int) -> FloatArray:
         """Noise of each corner: the measured level, shared out by the detector's own weights."""
@@ -51,4 +53,6 @@ class CornerNoise:
             keep = self.memory / self._dof
             self._sum *= keep
             self._dof *= keep
-        self.sigma_px = float(np.clip(np.sqrt(self._sum / self._dof), 0.01, 20.0))
+        guess = _GUESS_DOF * np.exp(-self._dof / _GUESS_FADES)
+        square = (self._sum + guess * self.guess_px**2) / (self._dof + guess)
+        self.sigma_px = float(np.clip(np.sqrt(square), _LEAST_PX, 20.0))

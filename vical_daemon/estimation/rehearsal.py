@@ -78,7 +78,7 @@ def rehearsed(
     sigmas[constant] = np.minimum(sigmas[constant], REHEARSED * trial.sigmas()[constant])
     fresh.S = np.diag(sigmas)
     for name, noise in trial.corner_noise.items():
-        fresh.corner_noise[name].sigma_px = noise.sigma_px
+        fresh.corner_noise[name] = noise
         fresh.jitter[name] = trial.jitter[name]
         fresh.consistency[name] = trial.consistency[name]
         fresh.consistency[name].settle()
