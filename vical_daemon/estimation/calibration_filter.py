@@ -132,8 +132,7 @@ class CalibrationFilter:
         """Correct the state with the points of one image; the verdict says what became of it."""
         noise = self.corner_noise[image.camera]
         lin = self._linearise(image)
-        H = unscented.solve_lower(self.S, lin.linear.T, transposed=True).T
-        image = self._shared_noise(image, H)
+        image = self._shared_noise(image, lin)
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
         keep = lin.valid & corner_gate(image, innovation, lin)
@@ -150,7 +149,7 @@ class CalibrationFilter:
                 f"innovation of the image is {level:.1f} times what it should be",
             )
         self.nis_level += 0.05 * (level - self.nis_level)
-        self._measure(image, lin, H, fit.keep)
+        self._measure(image, lin, fit.keep)
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
@@ -172,20 +171,20 @@ class CalibrationFilter:
             predicted_px=predicted,
         )
 
-    def _shared_noise(self, image: Image, H: FloatArray) -> Image:
+    def _shared_noise(self, image: Image, lin: Linear) -> Image:
         """The image with the noise that its corners share: the jitter of its stamp."""
         index, jitter = self.layout.cameras[image.camera].timeshift, self.jitter.get(image.camera)
         if index is None or jitter is None or not jitter.sigma_s:
             return image
-        return replace(image, common_px=H[:, index, None] * jitter.sigma_s)
+        return replace(image, common_px=lin.H[:, index, None] * jitter.sigma_s)
 
-    def _measure(self, image: Image, lin: Linear, H: FloatArray, keep: BoolArray) -> None:
+    def _measure(self, image: Image, lin: Linear, keep: BoolArray) -> None:
         """What an image says about stamps and lens before it is used."""
         where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
         rows, sigma = np.repeat(keep, 2), image.sigma_px[keep]
         innovation = ((image.uv - lin.z)[keep] / sigma[:, None]).ravel()
         weight = 1.0 / np.repeat(sigma, 2)[:, None]
-        whitened = H[rows] * weight
+        whitened = lin.H[rows] * weight
         jitter, agreement = self.jitter.get(image.camera), self.agreement.get(image.camera)
         if jitter is not None and where.timeshift is not None:
             level = self.consistency[image.camera].level
@@ -216,8 +215,7 @@ class CalibrationFilter:
         if keep.sum() < len(keep) // 2:
             return 36.0
         rows = np.repeat(keep, 2)
-        H = unscented.solve_lower(self.S, lin.linear.T, transposed=True).T
-        expected = np.concatenate([lin.linear, self._shared_noise(image, H).common_px], axis=1)[rows]
+        expected = np.concatenate([lin.linear, self._shared_noise(image, lin).common_px], axis=1)[rows]
         normal = normalised(lin.z[keep], (image.uv - lin.z)[keep], expected, image.sigma_px[keep])
         return None if normal is None else float(normal @ normal) / len(normal)
 
@@ -294,8 +292,6 @@ class CalibrationFilter:
             S=self.S.copy(),
             _motion_straight=Straightness(),
             _view_straight={},
-            agreement={},
-            jitter=dict(self.jitter),
         )
 
     def sigmas(self) -> FloatArray:

@@ -29,15 +29,11 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.rehearsal import rehearsed, wide_filter
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
-from vical_daemon.estimation.state import (
-    make_layout,
-)
+from vical_daemon.estimation.state import make_layout
 
 _ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must cost little
-_MAX_GAP_S = 0.5
 _KEEP_S = 5.0
 _LATE_S = 2e-3  # an image this little before the state is used by moving the pose back
-_TOLD_JITTER_S = 3e-4  # worth a word to the user
 _SKEW_OPEN = 1e-4  # s/s: two bad crystals
 
 
@@ -73,8 +69,6 @@ class Calibrator:
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
-        self._jitter_told: set[str] = set()
-        self._imu_noise_told = False
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -82,10 +76,7 @@ class Calibrator:
         if self._buffer is None:
             self._base_ns = t_imu_ns
             self._buffer = ImuBuffer(t_imu_ns)
-        gyro, accel = (
-            np.asarray(gyro_rps, dtype=np.float64),
-            np.asarray(specific_force_mps2, dtype=np.float64),
-        )
+        gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
         fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
         if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
             self.judge.saw_imu(t_imu_ns, gyro, accel)
@@ -216,32 +207,14 @@ class Calibrator:
         self._buffer.trim(f.state.t_s - _KEEP_S)
         ratio = self._held_back_ratio(frame, t_cam_s)
         if ratio is not None:
-            self.judge.held_back(ratio)
-            self._tell_imu_noise(f.consistency[frame.camera].scale)
+            self.judge.held_back(ratio, f.consistency[frame.camera].scale)
         if not f.plausible():
             self.watch.why = "the estimate left the range of what a rig can be"
             self._restart(f)
             return report
         self.judge.saw_frame(report, f)
-        self._tell_jitter(frame.camera, f)
         self._act(self.watch.look(report, f), frame, t_cam_s)
         return report
-
-    def _tell_jitter(self, camera: str, f: CalibrationFilter) -> None:
-        """Say once that stamps jitter: what to do about it is often a setting of the camera's driver."""
-        sigma_s = f.jitter[camera].sigma_s
-        if sigma_s > _TOLD_JITTER_S and camera not in self._jitter_told:
-            self._jitter_told.add(camera)
-            self.judge.announce(
-                f"{camera}: the stamps of the images jitter by {1e3 * sigma_s:.1f} ms; allowed for"
-            )
-
-    def _tell_imu_noise(self, scale: float) -> None:
-        """Say once that the imu's densities do not fit what is seen."""
-        doubt = "" if self._imu_noise_told else self._held_back.imu_noise_doubt(scale)
-        if doubt:
-            self._imu_noise_told = True
-            self.judge.announce(f"{doubt}: measure them with `vical allan`")
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
         """How well an image was predicted that the held-back copy of the filter has not used."""
@@ -297,6 +270,3 @@ class Calibrator:
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
         return self.judge.trace(camera)
-
-
-__all__ = ["Calibrator", "FrameReport"]

@@ -6,8 +6,8 @@ calibration that only explains its own data fails here.
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +19,7 @@ _EVERY_S = 1.5
 _AHEAD_S = 0.3
 _ENOUGH = 20  # predictions before the imu's noise is judged by them
 _WORSE, _BETTER = 1.5, 0.55  # mean squared error over its prediction: 4 standard deviations of chance
+_CLIP = 10.0
 _FITS = 2.0  # corner scale above which it is the images that do not fit
 
 
@@ -26,7 +27,6 @@ _FITS = 2.0  # corner scale above which it is the images that do not fit
 class HeldBack:
     """Takes a copy of the filter every 1.5 s and asks it 0.3 s later what it would have expected."""
 
-    _ratios: deque[float] = field(default_factory=lambda: deque(maxlen=2 * _ENOUGH))
     _copy: CalibrationFilter | None = None
     _next_s: float = float("-inf")
 
@@ -51,22 +51,20 @@ class HeldBack:
         if segment is None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
             return None
         held.predict(segment)
-        ratio = held.surprise(held.image(frame, t_cam_s, target[frame.ids]))
-        if ratio is not None:
-            self._ratios.append(min(ratio, 10.0))
-        return ratio
+        return held.surprise(held.image(frame, t_cam_s, target[frame.ids]))
 
-    def imu_noise_doubt(self, scale: float) -> str:
-        """What the predictions say about the imu's noise densities, in words; empty: they agree.
 
-        Args:
-            scale: `Consistency.scale` of the camera: with images that do not fit nothing can be said.
-        """
-        if len(self._ratios) < _ENOUGH or scale > _FITS:
-            return ""
-        mean = float(np.mean(self._ratios))
-        if mean > _WORSE:
-            return f"the imu foretells images worse than its noise densities say ({np.sqrt(mean):.1f} times)"
-        if mean < _BETTER:
-            return f"the imu foretells images better than its noise densities say ({np.sqrt(mean):.1f} times)"
+def imu_noise_doubt(ratios: Sequence[float], scale: float) -> str:
+    """What held-back predictions say about the imu's noise densities, in words; empty: they agree.
+
+    Args:
+        ratios: What `HeldBack.follow` returned of late.
+        scale: `Consistency.scale` of the camera: with images that do not fit nothing can be said.
+    """
+    if len(ratios) < _ENOUGH or scale > _FITS:
         return ""
+    mean = float(np.mean(np.minimum(ratios, _CLIP)))
+    if _BETTER <= mean <= _WORSE:
+        return ""
+    than = "worse" if mean > _WORSE else "better"
+    return f"the imu foretells images {than} than its noise densities say ({np.sqrt(mean):.1f} times)"

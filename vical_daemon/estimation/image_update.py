@@ -92,9 +92,7 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
         if step:
             lin = linearise(dx, S)
             keep = keep & lin.valid
-            # H S_prior = (H S) S^-1 S_prior, and the innovation refers to the prior mean
-            H = unscented.solve_lower(S, lin.linear.T, transposed=True).T
-            M, offset = H @ prior, H @ dx
+            M, offset = lin.H @ prior, lin.H @ dx  # the innovation refers to the prior mean
         r = ((image.uv - lin.z).ravel() + offset) * weight
         fit = _correct(image, prior, M * weight[:, None], r, lin, weight, keep)
         if curved_share(image, lin, fit.keep) < _CURVED:

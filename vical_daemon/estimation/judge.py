@@ -9,6 +9,7 @@ import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.held_back import imu_noise_doubt
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
@@ -23,6 +24,7 @@ _LOST = 3.0  # a direction this far above its target after the patience is calle
 _NIS_BAD = 4.0
 _HELD_BACK_BAD = 9.0
 _HYSTERESIS = 2.0
+_TOLD_JITTER_S = 3e-4  # worth a word to the user
 _RECENT = 60
 
 
@@ -58,6 +60,7 @@ class Judge:
         self._nis: deque[tuple[float, int]] = deque(maxlen=300)
         self._recent_used: deque[bool] = deque(maxlen=_RECENT)
         self._held_back: deque[float] = deque(maxlen=40)
+        self._told: set[str] = set()
         self._square: dict[str, deque[tuple[float, int]]] = {}
         self._trace: dict[str, Trace] = {}
         self._size: deque[float] = deque(maxlen=400)
@@ -94,9 +97,11 @@ class Judge:
             self.events.append("started anew after the change")
             self.bumped = ""
 
-    def announce(self, event: str) -> None:
-        """Put an event into the next estimate."""
-        self.events.append(event)
+    def announce(self, event: str, once: str = "") -> None:
+        """Put an event into the next estimate; of those with the same `once` only the first."""
+        if once not in self._told:
+            self.events.append(event)
+            self._told |= {once} if once else set()
 
     def changed(self, why: str) -> None:
         """The rig is not what it was: the calibration is being taken anew."""
@@ -105,9 +110,17 @@ class Judge:
         self._started_s = None
         self.status = Status.INCONSISTENT
 
-    def held_back(self, ratio: float) -> None:
-        """Squared error of an image that was predicted by the IMU alone, over its predicted variance."""
+    def held_back(self, ratio: float, scale: float) -> None:
+        """Take in how well the imu alone foretold an image.
+
+        Args:
+            ratio: Squared error over its predicted variance.
+            scale: `Consistency.scale` of the camera.
+        """
         self._held_back.append(ratio)
+        doubt = imu_noise_doubt(self._held_back, scale)
+        if doubt:
+            self.announce(f"{doubt}: measure them with `vical allan`", once="imu noise")
 
     def saw_frame(self, report: FrameReport, f: CalibrationFilter) -> None:
         """Take the verdict of one frame."""
@@ -123,6 +136,10 @@ class Judge:
         good = report.residual_px[report.accepted]
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
+        jitter_s = f.jitter[report.camera].sigma_s
+        if jitter_s > _TOLD_JITTER_S:  # what to do about it is often a setting of the camera's driver
+            told = f"{report.camera}: the stamps of the images jitter by {1e3 * jitter_s:.1f} ms; allowed for"
+            self.announce(told, once=f"jitter {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())

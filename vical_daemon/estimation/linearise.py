@@ -56,12 +56,14 @@ class Linear:
 
     Attributes:
         z: Mean of the predicted pixels, shape (n, 2).
+        H: Derivatives by the errors of the state, shape (2n, c).
         linear: H S, shape (2n, c).
         curved: Square root of the second-order covariance, shape (2n, k); k = 0 where it is negligible.
         valid: Points in front of the camera, shape (n,).
     """
 
     z: FloatArray
+    H: FloatArray
     linear: FloatArray
     curved: FloatArray
     valid: BoolArray
@@ -116,7 +118,8 @@ def by_sigma_points(
     valid: BoolArray = np.asarray(np.isfinite(pixels).all(axis=(0, 2)))
     flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
     m = unscented.moments(flat[1:] - flat[0])
-    return Linear((flat[0] + m.shift).reshape(-1, 2), m.linear, m.curved, valid)
+    H = unscented.solve_lower(S, m.linear.T, transposed=True).T
+    return Linear((flat[0] + m.shift).reshape(-1, 2), H, m.linear, m.curved, valid)
 
 
 def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
@@ -125,8 +128,8 @@ def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: 
     valid: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
     if not valid.all():
         uv, H = np.where(valid[:, None], uv, 0.0), np.where(valid[:, None, None], H, 0.0)
-    linear = H.reshape(-1, layout.size) @ S
-    return Linear(uv, linear, np.zeros((len(linear), 0)), valid)
+    H = H.reshape(-1, layout.size)
+    return Linear(uv, H, H @ S, np.zeros((len(H), 0)), valid)
 
 
 def view_derivatives(
