@@ -52,8 +52,8 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def film(target: Target, distance_m: float, seed: int = 1, **settings: float) -> SimulatedCamera:
-    """A hand-held camera before a board; reference lens with EuRoC-like distortion."""
+def rig_before(target: Target, distance_m: float, seed: int = 1, **changes: float) -> Rig:
+    """A hand-held rig before a board; reference lens with EuRoC-like distortion."""
     side = 1 if isinstance(target, AprilGrid) else -1
     size = target.points_m[:, :2].max(axis=0)
     rig = reference_rig(seed)
@@ -64,9 +64,13 @@ def film(target: Target, distance_m: float, seed: int = 1, **settings: float) ->
         distance_m=distance_m,
         board_size_m=(float(size[0]), float(size[1])),
     )
-    lens = Lens(distortion=DISTORTION)
-    moved = reference_rig(seed, trajectory=motion, lens=lens, side=side)
-    return SimulatedCamera(target, lens, moved.camera_pose_target, CameraSettings(**settings), seed)
+    return reference_rig(seed, trajectory=motion, lens=Lens(distortion=DISTORTION), side=side, **changes)
+
+
+def film(target: Target, distance_m: float, seed: int = 1, **settings: float) -> SimulatedCamera:
+    """The camera of that rig."""
+    rig = rig_before(target, distance_m, seed)
+    return SimulatedCamera(target, rig.lens, rig.camera_pose_target, CameraSettings(**settings), seed)
 
 
 def _boards(frames: int) -> None:

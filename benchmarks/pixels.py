@@ -8,39 +8,24 @@ from functools import partial
 
 import numpy as np
 from vical_mocks.camera import CameraSettings, SimulatedCamera
-from vical_mocks.lens import Lens
 from vical_mocks.points import SimulatedFrame, simulate
-from vical_mocks.rig import reference_rig
-from vical_mocks.trajectory import hand_motion
 
 from benchmarks import runner
-from benchmarks.detection import APRILGRID, CHECKERBOARD, DISTORTION
+from benchmarks.detection import APRILGRID, CHECKERBOARD, rig_before
 from benchmarks.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.vision.detector import BoardDetector
 from vical_daemon.vision.target import Target
 
-BOARDS: dict[str, tuple[Target, float, int]] = {  # distance m, printed side
-    "aprilgrid": (APRILGRID, 0.8, 1),
-    "checkerboard": (CHECKERBOARD, 0.6, -1),
-}
+BOARDS: dict[str, tuple[Target, float]] = {"aprilgrid": (APRILGRID, 0.8), "checkerboard": (CHECKERBOARD, 0.6)}
 _UNITS = np.array([1e3] * 3 + [180.0 / np.pi] * 3 + [1e6])
 
 
 def trial(board: str, seconds: float, exposure_s: float, seed: int) -> runner.Result:
     """One rendered recording, from the picture to the calibration."""
-    target, distance_m, side = BOARDS[board]
-    rng = np.random.default_rng([seed, 91])
-    rig = reference_rig(seed, lens=Lens(distortion=DISTORTION), side=side)
-    size = target.points_m[:, :2].max(axis=0)
-    motion = hand_motion(
-        seed,
-        T_imu_cam=(rig.R_imu_cam, rig.p_imu_cam),
-        side=side,
-        distance_m=distance_m,
-        board_size_m=(float(size[0]), float(size[1])),
-    )
-    rig = replace(rig, trajectory=motion, timeshift_cam_imu_s=float(rng.uniform(-0.05, 0.05)))
+    target, distance_m = BOARDS[board]
+    shift_s = float(np.random.default_rng([seed, 91]).uniform(-0.05, 0.05))
+    rig = rig_before(target, distance_m, seed, timeshift_cam_imu_s=shift_s)
     run = simulate(seed, seconds, rig=rig)
     settings = CameraSettings(exposure_s=exposure_s)
     film = SimulatedCamera(target, rig.lens, rig.camera_pose_target, settings, seed)

@@ -7,7 +7,6 @@ terminal's 4 kB do not outlast), a `StandIn` reads on, and what it reads waits i
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
@@ -15,13 +14,13 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from vical_daemon.bus import Bus
+from vical_daemon.outbox import Counted
 
-_log = logging.getLogger(__name__)
 LOOK_S = 0.025
 """The stand-in looks so often: a publication that lasts from one look to the next is held up."""
 
 
-class DirectOutbox:
+class DirectOutbox(Counted):
     """Queues by `put`; `flush` publishes in that order. What does not fit is dropped and counted.
 
     One thread flushes. Putting is up to one thread at a time, while another may flush.
@@ -32,28 +31,15 @@ class DirectOutbox:
     """
 
     def __init__(self, bus: Bus, depth: int) -> None:
-        self._bus = bus
+        super().__init__(bus)
         self._queue: deque[tuple[str, bytes]] = deque()
         self._depth = max(2, depth)
         self._publishing = False
-        self._overflowed = 0
-        self._refused = 0
-        self._published = 0
 
     @property
     def waiting(self) -> int:
         """Messages not published yet."""
         return len(self._queue)
-
-    @property
-    def dropped(self) -> int:
-        """Messages that did not fit, or that the bus did not take."""
-        return self._overflowed + self._refused
-
-    @property
-    def published(self) -> int:
-        """Messages handed to the bus."""
-        return self._published
 
     @property
     def progress(self) -> int | None:
@@ -72,13 +58,7 @@ class DirectOutbox:
         """Publish what waits, and what comes meanwhile."""
         queue, self._publishing = self._queue, True
         while queue:
-            key, payload = queue.popleft()
-            try:
-                self._bus.publish(key, payload)
-                self._published += 1
-            except Exception:  # a broken link must not end acquisition; the bus comes back by itself
-                self._refused += 1
-                _log.exception("cannot publish on %s", key)
+            self._hand_over(*queue.popleft())
         self._publishing = False
 
     def close(self) -> None:

@@ -12,7 +12,33 @@ from vical_daemon.bus import Bus
 _log = logging.getLogger(__name__)
 
 
-class Outbox:
+class Counted:
+    """What an outbox hands to the bus, counted."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._overflowed = self._refused = self._published = 0
+
+    @property
+    def dropped(self) -> int:
+        """Messages that did not fit, or that the bus did not take."""
+        return self._overflowed + self._refused
+
+    @property
+    def published(self) -> int:
+        """Messages handed to the bus."""
+        return self._published
+
+    def _hand_over(self, key: str, payload: bytes) -> None:
+        try:
+            self._bus.publish(key, payload)
+            self._published += 1
+        except Exception:  # a broken link must not end acquisition; the bus comes back by itself
+            self._refused += 1
+            _log.exception("cannot publish on %s", key)
+
+
+class Outbox(Counted):
     """Publishes in the order of `put`, in a thread of its own; what does not fit is dropped and counted.
 
     One thread puts. The queue is the interpreter's own: at 1000 samples a second a `Condition` costs more
@@ -25,12 +51,9 @@ class Outbox:
     """
 
     def __init__(self, bus: Bus, depth: int, name: str) -> None:
-        self._bus = bus
+        super().__init__(bus)
         self._queue: SimpleQueue[tuple[str, bytes] | None] = SimpleQueue()
         self._depth = depth
-        self._overflowed = 0
-        self._refused = 0
-        self._published = 0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -38,16 +61,6 @@ class Outbox:
     def waiting(self) -> int:
         """Messages not published yet."""
         return self._queue.qsize()
-
-    @property
-    def dropped(self) -> int:
-        """Messages that did not fit, or that the bus did not take."""
-        return self._overflowed + self._refused
-
-    @property
-    def published(self) -> int:
-        """Messages handed to the bus."""
-        return self._published
 
     def put(self, key: str, payload: bytes) -> None:
         """Queue one message; returns at once."""
@@ -69,9 +82,4 @@ class Outbox:
 
     def _run(self) -> None:
         while (message := self._queue.get()) is not None:
-            try:
-                self._bus.publish(*message)
-                self._published += 1
-            except Exception:  # a broken link must not end acquisition; the bus comes back by itself
-                self._refused += 1
-                _log.exception("cannot publish on %s", message[0])
+            self._hand_over(*message)

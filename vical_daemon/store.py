@@ -187,11 +187,11 @@ def _plain(value: Any) -> Any:
     """Number of an array library as a plain one: an estimate must never be lost over its type.
 
     Raises:
-        NotImplementedError: Anything else; so msgspec's `enc_hook` wants to be told.
+        TypeError: Anything else.
     """
     if hasattr(value, "item"):
         return value.item()
-    raise NotImplementedError(f"{type(value).__name__} cannot be stored")
+    raise TypeError(f"{type(value).__name__} cannot be stored")
 
 
 def _replace(path: Path, data: bytes) -> None:

@@ -293,18 +293,9 @@ def fronto_parallel(
     Rotation about the optical axis and shifts parallel to the board only.
     """
     rng = np.random.default_rng([seed, 14])
-    turn = Sinusoids(
-        np.zeros(3),
-        np.deg2rad([[0.0, 0.0, 20.0]] * 3),
-        rng.uniform(0.2, 0.7, (3, 3)),
-        rng.uniform(0, 6, (3, 3)),
-    )
-    sway = Sinusoids(
-        _viewpoint(board_size_m, distance_m, side),
-        distance_m * np.array([[0.06, 0.05, 0.0]] * 3),
-        rng.uniform(0.3, 1.2, (3, 3)),
-        rng.uniform(0, 6, (3, 3)),
-    )
+    turn = _three_waves(rng, np.zeros(3), np.deg2rad([0.0, 0.0, 20.0]), (0.2, 0.7))
+    place = _viewpoint(board_size_m, distance_m, side)
+    sway = _three_waves(rng, place, distance_m * np.array([0.06, 0.05, 0.0]), (0.3, 1.2))
     return Trajectory(turn, sway, _viewing_base(side), _imu_in_camera(T_imu_cam))
 
 
@@ -321,16 +312,14 @@ def planar(
     The lever arm across the floor is lost.
     """
     rng = np.random.default_rng([seed, 15])
-    turn = Sinusoids(
-        np.zeros(3),
-        np.deg2rad([[0.0, 6.0, 0.0]] * 3),
-        rng.uniform(0.4, 1.3, (3, 3)),
-        rng.uniform(0, 6, (3, 3)),
-    )
-    drive = Sinusoids(
-        _viewpoint(board_size_m, distance_m, side),
-        distance_m * np.array([[0.08, 0.0, 0.1]] * 3),
-        rng.uniform(0.3, 1.2, (3, 3)),
-        rng.uniform(0, 6, (3, 3)),
-    )
+    turn = _three_waves(rng, np.zeros(3), np.deg2rad([0.0, 6.0, 0.0]), (0.4, 1.3))
+    place = _viewpoint(board_size_m, distance_m, side)
+    drive = _three_waves(rng, place, distance_m * np.array([0.08, 0.0, 0.1]), (0.3, 1.2))
     return Trajectory(turn, drive, _viewing_base(side), _imu_in_camera(T_imu_cam))
+
+
+def _three_waves(
+    rng: np.random.Generator, middle: FloatArray, amplitude: FloatArray, hz: tuple[float, float]
+) -> Sinusoids:
+    """Three sinusoids an axis of one amplitude (shape (3,)), at frequencies and phases of chance."""
+    return Sinusoids(middle, np.tile(amplitude, (3, 1)), rng.uniform(*hz, (3, 3)), rng.uniform(0, 6, (3, 3)))

@@ -205,16 +205,21 @@ def test_a_direct_outbox_survives_a_bus_that_raises() -> None:
     assert (outbox.dropped, outbox.published, outbox.progress) == (1, 0, None)
 
 
-def test_while_the_bus_holds_the_reading_thread_up_another_one_reads_on(stop) -> None:
-    bus = HeldUpBus(b"3")
-    outbox = DirectOutbox(bus, 1000)
-    source = ScriptedSource([[i] for i in range(8)])
+def direct_line(bus, script, stop):
+    """A device whose reading thread publishes, with its stand-in, running."""
+    outbox, source = DirectOutbox(bus, 1000), ScriptedSource(script)
     loop: DeviceLoop[int] = DeviceLoop(
         "imu/imu0", lambda: source, lambda i: outbox.put("vical/a", b"%d" % i), stop,
         flush=outbox.flush, read_timeout_s=0.02,
     )  # fmt: skip
     loop.start()
     StandIn(outbox, loop.read_on, stop, "stand-in").start()
+    return source, loop, outbox
+
+
+def test_while_the_bus_holds_the_reading_thread_up_another_one_reads_on(stop) -> None:
+    bus = HeldUpBus(b"3")
+    source, loop, outbox = direct_line(bus, [[i] for i in range(8)], stop)
     _wait_for(lambda: not source.script)  # all was read, though 3 is not out yet
     assert [payload for payload, _ in bus.got] == [b"0", b"1", b"2"]
     assert loop.health().data_age_s < 5.0
@@ -228,14 +233,7 @@ def test_while_the_bus_holds_the_reading_thread_up_another_one_reads_on(stop) ->
 
 def test_a_loop_held_up_by_the_bus_still_ends_and_closes_its_device(stop) -> None:
     bus = HeldUpBus(b"0")
-    outbox = DirectOutbox(bus, 1000)
-    source = ScriptedSource([[0], [1]])
-    loop: DeviceLoop[int] = DeviceLoop(
-        "imu/imu0", lambda: source, lambda i: outbox.put("vical/a", b"%d" % i), stop,
-        flush=outbox.flush, read_timeout_s=0.02,
-    )  # fmt: skip
-    loop.start()
-    StandIn(outbox, loop.read_on, stop, "stand-in").start()
+    source, loop, outbox = direct_line(bus, [[0], [1]], stop)
     _wait_for(lambda: not source.script)
     stop.set()
     assert not loop.join(0.05)
