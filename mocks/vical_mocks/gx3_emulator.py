@@ -17,6 +17,7 @@ import termios
 import threading
 import time
 import tty
+from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Self
@@ -138,6 +139,12 @@ class Gx3Emulator:
             self._faults = faults
             if self._master >= 0:
                 self._link = FaultyLink(make_link(self._link_kind, self._rng, self.device.baud), faults)
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Nothing is sent or taken meanwhile; afterwards all that was due comes at once."""
+        with self._lock:
+            yield
 
     def start(self) -> Self:
         """Begin to run."""

@@ -18,6 +18,8 @@ from vical_drivers.samples import DeviceInfo, ImuSample, SourceStats
 _log = logging.getLogger(__name__)
 SILENCE_S = 2.0
 """A stream that is silent for this long counts as lost."""
+_ABSENT_S = 0.1
+"""A host that is away for longer than this between two reads has not listened: no silence of the device."""
 _BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
 
 
@@ -56,7 +58,7 @@ def open_imu(
         link: What lies in between: "auto", "usb", "ftdi" or "uart"; decides whether bytes take wire time.
         reconnect: Come back by itself after an unplug.
         warm_up_s: The first samples are held back this long, then all delivered, none lost.
-        silence_s: A stream without bytes for this long counts as lost.
+        silence_s: A stream without samples for this long counts as lost; pauses of the host do not count.
 
     Returns:
         The running source; close it, or use it as a context manager.
@@ -85,7 +87,7 @@ class MicrostrainImu(Closing):
         self._reconnects = 0
         self._attempts = 0
         self._closed = False
-        self._last_data_ns = 0
+        self._silent_s = self._last_read_s = 0.0
         self._next_attempt_ns = 0
         self._open()
 
@@ -117,7 +119,7 @@ class MicrostrainImu(Closing):
             self._stamper = SampleStamper(self.applied, port.wire_byte_ns, o.warm_up_s, o.clock)
         else:
             self._stamper.begin(self.applied, port.wire_byte_ns)
-        self._last_data_ns = time.monotonic_ns()
+        self._silent_s, self._last_read_s = 0.0, time.monotonic()
         self._attempts = 0
         _log.info("imu=%s model=%s serial=%s", self._path, self._info.model, self._info.serial_number)
 
@@ -130,18 +132,22 @@ class MicrostrainImu(Closing):
             return []
         try:
             raw = self._session.read(timeout_s)
-            if not raw:
-                self._watch_silence()
-                return []
+            self._watch_silence(heard=bool(raw), timeout_s=timeout_s)
         except DriverError:
             self._drop()
             raise
-        self._last_data_ns = raw[-1].t_arrival_ns
+        if not raw:
+            return []
         assert self._stamper is not None
         return self._stamper.stamp(raw)
 
-    def _watch_silence(self) -> None:
-        if time.monotonic_ns() - self._last_data_ns > self._options.silence_s * 1e9:
+    def _watch_silence(self, *, heard: bool, timeout_s: float) -> None:
+        """Add up the time in which the host listened and nothing came."""
+        now_s = time.monotonic()
+        listened_s = min(now_s - self._last_read_s, timeout_s + _ABSENT_S)
+        self._silent_s = 0.0 if heard else self._silent_s + listened_s
+        self._last_read_s = now_s
+        if self._silent_s > self._options.silence_s:
             raise DeviceTimeoutError(f"{self._path}: the stream went silent; check power and cable")
 
     def _drop(self) -> None:

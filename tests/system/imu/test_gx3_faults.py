@@ -69,6 +69,20 @@ def test_a_silent_device_is_noticed(emulate):
         collect(imu, 5)  # and it comes back by itself
 
 
+def test_a_host_that_was_away_does_not_call_the_device_silent(emulate):
+    emulator = emulate()
+    with open_imu(emulator.port_name, **FAST, silence_s=0.3) as imu:
+        collect(imu, 10)
+        with (
+            emulator.paused()
+        ):  # host and device stand still together, as when a virtual machine is not scheduled
+            imu.read(0.0)
+            time.sleep(0.5)
+            imu.read(0.0)
+        collect(imu, 60)
+        assert imu.stats().reconnects == 0
+
+
 def test_a_restarted_device_clock_is_noticed(emulate):
     emulator = emulate()
     with open_imu(emulator.port_name, rate_hz=200.0, **FAST) as imu:
