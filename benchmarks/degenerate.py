@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 from vical_mocks import trajectory
 from vical_mocks.points import simulate
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
@@ -15,7 +16,15 @@ from vical_mocks.trajectory import Trajectory
 
 from benchmarks import runner
 from benchmarks.bound import Bound, BoundOptions, bounds
-from benchmarks.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
+from benchmarks.feed import (
+    PARAMETERS,
+    CalibratorSubject,
+    Snapshot,
+    StartErrors,
+    camera_prior,
+    feed,
+    imu_noise,
+)
 from benchmarks.montecarlo import bound_sigmas
 from vical_daemon.estimation.measurements import CalibrationOptions
 
@@ -31,7 +40,7 @@ MOTIONS: dict[str, Callable[[int], Trajectory]] = {
     "slow 1 deg/s": lambda seed: trajectory.hand_motion(seed, 1.0, T_imu_cam=_MOUNT),
     "hand (control)": lambda seed: trajectory.hand_motion(seed, T_imu_cam=_MOUNT),
 }
-# With its prior only (StartErrors) a parameter is called lost by the bound above these sigmas.
+# With its prior only (StartErrors) a parameter or direction is called lost by the bound above these sigmas.
 _LOST = np.array([5e-3] * 3 + [np.deg2rad(0.3)] * 3 + [1e-3])
 
 
@@ -52,7 +61,6 @@ def trial(
     limit: Bound = bounds(run, BoundOptions(intrinsics=free, distortion=free, target_free=target_free))[0]
     lost = [name for name, s, most in zip(PARAMETERS, bound_sigmas(limit), _LOST, strict=False) if s > most]
     last = record.snapshots[-1] if record.snapshots else None
-    z = None if last is None else last.error[:7] / np.sqrt(np.diag(last.covariance))[:7]
     return {
         "ever_converged": any(status == "converged" for _, status, _ in record.statuses),
         "statuses": record.statuses,
@@ -60,10 +68,28 @@ def trial(
         "unobservable": record.unobservable,
         "guidance": record.guidance,
         "lost_by_bound": lost,
-        "z": z,
+        "z_shown": None
+        if last is None
+        else z_shown(limit.block("p_imu_cam", "r_imu_cam", "timeshift"), last),
         "sigma": None if last is None else np.sqrt(np.diag(last.covariance))[:7],
         "events": record.events,
     }
+
+
+def z_shown(limit: npt.NDArray[np.float64], last: Snapshot) -> list[float]:
+    """Errors over their stated sigmas along every direction that the bound says is known.
+
+    Args:
+        limit: The bound's covariance of lever arm, mounting and time shift, shape (7, 7).
+        last: What the estimator says.
+    """
+    found = []
+    for rows in (slice(0, 3), slice(3, 6), slice(6, 7)):
+        values, axes = np.linalg.eigh(limit[rows, rows])
+        for axis in axes[:, values < _LOST[rows][0] ** 2].T:
+            sigma = np.sqrt(axis @ last.covariance[rows, rows] @ axis)
+            found.append(float(axis @ last.error[rows] / sigma))
+    return found
 
 
 def main(argv: list[str]) -> int:
@@ -101,12 +127,10 @@ def _row(name: str, results: list[runner.Result]) -> str:
     converged = sum(r["ever_converged"] for r in results)
     first = results[0]
     status = ", ".join(sorted({r["statuses"][-1][1] for r in results if r["statuses"]}))
-    worst = 0.0
-    for r in results:
-        if r["z"] is not None:
-            rest = [z for p, z in zip(PARAMETERS, r["z"], strict=False) if p not in r["lost_by_bound"]]
-            worst = max(worst, float(np.nanmax(np.abs(rest), initial=0.0)))
+    shown = [abs(z) for r in results for z in r["z_shown"] or ()]
+    answered = sum(r["z_shown"] is not None for r in results)
+    rest = f"{max(shown):.1f} ({answered} of {len(results)} answered)" if shown else "no numbers"
     return (
         f"| {name} | {converged}/{len(results)} | {status} | {' '.join(first['lost_by_bound']) or '-'} "
-        f"| {'; '.join(first['unobservable']) or '-'} | {worst:.1f} | {first['reason']} |"
+        f"| {'; '.join(first['unobservable']) or '-'} | {rest} | {first['reason']} |"
     )

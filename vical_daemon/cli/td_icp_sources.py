@@ -13,7 +13,7 @@ from vical_daemon.estimation.camera_orientations import Orientations, target_ori
 from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.lens_refinement import LensFit, refine_lens
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
-from vical_daemon.estimation.start import Lens
+from vical_daemon.estimation.seen_poses import Lens
 from vical_daemon.estimation.td_icp_joint import OrientationStream
 from vical_daemon.estimation.track_orientations import track_orientations
 from vical_daemon.recording import Recording, Stream

@@ -34,6 +34,7 @@ from vical_daemon.estimation.retract import orthonormal, retract
 from vical_daemon.estimation.stamp_jitter import StampJitter
 from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State
 from vical_daemon.estimation.target_view import Rates
+from vical_daemon.estimation.unshown_axes import UnshownAxes
 
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
@@ -53,6 +54,7 @@ class CalibrationFilter:
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
         jitter: Measured random error of the stamps, by camera.
+        unshown: After a partial start: axes along which lever arms are not known.
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
@@ -66,6 +68,7 @@ class CalibrationFilter:
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     jitter: dict[str, StampJitter] = field(default_factory=dict)
+    unshown: UnshownAxes | None = None
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
     _motion_straight: Straightness = field(default_factory=Straightness)
@@ -270,9 +273,13 @@ class CalibrationFilter:
 
     def reopen(self, index: int, sigma: float) -> None:
         """Add independent uncertainty to one error: what was known about it is in doubt."""
-        column = np.zeros((self.layout.size, 1))
+        column = np.zeros(self.layout.size)
         column[index] = sigma
-        self.S = unscented.lower_root(np.concatenate([self.S, column], axis=1))
+        self.loosen(column)
+
+    def loosen(self, column: FloatArray) -> None:
+        """Add the covariance `column column'`: one direction of the errors, shape (n,), is in doubt."""
+        self.S = unscented.lower_root(np.concatenate([self.S, column[:, None]], axis=1))
 
     def reset_motion(self, R_world_imu: FloatArray, p_world_imu: FloatArray) -> None:
         """Forget where the rig is and keep the calibration: motion anew, with no tie to the rest."""

@@ -1,18 +1,16 @@
 """The estimator as the roles see it: measurements in, calibration out. No clock, no thread, no I/O.
 
-Flow: buffer until `start.attempt` succeeds -> filter everything buffered -> follow the stream behind a short
-lag (so that inertial data always bracket each image) -> `judge` says how far to trust it.
+Flow: `starting` collects until a start succeeds -> filter everything collected -> follow the stream behind a
+short lag (so that inertial data always bracket each image) -> `judge` says how far to trust it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
-from vical_daemon.estimation import start
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.frame_queue import FrameQueue
@@ -27,13 +25,12 @@ from vical_daemon.estimation.measurements import (
     FloatArray,
     PointsFrame,
 )
-from vical_daemon.estimation.rehearsal import rehearsed, wide_filter
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.seen_poses import Lens, pose_of
+from vical_daemon.estimation.starting import LATE_S, Starting
 from vical_daemon.estimation.state import make_layout
 
-_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must cost little
 _KEEP_S = 5.0
-_LATE_S = 2e-3  # an image this little before the state is used by moving the pose back
 _SKEW_OPEN = 1e-4  # s/s: two bad crystals
 
 
@@ -62,10 +59,8 @@ class Calibrator:
         self.filter: CalibrationFilter | None = None
         self._buffer: ImuBuffer | None = None
         self._base_ns = 0
-        self._waiting: dict[str, list[tuple[float, PointsFrame]]] = {name: [] for name in cameras}
         self._pending = FrameQueue(list(cameras))
-        self._next_attempt_s, self._attempt_every_s = -np.inf, _ATTEMPT_FIRST_S
-        self._caches: dict[str, start.PoseCache] = {}
+        self._starting = Starting(options, self.layout, self.target, self._step)
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
@@ -107,12 +102,8 @@ class Calibrator:
         """Do what can be done with what has arrived."""
         if self._buffer is None:
             return []
-        if self.filter is None:
-            self._collect()
-            if self._buffer.newest_s >= self._next_attempt_s:
-                self._next_attempt_s = self._buffer.newest_s + self._attempt_every_s
-                self._attempt_every_s = min(1.25 * self._attempt_every_s, _ATTEMPT_MOST_S)
-                self._attempt()
+        if self.filter is None or self.filter.unshown is not None:
+            self._maybe_start()
         return self._follow(flush=False)
 
     def finish(self) -> list[FrameReport]:
@@ -120,52 +111,30 @@ class Calibrator:
         if self._buffer is None:
             return []
         if self.filter is None:
-            self._collect()
-            self._attempt()
+            self._maybe_start(at_end=True)
         return self._follow(flush=True)
 
-    def _collect(self) -> None:
-        """Move arrived frames to the starting set, thinning the oldest half when it grows too long."""
-        for t, frame in self._pending.take_all():
-            waiting = self._waiting[frame.camera]
-            waiting.append((t, frame))
-            if len(waiting) > start.MAX_FRAMES:
-                del waiting[: len(waiting) // 2]
-        oldest = min((w[0][0] for w in self._waiting.values() if w), default=None)
-        if oldest is not None and self._buffer is not None:
-            self._buffer.trim(oldest - _KEEP_S)
-
-    def _attempt(self) -> None:
+    def _maybe_start(self, *, at_end: bool = False) -> None:
+        """Collect while there is no filter, and try to start one; a partial one gives way to a full one."""
         assert self._buffer is not None
-        spans = [w[-1][0] - w[0][0] for w in self._waiting.values() if len(w) > 1]
-        if len(spans) < len(self._waiting) or min(spans) < start.MIN_SPAN_S:
-            self.judge.waiting("collecting the first seconds: move the rig, keep the target in view")
-            return
-        result = start.attempt(
-            self._buffer, self._waiting, self.priors, self.options, self.layout, self.target, self._caches
-        )
-        if result.state is None:
-            self.judge.waiting(result.reason, result.motion_missing)
-            return
-        begin = result.state.t_s
-        shifts = {name: c.timeshift_s for name, c in result.state.cameras.items()}
-        frames = [
-            (t, f) for w in self._waiting.values() for t, f in w if t + shifts[f.camera] > begin - _LATE_S
-        ]
-        frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
-        make = partial(wide_filter, layout=self.layout, options=self.options)
-        self.filter = rehearsed(result.state, frames, make, self._step)
         if self.filter is None:
-            self.judge.waiting("the first seconds do not fit together yet: keep the board in view and moving")
+            self._starting.take(self._pending.take_all())
+            self._buffer.trim(self._starting.oldest_s - _KEEP_S)
+        if not (at_end or self._starting.due(self._buffer.newest_s)):
             return
-        self._caches.clear()
-        self.judge.started(begin)
-        self.watch.started(begin)
-        self._stale = None
-        for t, frame in frames:
+        found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
+        if found.filter is None:
+            if self.filter is None:
+                self.judge.waiting(found.reason, found.motion_missing)
+            return
+        later = self._pending.take_all()
+        self.filter, self._stale = found.filter, None
+        self._held_back = HeldBack()
+        self.judge.started(found.begin_s, found.reason)
+        self.watch.started(found.begin_s)
+        self._starting.anew()
+        for t, frame in [*found.frames, *later]:
             self._pending.push(t, frame)
-        for waiting in self._waiting.values():
-            waiting.clear()
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
@@ -184,7 +153,7 @@ class Calibrator:
         """Propagate a filter to one image and correct it; None where inertial data are missing."""
         assert self._buffer is not None
         t_s = t_cam_s + f.state.cameras[frame.camera].timeshift_s
-        if t_s < f.state.t_s - _LATE_S:
+        if t_s < f.state.t_s - LATE_S:
             return None
         if t_s > f.state.t_s:
             segment = self._buffer.segment(f.state.t_s, t_s)
@@ -204,7 +173,10 @@ class Calibrator:
         if report is None:
             self.judge.frames_ignored += 1
             return None
-        self._buffer.trim(f.state.t_s - _KEEP_S)
+        if f.unshown is not None:
+            self._starting.take([(t_cam_s, frame)])
+            f.unshown.follow(f)
+        self._buffer.trim(min(f.state.t_s, self._starting.oldest_s) - _KEEP_S)
         ratio = self._held_back_ratio(frame, t_cam_s)
         if ratio is not None:
             self.judge.held_back(ratio, f.consistency[frame.camera].scale)
@@ -241,8 +213,8 @@ class Calibrator:
     def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """After a run of refused images: take attitude and position from the image, keep the calibration."""
         camera = f.state.cameras[frame.camera]
-        lens = start.Lens(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)
-        seen = start.pose_of(frame, t_cam_s, lens, self.target)
+        lens = Lens(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)
+        seen = pose_of(frame, t_cam_s, lens, self.target)
         if seen is None:
             return
         R = seen.R_target_cam @ camera.R_imu_cam.T
@@ -251,6 +223,10 @@ class Calibrator:
 
     def _restart(self, f: CalibrationFilter) -> None:
         """The rig has changed: forget mounting and delay, keep the lens, and start from the data to come."""
+        if f.unshown is not None:  # nothing has changed: the guesses were wrong
+            self.filter = None
+            self._starting.anew()
+            return
         for name, camera in f.state.cameras.items() if f.plausible() else ():
             self.priors[name] = replace(
                 self.priors[name],
@@ -259,7 +235,7 @@ class Calibrator:
             )
         self.judge.changed(self.watch.why)
         self._stale, self.filter = (f if f.plausible() else None), None
-        self._next_attempt_s, self._attempt_every_s = -np.inf, _ATTEMPT_FIRST_S
+        self._starting.anew()
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

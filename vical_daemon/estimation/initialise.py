@@ -16,6 +16,10 @@ from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.imu_model import strapdown
 from vical_daemon.estimation.measurements import FloatArray
 
+STILL_RAD = 0.05
+"""RMS turn of an axis below which it has shown nothing of a lever arm along it."""
+HELD_M = 1e-3
+"""Sigma with which a lever arm is held at zero along such an axis, m."""
 _ACCEL_BIAS_PRIOR = 0.3  # m/s^2, the datasheet's worst turn-on bias several times over
 
 
@@ -47,6 +51,8 @@ def linear_start(
     p_world_cam: FloatArray,
     gyro_bias: FloatArray,
     position_sigma: FloatArray,
+    *,
+    only_if_shown: bool = False,
 ) -> LinearStart | None:
     """Solve velocity, gravity, accelerometer bias and lever arm from poses of the camera.
 
@@ -60,6 +66,8 @@ def linear_start(
         p_world_cam: Camera positions, m, shape (n, 3).
         gyro_bias: rad/s.
         position_sigma: Standard deviation of each camera position, m, shape (n,).
+        only_if_shown: Hold the lever arm at zero along axes that hardly turn: there, errors of the
+            attitudes, which are those of the positions times the board's distance, would be taken for it.
 
     Returns:
         The solution, or None where the readings do not cover the instants.
@@ -80,15 +88,28 @@ def linear_start(
     w = 1.0 / position_sigma
     rows = (A * w[:, None, None]).reshape(-1, 15)
     y = ((p_world_cam - D) * w[:, None]).ravel()
-    prior = np.zeros((3, 15))
-    prior[:, 12:15] = eye / _ACCEL_BIAS_PRIOR
-    A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(3)])
+    prior = np.zeros((6, 15))
+    prior[:3, 12:15] = eye / _ACCEL_BIAS_PRIOR
+    if only_if_shown:
+        axes = still_axes(R_world_imu.mean(axis=0))
+        prior[3:, 9:12] = axes.T @ axes / HELD_M
+    A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(6)])
     x, *_ = np.linalg.lstsq(A_all, y_all, rcond=None)
     residual = (y - rows @ x).reshape(-1, 3)
     variance = float(np.mean(residual**2))
     cov = np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)
     rms = float(np.sqrt(np.mean((residual / w[:, None]) ** 2)))
     return LinearStart(x[9:12], x[3:6], x[6:9], x[12:15], np.sqrt(np.diag(cov)[9:12]), rms)
+
+
+def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:
+    """Axes of the imu that kept their direction, from the mean of its attitudes (3, 3); shape (k, 3).
+
+    A unit axis a that turns by small angles of RMS s has a mean R a of squared length 1 - s^2.
+    """
+    moved, axes = np.linalg.eigh(np.eye(3) - mean_R_world_imu.T @ mean_R_world_imu)
+    still: FloatArray = axes[:, moved < STILL_RAD**2].T
+    return still
 
 
 def _integrate(

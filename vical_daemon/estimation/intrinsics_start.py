@@ -16,7 +16,7 @@ from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.planar_pose import planar_pose
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.start import Lens
+    from vical_daemon.estimation.seen_poses import Lens
 
 _VIEWS = 24
 _STEPS = 15

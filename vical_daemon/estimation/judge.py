@@ -26,6 +26,7 @@ _HELD_BACK_BAD = 9.0
 _HYSTERESIS = 2.0
 _TOLD_JITTER_S = 3e-4  # worth a word to the user
 _RECENT = 60
+_MOVE = "turn the rig about all three axes while moving it"
 
 
 class Judge:
@@ -53,6 +54,7 @@ class Judge:
         self._ever_converged = False
         self._start_reason = ""
         self._motion_missing = False
+        self._partial = ""
         self._first_ns = self._newest_ns = 0
         self._first_frame_s: float | None = None
         self._started_s: float | None = None
@@ -87,9 +89,9 @@ class Judge:
         """The start is not possible yet; `motion_missing`: more motion, not more time, would help."""
         self._start_reason, self._motion_missing = why, motion_missing
 
-    def started(self, t_s: float) -> None:
-        """The filter runs from `t_s` on."""
-        self._start_reason, self._started_s = "", t_s
+    def started(self, t_s: float, partial: str = "") -> None:
+        """The filter runs from `t_s` on; `partial`: what the motion did not show, and was guessed."""
+        self._start_reason, self._started_s, self._partial = "", t_s, partial
         self._recent_used.clear()
         self._nis.clear()
         self._held_back.clear()
@@ -221,6 +223,8 @@ class Judge:
         if self.status == Status.CONVERGED:
             lacking = [g for g in lacking if g.excess > _HYSTERESIS]
         if not lacking:
+            if self._partial:
+                return Status.DEGENERATE, self._partial, _MOVE
             if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
                 return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
             if self.clocks_in_doubt:
@@ -250,7 +254,7 @@ class Judge:
             return Status.WAITING, "the target has not been seen yet: show the whole board to the camera", ""
         seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
         if self._motion_missing and seen_for > _PATIENCE_S:
-            advice = shortcoming(self._motion, None) or "turn the rig about all three axes while moving it"
+            advice = shortcoming(self._motion, None) or _MOVE
             return Status.DEGENERATE, self._start_reason, advice
         return Status.INITIALISING, self._start_reason or "collecting the first seconds", ""
 

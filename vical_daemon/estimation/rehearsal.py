@@ -8,10 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation import unscented
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.initialise import HELD_M
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
 from vical_daemon.estimation.stamp_jitter import StampJitter
@@ -26,6 +28,7 @@ from vical_daemon.estimation.state import (
     Layout,
     State,
 )
+from vical_daemon.estimation.unshown_axes import UNKNOWN_M, UnshownAxes
 
 REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
 SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
@@ -73,10 +76,10 @@ def rehearsed(
         cameras={name: replace(camera, skew=0.0) for name, camera in trial.state.cameras.items()},
     )
     fresh = make(begin)
-    sigmas = np.diag(fresh.S).copy()
-    constant = slice(MOTION.stop, None)
-    sigmas[constant] = np.minimum(sigmas[constant], REHEARSED * trial.sigmas()[constant])
-    fresh.S = np.diag(sigmas)
+    wide = np.diag(fresh.S)
+    narrow = np.minimum(wide, REHEARSED * trial.sigmas())
+    narrow[: MOTION.stop] = wide[: MOTION.stop]
+    fresh.S = fresh.S * (narrow / wide)[:, None]
     for name, noise in trial.corner_noise.items():
         fresh.corner_noise[name] = noise
         fresh.jitter[name] = trial.jitter[name]
@@ -85,26 +88,51 @@ def rehearsed(
     return fresh
 
 
-def wide_filter(state: State, layout: Layout, options: CalibrationOptions) -> CalibrationFilter:
-    """Build a filter about a start, with sigmas many times what the start is worth."""
+def wide_filter(
+    state: State, layout: Layout, options: CalibrationOptions, still_axes: FloatArray | None = None
+) -> CalibrationFilter:
+    """Build a filter about a start, with sigmas many times what the start is worth.
+
+    Args:
+        state: The start.
+        layout: Where the errors live.
+        options: Noise.
+        still_axes: Of a partial start, see `StartResult`.
+    """
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
-    root = np.diag(start_sigmas(state, layout))
+    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None))
+    unshown = None if still_axes is None else UnshownAxes(still_axes)
+    for where in layout.cameras.values():
+        if unshown is not None and where.position is not None:
+            held = unshown.projector
+            root[where.position, where.position] = UNKNOWN_M * (np.eye(3) - held) + HELD_M * held
     agreement = {name: LensAgreement() for name in layout.cameras}
     jitter = {name: StampJitter() for name in layout.cameras}
     return CalibrationFilter(
-        state, layout, root, options.imu_noise, noise, walk, consistency, agreement, jitter
+        state,
+        layout,
+        unscented.lower_root(root),
+        options.imu_noise,
+        noise,
+        walk,
+        consistency,
+        agreement,
+        jitter,
+        unshown,
     )
 
 
-def start_sigmas(state: State, layout: Layout) -> FloatArray:
+def start_sigmas(state: State, layout: Layout, *, partial: bool) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
     The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
     """
     s = np.zeros(layout.size)
-    s[ATTITUDE], s[POSITION], s[VELOCITY] = 0.1, 0.1, 0.5
+    # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
+    lever_arm, position, angle = (UNKNOWN_M, 3.0 * UNKNOWN_M, 0.03) if partial else (0.15, 0.1, 0.1)
+    s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix], s[layout.accel_matrix] = 0.01, 0.01
@@ -113,7 +141,7 @@ def start_sigmas(state: State, layout: Layout) -> FloatArray:
     for name, where in layout.cameras.items():
         focal = float(state.cameras[name].intrinsics[0])
         if where.position is not None and where.rotation is not None:
-            s[where.position], s[where.rotation] = 0.15, 0.1
+            s[where.position], s[where.rotation] = lever_arm, angle
         if where.timeshift is not None and where.skew is not None:
             s[where.timeshift], s[where.skew] = 5e-3, SKEW_CLOSED
         if where.intrinsics is not None and where.distortion is not None:

@@ -64,4 +64,7 @@ def pose_covariance(f: CalibrationFilter, where: CameraSlices) -> FloatArray:
         *range(where.position.start, where.position.stop),
         *range(where.rotation.start, where.rotation.stop),
     ]
-    return f.covariance(rows)
+    covariance = f.covariance(rows)
+    if f.unshown is not None:
+        covariance[:3, :3] += f.unshown.covariance()
+    return covariance

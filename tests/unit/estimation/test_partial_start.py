@@ -1,0 +1,102 @@
+"""Motion that shows only part of the calibration: that part is right, the rest named, nothing converges."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from vical_mocks import trajectory
+from vical_mocks.curves import Pause, Paused
+from vical_mocks.points import simulate
+from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
+
+from tests.unit.estimation.test_calibrator import calibrate, errors
+from vical_daemon.estimation.initialise import still_axes
+from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.snapshot import pose_covariance
+
+MOUNT = (NOMINAL_R_IMU_CAM, NOMINAL_P_IMU_CAM)
+
+
+def run_of(motion, seed=4, seconds=20.0):
+    return simulate(seed, seconds, rig=reference_rig(seed, timeshift_cam_imu_s=0.03, trajectory=motion))
+
+
+@pytest.mark.parametrize(
+    ("motion", "hidden_cam"),
+    [
+        (trajectory.pure_translation(4, T_imu_cam=MOUNT), np.eye(3)),
+        (trajectory.one_axis(4, [0, 0, 1], T_imu_cam=MOUNT), np.eye(3)[2:]),
+        (trajectory.one_axis(4, [1, 0, 0], T_imu_cam=MOUNT), np.eye(3)[:1]),
+    ],
+    ids=["pure translation", "about the optical axis", "nodding"],
+)
+def test_what_the_motion_shows_is_right_and_what_it_does_not_is_named(motion, hidden_cam):
+    run = run_of(motion)
+    statuses = []
+    c = calibrate(run, each=lambda c: statuses.append(c.estimate().status))
+    estimate = c.estimate()
+    assert Status.CONVERGED not in statuses
+    assert estimate.status == Status.DEGENERATE
+    x, sigma = errors(estimate, run)
+    assert np.abs(x / sigma)[3:].max() < 4.0
+    assert sigma[3:6].max() < np.deg2rad(0.1)
+    assert sigma[6] < 2e-4
+    camera = estimate.cameras["cam0"]
+    R = Rotation.from_quat(np.roll(camera.T_imu_cam.q_wxyz, -1)).as_matrix()
+    position = R.T @ np.array(camera.T_imu_cam.covariance)[:3, :3] @ R
+    spread = np.einsum("ki,ij,kj->k", hidden_cam, position, hidden_cam)
+    assert np.sqrt(spread).min() > 0.25
+    shown = np.eye(3) - hidden_cam.T @ hidden_cam  # along these axes the lever arm is known, and right
+    known = shown @ position @ shown
+    if len(hidden_cam) < 3:
+        assert np.sqrt(np.trace(known)) < 0.02
+        assert np.linalg.norm(shown @ R.T @ x[:3]) < 4.0 * np.sqrt(np.trace(known))
+    assert len(camera.unobservable) == len(hidden_cam)
+    assert all("lever arm" in name for name in camera.unobservable)
+
+
+def test_a_partial_start_gives_way_to_a_full_one_as_soon_as_the_rig_turns():
+    hand = trajectory.hand_motion(4, T_imu_cam=MOUNT)
+    late = trajectory.Trajectory(
+        Paused(hand.rotation, [Pause(0.5, 11.0)]),
+        hand.position,
+        hand.R_world_base0,
+        (hand.R_base_imu, hand.p_base_imu),
+    )
+    run = run_of(late, seconds=26.0)
+    partial = []
+    c = calibrate(run, each=lambda c: partial.append(c.filter is not None and c.filter.unshown is not None))
+    assert any(partial)
+    estimate = c.estimate()
+    assert estimate.status == Status.CONVERGED
+    assert c.filter.unshown is None
+    x, sigma = errors(estimate, run)
+    assert np.abs(x / sigma).max() < 4.0
+    assert sigma[:3].max() < 2e-3
+
+
+def test_turning_on_the_spot_at_one_rate_shows_too_little_to_begin_with():
+    run = run_of(trajectory.constant_rate(T_imu_cam=MOUNT))
+    estimate = calibrate(run).estimate()
+    assert estimate.status == Status.DEGENERATE
+    assert estimate.cameras == {}
+
+
+def test_an_axis_that_begins_to_turn_is_released():
+    run = run_of(trajectory.pure_translation(4, T_imu_cam=MOUNT), seconds=10.0)
+    f = calibrate(run).filter
+    assert len(f.unshown.axes) == 3
+    before = pose_covariance(f, f.layout.cameras["cam0"])[:3, :3]
+    for angle in np.linspace(0.0, 1.0, 2000):  # 57 degrees about z: x and y turn, z does not
+        f.state.R_world_imu = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() @ f.state.R_world_imu
+        f.state.t_s += 0.05
+        f.unshown.follow(f)
+    assert len(f.unshown.axes) < 3
+    after = pose_covariance(f, f.layout.cameras["cam0"])[:3, :3]
+    assert np.linalg.eigvalsh(after - before).min() > -1e-6  # released, not made known
+
+
+def test_still_axes_are_those_that_keep_their_direction():
+    swing = Rotation.from_rotvec(np.outer(0.3 * np.sin(np.linspace(0, 20, 400)), [0.0, 0.6, 0.8]))
+    axes = still_axes((Rotation.from_euler("xyz", [0.4, -1.0, 2.0]) * swing).as_matrix().mean(axis=0))
+    assert axes.shape == (1, 3)
+    assert abs(axes[0] @ [0.0, 0.6, 0.8]) == pytest.approx(1.0, abs=1e-3)
