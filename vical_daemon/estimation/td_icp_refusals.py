@@ -15,6 +15,7 @@ FloatArray = npt.NDArray[np.float64]
 
 _DEG = np.pi / 180.0
 _MIN_RATE_RPS = 3.0 * _DEG  # slower than this is "not moving"
+_STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3
 _ROTATION_LOST_RAD = 3.0 * _DEG
 UNEVEN = 1e-3  # no two crystals are as far apart
@@ -41,7 +42,8 @@ def refuse_motion(
     kernel = np.ones(length) / length
     mean_rate = np.stack([np.convolve(gyro[near, i], kernel, mode="valid") for i in range(3)], axis=1)
     rate_imu = float(np.median(np.linalg.norm(mean_rate, axis=1)))
-    swing = float(np.median(np.linalg.norm(mean_rate - np.median(mean_rate, axis=0), axis=1)))
+    change = np.linalg.norm(mean_rate - np.median(mean_rate, axis=0), axis=1)
+    swing = float(np.median(change))
     ratio = rate_imu / max(rate_cam, 1e-9)
     if rate_cam < _MIN_RATE_RPS and swing < _MIN_RATE_RPS:
         return (
@@ -50,6 +52,16 @@ def refuse_motion(
         )
     if rate_cam < _MIN_RATE_RPS and swing > 5.0 * _MIN_RATE_RPS:
         return "the imu turns but the camera does not: is the camera fixed to the imu, are its poses fresh?"
+    if 0.5 < ratio < 2.0 and float(np.quantile(change, 0.95)) < _STEADY * rate_imu:
+        return (
+            f"it turns at one rate ({rate_imu / _DEG:.0f} deg/s) about one axis all the time: neither delay "
+            "nor mounting about that axis show; turn to and fro, and about other axes"
+        )
+    return _wrong_unit(ratio)
+
+
+def _wrong_unit(ratio: float) -> str:
+    """Say when the gyro's rates over the camera's look like degrees taken for radians, or the reverse."""
     if 35.0 < ratio < 95.0:
         return (
             f"the gyro's rates are {ratio:.1f} times the camera's: they look like degrees per second "

@@ -78,6 +78,7 @@ def test_turning_on_the_spot_at_one_rate_shows_too_little_to_begin_with():
     run = run_of(trajectory.constant_rate(T_imu_cam=MOUNT))
     estimate = calibrate(run).estimate()
     assert estimate.status == Status.DEGENERATE
+    assert "one rate" in estimate.reason
     assert estimate.cameras == {}
 
 
