@@ -170,7 +170,7 @@ class Judge:
             first = next(iter(f.state.cameras.values()))
             advice = shortcoming(self._motion, first.R_imu_cam, f.state.gyro_bias) or advice
         self._ever_converged |= self.status == Status.CONVERGED
-        if f is not None and self.status == Status.DEGENERATE:
+        if f is not None and (self.status == Status.DEGENERATE or f.unshown is not None):
             cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
         events, self.events = self.events, []
         return CalibrationEstimate(

@@ -80,6 +80,8 @@ class FlowPredictor:
         self._affine: FloatArray | None = None
         self._step_s = 0.0
         self._gyro_error_px = self._flow_error_px = 0.0
+        # between two pictures, once asked for: (their stamps, rotation)
+        self._turn: tuple[tuple[int | None, int | None], FloatArray | None] | None = None
 
     def add_imu(self, t_imu_ns: int, gyro_rps: tuple[float, float, float]) -> None:
         """Take one gyro sample (rad/s, imu frame); samples that go back in time are ignored."""
@@ -95,7 +97,9 @@ class FlowPredictor:
         return by_gyro
 
     def _by_gyro(self, uv_px: FloatArray, t_before_ns: int | None, t_now_ns: int | None) -> FloatArray | None:
-        rotation = self.rotation(t_before_ns, t_now_ns)
+        if self._turn is None or self._turn[0] != (t_before_ns, t_now_ns):
+            self._turn = (t_before_ns, t_now_ns), self.rotation(t_before_ns, t_now_ns)
+        rotation = self._turn[1]
         if rotation is None or self.camera is None:
             return None
         rays = self.camera.rays(uv_px)
@@ -116,7 +120,7 @@ class FlowPredictor:
     ) -> None:
         """Remember the mean (affine) flow of a frame for the next one, and which foretelling was right."""
         self._compare(before_px, now_px, t_before_ns, t_now_ns)
-        self._affine = None
+        self._affine = self._turn = None
         if len(before_px) >= 8:
             design = np.column_stack([before_px, np.ones(len(before_px))])
             flow = now_px - before_px
@@ -154,8 +158,9 @@ class FlowPredictor:
         # The newest sample may lag a little behind the picture: its rate is held.
         if end - self._gyro[-1][0] > 20_000_000:
             return None
-        times = np.array([t - begin for t, _ in self._gyro], np.float64) * 1e-9
-        rates = np.array([rate for _, rate in self._gyro])
+        near = self._since(begin)
+        times = np.array([t - begin for t, _ in near], np.float64) * 1e-9
+        rates = np.array([rate for _, rate in near])
         span = (end - begin) * 1e-9
         inner = times[(times > 0) & (times < span)]
         grid = np.concatenate([[0.0], inner, [span]])
@@ -165,6 +170,15 @@ class FlowPredictor:
             R_before_now = R_before_now @ cv2.Rodrigues(rate * step)[0]
         R_imu_cam = self.camera.R_imu_cam
         return np.asarray(R_imu_cam.T @ R_before_now.T @ R_imu_cam)
+
+    def _since(self, t_imu_ns: int) -> list[tuple[int, FloatArray]]:
+        """Samples from the last one at or before an instant on, in order: few of the many that are kept."""
+        near: list[tuple[int, FloatArray]] = []
+        for sample in reversed(self._gyro):
+            near.append(sample)
+            if sample[0] <= t_imu_ns:
+                break
+        return near[::-1]
 
     def undistort(self, uv_px: FloatArray) -> FloatArray:
         """Pixels of the ideal pinhole of the same focal length (for epipolar lines); as given without one."""

@@ -82,14 +82,15 @@ class Templates:
         uv = uv_px.copy()
         strength = np.linalg.norm(self.values, axis=1) + 1e-6
         error = np.zeros_like(self.values)
+        places, gain = window_places(RADIUS, warp), warp @ self.inverse
         for _ in range(ITERATIONS):
-            window = sample_windows(smooth, uv, RADIUS, warp).reshape(len(uv), SIZE**2)
-            window = window - window.mean(axis=1, keepdims=True)
-            power = np.sum(window * window, axis=1) + 1e-6
-            match = np.sum(window * self.values, axis=1)
+            window = _look(smooth, uv, places)
+            window -= window.mean(axis=1, keepdims=True)
+            power = _dot(window, window) + 1e-6
+            match = _dot(window, self.values)
             error = window * np.clip(match / power, 0.3, 3.0)[:, None] - self.values
-            right = np.stack([np.sum(self.gx * error, axis=1), np.sum(self.gy * error, axis=1)], axis=1)
-            step = np.einsum("nij,njk,nk->ni", warp, self.inverse, right.astype(np.float64))
+            right = np.stack([_dot(self.gx, error), _dot(self.gy, error)], axis=1)
+            step = (gain @ right[:, :, None].astype(np.float64))[:, :, 0]
             length = np.linalg.norm(step, axis=1, keepdims=True)
             uv = uv - step * np.minimum(1.0, 0.7 / np.maximum(length, 1e-9))
         rest = np.linalg.norm(error, axis=1)
@@ -103,31 +104,31 @@ def no_templates() -> Templates:
     return Templates(empty, empty, empty, np.zeros((0, 2, 2)))
 
 
-def sample_windows(
-    smooth: Float32, centre_px: FloatArray, radius: int, warp: FloatArray | None = None
-) -> Float32:
-    """Windows of edge 2 radius + 1 around pixels, turned by `warp`, shape (n, edge, edge)."""
+def window_places(radius: int, warp: FloatArray) -> tuple[Float32, Float32]:
+    """Where pixels of windows lie about their centres, turned by `warp` (n, 2, 2): u, v, (n, edge^2) each."""
     span = np.arange(-radius, radius + 1, dtype=np.float32)
-    edge, count = len(span), len(centre_px)
-    if not count:
-        return np.zeros((0, edge, edge), np.float32)
+    right, down = np.tile(span, len(span)), np.repeat(span, len(span))
+    W = warp.astype(np.float32)[:, :, :, None]
+    u, v = W[:, 0, 0] * right + W[:, 0, 1] * down, W[:, 1, 0] * right + W[:, 1, 1] * down
+    return u, v
+
+
+def sample_windows(smooth: Float32, centre_px: FloatArray, radius: int) -> Float32:
+    """Windows of edge 2 radius + 1 around pixels, shape (n, edge, edge)."""
+    edge, count = 2 * radius + 1, len(centre_px)
+    upright = np.broadcast_to(np.eye(2), (count, 2, 2))
+    return _look(smooth, centre_px, window_places(radius, upright)).reshape(count, edge, edge)
+
+
+def _look(smooth: Float32, centre_px: FloatArray, places: tuple[Float32, Float32]) -> Float32:
+    """Grey levels of windows, bilinear, (n, edge^2); u and v apart, as numpy is slow on pairs."""
+    if not len(centre_px):
+        return np.zeros(places[0].shape, np.float32)
     centre = centre_px.astype(np.float32)
-    W = np.broadcast_to(np.eye(2), (count, 2, 2)) if warp is None else warp
-    along, across = W.astype(np.float32)[:, :, 0], W.astype(np.float32)[:, :, 1]
-    offset = (
-        along[:, None, None, :] * span[None, None, :, None]
-        + across[:, None, None, :] * span[None, :, None, None]
-    )
-    places = centre[:, None, None, :] + offset
-    rows = 32000 // edge
-    parts = [
-        cv2.remap(
-            smooth,
-            places[i : i + rows].reshape(-1, edge, 2),
-            None,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        for i in range(0, count, rows)
-    ]
-    return np.concatenate(parts).reshape(count, edge, edge)
+    u, v = places[0] + centre[:, :1], places[1] + centre[:, 1:]
+    return np.asarray(cv2.remap(smooth, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _dot(a: Float32, b: Float32) -> Float32:
+    """Row by row."""
+    return np.asarray(np.einsum("ni,ni->n", a, b))
