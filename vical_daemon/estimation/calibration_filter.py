@@ -16,7 +16,7 @@ from vical_daemon.estimation import unscented
 from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.image_update import corner_gate, curved_share, frame_limit, solve
+from vical_daemon.estimation.image_update import corner_gate, curved_share, frame_limit, rows_of, solve
 from vical_daemon.estimation.imu_buffer import ImuSegment
 from vical_daemon.estimation.imu_model import process_noise
 from vical_daemon.estimation.lens_agreement import LensAgreement
@@ -157,8 +157,7 @@ class CalibrationFilter:
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None]
-        rows = np.repeat(keep, 2)
-        expected = np.concatenate([lin.linear, image.common_px], axis=1)[rows]
+        expected = _expected(image, lin)[rows_of(keep)]
         self.consistency[image.camera].learn(lin.z[keep], innovation[keep], expected, image.sigma_px[keep])
         return FrameReport(
             image.t_ns,
@@ -184,17 +183,18 @@ class CalibrationFilter:
     def _measure(self, image: Image, lin: Linear, keep: BoolArray) -> None:
         """What an image says about stamps and lens before it is used."""
         where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
-        rows, sigma = np.repeat(keep, 2), image.sigma_px[keep]
+        rows, sigma = rows_of(keep), image.sigma_px[keep]
         innovation = ((image.uv - lin.z)[keep] / sigma[:, None]).ravel()
-        weight = 1.0 / np.repeat(sigma, 2)[:, None]
-        whitened = lin.H[rows] * weight
+        weight = 1.0 / np.repeat(sigma, 2)
         jitter, agreement = self.jitter.get(image.camera), self.agreement.get(image.camera)
         if jitter is not None and where.timeshift is not None:
             level = self.consistency[image.camera].level
-            jitter.learn(innovation, whitened[:, where.timeshift], lin.linear[rows] * weight, level)
+            by_shift = lin.H[rows, where.timeshift] * weight
+            jitter.learn(innovation, by_shift, (by_shift * weight) @ lin.linear[rows], level)
         if agreement is not None and where.intrinsics is not None and where.distortion is not None:
             lens = slice(where.intrinsics.start, where.distortion.stop)
             values = np.concatenate([camera.intrinsics, camera.distortion])
+            whitened = lin.H[rows] * weight[:, None]
             agreement.learn(self.state.t_s, innovation, whitened[:, :6], whitened[:, lens], values)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
@@ -217,8 +217,7 @@ class CalibrationFilter:
         keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)
         if keep.sum() < len(keep) // 2:
             return 36.0
-        rows = np.repeat(keep, 2)
-        expected = np.concatenate([lin.linear, self._shared_noise(image, lin).common_px], axis=1)[rows]
+        expected = _expected(self._shared_noise(image, lin), lin)[rows_of(keep)]
         normal = normalised(lin.z[keep], (image.uv - lin.z)[keep], expected, image.sigma_px[keep])
         return None if normal is None else float(normal @ normal) / len(normal)
 
@@ -309,3 +308,8 @@ class CalibrationFilter:
         """Covariance of chosen errors, shape (k, k)."""
         part = self.S[rows]
         return np.asarray(part @ part.T)
+
+
+def _expected(image: Image, lin: Linear) -> FloatArray:
+    """What moves the pixels beside the corners' own noise: states and what the corners share."""
+    return np.concatenate([lin.linear, image.common_px], axis=1) if image.common_px.size else lin.linear

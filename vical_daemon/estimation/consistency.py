@@ -21,10 +21,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.unscented import solve_lower
 
 MODES = 8
 _MIN_CORNERS = 8
 _LAGS = 20
+_TAPER = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
 _SIGNIFICANT = 5.0
 _FLOOR = 0.5
 _GAIN_START, _GAIN_END = 0.1, 0.01
@@ -68,12 +70,16 @@ def normalised(
     if len(uv) < _MIN_CORNERS:
         return None
     whitened = 1.0 / np.repeat(sigma, 2)
-    Q, R = np.linalg.qr(modes(uv) * whitened[:, None])
-    diagonal = np.abs(np.diag(R))
+    W = modes(uv) * whitened[:, None]
+    try:
+        L: FloatArray = np.linalg.cholesky(W.T @ W).astype(np.float64, copy=False)  # W = Q L'
+    except np.linalg.LinAlgError:
+        return None
+    diagonal = np.diag(L)
     if diagonal.min() < 1e-6 * diagonal.max():
         return None
-    seen = Q.T @ (innovation.ravel() * whitened)
-    state = Q.T @ (linear * whitened[:, None])
+    Q = solve_lower(L, W.T).T * whitened[:, None]
+    seen, state = innovation.ravel() @ Q, Q.T @ linear
     out: FloatArray = np.clip(seen / np.sqrt(1.0 + (state**2).sum(axis=1)), -_CLIP, _CLIP)
     return out
 
@@ -99,7 +105,7 @@ class Consistency:
     _skip: int = _SETTLE
     _weight: float = 0.0
     _lagged: FloatArray = field(default_factory=lambda: np.zeros(_LAGS + 1))
-    _recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_LAGS))
+    _recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_LAGS + 1))
 
     def settle(self) -> None:
         """A filter starts anew with what was learnt: let its first images pass."""
@@ -152,14 +158,10 @@ class Consistency:
             self._weight *= keep
             self._lagged *= keep
         self._weight += 1.0
-        self._lagged[0] += normal @ normal
-        for lag, old in enumerate(reversed(self._recent), start=1):
-            self._lagged[lag] += normal @ old
         self._recent.append(normal)
+        self._lagged[: len(self._recent)] += (np.array(self._recent) @ normal)[::-1]
         if self._weight < 100.0:
             return
-        rho = self._lagged[1:] / self._lagged[0]
-        taper = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
-        total = 2.0 * float((taper * rho).sum())
-        noise = 2.0 * float(np.sqrt((taper**2).sum() / (MODES * self._weight)))
+        total = 2.0 * float(_TAPER @ self._lagged[1:] / self._lagged[0])
+        noise = 2.0 * float(np.sqrt(_TAPER @ _TAPER / (MODES * self._weight)))
         self.factor = 1.0 + total if total > max(_SIGNIFICANT * noise, _FLOOR) else 1.0

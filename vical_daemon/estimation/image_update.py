@@ -54,11 +54,17 @@ class ImageFit:
     left: FloatArray
 
 
+def rows_of(keep: BoolArray) -> BoolArray | slice:
+    """The two rows of each point kept; a slice where that is all of them, which copies nothing."""
+    return slice(None) if keep.all() else np.repeat(keep, 2)
+
+
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-    var = (lin.linear**2).sum(axis=1) + (image.common_px**2).sum(axis=1)
-    if lin.curved.size:
-        var += (lin.curved**2).sum(axis=1)
+    var = np.einsum("ij,ij->i", lin.linear, lin.linear)
+    for more in (image.common_px, lin.curved):
+        if more.size:
+            var += np.einsum("ij,ij->i", more, more)
     var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]
     passed: BoolArray = (innovation**2 / var).sum(axis=1) < _CORNER_GATE
     return passed
@@ -114,17 +120,18 @@ def _correct(
     keep: BoolArray,
 ) -> ImageFit:
     """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
-    n = prior.shape[0]
-    columns = [M, image.common_px * weight[:, None]]
+    columns = [M]
+    if image.common_px.size:
+        columns.append(image.common_px * weight[:, None])
     if lin.curved.size:
         curved = lin.curved * weight[:, None]
         if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
             columns.append(curved)
-    full = np.concatenate(columns, axis=1)
+    full = np.concatenate(columns, axis=1) if len(columns) > 1 else M
     for _ in range(3):
-        rows = np.repeat(keep, 2)
+        rows = rows_of(keep)
         small, r_small, rest, dof_rest = unscented.compress(full[rows], r[rows])
-        c = unscented.correct(prior, small[:, :n], r_small, small[:, n:])
+        c = unscented.correct(prior, small, r_small)
         left = (r - full @ c.solution).reshape(-1, 2)
         bad = keep & ((left**2).sum(axis=1) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
         if not bad.any() or (keep & ~bad).sum() < 4:
@@ -132,7 +139,7 @@ def _correct(
         keep = keep & ~bad
     # A compressed image has as many rows as there are states, though it shows but some of them: rows that no
     # state moves are residuals like the rest, and say nothing about whether the innovations fit.
-    alone = (small**2).sum(axis=1) < _ALONE if dof_rest else np.zeros(len(r_small), bool)
+    alone = np.einsum("ij,ij->i", small, small) < _ALONE if dof_rest else np.zeros(len(r_small), bool)
     apart = float((r_small[alone] ** 2).sum())
     count = int(alone.sum())
     return ImageFit(

@@ -120,20 +120,21 @@ def bias_derivatives(
     Returns:
         Rotation (local) by gyro bias (3, 3), velocity (3, 6) and position (3, 6) by [gyro, accel] bias.
     """
-    t = relative.t_s
-    half = 0.5 * np.diff(t)[:, None, None]
+    dt = np.diff(relative.t_s)
+    half = 0.5 * dt[:, None, None]
     dR = relative.dR[0]
-
-    def integral(x: FloatArray) -> FloatArray:
-        out = np.zeros_like(x)
-        np.cumsum((x[1:] + x[:-1]) * half, axis=0, out=out[1:])
-        return out
-
-    A = -integral(dR)
+    A = np.zeros_like(dR)
+    np.cumsum((dR[1:] + dR[:-1]) * -half, axis=0, out=A[1:])
     force = np.matmul(dR, (segment.accel - accel_bias)[..., None])[..., 0]
-    speed = np.concatenate([integral(-so3.hat(force) @ A), A], axis=2)
-    place = integral(speed)
-    return dR[-1].T @ A[-1], speed[-1], place[-1]
+    pull = -so3.hat(force) @ A
+    speed = np.zeros((len(A), 3, 6))
+    np.cumsum((pull[1:] + pull[:-1]) * half, axis=0, out=speed[1:, :, :3])
+    speed[:, :, 3:] = A
+    weight = np.zeros(len(A))
+    weight[1:] = 0.5 * dt
+    weight[:-1] += 0.5 * dt
+    place = np.tensordot(weight, speed, axes=1)
+    return dR[-1].T @ A[-1], speed[-1], place
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

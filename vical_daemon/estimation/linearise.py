@@ -127,44 +127,48 @@ def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: 
     uv, H = view_derivatives(state, layout, rates, image)
     valid: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
     if not valid.all():
-        uv, H = np.where(valid[:, None], uv, 0.0), np.where(valid[:, None, None], H, 0.0)
-    H = H.reshape(-1, layout.size)
+        uv, H = np.where(valid[:, None], uv, 0.0), np.where(np.repeat(valid, 2)[:, None], H, 0.0)
     return Linear(uv, H, H @ S, np.zeros((len(H), 0)), valid)
 
 
 def view_derivatives(
     state: State, layout: Layout, rates: Rates, image: Image
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels (n, 2) and their derivatives by the errors of the state, shape (n, 2, size).
+    """Pixels (n, 2) and their derivatives by the errors of the state, shape (2n, size).
 
     x_imu = R^T (s X - p) with R = R_world_imu Exp(omega d), d = t_cam + shift - t_state; global shutter.
     [docs/math/filter.md, eq. (7); derivatives tested against differences]
     """
     where, cam = layout.cameras[image.camera], state.cameras[image.camera]
     d = image.t_cam_s + cam.timeshift_s - state.t_s
-    ahead = so3.exp(rates.omega * d)
+    ahead = so3.exp_one(rates.omega * d)
     R = state.R_world_imu @ ahead
     p = state.p_world_imu + d * state.v_world_imu + 0.5 * d * d * rates.accel
     x_imu = (image.points * state.target_scale - p) @ R
     x_cam = (x_imu - cam.p_imu_cam) @ cam.R_imu_cam
     with np.errstate(all="ignore"):
         uv, J, J_lens = project_jacobians(x_cam, cam.intrinsics, cam.distortion, cam.distortion_model)
+    # Two rows a point from here on: numpy multiplies one long matrix in the time of a few short ones.
+    J = J.reshape(-1, 3)
     J_imu = J @ cam.R_imu_cam.T
     J_world = J_imu @ R.T
-    H = np.zeros((len(uv), 2, layout.size))
-    H[:, :, ATTITUDE] = J_imu @ so3.hat(x_imu) @ ahead.T
-    H[:, :, POSITION] = -J_world
-    H[:, :, VELOCITY] = -d * J_world
+    by_turn = cross(J_imu, np.repeat(x_imu, 2, axis=0))  # j' hat(x) = (j x x)'
+    H = np.zeros((len(J), layout.size))
+    H[:, ATTITUDE] = by_turn @ ahead.T
+    H[:, POSITION] = -J_world
+    H[:, VELOCITY] = -d * J_world
     if where.position is not None and where.rotation is not None:
-        H[:, :, where.position] = -J_imu
-        H[:, :, where.rotation] = J @ so3.hat(x_cam)
+        H[:, where.position] = -J_imu
+        H[:, where.rotation] = cross(J, np.repeat(x_cam, 2, axis=0))
     if where.timeshift is not None:
-        drift = R.T @ (state.v_world_imu + d * rates.accel) + cross(rates.omega, x_imu)
-        H[:, :, where.timeshift] = -np.matmul(J_imu, drift[..., None])[..., 0]
+        # x_imu moves by -R'(v + d a) - omega x x_imu; j' (omega x x) = -(j x x)' omega
+        speed = R.T @ (state.v_world_imu + d * rates.accel)
+        H[:, where.timeshift] = by_turn @ rates.omega - J_imu @ speed
     if where.intrinsics is not None and where.distortion is not None:
-        H[:, :, where.intrinsics], H[:, :, where.distortion] = J_lens[..., :4], J_lens[..., 4:]
+        lens = J_lens.reshape(-1, 8)
+        H[:, where.intrinsics], H[:, where.distortion] = lens[:, :4], lens[:, 4:]
     if layout.target_scale is not None:
-        H[:, :, layout.target_scale] = np.matmul(J_world, image.points[..., None])[..., 0]
+        H[:, layout.target_scale] = np.einsum("ij,ij->i", J_world, np.repeat(image.points, 2, axis=0))
     return uv, H
 
 

@@ -16,10 +16,13 @@ from vical_daemon.estimation.state import (
     LOWER,
     POSITION,
     VELOCITY,
+    CameraSlices,
     CameraState,
     Layout,
     State,
     rotation_from_grp,
+    rotation_of_grp,
+    tilt_basis,
     tilted_gravity,
 )
 
@@ -97,37 +100,44 @@ def camera_points(camera: CameraState, layout: Layout, name: str, errors: FloatA
 
 def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     """Return the state moved by one error vector, shape (n,). The argument is not changed."""
-    motion = motion_points(state, layout, dx[None])
-    cameras = {}
-    for name, camera in state.cameras.items():
-        c = camera_points(camera, layout, name, dx[None])
-        cameras[name] = CameraState(
-            orthonormal(c.R_imu_cam[0]),
-            c.p_imu_cam[0],
-            float(c.timeshift_s[0]),
-            c.intrinsics[0],
-            c.distortion[0],
-            camera.distortion_model,
-            camera.resolution,
-            float(c.readout_s[0]),
-            camera.skew + (float(dx[skew]) if (skew := layout.cameras[name].skew) is not None else 0.0),
-        )
+    gyro_matrix, accel_matrix = state.gyro_matrix, state.accel_matrix
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        points = motion_points(state, layout, dx[None])
+        assert points.gyro_matrix is not None
+        assert points.accel_matrix is not None
+        gyro_matrix, accel_matrix = points.gyro_matrix[0], points.accel_matrix[0]
     scale = state.target_scale
     if layout.target_scale is not None:
         scale += float(dx[layout.target_scale])
     return State(
         state.t_s,
-        orthonormal(motion.R[0]),
-        motion.p[0],
-        motion.v[0],
-        motion.gyro_bias[0],
-        motion.accel_bias[0],
-        motion.gravity[0],
-        cameras,
-        state.gyro_matrix if motion.gyro_matrix is None else motion.gyro_matrix[0],
-        state.accel_matrix if motion.accel_matrix is None else motion.accel_matrix[0],
+        orthonormal(state.R_world_imu @ rotation_of_grp(dx[ATTITUDE])),
+        state.p_world_imu + dx[POSITION],
+        state.v_world_imu + dx[VELOCITY],
+        state.gyro_bias + dx[GYRO_BIAS],
+        state.accel_bias + dx[ACCEL_BIAS],
+        rotation_of_grp(tilt_basis(state.gravity) @ dx[GRAVITY]) @ state.gravity,
+        {name: _moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
+        gyro_matrix,
+        accel_matrix,
         scale,
     )
+
+
+def _moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> CameraState:
+    R, p, K, D = camera.R_imu_cam, camera.p_imu_cam, camera.intrinsics, camera.distortion
+    shift, readout, skew = camera.timeshift_s, camera.readout_s, camera.skew
+    if where.rotation is not None and where.position is not None:
+        R, p = orthonormal(R @ rotation_of_grp(dx[where.rotation])), p + dx[where.position]
+    if where.timeshift is not None:
+        shift += float(dx[where.timeshift])
+    if where.skew is not None:
+        skew += float(dx[where.skew])
+    if where.intrinsics is not None and where.distortion is not None:
+        K, D = K + dx[where.intrinsics], D + dx[where.distortion]
+    if where.readout is not None:
+        readout += float(dx[where.readout])
+    return CameraState(R, p, shift, K, D, camera.distortion_model, camera.resolution, readout, skew)
 
 
 def orthonormal(R: FloatArray) -> FloatArray:

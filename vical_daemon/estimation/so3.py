@@ -8,6 +8,8 @@ Formulas: Sola, "Quaternion kinematics for the error-state Kalman filter" (2017)
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -73,6 +75,23 @@ def exp(rotvec: FloatArray) -> FloatArray:
     half_sinc = np.sin(0.5 * angle) / (0.5 * angle)
     gamma = 0.5 * half_sinc * half_sinc  # (1 - cos) / angle^2 without cancellation
     return _polynomial(1.0 - gamma * angle2, np.sin(angle) / angle, gamma, v)
+
+
+def exp_one(rotvec: FloatArray) -> FloatArray:
+    """`exp` of one rotation vector, shape (3,), in plain numbers: numpy takes ten times as long."""
+    x, y, z = rotvec.tolist()
+    angle2 = x * x + y * y + z * z
+    half = 0.5 * math.sqrt(angle2 + _NO_ANGLE)
+    half_sinc = math.sin(half) / half
+    c, s = 0.5 * half_sinc * half_sinc, math.sin(2.0 * half) / (2.0 * half)
+    w = 1.0 - c * angle2
+    return np.array(
+        [
+            [w + c * x * x, c * x * y - s * z, c * x * z + s * y],
+            [c * x * y + s * z, w + c * y * y, c * y * z - s * x],
+            [c * x * z - s * y, c * y * z + s * x, w + c * z * z],
+        ]
+    )
 
 
 def log(R: FloatArray) -> FloatArray:

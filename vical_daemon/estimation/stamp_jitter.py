@@ -37,14 +37,14 @@ class StampJitter:
     _pairs: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MEMORY))
 
     def learn(
-        self, innovation: FloatArray, by_shift: FloatArray, linear: FloatArray, level: float = 1.0
+        self, innovation: FloatArray, by_shift: FloatArray, state: FloatArray, level: float = 1.0
     ) -> None:
         """Take in one image before it is used.
 
         Args:
             innovation: Measured minus predicted, over the corner noise, shape (2n,).
             by_shift: Derivative of the whitened pixels by the time shift, 1/s, shape (2n,).
-            linear: H S of the whitened pixels (state uncertainty), shape (2n, c).
+            state: `by_shift` times H S of the whitened pixels (what states add to the sum), shape (c,).
             level: By how much innovations of any kind exceed their variances: where the model does not fit,
                 that along the motion of the corners is no jitter.
         """
@@ -52,7 +52,7 @@ class StampJitter:
         if not size > 0.0:
             return
         self.images += 1
-        part = by_shift @ linear / size
+        part = state / size
         error = float(by_shift @ innovation) / size
         self._pairs.append((error * error, level * (1.0 / size + float(part @ part))))
         if len(self._pairs) >= _LEAST and self.images % _EVERY == 0:

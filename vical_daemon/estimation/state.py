@@ -171,6 +171,22 @@ def rotation_from_grp(p: FloatArray) -> FloatArray:
     return out
 
 
+def rotation_of_grp(p: FloatArray) -> FloatArray:
+    """`rotation_from_grp` of one error, shape (3,), in plain numbers: numpy takes ten times as long."""
+    x, y, z = (0.25 * p).tolist()
+    s = x * x + y * y + z * z
+    d = 1.0 / (1.0 + s) ** 2
+    a, b = 4.0 * (1.0 - s) * d, 8.0 * d
+    w = 1.0 - b * s
+    return np.array(
+        [
+            [w + b * x * x, b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, w + b * y * y, b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, w + b * z * z],
+        ]
+    )
+
+
 def grp_from_rotation(R: FloatArray) -> FloatArray:
     """Attitude errors (a = 1, f = 4) of rotations below 180 degrees, shape (..., 3)."""
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]

@@ -8,6 +8,7 @@ cannot lose symmetry or positivity. No matrix is ever inverted.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -72,9 +73,14 @@ def lower_root(columns: FloatArray) -> FloatArray:
     """Return lower-triangular L with L L^T = A A^T for A (n, k), k >= n, by QR; its diagonal is >= 0."""
     n = columns.shape[0]
     qr, _, _, _ = dgeqrf(columns.T)
-    L: FloatArray = np.tril(qr[:n].T)
-    signs = np.where(np.diag(L) < 0.0, -1.0, 1.0)
-    return L * signs
+    L: FloatArray = qr[:n].T * _lower(n)
+    return L * np.where(L.diagonal() < 0.0, -1.0, 1.0)
+
+
+@lru_cache(maxsize=64)
+def _lower(n: int) -> FloatArray:
+    """Ones on and below the diagonal (numpy's `tril` makes them anew at each call)."""
+    return np.tri(n)
 
 
 def compress(M: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, float, int]:
@@ -95,7 +101,7 @@ def compress(M: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, floa
     stacked[:, :n] = M
     stacked[:, n] = r
     qr, _, _, _ = dgeqrf(stacked, overwrite_a=True)
-    top = np.triu(qr[: n + 1])
+    top = qr[: n + 1] * _lower(n + 1).T
     return top[:n, :n], top[:n, n], float(top[n, n] ** 2), m - n
 
 
@@ -115,33 +121,32 @@ class Correction(NamedTuple):
     solution: FloatArray
 
 
-def correct(S: FloatArray, M: FloatArray, r: FloatArray, common: FloatArray | None = None) -> Correction:
-    """Kalman update in square-root form for whitened rows r = M e + common c + unit noise, e ~ N(0, I).
+def correct(S: FloatArray, M: FloatArray, r: FloatArray) -> Correction:
+    """Kalman update in square-root form for whitened rows r = M [e c] + unit noise, e and c ~ N(0, I).
 
-    With Lambda lower triangular, Lambda^T Lambda = I + [M common]^T [M common]:
-    S+ = S Lambda^-1 (top left), dx = S+ y, y = Lambda^-T M^T r, NIS = r^T r - y^T y.
+    With Lambda lower triangular, Lambda^T Lambda = I + M^T M: S+ = S Lambda^-1 (top left),
+    dx = S+ y, y = Lambda^-T M^T r, NIS = r^T r - y^T y.
 
     Args:
         S: Square root of the covariance, lower triangular, (n, n).
-        M: H S of the whitened rows, shape (m, n).
+        M: H S of the whitened rows, then columns of noise c shared by rows (stamp jitter, curvature), if
+            any, shape (m, n + k).
         r: Whitened innovation, shape (m,).
-        common: Columns of noise shared by rows (stamp jitter, curvature), shape (m, k), or None.
 
     Returns:
         The correction.
     """
-    n = S.shape[0]
-    full = M if common is None else np.concatenate([M, common], axis=1)
-    k = full.shape[1]
-    stacked = np.empty((len(full) + k, k), order="F")
-    stacked[:k] = np.eye(k)[:, ::-1]
-    stacked[k:] = full[:, ::-1]
+    n, k = S.shape[0], M.shape[1]
+    stacked = np.empty((len(M) + k, k), order="F")
+    stacked[:k] = 0.0
+    stacked[range(k), range(k - 1, -1, -1)] = 1.0
+    stacked[k:] = M[:, ::-1]
     qr, _, _, _ = dgeqrf(stacked, overwrite_a=True)
-    Lambda = np.triu(qr[:k])[::-1, ::-1]
-    y = solve_lower(Lambda, full.T @ r, transposed=True)
+    Lambda = (qr[:k] * _lower(k).T)[::-1, ::-1]
+    y = solve_lower(Lambda, M.T @ r, transposed=True)
     inner = Lambda[:n, :n]
     new = solve_lower(inner, S.T, transposed=True).T
-    signs = np.where(np.diag(new) < 0.0, -1.0, 1.0)
+    signs = np.where(new.diagonal() < 0.0, -1.0, 1.0)
     dx = new @ y[:n]
     solution = solve_lower(Lambda, y)
-    return Correction(np.tril(new * signs), dx, float(r @ r - y @ y), solution)
+    return Correction(new * signs * _lower(n), dx, float(r @ r - y @ y), solution)

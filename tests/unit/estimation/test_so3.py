@@ -37,6 +37,12 @@ def test_exp_and_log_agree_with_scipy_everywhere():
     np.testing.assert_allclose(back[away], v[away], atol=1e-14, rtol=1e-13)
 
 
+def test_exp_of_one_vector_is_exp():
+    v = np.random.default_rng(3).normal(size=(50, 3)) * np.logspace(-12, 0.9, 50)[:, None]
+    np.testing.assert_allclose([so3.exp_one(x) for x in v], so3.exp(v), atol=4e-16)
+    np.testing.assert_array_equal(so3.exp_one(np.zeros(3)), np.eye(3))
+
+
 def test_log_is_accurate_to_a_relative_error_near_zero():
     v = np.array([[1e-9, -2e-9, 3e-9], [0, 1e-12, 0]])
     np.testing.assert_allclose(so3.log(so3.exp(v)), v, rtol=1e-12)

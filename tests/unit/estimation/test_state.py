@@ -12,6 +12,7 @@ def test_rotation_from_grp_is_scipys_rotation_from_mrp_and_back():
     R = st.rotation_from_grp(p)
     np.testing.assert_allclose(R, Rotation.from_mrp(p / 4.0).as_matrix(), atol=1e-13)
     np.testing.assert_allclose(st.grp_from_rotation(R), p, atol=1e-10)
+    np.testing.assert_allclose([st.rotation_of_grp(x) for x in p], R, atol=1e-15)
 
 
 def test_small_errors_are_rotation_vectors():

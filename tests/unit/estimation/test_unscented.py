@@ -21,7 +21,7 @@ def test_correct_equals_the_kalman_update(common):
     P, R = S @ S.T, np.eye(m) + C @ C.T
     Z = H @ P @ H.T + R
     K = P @ H.T @ np.linalg.inv(Z)
-    c = unscented.correct(S, H @ S, r, C if common else None)
+    c = unscented.correct(S, np.hstack([H @ S, C]) if common else H @ S, r)
     np.testing.assert_allclose(c.dx, K @ r, atol=1e-10)
     np.testing.assert_allclose(c.S @ c.S.T, P - K @ Z @ K.T, atol=1e-9)
     assert c.nis == pytest.approx(r @ np.linalg.solve(Z, r), rel=1e-9)
