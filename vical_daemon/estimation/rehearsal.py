@@ -1,4 +1,4 @@
-"""From a start to a running filter: wide sigmas, one run to learn, and the run that counts."""
+"""From a start to a running filter: wide sigmas, two runs to learn, and the run that counts."""
 
 from __future__ import annotations
 
@@ -42,9 +42,11 @@ def rehearsed(
     make: Callable[[State], CalibrationFilter],
     step: Step,
 ) -> CalibrationFilter | None:
-    """Run over the start once to learn its noise; return a filter that starts again from the same place.
+    """Run over the start twice to learn; return a filter that starts again from the same place.
 
-    The second start takes what the first run found as its mean, and five times its sigmas: so wide that
+    The first run is far from straight: what it says of mounting and delay counts, what it says of the noise
+    does not (its innovations are large for other reasons). The second one, about its answer, measures the
+    noise. Each next run takes what the last one found as its mean, and five times its sigmas: so wide that
     the data, counted again, add 4 % of information; so narrow that the model is straight from the first
     image on, and nothing is lost to its curvature.
 
@@ -58,15 +60,34 @@ def rehearsed(
         The filter, or None where the start does not hold together.
     """
     trial = make(deepcopy(state))
+    for straight in (False, True):
+        if not _holds_together(trial, frames, step):
+            return None
+        fresh = _about(trial, state, make)
+        if straight:
+            fresh.jitter, fresh.consistency = trial.jitter, trial.consistency
+            for consistency in fresh.consistency.values():
+                consistency.settle()
+        trial = fresh
+    return trial
+
+
+def _holds_together(trial: CalibrationFilter, frames: list[tuple[float, PointsFrame]], step: Step) -> bool:
+    """Run over the start; whether it stays plausible and most images fit."""
     used = refused = 0
     for t_cam_s, frame in frames:
         report = step(trial, frame, t_cam_s)
         used += report is not None and report.used
         refused += report is not None and not report.used
         if not trial.plausible():
-            return None
-    if refused > used:
-        return None
+            return False
+    return refused <= used
+
+
+def _about(
+    trial: CalibrationFilter, state: State, make: Callable[[State], CalibrationFilter]
+) -> CalibrationFilter:
+    """A filter that begins where `trial` did, with the calibration it found and five times its sigmas."""
     begin = replace(
         trial.state,
         t_s=state.t_s,
@@ -80,11 +101,7 @@ def rehearsed(
     narrow = np.minimum(wide, REHEARSED * trial.sigmas())
     narrow[: MOTION.stop] = wide[: MOTION.stop]
     fresh.S = fresh.S * (narrow / wide)[:, None]
-    for name, noise in trial.corner_noise.items():
-        fresh.corner_noise[name] = noise
-        fresh.jitter[name] = trial.jitter[name]
-        fresh.consistency[name] = trial.consistency[name]
-        fresh.consistency[name].settle()
+    fresh.corner_noise = trial.corner_noise
     return fresh
 
 
