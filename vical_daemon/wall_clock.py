@@ -8,8 +8,10 @@ processes of the service have been stopped and the runtime directory is gone, or
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,15 +76,26 @@ def shared_clock(folder: Path) -> WallClock:
         folder: The runtime directory.
     """
     path = folder / FILE_NAME
-    for _ in range(10):
-        clock = _read(path)
-        if clock is not None and clock.boot_id == boot_id():
-            return clock
-        if clock is not None or path.exists():
-            with contextlib.suppress(FileNotFoundError):  # another role was faster
-                path.unlink()
-        _create(path, private_clock())
-    raise PermissionError(13, "cannot agree on the clock offset; is the folder writable?", str(path))
+    clock = _read(path)
+    if clock is not None and clock.boot_id == boot_id():  # such a file is never replaced: no lock needed
+        return clock
+    with _alone_in(folder):
+        clock = _read(path)  # another role may have been faster
+        if clock is None or clock.boot_id != boot_id():
+            clock = private_clock()
+            _replace(path, clock)
+    return clock
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock; it is gone with the process."""
+    handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def boot_id() -> str:
@@ -93,16 +106,11 @@ def boot_id() -> str:
         return ""
 
 
-def _create(path: Path, clock: WallClock) -> None:
-    """Make the file with its whole content at once, unless somebody else was first."""
+def _replace(path: Path, clock: WallClock) -> None:
+    """Put the file there with its whole content at once."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{time.monotonic_ns()}")
     temporary.write_bytes(msgspec.json.encode(clock))
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        pass  # another role was faster: its clock is the one that counts
-    finally:
-        temporary.unlink()
+    temporary.replace(path)
 
 
 def _read(path: Path) -> WallClock | None:

@@ -18,7 +18,10 @@ def test_offset_is_unix_minus_monotonic() -> None:
     assert clock.unix_ns(123) == 123 + clock.offset_ns
 
 
-def test_all_processes_agree_even_when_they_start_together(tmp_path: Path) -> None:
+@pytest.mark.parametrize("left", [None, b'{"offset_ns": 5, "boot_id": "old"}'])
+def test_all_processes_agree_even_when_they_start_together(tmp_path: Path, left: bytes | None) -> None:
+    if left is not None:
+        (tmp_path / FILE_NAME).write_bytes(left)
     with ThreadPoolExecutor(16) as pool:
         clocks = list(pool.map(lambda _: shared_clock(tmp_path), range(64)))
     assert len({clock.offset_ns for clock in clocks}) == 1
