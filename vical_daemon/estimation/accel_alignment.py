@@ -20,14 +20,15 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.rotation_start import camera_turns
 
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
 _STEP_S = 0.01
 _LEVER_ARM_PRIOR_M = 0.3
 _BIAS_PRIOR = 0.3  # m/s^2
 _GYRO_BIAS_PRIOR_RPS = 0.1
+_PRIORS = 9  # rows for these three vectors
 _MIN_WINDOWS = 12
-_TURN_S = 0.2
 _COARSE_S, _FINE_S = 0.02, 0.004
 _APART_S = 0.25  # another delay this far away must fit worse by the contrast
 _MIN_CONTRAST = 4.0
@@ -79,12 +80,11 @@ class _Evidence:
     seen: FloatArray  # accelerations, turns and priors over their sigmas, shape (n,)
     others: FloatArray  # maps of gravity, lever arm, bias (camera frame) and gyro bias, shape (n, 12)
     basis: FloatArray  # orthonormal, of the columns of `others`
-    n_priors: int = 9
 
     @property
     def dof(self) -> int:
         """Degrees of freedom of the residuals."""
-        return max(len(self.seen) - self.n_priors - 16, 1)
+        return max(len(self.seen) - _PRIORS - 16, 1)
 
     def project(self, x: FloatArray) -> FloatArray:
         """Take out what the eliminated unknowns explain."""
@@ -147,7 +147,7 @@ def align(
 
 
 def _with_angles(rows: FloatArray) -> FloatArray:
-    """Append the integral of the rates, rad, as three columns."""
+    """Append the integral of the rates, rad, as three columns: over a fifth of a second nearly the turn."""
     steps = np.diff(rows[:, 0])[:, None]
     angle = np.cumsum(0.5 * (rows[1:, 1:4] + rows[:-1, 1:4]) * steps, axis=0)
     return np.hstack([rows, np.vstack([np.zeros(3), angle])])
@@ -170,13 +170,10 @@ def _gather(
         return None
     kernels = np.array([kernel for _, kernel in windows])
     weights = np.array([weight for weight, _ in windows])
-    sigma = np.sqrt((weights * sigma_m) ** 2 @ np.ones(len(t)))
-    first = np.arange(0, len(t), 2)
-    second = np.searchsorted(t, t[first] + 0.999 * _TURN_S)
-    inside = (second < len(t)) & (np.take(t, second, mode="clip") - t[first] < 3.0 * _TURN_S)
-    first, second = first[inside], second[inside]
+    sigma = np.linalg.norm(weights * sigma_m, axis=1)
+    turns = camera_turns(t, so3.quat_from_matrix(R), most=len(t) // 2)
+    first, second, turn = turns.first, turns.second, turns.rotvec_cam
     turn_sigma = np.hypot(sigma_rad[first], sigma_rad[second])
-    turn = so3.log(np.swapaxes(R[first], 1, 2) @ R[second])
     others = _other_unknowns(weights, kernels, R, R_grid, sigma, (t[second] - t[first]) / turn_sigma)
     seen = np.concatenate([(weights @ p / sigma[:, None]).ravel(), (turn / turn_sigma[:, None]).ravel()])
     return _Evidence(
@@ -186,7 +183,7 @@ def _gather(
         sigma,
         np.array([t[first], t[second]]),
         turn_sigma,
-        np.concatenate([seen, np.zeros(9)]),
+        np.concatenate([seen, np.zeros(_PRIORS)]),
         others,
         np.linalg.qr(others)[0],
     )
@@ -220,14 +217,14 @@ def _other_unknowns(
 ) -> FloatArray:
     """Map gravity, lever arm, accelerometer bias (camera frame) and gyro bias to what is seen."""
     nw, nk = len(kernels), len(span_by_sigma)
-    out = np.zeros((3 * (nw + nk) + 9, 12))
+    out = np.zeros((3 * (nw + nk) + _PRIORS, 12))
     lever, bias = np.einsum("wk,kij->wij", weights, R), np.einsum("wg,gij->wij", kernels, R_grid)
     gravity = np.broadcast_to(np.eye(3), lever.shape)
     by_force = np.concatenate([gravity, lever, -bias], axis=2) / accel_sigma[:, None, None]
     out[: 3 * nw, :9] = by_force.reshape(-1, 9)
-    out[3 * nw : -9, 9:] = -(span_by_sigma[:, None, None] * np.eye(3)).reshape(-1, 3)
+    out[3 * nw : -_PRIORS, 9:] = -(span_by_sigma[:, None, None] * np.eye(3)).reshape(-1, 3)
     sigmas = np.repeat([_LEVER_ARM_PRIOR_M, _BIAS_PRIOR, _GYRO_BIAS_PRIOR_RPS], 3)
-    out[-9:, 3:] = np.diag(1.0 / sigmas)
+    out[-_PRIORS:, 3:] = np.diag(1.0 / sigmas)
     return out
 
 
@@ -258,7 +255,7 @@ class _Reduced:
         turned = np.stack([np.interp(e.turn_span_s + shift_s, t, rows[:, 7 + m]) for m in range(3)], axis=-1)
         turn = (turned[1] - turned[0]) / e.turn_sigma[:, None]
         by_turn = (np.eye(3)[None, :, :, None] * turn[:, None, None, :]).reshape(-1, 9)
-        D = np.vstack([by_force.reshape(-1, 9), by_turn, np.zeros((e.n_priors, 9))])
+        D = np.vstack([by_force.reshape(-1, 9), by_turn, np.zeros((_PRIORS, 9))])
         PD, Py = e.project(D), e.project(e.seen)
         return cls(PD.T @ PD, PD.T @ Py, float(Py @ Py), D, e.seen, e.others)
 

@@ -130,8 +130,8 @@ class Calibrator:
         later = self._pending.take_all()
         self.filter, self._stale = found.filter, None
         self._held_back = HeldBack()
-        self.judge.started(found.begin_s, found.reason)
-        self.watch.started(found.begin_s)
+        self.judge.started(self.filter.state.t_s, found.reason)
+        self.watch.started(self.filter.state.t_s)
         self._starting.anew()
         for t, frame in [*found.frames, *later]:
             self._pending.push(t, frame)

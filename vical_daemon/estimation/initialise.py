@@ -51,8 +51,7 @@ def linear_start(
     p_world_cam: FloatArray,
     gyro_bias: FloatArray,
     position_sigma: FloatArray,
-    *,
-    only_if_shown: bool = False,
+    held_axes: FloatArray | None = None,
 ) -> LinearStart | None:
     """Solve velocity, gravity, accelerometer bias and lever arm from poses of the camera.
 
@@ -66,8 +65,8 @@ def linear_start(
         p_world_cam: Camera positions, m, shape (n, 3).
         gyro_bias: rad/s.
         position_sigma: Standard deviation of each camera position, m, shape (n,).
-        only_if_shown: Hold the lever arm at zero along axes that hardly turn: there, errors of the
-            attitudes, which are those of the positions times the board's distance, would be taken for it.
+        held_axes: Of the imu, along which the lever arm is held at zero, shape (k, 3): where an axis hardly
+            turns (`still_axes`), errors of the attitudes would be taken for a lever arm along it.
 
     Returns:
         The solution, or None where the readings do not cover the instants.
@@ -90,9 +89,8 @@ def linear_start(
     y = ((p_world_cam - D) * w[:, None]).ravel()
     prior = np.zeros((6, 15))
     prior[:3, 12:15] = eye / _ACCEL_BIAS_PRIOR
-    if only_if_shown:
-        axes = still_axes(R_world_imu.mean(axis=0))
-        prior[3:, 9:12] = axes.T @ axes / HELD_M
+    if held_axes is not None:
+        prior[3:, 9:12] = held_axes.T @ held_axes / HELD_M
     A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(6)])
     x, *_ = np.linalg.lstsq(A_all, y_all, rcond=None)
     residual = (y - rows @ x).reshape(-1, 3)

@@ -58,7 +58,7 @@ def motion_start(
         The state, or the reason why not.
     """
     state: State | None = None
-    size, axes = 0.0, np.zeros((0, 3))
+    size, still = 0.0, None
     for name, poses in seen.items():
         camera = cameras[name]
         # Only the latest stretch: the double integral drifts, and what was long ago costs more than it gives.
@@ -66,7 +66,7 @@ def motion_start(
         inside = [p for p in poses if since < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
-        linear = _linear(buffer, inside, camera, gyro_bias_rps[name], partial)
+        linear, axes = _linear(buffer, inside, camera, gyro_bias_rps[name], partial)
         invisible = linear is not None and float(np.max(linear.sigma_p_imu_cam)) > 0.1
         if linear is None or (invisible and not partial):
             why = f"{name}: lever arm not yet visible: turn the rig about two axes"
@@ -75,8 +75,7 @@ def motion_start(
             camera.p_imu_cam = linear.p_imu_cam
         if state is None:
             size = float(np.linalg.norm(linear.gravity))
-            R = np.array([p.R_target_cam for p in inside]) @ camera.R_imu_cam.T
-            axes = still_axes(R.mean(axis=0))
+            still = axes
             state = _state_at(inside[0], camera, linear, gyro_bias_rps[name], cameras, options)
     if not 0.7 * options.gravity_mps2 < size < 1.3 * options.gravity_mps2:
         why = (
@@ -84,7 +83,7 @@ def motion_start(
             "check the target's size in its YAML and the unit of the accelerometer"
         )
         return StartResult(None, why)
-    return StartResult(state, "", still_axes=axes if partial else None)
+    return StartResult(state, "", still_axes=still)
 
 
 def _linear(
@@ -93,14 +92,17 @@ def _linear(
     camera: CameraState,
     gyro_bias: FloatArray,
     partial: bool,
-) -> LinearStart | None:
+) -> tuple[LinearStart | None, FloatArray | None]:
+    """The linear start, and the axes along which a partial one guesses."""
     R = np.array([p.R_target_cam for p in poses]) @ camera.R_imu_cam.T
     p = np.array([p.p_target_cam for p in poses])
     sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
     t = np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
-    if partial:
-        R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
-    return linear_start(buffer, t, R, p, gyro_bias, sigma, only_if_shown=partial)
+    if not partial:
+        return linear_start(buffer, t, R, p, gyro_bias, sigma), None
+    R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
+    axes = still_axes(R.mean(axis=0))
+    return linear_start(buffer, t, R, p, gyro_bias, sigma, axes), axes
 
 
 def _smooth(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bias: FloatArray) -> FloatArray:

@@ -33,12 +33,13 @@ from vical_daemon.estimation.unshown_axes import UNKNOWN_M, UnshownAxes
 REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
 SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
 
+Frames = list[tuple[float, PointsFrame]]
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
 
 def rehearsed(
     state: State,
-    frames: list[tuple[float, PointsFrame]],
+    frames: Frames,
     make: Callable[[State], CalibrationFilter],
     step: Step,
 ) -> CalibrationFilter | None:
@@ -72,7 +73,7 @@ def rehearsed(
     return trial
 
 
-def _holds_together(trial: CalibrationFilter, frames: list[tuple[float, PointsFrame]], step: Step) -> bool:
+def _holds_together(trial: CalibrationFilter, frames: Frames, step: Step) -> bool:
     """Run over the start; whether it stays plausible and most images fit."""
     used = refused = 0
     for t_cam_s, frame in frames:

@@ -49,30 +49,36 @@ class StartData:
     caches: dict[str, PoseCache]
 
 
+@dataclass(frozen=True, slots=True)
+class _Rough:
+    """One camera before its lever arm is known."""
+
+    camera: CameraState
+    poses: list[SeenPose]
+    gyro_bias_rps: FloatArray
+
+
 def attempt(data: StartData) -> StartResult:
     """Try to start with everything known; see `StartData`.
 
     Returns:
         A state at the first usable frame, or the reason why not.
     """
-    cameras: dict[str, CameraState] = {}
-    gyro_bias: dict[str, FloatArray] = {}
-    seen: dict[str, list[SeenPose]] = {}
-    for name, prior in data.priors.items():
+    rough: dict[str, _Rough] = {}
+    for name in data.priors:
         lens, poses = _poses(data, name)
         needed = 20 if data.layout.cameras[name].intrinsics is None else 30
         if len(poses) < needed:
             return StartResult(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )
-        result = _timing(data.buffer, poses, lens)
-        why = result.reason or _not_sure_yet(result)
+        found = _timing(data.buffer, poses, lens)
+        why = found.reason or _not_sure_yet(found)
         if why:
             return StartResult(None, f"{name}: {why}", motion_missing=True)
-        seen[name], gyro_bias[name] = poses, result.gyro_bias_rps
-        cameras[name] = _camera(lens, prior, result.R_imu_cam, result.timeshift_cam_imu_s)
-        _hold_priors(cameras[name], prior, data.options)
-    return motion_start(data.buffer, seen, cameras, gyro_bias, data.options)
+        camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_cam_imu_s)
+        rough[name] = _Rough(camera, poses, found.gyro_bias_rps)
+    return _with_motion(data, rough)
 
 
 def partial_attempt(data: StartData, reason: str) -> StartResult:
@@ -85,11 +91,9 @@ def partial_attempt(data: StartData, reason: str) -> StartResult:
     Returns:
         A state that is a guess where the motion shows nothing, or the reason again.
     """
-    cameras: dict[str, CameraState] = {}
-    gyro_bias: dict[str, FloatArray] = {}
-    seen: dict[str, list[SeenPose]] = {}
+    rough: dict[str, _Rough] = {}
     refused = StartResult(None, reason, motion_missing=True)
-    for name, prior in data.priors.items():
+    for name in data.priors:
         lens, poses = _poses(data, name, data.frames[name][-1][0] - _PARTIAL_STRETCH_S)
         if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < _PARTIAL_MIN_S:
             return refused
@@ -99,16 +103,26 @@ def partial_attempt(data: StartData, reason: str) -> StartResult:
             np.array([p.R_target_cam for p in poses]),
             np.array([p.p_target_cam for p in poses]),
             np.maximum([p.sigma_m for p in poses], 2e-4),
-            np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0])),
+            _attitude_sigmas(poses, lens),
             _PARTIAL_SHIFTS_S,
         )
         if found is None or not found.trusted:
             return refused
-        seen[name], gyro_bias[name] = poses, found.gyro_bias_rps
-        cameras[name] = _camera(lens, prior, found.R_imu_cam, found.timeshift_s)
-        _hold_priors(cameras[name], prior, data.options)
-    result = motion_start(data.buffer, seen, cameras, gyro_bias, data.options, partial=True)
+        camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_s)
+        rough[name] = _Rough(camera, poses, found.gyro_bias_rps)
+    result = _with_motion(data, rough, partial=True)
     return refused if result.state is None else replace(result, reason=reason)
+
+
+def _with_motion(data: StartData, rough: dict[str, _Rough], *, partial: bool = False) -> StartResult:
+    return motion_start(
+        data.buffer,
+        {name: r.poses for name, r in rough.items()},
+        {name: r.camera for name, r in rough.items()},
+        {name: r.gyro_bias_rps for name, r in rough.items()},
+        data.options,
+        partial=partial,
+    )
 
 
 def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, list[SeenPose]]:
@@ -120,18 +134,29 @@ def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, 
     return lens, cache.poses(data.frames[name], lens, data.target, since_s)
 
 
-def _camera(lens: Lens, prior: CameraPrior, R_imu_cam: FloatArray, timeshift_s: float) -> CameraState:
-    """A camera whose lever arm is still to be found."""
+def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift_s: float) -> CameraState:
+    """A camera whose lever arm is still to be found; what is held fixed is as it was given."""
+    prior, fix = data.priors[name], data.options.fix
+    p_imu_cam = np.zeros(3)
+    if "timeshift" in fix and prior.timeshift_cam_imu_s is not None:
+        shift_s = prior.timeshift_cam_imu_s
+    if "extrinsics" in fix and prior.T_imu_cam is not None:
+        R_imu_cam, p_imu_cam = prior.T_imu_cam[0].copy(), prior.T_imu_cam[1].copy()
     return CameraState(
         R_imu_cam,
-        np.zeros(3),
-        timeshift_s,
+        p_imu_cam,
+        shift_s,
         lens.intrinsics,
         lens.distortion,
         lens.model,
         lens.resolution,
         prior.readout_s,
     )
+
+
+def _attitude_sigmas(poses: list[SeenPose], lens: Lens) -> FloatArray:
+    """Of the poses as stated, but at least a fifth of a pixel, rad, shape (n,)."""
+    return np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0]))
 
 
 def _timing(buffer: ImuBuffer, poses: list[SeenPose], lens: Lens) -> TdIcpResult:
@@ -141,7 +166,7 @@ def _timing(buffer: ImuBuffer, poses: list[SeenPose], lens: Lens) -> TdIcpResult
         rows[:, 1:4],
         np.array([p.t_cam_s for p in poses]),
         np.array([p.R_target_cam for p in poses]),
-        np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0])),
+        _attitude_sigmas(poses, lens),
     )
 
 
@@ -154,11 +179,3 @@ def _not_sure_yet(result: TdIcpResult) -> str:
         worst = np.rad2deg(float(np.max(result.rotation_sigma_rad)))
         return f"mounting rotation known to {worst:.1f} deg so far: turn the rig about a second axis"
     return ""
-
-
-def _hold_priors(camera: CameraState, prior: CameraPrior, options: CalibrationOptions) -> None:
-    """Put values that are held fixed back to what was given."""
-    if "timeshift" in options.fix and prior.timeshift_cam_imu_s is not None:
-        camera.timeshift_s = prior.timeshift_cam_imu_s
-    if "extrinsics" in options.fix and prior.T_imu_cam is not None:
-        camera.R_imu_cam, camera.p_imu_cam = prior.T_imu_cam[0].copy(), prior.T_imu_cam[1].copy()

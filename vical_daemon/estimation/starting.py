@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,10 +10,9 @@ import numpy as np
 
 from vical_daemon.estimation import start
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
-from vical_daemon.estimation.rehearsal import rehearsed, wide_filter
+from vical_daemon.estimation.rehearsal import Frames, Step, rehearsed, wide_filter
 from vical_daemon.estimation.seen_poses import PoseCache
 from vical_daemon.estimation.state import Layout
 
@@ -23,9 +22,6 @@ _ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must co
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
 
-Frames = list[tuple[float, PointsFrame]]
-Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
-
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
@@ -34,18 +30,14 @@ class Attempt:
     Attributes:
         filter: Ready to take `frames`, or None.
         frames: Those it begins with, in order of the imu's time.
-        begin_s: Where it stands, imu clock.
         reason: Why there is none, or what the motion does not show.
         motion_missing: It is motion that is missing, not time.
-        still_axes: See `StartResult`.
     """
 
     filter: CalibrationFilter | None
     frames: Frames
-    begin_s: float
     reason: str
     motion_missing: bool = False
-    still_axes: FloatArray | None = None
 
 
 class Starting:
@@ -125,8 +117,8 @@ class Starting:
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)
-        return Attempt(found, frames, begin_s, result.reason, still_axes=result.still_axes)
+        return Attempt(found, frames, result.reason)
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:
-    return Attempt(None, [], 0.0, reason, motion_missing)
+    return Attempt(None, [], reason, motion_missing)

@@ -3,9 +3,9 @@
 Where an axis `a` of the imu keeps its direction R a in the world, a lever arm longer by `a` and an imu that
 stands back by `R a` give the same images: the motion shows nothing of it, and whatever it is assumed to be,
 the rest comes out the same. A filter that lets it float sees `R a` in slightly different directions at each
-image and takes that for information (as SLAM filters do; Huang et al. 2010): its sigma collapses, and its
-error bends the mounting. So it is held, its variance is added where the estimate leaves, and the first real
-turn of the axis releases it.
+image and takes that for information (as SLAM filters do; Huang et al. 2010): its sigma collapses while it
+runs off. So it is held, its variance is added where the estimate leaves, and the first real turn of the
+axis releases it.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ class FeatureTracker:
         features.keep(good)
 
     def _comes_back(self, before: Gray, now: Gray, uv_before: FloatArray, uv_now: FloatArray) -> BoolArray:
-        """Whether the way back ends where the feature came from; at half the size, at a sixth of the cost."""
+        """Whether the way back ends where the feature came from; at half the size, at a third of the cost."""
         back, good = self._flow(
             cv2.pyrDown(now),
             cv2.pyrDown(before),
