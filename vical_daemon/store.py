@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
 from vical_daemon.messages.poses import rotation_matrix
+from vical_daemon.whole_file import write_whole
 
 _log = logging.getLogger(__name__)
 _FORMAT = 1
@@ -112,7 +112,7 @@ class CalibrationStore:
             raise StoreError(f"calibration of {camera} is not stored: {problem}")
         path = self.path(imu_serial, camera_serial)
         try:
-            _replace(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
+            write_whole(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
         except OSError as error:
             raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
         return path
@@ -192,24 +192,3 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "item"):
         return value.item()
     raise TypeError(f"{type(value).__name__} cannot be stored")
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Write a file so that its name means the old or the new content at any moment, also on the disk."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

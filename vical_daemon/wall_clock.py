@@ -17,6 +17,8 @@ from pathlib import Path
 
 import msgspec
 
+from vical_daemon.whole_file import write_whole
+
 FILE_NAME = "wall_clock.json"
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
@@ -83,7 +85,7 @@ def shared_clock(folder: Path) -> WallClock:
         clock = _read(path)  # another role may have been faster
         if clock is None or clock.boot_id != boot_id():
             clock = private_clock()
-            _replace(path, clock)
+            write_whole(path, msgspec.json.encode(clock))
     return clock
 
 
@@ -104,13 +106,6 @@ def boot_id() -> str:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
         return ""
-
-
-def _replace(path: Path, clock: WallClock) -> None:
-    """Put the file there with its whole content at once."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{time.monotonic_ns()}")
-    temporary.write_bytes(msgspec.json.encode(clock))
-    temporary.replace(path)
 
 
 def _read(path: Path) -> WallClock | None:

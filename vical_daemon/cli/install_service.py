@@ -14,6 +14,7 @@ from pathlib import Path
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
+from vical_daemon.whole_file import write_whole
 
 _UNITS = Path("etc/systemd/system")
 _HOMES = ("/home", "/root", "/run/user")
@@ -185,11 +186,8 @@ def _require_rights(root: Path) -> None:
 def _perform(step: Step) -> None:
     if step.action == "write":
         path = Path(step.what)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(path.name + ".new")
-        temporary.write_text(step.text, encoding="utf-8")
-        temporary.chmod(0o644)
-        temporary.replace(path)
+        write_whole(path, step.text.encode())
+        path.chmod(0o644)
     elif step.action == "remove":
         Path(step.what).unlink(missing_ok=True)
     elif step.command:

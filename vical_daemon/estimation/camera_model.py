@@ -140,13 +140,8 @@ def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, Fl
     iz = 1.0 / _front(points[..., 2])
     x, y = points[..., 0] * iz, points[..., 1] * iz
     k1, k2, p1, p2 = (D[..., i] for i in range(4))
-    x2, y2, xy2 = x * x, y * y, 2.0 * x * y
-    r2 = x2 + y2
-    across, down = r2 + 2.0 * x2, r2 + 2.0 * y2
-    radial = 1.0 + r2 * (k1 + k2 * r2)
-    d = np.empty((*radial.shape, 2))
-    d[..., 0] = x * radial + p1 * xy2 + p2 * across
-    d[..., 1] = y * radial + p1 * down + p2 * xy2
+    r2 = x * x + y * y
+    d = distort(np.stack((x, y), axis=-1), D)
     a, b, c = _radtan_derivative(x, y, r2, k1, k2, p1, p2)
     J = np.empty((*d.shape, 3))
     J[..., 0, 0] = a * iz
@@ -158,8 +153,8 @@ def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, Fl
     r4 = r2 * r2
     J_d[..., 0, 0], J_d[..., 1, 0] = x * r2, y * r2
     J_d[..., 0, 1], J_d[..., 1, 1] = x * r4, y * r4
-    J_d[..., 0, 2] = J_d[..., 1, 3] = xy2
-    J_d[..., 1, 2], J_d[..., 0, 3] = down, across
+    J_d[..., 0, 2] = J_d[..., 1, 3] = 2.0 * x * y
+    J_d[..., 1, 2], J_d[..., 0, 3] = r2 + 2.0 * y * y, r2 + 2.0 * x * x
     return d, J, J_d
 
 
