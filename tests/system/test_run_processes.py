@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from vical_mocks.gx3_emulator import Gx3Emulator
 
@@ -109,9 +110,12 @@ def test_all_processes_run_record_and_stop_cleanly(daemon: Daemon) -> None:
     numbers = [s.sequence for s in got if s.key.endswith("/imu/imu0")]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # none lost on the bus
     (log,) = (daemon.folder / "state" / "log").glob("*.mcap")
-    recorded = open_recording(log, check=False).imus["imu0"]
+    recorded = open_recording(log, check=False).imu_arrays("imu0").t_ns
     live = [decode_imu(s.payload).stamp_ns for s in got if s.key.endswith("/imu/imu0")]
-    assert recorded.count >= len(live) and recorded.largest_gap_s < 0.05
+    # Nothing that was on the bus is missing in the file. (Evenness is no matter of this test: a virtual
+    # machine that stands still for seconds overruns the terminal: that hole is the emulated device's.)
+    first = int(np.searchsorted(recorded, live[0]))
+    np.testing.assert_array_equal(recorded[first : first + len(live)], live)
 
 
 def test_systemd_is_told_ready_alive_and_stopping(daemon: Daemon) -> None:
