@@ -16,9 +16,15 @@ from vical_daemon.estimation import unscented
 from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.image_update import corner_gate, curved_share, frame_limit, rows_of, solve
+from vical_daemon.estimation.image_update import (
+    ImageFit,
+    corner_gate,
+    curved_share,
+    frame_limit,
+    rows_of,
+    solve,
+)
 from vical_daemon.estimation.imu_buffer import ImuSegment
-from vical_daemon.estimation.imu_model import process_noise
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.linearise import (
     Image,
@@ -28,14 +34,15 @@ from vical_daemon.estimation.linearise import (
     by_sigma_points,
     project_errors,
 )
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.retract import orthonormal, retract
 from vical_daemon.estimation.stamp_jitter import StampJitter
-from vical_daemon.estimation.state import ATTITUDE, MOTION, Layout, State
+from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, State
 from vical_daemon.estimation.target_view import Rates
 from vical_daemon.estimation.unshown_axes import UnshownAxes
 
+_EYE = np.eye(3)
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
 
@@ -81,14 +88,14 @@ class CalibrationFilter:
             self._set_rates(segment)
             return
         state = self.state
-        moved, Q, gyro_var, accel_var = self._moved(segment)
-        self._grow(moved, Q, gyro_var, accel_var)
+        moved, Q = self._moved(segment)
+        self._grow(moved, Q)
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         state.t_s = float(segment.t_s[-1])
         self._set_rates(segment)
 
-    def _moved(self, segment: ImuSegment) -> tuple[Moved, FloatArray, float, float]:
-        """The motion at the end of a segment and the noise gathered on the way."""
+    def _moved(self, segment: ImuSegment) -> tuple[Moved, FloatArray]:
+        """The motion at the end of a segment and the covariance of the noise gathered on the way."""
         d = self.layout.dynamic
         S = self.S[:d, :d]
         sigmas = np.sqrt((S**2).sum(axis=1))
@@ -97,17 +104,16 @@ class CalibrationFilter:
             moved = move_by_derivatives(self.state, S, segment)
         else:
             moved = move_by_sigma_points(self.state, self.layout, S, segment)
-        noise = process_noise(self.state.R_world_imu, moved.relative, self.imu_noise)
-        Q = noise.covariance
+        Q = moved.influence.noise(self.imu_noise)
         if not straight:
             share = np.sqrt((moved.curved**2).sum(axis=1) / np.diag(Q)).max()
             self._motion_straight.measured(sigmas, float(share))
-        return moved, Q, noise.gyro_bias_var, noise.accel_bias_var
+        return moved, Q
 
-    def _grow(self, moved: Moved, Q: FloatArray, gyro_var: float, accel_var: float) -> None:
+    def _grow(self, moved: Moved, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
         n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
-        dt = float(moved.relative.t_s[-1])
+        dt, noise = moved.seconds, self.imu_noise
         drift = np.flatnonzero(self.walk)
         A = np.zeros((n, n + c + 9 + 6 + len(drift)))
         A[:, :n] = self.S
@@ -118,10 +124,11 @@ class CalibrationFilter:
                 self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
         A[:9, n : n + c] = moved.curved
         at = n + c
-        A[:9, at : at + 9] = np.linalg.cholesky(Q + 1e-30 * np.eye(9))
-        A[range(9, 12), range(at + 9, at + 12)] = np.sqrt(gyro_var)
-        A[range(12, 15), range(at + 12, at + 15)] = np.sqrt(accel_var)
-        A[drift, at + 15 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
+        A[:9, at : at + 9] = unscented.root(Q)
+        A[GYRO_BIAS, at + 9 : at + 12] = noise.gyro_walk * np.sqrt(dt) * _EYE
+        A[ACCEL_BIAS, at + 12 : at + 15] = noise.accel_walk * np.sqrt(dt) * _EYE
+        if len(drift):
+            A[drift, at + 15 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
         self.S = unscented.lower_root(A)
 
     def _set_rates(self, segment: ImuSegment) -> None:
@@ -135,7 +142,6 @@ class CalibrationFilter:
         """Correct the state with the points of one image; the verdict says what became of it."""
         noise = self.corner_noise[image.camera]
         lin = self._linearise(image)
-        image = self._shared_noise(image, lin)
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
         keep = lin.valid & corner_gate(image, innovation, lin)
@@ -152,13 +158,14 @@ class CalibrationFilter:
                 f"innovation of the image is {level:.1f} times what it should be",
             )
         self.nis_level += 0.05 * (level - self.nis_level)
-        self._measure(image, lin, fit.keep)
+        self._measure(image, lin, fit)
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None]
-        expected = _expected(image, lin)[rows_of(keep)]
-        self.consistency[image.camera].learn(lin.z[keep], innovation[keep], expected, image.sigma_px[keep])
+        self.consistency[image.camera].learn(
+            lin.z[keep], innovation[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
+        )
         return FrameReport(
             image.t_ns,
             image.camera,
@@ -173,36 +180,38 @@ class CalibrationFilter:
             predicted_px=predicted,
         )
 
-    def _shared_noise(self, image: Image, lin: Linear) -> Image:
-        """The image with the noise that its corners share: the jitter of its stamp."""
+    def _with_jitter(self, image: Image, lin: Linear) -> Linear:
+        """The linearised image with the noise that its corners share: the jitter of its stamp."""
         index, jitter = self.layout.cameras[image.camera].timeshift, self.jitter.get(image.camera)
-        if index is None or jitter is None or not jitter.sigma_s:
-            return image
-        return replace(image, common_px=lin.H[:, index, None] * jitter.sigma_s)
+        if index is not None and jitter is not None and jitter.sigma_s:
+            lin.shared = lin.by_error[:, index, None] * jitter.sigma_s
+        return lin
 
-    def _measure(self, image: Image, lin: Linear, keep: BoolArray) -> None:
+    def _measure(self, image: Image, lin: Linear, fit: ImageFit) -> None:
         """What an image says about stamps and lens before it is used."""
         where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
-        rows, sigma = rows_of(keep), image.sigma_px[keep]
-        innovation = ((image.uv - lin.z)[keep] / sigma[:, None]).ravel()
-        weight = 1.0 / np.repeat(sigma, 2)
+        if lin.curved.size:  # the fit may be linearised elsewhere
+            rows, sigma = rows_of(fit.keep), image.sigma_px[fit.keep]
+            ways = lin.ways[rows] / np.repeat(sigma, 2)[:, None]
+            innovation = ((image.uv - lin.z)[fit.keep] / sigma[:, None]).ravel()
+        else:
+            ways, innovation = fit.ways, fit.r
         jitter, agreement = self.jitter.get(image.camera), self.agreement.get(image.camera)
         if jitter is not None and where.timeshift is not None:
             level = self.consistency[image.camera].level
-            by_shift = lin.H[rows, where.timeshift] * weight
-            jitter.learn(innovation, by_shift, (by_shift * weight) @ lin.linear[rows], level)
+            by_shift = ways @ lin.by_error[:, where.timeshift]
+            jitter.learn(innovation, by_shift, (by_shift @ ways) @ lin.spread, level)
         if agreement is not None and where.intrinsics is not None and where.distortion is not None:
             lens = slice(where.intrinsics.start, where.distortion.stop)
             values = np.concatenate([camera.intrinsics, camera.distortion])
-            whitened = lin.H[rows] * weight[:, None]
-            agreement.learn(self.state.t_s, innovation, whitened[:, :6], whitened[:, lens], values)
+            by_pose, by_lens = ways @ lin.by_error[:, :6], ways @ lin.by_error[:, lens]
+            agreement.learn(self.state.t_s, innovation, by_pose, by_lens, values)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""
         sigma = self.corner_noise[frame.camera].sigmas(frame.sigma_px, len(frame.ids))
         sigma = sigma * np.sqrt(self.consistency[frame.camera].scale)
-        alone = np.zeros((2 * len(frame.ids), 0))
-        return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma, alone)
+        return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma)
 
     @staticmethod
     def _refused(image: Image, residual: FloatArray, predicted: FloatArray, why: str) -> FrameReport:
@@ -217,8 +226,9 @@ class CalibrationFilter:
         keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)
         if keep.sum() < len(keep) // 2:
             return 36.0
-        expected = _expected(self._shared_noise(image, lin), lin)[rows_of(keep)]
-        normal = normalised(lin.z[keep], (image.uv - lin.z)[keep], expected, image.sigma_px[keep])
+        normal = normalised(
+            lin.z[keep], (image.uv - lin.z)[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
+        )
         return None if normal is None else float(normal @ normal) / len(normal)
 
     def predict_pixels(self, camera: str, t_cam_s: float, points: FloatArray) -> FloatArray:
@@ -236,13 +246,16 @@ class CalibrationFilter:
         straight = self._view_straight.setdefault(image.camera, Straightness())
         sigmas = self.sigmas()
         if not rolling and straight.holds(sigmas):
-            return by_derivatives(self.state, self.layout, self.rates, image, self.S)
+            return self._with_jitter(
+                image, by_derivatives(self.state, self.layout, self.rates, image, self.S)
+            )
         lin = self._by_points(image, np.zeros(self.layout.size), self.S)
         straight.measured(sigmas, curved_share(image, lin, lin.valid))
         return lin
 
     def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
-        return by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
+        lin = by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
+        return self._with_jitter(image, lin)
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
@@ -308,8 +321,3 @@ class CalibrationFilter:
         """Covariance of chosen errors, shape (k, k)."""
         part = self.S[rows]
         return np.asarray(part @ part.T)
-
-
-def _expected(image: Image, lin: Linear) -> FloatArray:
-    """What moves the pixels beside the corners' own noise: states and what the corners share."""
-    return np.concatenate([lin.linear, image.common_px], axis=1) if image.common_px.size else lin.linear

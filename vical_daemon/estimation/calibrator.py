@@ -6,6 +6,7 @@ short lag (so that inertial data always bracket each image) -> `judge` says how 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -72,8 +73,9 @@ class Calibrator:
             self._base_ns = t_imu_ns
             self._buffer = ImuBuffer(t_imu_ns)
         gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
-        fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
-        if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
+        if math.isfinite(sum(gyro_rps) + sum(specific_force_mps2)) and self._buffer.append(
+            (t_imu_ns - self._base_ns) * 1e-9, gyro, accel
+        ):
             self.judge.saw_imu(t_imu_ns, gyro, accel)
         else:
             self.judge.imu_refused += 1

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.unscented import solve_lower
+from vical_daemon.estimation.unscented import root, solve_lower
 
 MODES = 8
 _MIN_CORNERS = 8
@@ -60,7 +60,7 @@ def modes(uv: FloatArray) -> FloatArray:
 
 
 def normalised(
-    uv: FloatArray, innovation: FloatArray, linear: FloatArray, sigma: FloatArray
+    uv: FloatArray, innovation: FloatArray, ways: FloatArray, moves: FloatArray, sigma: FloatArray
 ) -> FloatArray | None:
     """Innovation in the eight modes, each over its predicted standard deviation; arguments as `learn`.
 
@@ -72,14 +72,14 @@ def normalised(
     whitened = 1.0 / np.repeat(sigma, 2)
     W = modes(uv) * whitened[:, None]
     try:
-        L: FloatArray = np.linalg.cholesky(W.T @ W).astype(np.float64, copy=False)  # W = Q L'
+        L = root(W.T @ W)  # W = Q L'
     except np.linalg.LinAlgError:
         return None
     diagonal = np.diag(L)
     if diagonal.min() < 1e-6 * diagonal.max():
         return None
     Q = solve_lower(L, W.T).T * whitened[:, None]
-    seen, state = innovation.ravel() @ Q, Q.T @ linear
+    seen, state = innovation.ravel() @ Q, (Q.T @ ways) @ moves
     out: FloatArray = np.clip(seen / np.sqrt(1.0 + (state**2).sum(axis=1)), -_CLIP, _CLIP)
     return out
 
@@ -122,16 +122,19 @@ class Consistency:
         """Usual squared innovation in a mode over its prediction, >= 1."""
         return max(1.0, self._lagged[0] / (MODES * self._weight)) if self._weight else 1.0
 
-    def learn(self, uv: FloatArray, innovation: FloatArray, linear: FloatArray, sigma: FloatArray) -> None:
+    def learn(
+        self, uv: FloatArray, innovation: FloatArray, ways: FloatArray, moves: FloatArray, sigma: FloatArray
+    ) -> None:
         """Take in the innovation of one image.
 
         Args:
             uv: Predicted pixels of the accepted corners, shape (n, 2).
             innovation: Measured minus predicted, px, shape (n, 2).
-            linear: H S for these corners (state uncertainty), px, shape (2n, c).
+            ways: How these corners move in each way in which the image can, px, shape (2n, k).
+            moves: Square root of how far the state and what corners share move it, shape (k, c).
             sigma: Corner noise as used, px, shape (n,).
         """
-        normal = normalised(uv, innovation, linear, sigma)
+        normal = normalised(uv, innovation, ways, moves, sigma)
         if normal is None:
             return
         if self._skip > 0:

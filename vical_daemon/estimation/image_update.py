@@ -42,6 +42,8 @@ class ImageFit:
         rest: Sum of squares that no state error explains, whitened.
         dof_rest: Its degrees of freedom.
         left: Whitened residuals after the correction, shape (n, 2).
+        ways: The ways of the kept rows, whitened and compressed: sums over the rows stay, shape (m, k).
+        r: Their innovation, shape (m,).
     """
 
     S: FloatArray
@@ -52,6 +54,8 @@ class ImageFit:
     rest: float
     dof_rest: int
     left: FloatArray
+    ways: FloatArray
+    r: FloatArray
 
 
 def rows_of(keep: BoolArray) -> BoolArray | slice:
@@ -61,10 +65,12 @@ def rows_of(keep: BoolArray) -> BoolArray | slice:
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-    var = np.einsum("ij,ij->i", lin.linear, lin.linear)
-    for more in (image.common_px, lin.curved):
-        if more.size:
-            var += np.einsum("ij,ij->i", more, more)
+    moves = lin.moves
+    size = len(moves)
+    moved = lin.ways @ (unscented.lower_root(moves) if moves.shape[1] > size else moves)
+    var = np.einsum("ij,ij->i", moved, moved)
+    if lin.curved.size:
+        var += np.einsum("ij,ij->i", lin.curved, lin.curved)
     var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]
     passed: BoolArray = (innovation**2 / var).sum(axis=1) < _CORNER_GATE
     return passed
@@ -92,15 +98,16 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
         The fit. [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
     """
     S, dx = prior, np.zeros(len(prior))
-    M, offset = lin.linear, np.zeros(2 * len(image.ids))
+    spread, offset = lin.spread, np.zeros(2 * len(image.ids))
     weight = 1.0 / np.repeat(image.sigma_px, 2)
     for step in range(_ITERATIONS):
         if step:
             lin = linearise(dx, S)
             keep = keep & lin.valid
-            M, offset = lin.H @ prior, lin.H @ dx  # the innovation refers to the prior mean
+            # the innovation refers to the prior mean
+            spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
         r = ((image.uv - lin.z).ravel() + offset) * weight
-        fit = _correct(image, prior, M * weight[:, None], r, lin, weight, keep)
+        fit = _correct(prior, spread, r, lin, weight, keep)
         if curved_share(image, lin, fit.keep) < _CURVED:
             break
         step_size = unscented.solve_lower(fit.S, fit.dx - dx)
@@ -111,34 +118,27 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
 
 
 def _correct(
-    image: Image,
-    prior: FloatArray,
-    M: FloatArray,
-    r: FloatArray,
-    lin: Linear,
-    weight: FloatArray,
-    keep: BoolArray,
+    prior: FloatArray, spread: FloatArray, r: FloatArray, lin: Linear, weight: FloatArray, keep: BoolArray
 ) -> ImageFit:
     """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
-    columns = [M]
-    if image.common_px.size:
-        columns.append(image.common_px * weight[:, None])
+    ways = lin.ways * weight[:, None]
+    k = ways.shape[1]
     if lin.curved.size:
         curved = lin.curved * weight[:, None]
         if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
-            columns.append(curved)
-    full = np.concatenate(columns, axis=1) if len(columns) > 1 else M
+            ways = np.concatenate([ways, curved], axis=1)
     for _ in range(3):
         rows = rows_of(keep)
-        small, r_small, rest, dof_rest = unscented.compress(full[rows], r[rows])
+        R, r_small, rest, dof_rest = unscented.compress(ways[rows], r[rows])
+        small = np.concatenate([R[:, :k] @ spread, R[:, :k] @ lin.shared, R[:, k:]], axis=1)
         c = unscented.correct(prior, small, r_small)
-        left = (r - full @ c.solution).reshape(-1, 2)
+        e, shared, bent = np.split(c.solution, np.cumsum([len(prior), lin.shared.shape[1]]))
+        left = (r - ways @ np.concatenate([spread @ e + lin.shared @ shared, bent])).reshape(-1, 2)
         bad = keep & ((left**2).sum(axis=1) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
         if not bad.any() or (keep & ~bad).sum() < 4:
             break
         keep = keep & ~bad
-    # A compressed image has as many rows as there are states, though it shows but some of them: rows that no
-    # state moves are residuals like the rest, and say nothing about whether the innovations fit.
+    # Rows that no state moves are residuals like the rest, and say nothing about whether the innovations fit.
     alone = np.einsum("ij,ij->i", small, small) < _ALONE if dof_rest else np.zeros(len(r_small), bool)
     apart = float((r_small[alone] ** 2).sum())
     count = int(alone.sum())
@@ -151,4 +151,6 @@ def _correct(
         rest + apart,
         dof_rest + count,
         left,
+        R[:, :k],
+        r_small,
     )

@@ -114,7 +114,7 @@ class ImuBuffer:
         cut = np.concatenate([value[:1], inside[middle, 1:], value[1:]])
         rise = np.concatenate([change[:1], slope[middle], change[1:]])
         times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
-        gap = float(np.max(np.diff(t[first : high + 1]), initial=0.0))
+        gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
         return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:])
 
 
@@ -124,17 +124,19 @@ def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:
     Next to a hole (four times the usual step and more) the difference over the hole says nothing about the
     slope: the chord of the other side is taken, or none.
     """
-    dt = np.diff(rows[:, 0])
-    chord = np.diff(rows[:, 1:], axis=0) / dt[:, None]
-    usual = float(np.min(dt))
-    weight = np.where(dt > 4.0 * usual, 0.0, 1.0)
-    left = np.concatenate([[0.0], weight])
-    right = np.concatenate([weight, [0.0]])
-    before = np.concatenate([chord[:1], chord])
-    after = np.concatenate([chord, chord[-1:]])
-    total = left + right
-    out = (left[:, None] * before + right[:, None] * after) / np.maximum(total, 1.0)[:, None]
-    return np.asarray(out[begin : begin + count])
+    t, values = rows[:, 0], rows[:, 1:]
+    dt = t[1:] - t[:-1]
+    chord = (values[1:] - values[:-1]) / dt[:, None]
+    whole = (dt <= 4.0 * dt.min()).astype(np.float64)
+    sides = np.zeros((len(rows), 1))
+    sides[:-1, 0] = whole
+    sides[1:, 0] += whole
+    out = np.empty_like(values)
+    chord *= whole[:, None]
+    out[:-1], out[-1] = chord, 0.0
+    out[1:] += chord
+    out /= np.maximum(sides, 1.0)
+    return out[begin : begin + count]
 
 
 def _hermite(

@@ -9,7 +9,6 @@ bias the time shift by tenths of a millisecond; straight lines between samples w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +69,7 @@ def strapdown(
     Returns:
         The relative motion at every node.
     """
-    dt = np.diff(segment.t_s)
+    dt = segment.t_s[1:] - segment.t_s[:-1]
     omega = segment.gyro - gyro_bias[:, None, :]
     force = segment.accel - accel_bias[:, None, :]
     if gyro_matrix is not None:
@@ -102,39 +101,6 @@ def strapdown(
     np.cumsum(gained, axis=1, out=dv[:, 1:])
     np.cumsum(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
     return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0])
-
-
-def bias_derivatives(
-    segment: ImuSegment, relative: Strapdown, accel_bias: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Derivatives of the relative motion at the end by the biases (trapezoids over the nodes).
-
-    With A(t) = -int R dt (turn in the start frame by gyro bias): dv = int R f has d/d b_a = A and
-    d/d b_g = -int hat(R f) A; the derivatives of dp are the integrals of both. [Forster et al. 2017, (69)]
-
-    Args:
-        segment: Readings.
-        relative: Their integrals for one pair of biases (index 0 is used).
-        accel_bias: m/s^2, shape (3,).
-
-    Returns:
-        Rotation (local) by gyro bias (3, 3), velocity (3, 6) and position (3, 6) by [gyro, accel] bias.
-    """
-    dt = np.diff(relative.t_s)
-    half = 0.5 * dt[:, None, None]
-    dR = relative.dR[0]
-    A = np.zeros_like(dR)
-    np.cumsum((dR[1:] + dR[:-1]) * -half, axis=0, out=A[1:])
-    force = np.matmul(dR, (segment.accel - accel_bias)[..., None])[..., 0]
-    pull = -so3.hat(force) @ A
-    speed = np.zeros((len(A), 3, 6))
-    np.cumsum((pull[1:] + pull[:-1]) * half, axis=0, out=speed[1:, :, :3])
-    speed[:, :, 3:] = A
-    weight = np.zeros(len(A))
-    weight[1:] = 0.5 * dt
-    weight[:-1] += 0.5 * dt
-    place = np.tensordot(weight, speed, axes=1)
-    return dR[-1].T @ A[-1], speed[-1], place
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -187,52 +153,67 @@ def compose(start: Motion, relative: Strapdown, gravity: FloatArray) -> Motion:
     return Motion(np.matmul(start.R, relative.dR[:, -1]), p, v)
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessNoise:
-    """Noise accumulated over a segment.
+class Influence(NamedTuple):
+    """What errors of the readings, made at each node of a segment, do to its end.
 
     Attributes:
-        covariance: Of [rotation (local, right) 3, position 3, velocity 3] at the end, shape (9, 9).
-        gyro_bias_var: Variance added to each gyro bias, (rad/s)^2.
-        accel_bias_var: Variance added to each accelerometer bias, (m/s^2)^2.
+        at: [rotation (local, right) 3, position 3, velocity 3] at the end by a rate error (three columns) and
+            a force error (three) that act for a second, shape (n + 1, 9, 6).
+        weights: Duration that each node stands for (trapezoids), s, shape (n + 1,).
+        beyond: By how much trapezoids exaggerate the integral of the squared time to the end, s^3.
     """
 
-    covariance: FloatArray
-    gyro_bias_var: float
-    accel_bias_var: float
+    at: FloatArray
+    weights: FloatArray
+    beyond: float
+
+    def by_bias(self) -> FloatArray:
+        """Return the end by constant biases [gyro 3, accel 3], shape (9, 6); Forster et al. 2017, (69)."""
+        return -(self.weights @ self.at.reshape(-1, 54)).reshape(9, 6)
+
+    def noise(self, noise: ImuNoise) -> FloatArray:
+        """Covariance of the end that white noise of the readings brings, shape (9, 9)."""
+        roots = np.sqrt(self.weights)[:, None] * _densities(noise)
+        G = (self.at * roots[:, None, :]).transpose(1, 0, 2).reshape(9, -1)
+        covariance = G @ G.T
+        covariance[_PLACE, _PLACE] -= noise.accel_density**2 * self.beyond
+        return covariance
 
 
-def process_noise(R_start: FloatArray, relative: Strapdown, noise: ImuNoise) -> ProcessNoise:
-    """Propagate white rate and force noise through one segment in closed form.
+_PLACE = np.arange(3, 6)
 
-    A rotation error made in interval i turns all specific force integrated after it:
-    d v_end = -hat(V_end - V_i) R_i d theta_i, d p_end = -hat(P_end - P_i - V_i (T - t_i)) R_i d theta_i.
-    (tested against a Monte Carlo of the integration itself)
+
+def _densities(noise: ImuNoise) -> FloatArray:
+    return np.array([noise.gyro_density] * 3 + [noise.accel_density] * 3)
+
+
+def influence(R_start: FloatArray, relative: Strapdown) -> Influence:
+    """Follow an error of rate or force from where it is made to the end of the segment, in closed form.
+
+    A turn d theta at s (imu frame) turns all specific force integrated after it:
+    d v_end = -hat(V_end - V(s)) R(s) d theta, d p_end = -hat(P_end - P(s) - V(s) (T - s)) R(s) d theta.
+    (tested against a Monte Carlo of the integration, and against differences)
 
     Args:
-        R_start: R_world_imu at the start, shape (3, 3).
+        R_start: R_world_imu at the start, shape (3, 3); positions and velocities come out in its world.
         relative: Strapdown of the nominal, batch of 1 (index 0 is used).
-        noise: Densities.
 
     Returns:
-        The accumulated noise.
+        The influence of each node.
     """
-    t, dt = relative.t_s, np.diff(relative.t_s)
-    T = t[-1]
+    t = relative.t_s
+    dt = t[1:] - t[:-1]
+    left = (t[-1] - t)[:, None]
     R = R_start @ relative.dR[0]
     V = relative.dv[0] @ R_start.T
     P = relative.dp[0] @ R_start.T
-    mid, after = 0.5 * (t[:-1] + t[1:]), R[1:]
-    gyro = (noise.gyro_density * np.sqrt(dt))[:, None, None] * after
-    accel = (noise.accel_density * np.sqrt(dt))[:, None, None] * after
-    G = np.zeros((len(dt), 9, 6))
-    G[:, 0:3, 0:3] = R[-1].T @ gyro
-    G[:, 3:6, 0:3] = -so3.hat(P[-1] - P[1:] - V[1:] * (T - t[1:])[:, None]) @ gyro
-    G[:, 6:9, 0:3] = -so3.hat(V[-1] - V[1:]) @ gyro
-    G[:, 3:6, 3:6] = accel * (T - mid)[:, None, None]
-    G[:, 6:9, 3:6] = accel
-    flat = G.transpose(1, 0, 2).reshape(9, -1)
-    covariance = flat @ flat.T
-    within = noise.accel_density**2 * float(np.sum(dt**3)) / 12.0
-    covariance[3:6, 3:6] += within * np.eye(3)
-    return ProcessNoise(covariance, noise.gyro_walk**2 * T, noise.accel_walk**2 * T)
+    at = np.zeros((len(t), 9, 6))
+    at[:, 0:3, 0:3] = R[-1].T @ R
+    at[:, 3:6, 0:3] = so3.hat(P + V * left - P[-1]) @ R
+    at[:, 6:9, 0:3] = so3.hat(V - V[-1]) @ R
+    at[:, 3:6, 3:6] = R * left[..., None]
+    at[:, 6:9, 3:6] = R
+    weights = np.zeros(len(t))
+    weights[1:] = 0.5 * dt
+    weights[:-1] += 0.5 * dt
+    return Influence(at, weights, float((dt * dt) @ dt) / 6.0)

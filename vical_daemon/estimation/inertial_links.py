@@ -13,10 +13,12 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.imu_model import bias_derivatives, process_noise, strapdown
+from vical_daemon.estimation.imu_model import influence, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
+_EYE = np.eye(3)
+_ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 
 
 @dataclass(slots=True)
@@ -57,17 +59,14 @@ def make_link(
     if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
     motion = strapdown(segment, gyro_bias[None], accel_bias[None])
-    turn, speed, place = bias_derivatives(segment, motion, accel_bias)
-    by_bias = np.concatenate([np.concatenate([turn, np.zeros((3, 3))], axis=1), speed, place])
-    covariance = process_noise(np.eye(3), motion, noise).covariance
-    order = [0, 1, 2, 6, 7, 8, 3, 4, 5]
-    root = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(order, order)]))
+    errors = influence(_EYE, motion)
+    root = np.linalg.inv(np.linalg.cholesky(errors.noise(noise)[_ORDER[:, None], _ORDER]))
     return Link(
         float(motion.t_s[-1]),
         motion.dR[0, -1],
         motion.dv[0, -1],
         motion.dp[0, -1],
-        by_bias,
+        errors.by_bias()[_ORDER],
         root,
         gyro_bias.copy(),
         accel_bias.copy(),

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.unscented import upper_root
 
 _STRETCH_S = 5.0
 _SIGNIFICANT = 0.01
@@ -67,10 +68,12 @@ class LensAgreement:
             self._close(lens[0])
             self._begin_s = t_s
         # whatever the pose of the image may be: only what no pose explains says something about the lens
-        Q = np.linalg.qr(by_pose)[0]
-        J = by_lens - Q @ (Q.T @ by_lens)
+        p, n = by_pose.shape[1], by_pose.shape[1] + by_lens.shape[1]
+        rows = np.concatenate([by_pose, by_lens, innovation[:, None]], axis=1)
+        R = upper_root(rows)[p:n]
+        J = R[:, p:n]
         self._now.information += J.T @ J
-        self._now.weighted += J.T @ (innovation + by_lens @ lens)
+        self._now.weighted += J.T @ (R[:, n] + J @ lens)
 
     def _close(self, focal_px: float) -> None:
         """Put the stretch to the others and leave out each in turn."""

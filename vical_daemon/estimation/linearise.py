@@ -3,6 +3,10 @@
 Sigma points see the second-order part of the model. Once that part is far below the corner noise, they cost
 fifty projections and say what one derivative says: then the derivative is taken. Which of the two holds is
 *measured*, and measured again when a sigma has grown or some time has passed. [docs/math/filter.md, eq. (11)]
+
+An image can move in few ways only: six with the pose of the camera, some with its lens. So the derivatives by
+forty errors of the state are kept as a product, rows by ways times ways by errors, and whatever goes through
+all rows of an image goes through fourteen columns.
 """
 
 from __future__ import annotations
@@ -36,8 +40,6 @@ class Image:
         points: Their places in the world, m, shape (n, 3).
         uv: Measured pixels, shape (n, 2).
         sigma_px: White noise of each corner per axis, px, shape (n,).
-        common_px: Square root of the noise that all corners share (a late stamp moves them all), px,
-            shape (2n, k).
     """
 
     camera: str
@@ -47,26 +49,35 @@ class Image:
     points: FloatArray
     uv: FloatArray
     sigma_px: FloatArray
-    common_px: FloatArray
 
 
 @dataclass(slots=True)
 class Linear:
-    """One image linearised: z + H S e + curved, e ~ N(0, I), in pixels.
+    """One image linearised: z + ways (spread e + shared c) + curved u, in pixels; e, c, u ~ N(0, I).
 
     Attributes:
         z: Mean of the predicted pixels, shape (n, 2).
-        H: Derivatives by the errors of the state, shape (2n, c).
-        linear: H S, shape (2n, c).
-        curved: Square root of the second-order covariance, shape (2n, k); k = 0 where it is negligible.
+        ways: How pixels move in each of the k ways in which the image can move, shape (2n, k).
+        by_error: The ways by the errors of the state: the derivatives are H = ways @ by_error; shape (k, c).
+        spread: `by_error` S, shape (k, c).
+        curved: Square root of the second-order covariance, shape (2n, q); q = 0 where it is negligible.
         valid: Points in front of the camera, shape (n,).
+        shared: Square root of the noise that all corners share, in the same ways (a late stamp moves them
+            all), shape (k, r).
     """
 
     z: FloatArray
-    H: FloatArray
-    linear: FloatArray
+    ways: FloatArray
+    by_error: FloatArray
+    spread: FloatArray
     curved: FloatArray
     valid: BoolArray
+    shared: FloatArray
+
+    @property
+    def moves(self) -> FloatArray:
+        """What moves the image beside the corners' own noise: states and what corners share, (k, c + r)."""
+        return np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
 
 
 def project_errors(
@@ -118,58 +129,83 @@ def by_sigma_points(
     valid: BoolArray = np.asarray(np.isfinite(pixels).all(axis=(0, 2)))
     flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
     m = unscented.moments(flat[1:] - flat[0])
-    H = unscented.solve_lower(S, m.linear.T, transposed=True).T
-    return Linear((flat[0] + m.shift).reshape(-1, 2), H, m.linear, m.curved, valid)
+    # the columns of S are the ways
+    by_error = unscented.solve_lower(S, np.eye(len(S)))
+    unit, none = np.eye(len(S)), np.zeros((len(S), 0))
+    return Linear((flat[0] + m.shift).reshape(-1, 2), m.linear, by_error, unit, m.curved, valid, none)
 
 
 def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
     """The same to first order, about the nominal state; global shutter only."""
-    uv, H = view_derivatives(state, layout, rates, image)
+    uv, ways, by_error = view_derivatives(state, layout, rates, image)
     valid: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
     if not valid.all():
-        uv, H = np.where(valid[:, None], uv, 0.0), np.where(np.repeat(valid, 2)[:, None], H, 0.0)
-    return Linear(uv, H, H @ S, np.zeros((len(H), 0)), valid)
+        uv, ways = np.where(valid[:, None], uv, 0.0), np.where(np.repeat(valid, 2)[:, None], ways, 0.0)
+    k = len(by_error)
+    return Linear(uv, ways, by_error, by_error @ S, np.zeros((len(ways), 0)), valid, np.zeros((k, 0)))
 
 
 def view_derivatives(
     state: State, layout: Layout, rates: Rates, image: Image
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels (n, 2) and their derivatives by the errors of the state, shape (2n, size).
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How the pixels move with the camera and its lens, and those with the errors of the state.
 
-    x_imu = R^T (s X - p) with R = R_world_imu Exp(omega d), d = t_cam + shift - t_state; global shutter.
+    The ways are: the camera turns by phi and moves by tau (in its own frame), d x_cam = x_cam x phi - tau;
+    its lens; the size of the target. Global shutter.
     [docs/math/filter.md, eq. (7); derivatives tested against differences]
+
+    Returns:
+        Pixels (n, 2); their derivatives in the k ways, shape (2n, k); the ways by the errors of the state,
+        shape (k, size).
     """
     where, cam = layout.cameras[image.camera], state.cameras[image.camera]
-    d = image.t_cam_s + cam.timeshift_s - state.t_s
-    ahead = so3.exp_one(rates.omega * d)
-    R = state.R_world_imu @ ahead
-    p = state.p_world_imu + d * state.v_world_imu + 0.5 * d * d * rates.accel
-    x_imu = (image.points * state.target_scale - p) @ R
-    x_cam = (x_imu - cam.p_imu_cam) @ cam.R_imu_cam
+    ahead_s = image.t_cam_s + cam.timeshift_s - state.t_s
+    turn = so3.exp_one(rates.omega * ahead_s)
+    R = state.R_world_imu @ turn
+    p = state.p_world_imu + ahead_s * (state.v_world_imu + (0.5 * ahead_s) * rates.accel)
+    arm = image.points * state.target_scale - p
+    x_cam = (arm @ R - cam.p_imu_cam) @ cam.R_imu_cam
     with np.errstate(all="ignore"):
         uv, J, J_lens = project_jacobians(x_cam, cam.intrinsics, cam.distortion, cam.distortion_model)
-    # Two rows a point from here on: numpy multiplies one long matrix in the time of a few short ones.
     J = J.reshape(-1, 3)
-    J_imu = J @ cam.R_imu_cam.T
-    J_world = J_imu @ R.T
-    by_turn = cross(J_imu, np.repeat(x_imu, 2, axis=0))  # j' hat(x) = (j x x)'
-    H = np.zeros((len(J), layout.size))
-    H[:, ATTITUDE] = by_turn @ ahead.T
-    H[:, POSITION] = -J_world
-    H[:, VELOCITY] = -d * J_world
-    if where.position is not None and where.rotation is not None:
-        H[:, where.position] = -J_imu
-        H[:, where.rotation] = cross(J, np.repeat(x_cam, 2, axis=0))
-    if where.timeshift is not None:
-        # x_imu moves by -R'(v + d a) - omega x x_imu; j' (omega x x) = -(j x x)' omega
-        speed = R.T @ (state.v_world_imu + d * rates.accel)
-        H[:, where.timeshift] = by_turn @ rates.omega - J_imu @ speed
+    by_error = _pose_by_error(state, layout, rates, image.camera, ahead_s, turn)
+    ways = np.empty((len(J), len(by_error)))
+    ways[:, :3] = cross(J, np.repeat(x_cam, 2, axis=0))  # j' (x x phi) = (j x x)' phi
+    ways[:, 3:6] = -J
     if where.intrinsics is not None and where.distortion is not None:
-        lens = J_lens.reshape(-1, 8)
-        H[:, where.intrinsics], H[:, where.distortion] = lens[:, :4], lens[:, 4:]
+        ways[:, 6:14] = J_lens.reshape(-1, 8)
+        by_error[6:10, where.intrinsics] = by_error[10:14, where.distortion] = np.eye(4)
     if layout.target_scale is not None:
-        H[:, layout.target_scale] = np.einsum("ij,ij->i", J_world, np.repeat(image.points, 2, axis=0))
-    return uv, H
+        grown = image.points @ (R @ cam.R_imu_cam)
+        ways[:, -1] = np.einsum("ij,ij->i", J, np.repeat(grown, 2, axis=0))
+        by_error[-1, layout.target_scale] = 1.0
+    return uv, ways, by_error
+
+
+def _pose_by_error(
+    state: State, layout: Layout, rates: Rates, camera: str, ahead_s: float, turn: FloatArray
+) -> FloatArray:
+    """Turn and move of the camera (first six rows) by the errors of the state; rows of lens and scale are 0.
+
+    A rig that turns by a (imu frame, at the image) turns its camera by phi = R_imu_cam' a and moves it by
+    tau = R_imu_cam' (a x p_imu_cam).
+    """
+    where, cam = layout.cameras[camera], state.cameras[camera]
+    rows = 6 + (8 if where.intrinsics is not None else 0) + (layout.target_scale is not None)
+    out = np.zeros((rows, layout.size))
+    to_cam = cam.R_imu_cam.T
+    arm = -to_cam @ so3.hat(cam.p_imu_cam)
+    out[0:3, ATTITUDE], out[3:6, ATTITUDE] = to_cam @ turn.T, arm @ turn.T
+    from_world = to_cam @ (state.R_world_imu @ turn).T
+    out[3:6, POSITION], out[3:6, VELOCITY] = from_world, ahead_s * from_world
+    if where.position is not None and where.rotation is not None:
+        out[3:6, where.position] = to_cam
+        out[0:3, where.rotation] = np.eye(3)
+    if where.timeshift is not None:
+        out[0:3, where.timeshift] = to_cam @ rates.omega
+        speed = state.v_world_imu + ahead_s * rates.accel
+        out[3:6, where.timeshift] = arm @ rates.omega + from_world @ speed
+    return out
 
 
 @dataclass(slots=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vical_daemon.estimation import so3, unscented
 from vical_daemon.estimation.imu_buffer import ImuSegment
-from vical_daemon.estimation.imu_model import Motion, Strapdown, bias_derivatives, compose, strapdown
+from vical_daemon.estimation.imu_model import Influence, Motion, compose, influence, strapdown
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.retract import motion_points
 from vical_daemon.estimation.state import (
@@ -25,6 +25,9 @@ from vical_daemon.estimation.state import (
     tilt_basis,
 )
 
+BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
+_EYE = np.eye(3)
+
 
 class Moved(NamedTuple):
     """Motion at the end of a segment.
@@ -33,7 +36,8 @@ class Moved(NamedTuple):
         R, p, v: Mean.
         linear: F S of [attitude, position, velocity], shape (9, d).
         curved: Square root of the second-order covariance, shape (9, k); k = 0 by derivatives.
-        relative: The nominal's integrals.
+        influence: What errors of the readings do to it.
+        seconds: Length of the segment.
     """
 
     R: FloatArray
@@ -41,7 +45,8 @@ class Moved(NamedTuple):
     v: FloatArray
     linear: FloatArray
     curved: FloatArray
-    relative: Strapdown
+    influence: Influence
+    seconds: float
 
 
 def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
@@ -61,7 +66,8 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
         end.v[0] + m.shift[VELOCITY],
         m.linear,
         m.curved,
-        relative,
+        influence(state.R_world_imu, relative),
+        float(relative.t_s[-1]),
     )
 
 
@@ -71,22 +77,21 @@ def move_by_derivatives(state: State, S: FloatArray, segment: ImuSegment) -> Mov
     T = float(relative.t_s[-1])
     dR, dv, dp = relative.dR[0, -1], relative.dv[0, -1], relative.dp[0, -1]
     R, g = state.R_world_imu, state.gravity
+    errors = influence(R, relative)
     F = np.zeros((9, len(S)))
     tilt = -so3.hat(g) @ tilt_basis(g)
     F[ATTITUDE, ATTITUDE] = dR.T
     F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ so3.hat(dp), -R @ so3.hat(dv)
-    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = np.eye(3)
-    F[POSITION, VELOCITY] = T * np.eye(3)
+    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = _EYE
+    F[POSITION, VELOCITY] = T * _EYE
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
-    turn, speed, place = bias_derivatives(segment, relative, state.accel_bias)
-    F[ATTITUDE, GYRO_BIAS] = turn
-    F[VELOCITY, GYRO_BIAS], F[VELOCITY, ACCEL_BIAS] = R @ speed[:, :3], R @ speed[:, 3:]
-    F[POSITION, GYRO_BIAS], F[POSITION, ACCEL_BIAS] = R @ place[:, :3], R @ place[:, 3:]
+    F[:, BIASES] = errors.by_bias()
     return Moved(
         R @ dR,
         state.p_world_imu + T * state.v_world_imu + (0.5 * T * T) * g + R @ dp,
         state.v_world_imu + T * g + R @ dv,
         F @ S,
         np.zeros((9, 0)),
-        relative,
+        errors,
+        T,
     )

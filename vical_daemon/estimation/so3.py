@@ -19,6 +19,12 @@ _NO_ANGLE = 1e-40  # rad^2: keeps sin(a)/a defined at zero, and changes no digit
 _SERIES_BELOW_RAD = 0.3  # below it the closed forms lose digits, and five terms of the series are exact
 
 
+_SKEW = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]],
+    dtype=np.float64,
+)
+
+
 def hat(v: FloatArray) -> FloatArray:
     """Return the skew matrix with `hat(v) @ u == cross(v, u)`.
 
@@ -29,14 +35,7 @@ def hat(v: FloatArray) -> FloatArray:
         Skew-symmetric matrices, shape (..., 3, 3).
     """
     v = np.asarray(v, dtype=np.float64)
-    out = np.zeros((*v.shape, 3))
-    out[..., 2, 1] = v[..., 0]
-    out[..., 0, 2] = v[..., 1]
-    out[..., 1, 0] = v[..., 2]
-    out[..., 1, 2] = -v[..., 0]
-    out[..., 2, 0] = -v[..., 1]
-    out[..., 0, 1] = -v[..., 2]
-    return out
+    return np.asarray((v @ _SKEW).reshape(*v.shape, 3))
 
 
 def vee(S: FloatArray) -> FloatArray:

@@ -7,7 +7,6 @@ well as corners and predicted pose are; how much it varies beyond that, over man
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,7 +33,8 @@ class StampJitter:
 
     sigma_s: float = 0.0
     images: int = 0
-    _pairs: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_MEMORY))
+    _square: FloatArray = field(default_factory=lambda: np.zeros(_MEMORY))
+    _usual: FloatArray = field(default_factory=lambda: np.zeros(_MEMORY))
 
     def learn(
         self, innovation: FloatArray, by_shift: FloatArray, state: FloatArray, level: float = 1.0
@@ -51,13 +51,14 @@ class StampJitter:
         size = float(by_shift @ by_shift)
         if not size > 0.0:
             return
-        self.images += 1
         part = state / size
         error = float(by_shift @ innovation) / size
-        self._pairs.append((error * error, level * (1.0 / size + float(part @ part))))
-        if len(self._pairs) >= _LEAST and self.images % _EVERY == 0:
-            square, usual = np.array(self._pairs).T
-            self.sigma_s = _excess(square, usual)
+        place = self.images % _MEMORY
+        self._square[place] = error * error
+        self._usual[place] = level * (1.0 / size + float(part @ part))
+        self.images += 1
+        if self.images >= _LEAST and self.images % _EVERY == 0:
+            self.sigma_s = _excess(self._square[: self.images], self._usual[: self.images])
 
 
 def _excess(square: FloatArray, usual: FloatArray) -> float:

@@ -17,7 +17,7 @@ def feed(consistency, rng, frames, size=1.0, common=None):
         e = 0.5 * size * rng.normal(size=UV.shape)
         if common is not None:
             e = e + (modes(UV) @ common[k]).reshape(-1, 2)
-        consistency.learn(UV, e, LINEAR, SIGMA * np.sqrt(consistency.scale))
+        consistency.learn(UV, e, LINEAR, np.eye(LINEAR.shape[1]), SIGMA * np.sqrt(consistency.scale))
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -82,7 +82,7 @@ def test_process_noise_agrees_with_a_monte_carlo_of_the_integration():
     seg = segment(T, 100)
     relative = im.strapdown(seg, np.zeros((1, 3)), np.zeros((1, 3)))
     R0 = Rotation.from_rotvec([0.3, -0.4, 0.2])
-    Q = im.process_noise(R0.as_matrix(), relative, noise).covariance
+    Q = im.influence(R0.as_matrix(), relative).noise(noise)
     fine = segment(T, steps / T)
     h = T / steps
     zero = np.zeros((n, 3))
@@ -102,3 +102,29 @@ def test_process_noise_agrees_with_a_monte_carlo_of_the_integration():
     d = np.sqrt(np.diag(Q))
     np.testing.assert_allclose(np.sqrt(np.diag(samples)) / d, 1.0, atol=0.06)
     np.testing.assert_allclose(samples / np.outer(d, d), Q / np.outer(d, d), atol=0.09)
+
+
+def test_influence_of_a_bias_agrees_with_differences_of_the_integration():
+    seg, step = segment(0.1, 200), 1e-5
+    R0 = Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix()
+    biases = np.concatenate([np.zeros((1, 6)), step * np.eye(6)])
+    relative = im.strapdown(seg, biases[:, :3], biases[:, 3:])
+    start = im.Motion(np.repeat(R0[None], 7, 0), np.zeros((7, 3)), np.zeros((7, 3)))
+    end = im.compose(start, relative, np.repeat(G[None], 7, 0))
+    turned = Rotation.from_matrix(end.R[0].T @ end.R[1:]).as_rotvec()
+    moved = np.concatenate([turned, end.p[1:] - end.p[0], end.v[1:] - end.v[0]], axis=1).T / step
+    nominal = im.Strapdown(*(x[:1] for x in relative[:3]), relative.t_s)
+    by_bias = im.influence(R0, nominal).by_bias()
+    scale = np.abs(by_bias).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(by_bias / scale, moved / scale, atol=2e-3)  # trapezoids over the nodes
+
+
+def test_white_noise_of_a_force_that_keeps_its_direction_is_exact():
+    t = np.array([0.0, 0.004, 0.01, 0.03])
+    still = ImuSegment(t, np.zeros((4, 3)), np.tile([0.0, 0.0, 9.8], (4, 1)), 0.02)
+    relative = im.strapdown(still, np.zeros((1, 3)), np.zeros((1, 3)))
+    Q = im.influence(np.eye(3), relative).noise(ImuNoise(gyro_density=1e-9, accel_density=0.1))
+    T = t[-1]
+    np.testing.assert_allclose(
+        Q[3:, 3:], 0.01 * np.kron([[T**3 / 3, T**2 / 2], [T**2 / 2, T]], np.eye(3)), atol=1e-15
+    )

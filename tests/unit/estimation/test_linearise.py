@@ -56,7 +56,6 @@ def scene(model: str, estimate=frozenset({"target_scale"})):
         points,
         uv,
         np.full(len(points), 0.3),
-        np.zeros((2 * len(points), 0)),
     )
     return state, layout, rates, image
 
@@ -64,7 +63,9 @@ def scene(model: str, estimate=frozenset({"target_scale"})):
 @pytest.mark.parametrize("model", ["radtan", "equidistant"])
 def test_derivatives_of_the_view_are_those_of_the_projection(model):
     state, layout, rates, image = scene(model)
-    uv, H = view_derivatives(state, layout, rates, image)
+    uv, ways, by_error = view_derivatives(state, layout, rates, image)
+    H = ways @ by_error
+    assert ways.shape == (2 * len(image.points), 6 + 8 + 1)
     steps = 1e-6 * np.eye(layout.size)
     arguments = (state, layout, rates, "cam0", image.t_cam_s, image.points, None)
     differences = (project_errors(*arguments, steps) - project_errors(*arguments, -steps)) / 2e-6
@@ -80,7 +81,9 @@ def test_both_ways_to_linearise_agree_when_the_spread_is_small():
     S = np.diag(np.full(layout.size, 1e-5))
     points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
     straight = by_derivatives(state, layout, rates, image, S)
-    np.testing.assert_allclose(straight.linear, points.linear, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(
+        straight.ways @ straight.spread, points.ways @ points.spread, rtol=1e-4, atol=1e-7
+    )
     np.testing.assert_allclose(straight.z, points.z, atol=1e-4)
     assert straight.curved.shape == (2 * len(image.points), 0)
 
@@ -93,7 +96,7 @@ def test_points_behind_the_camera_are_invalid_either_way():
     straight = by_derivatives(state, layout, rates, image, S)
     np.testing.assert_array_equal(straight.valid, points.valid)
     assert not straight.valid[3]
-    assert np.isfinite(straight.linear).all()
+    assert np.isfinite(straight.ways @ straight.spread).all()
 
 
 def test_derivatives_of_the_motion_agree_with_sigma_points():
