@@ -62,6 +62,7 @@ class CalibrationFilter:
         agreement: How far stretches of the data agree about the lens, by camera.
         jitter: Measured random error of the stamps, by camera.
         unshown: After a partial start: axes along which lever arms are not known.
+        drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
@@ -76,6 +77,7 @@ class CalibrationFilter:
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     jitter: dict[str, StampJitter] = field(default_factory=dict)
     unshown: UnshownAxes | None = None
+    drifting: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
     _motion_straight: Straightness = field(default_factory=Straightness)

@@ -14,6 +14,7 @@ import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
+from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, in_doubt
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
@@ -32,7 +33,6 @@ from vical_daemon.estimation.starting import LATE_S, Starting
 from vical_daemon.estimation.state import make_layout
 
 _KEEP_S = 5.0
-_SKEW_OPEN = 1e-4  # s/s: two bad crystals
 
 
 class Calibrator:
@@ -202,15 +202,22 @@ class Calibrator:
         assert f is not None
         if action is Action.POSE:
             self._pose_anew(f, frame, t_cam_s)
-        elif action is Action.SKEW:
-            where = f.layout.cameras[frame.camera]
-            assert where.timeshift is not None
-            assert where.skew is not None
-            f.reopen(where.skew, _SKEW_OPEN)
-            f.reopen(where.timeshift, _SKEW_OPEN * 10.0)
-            self.judge.announce(f"{frame.camera}: {self.watch.why}; the drift is now estimated too")
+        elif action in (Action.SKEW, Action.WANDER):
+            self._let_drift(f, frame.camera, anew=action is Action.WANDER)
         elif action is Action.RESTART:
             self._restart(f)
+
+    def _let_drift(self, f: CalibrationFilter, camera: str, *, anew: bool) -> None:
+        """The clock of this camera drifts; `anew`: and not as it did before."""
+        where = f.layout.cameras[camera]
+        assert where.timeshift is not None
+        assert where.skew is not None
+        f.drifting.add(camera)
+        f.walk[where.skew] = SKEW_WALK**2
+        if anew:
+            f.reopen(where.skew, SKEW_SIGMA)
+            f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
+        self.judge.announce(f"{camera}: {self.watch.why}; the drift is now estimated too")
 
     def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """After a run of refused images: take attitude and position from the image, keep the calibration."""
@@ -242,7 +249,8 @@ class Calibrator:
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
-        self.judge.clocks_in_doubt = self.watch.doubtful
+        drifting = self.filter is not None and any(in_doubt(self.filter, name) for name in self.priors)
+        self.judge.clocks_in_doubt = drifting or self.watch.doubtful
         return self.judge.estimate(self.filter, self._stale)
 
     def trace(self, camera: str) -> list[TracePoint]:

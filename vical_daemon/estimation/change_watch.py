@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.clock_drift import as_if_alike, surely_apart
 from vical_daemon.estimation.drift_watch import DriftWatch
 from vical_daemon.estimation.frame_report import FrameReport
 
@@ -19,7 +20,8 @@ _REFUSED_CHANGED = 8  # images in a row, soon after that, before the calibration
 _SOON_S = 4.0
 _SETTLE_S = 3.0  # after a start the innovations still move
 _DRIFT_FLOOR_S = 30e-6
-_DRIFT_AFTER_S = 4.0
+_DRIFT_AFTER_S = 2.0
+_EVERY_S = 1.0
 
 
 class Action(Enum):
@@ -29,6 +31,7 @@ class Action(Enum):
     POSE = auto()
     RESTART = auto()
     SKEW = auto()
+    WANDER = auto()
 
 
 @dataclass(slots=True)
@@ -44,19 +47,19 @@ class ChangeWatch:
     _pose_taken_s: float = float("-inf")
     _started_s: float = float("inf")
     _drift: dict[str, DriftWatch] = field(default_factory=dict)
-    _skewed: set[str] = field(default_factory=set)
+    _next_s: float = float("-inf")
 
     def started(self, t_s: float) -> None:
         """A filter starts at `t_s`."""
         self._refused = 0
         self._pose_taken_s, self._started_s = float("-inf"), t_s
         self._drift.clear()
-        self._skewed.clear()
+        self._next_s = t_s + _DRIFT_AFTER_S
 
     @property
     def doubtful(self) -> bool:
         """A time shift may be drifting: too early to say so, too likely to ignore."""
-        return any(w.doubtful for name, w in self._drift.items() if name not in self._skewed)
+        return any(w.doubtful for w in self._drift.values())
 
     def look(self, report: FrameReport, f: CalibrationFilter) -> Action:
         """Say what is to be done after this image."""
@@ -81,14 +84,21 @@ class ChangeWatch:
         return self._look_for_drift(report.camera, f)
 
     def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
-        index = f.layout.cameras[camera].timeshift
-        if index is None or camera in self._skewed or f.state.t_s < self._started_s + _DRIFT_AFTER_S:
+        """See once a second whether the clocks run apart, or the time shift moves in another way."""
+        index, t_s = f.layout.cameras[camera].timeshift, f.state.t_s
+        if index is None or camera in f.drifting or t_s < self._next_s:
             return Action.NONE
+        self._next_s = t_s + _EVERY_S
+        if surely_apart(f, camera):
+            self._drift.pop(camera, None)
+            self.why = "the time shift drifts: the clocks of camera and imu run at different rates"
+            return Action.SKEW
+        alike = as_if_alike(f, camera)
+        variance = float(alike.S[index] @ alike.S[index])
+        value = alike.state.cameras[camera].timeshift_s
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
-        variance = float(f.S[index] @ f.S[index])
-        value = f.state.cameras[camera].timeshift_s
-        if not watch.drifts(f.state.t_s, value, variance, f.consistency[camera].factor):
+        if not watch.drifts(t_s, value, variance, f.consistency[camera].factor):
             return Action.NONE
-        self._skewed.add(camera)
-        self.why = "the time shift drifts: the clocks of camera and imu run at different rates"
-        return Action.SKEW
+        self._drift.pop(camera)
+        self.why = "the time shift moves: the clocks of camera and imu run at changing rates"
+        return Action.WANDER

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.clock_drift import averaged
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import imu_noise_doubt
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
@@ -146,7 +147,7 @@ class Judge:
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())
         if trace.due(f.state.t_s):
-            trace.add(f.state.t_s, self._camera(camera, f), self.nis_per_dof(), self.status)
+            trace.add(f.state.t_s, self._camera(camera, averaged(f)), self.nis_per_dof(), self.status)
 
     # ------------------------------------------------------------------ what is said
     def nis_per_dof(self) -> float:
@@ -162,6 +163,7 @@ class Judge:
         self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
     ) -> CalibrationEstimate:
         """Put everything together; `stale`: what was known before a change, shown while starting anew."""
+        f, stale = (None if x is None else averaged(x) for x in (f, stale))
         shown = f or stale
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}

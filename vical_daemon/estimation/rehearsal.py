@@ -1,4 +1,4 @@
-"""From a start to a running filter: wide sigmas, two runs to learn, and the run that counts."""
+"""From a start to a running filter: wide sigmas, some runs to learn, and the run that counts."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation import unscented
+from vical_daemon.estimation import so3, unscented
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
@@ -30,8 +31,9 @@ from vical_daemon.estimation.state import (
 )
 from vical_daemon.estimation.unshown_axes import UNKNOWN_M, UnshownAxes
 
+_MOST_RUNS = 6
+_STANDS = 3.0  # sigmas by which the answer may have moved: the next run moves it by a tenth of that
 REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
-SKEW_CLOSED = 1e-8  # s/s; opened when the time shift is seen to drift
 
 Frames = list[tuple[float, PointsFrame]]
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
@@ -43,13 +45,14 @@ def rehearsed(
     make: Callable[[State], CalibrationFilter],
     step: Step,
 ) -> CalibrationFilter | None:
-    """Run over the start twice to learn; return a filter that starts again from the same place.
+    """Run over the start to learn; return a filter that starts again from the same place.
 
     The first run is far from straight: what it says of mounting and delay counts, what it says of the noise
     does not (its innovations are large for other reasons). The second one, about its answer, measures the
     noise. Each next run takes what the last one found as its mean, and five times its sigmas: so wide that
     the data, counted again, add 4 % of information; so narrow that the model is straight from the first
-    image on, and nothing is lost to its curvature.
+    image on, and nothing is lost to its curvature. Where the answer still moved a lot, the last run was not
+    straight either (lever arms that are hardly shown), and there is another one.
 
     Args:
         state: Where the start thinks the rig is, and its calibration.
@@ -60,17 +63,34 @@ def rehearsed(
     Returns:
         The filter, or None where the start does not hold together.
     """
-    trial = make(deepcopy(state))
-    for straight in (False, True):
+    trial, last = make(deepcopy(state)), None
+    for _ in range(_MOST_RUNS):
         if not _holds_together(trial, frames, step):
             return None
         fresh = _about(trial, state, make)
-        if straight:
+        if last is not None:
             fresh.jitter, fresh.consistency = trial.jitter, trial.consistency
             for consistency in fresh.consistency.values():
                 consistency.settle()
-        trial = fresh
+        stands = last is not None and _moved(last, trial) < _STANDS
+        trial, last = fresh, trial
+        if stands:
+            break
     return trial
+
+
+def _moved(before: CalibrationFilter, after: CalibrationFilter) -> float:
+    """The largest change of a mounting, lever arm or delay, in sigmas."""
+    sigmas, most = after.sigmas(), 0.0
+    for name, where in after.layout.cameras.items():
+        old, new = before.state.cameras[name], after.state.cameras[name]
+        if where.position is not None and where.rotation is not None:
+            arm = np.abs(new.p_imu_cam - old.p_imu_cam) / sigmas[where.position]
+            turn = np.abs(so3.log(old.R_imu_cam.T @ new.R_imu_cam)) / sigmas[where.rotation]
+            most = max(most, float(arm.max()), float(turn.max()))
+        if where.timeshift is not None:
+            most = max(most, abs(new.timeshift_s - old.timeshift_s) / float(sigmas[where.timeshift]))
+    return most
 
 
 def _holds_together(trial: CalibrationFilter, frames: Frames, step: Step) -> bool:
@@ -161,7 +181,7 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool) -> FloatArray:
         if where.position is not None and where.rotation is not None:
             s[where.position], s[where.rotation] = lever_arm, angle
         if where.timeshift is not None and where.skew is not None:
-            s[where.timeshift], s[where.skew] = 5e-3, SKEW_CLOSED
+            s[where.timeshift], s[where.skew] = 5e-3, SKEW_SIGMA
         if where.intrinsics is not None and where.distortion is not None:
             s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
         if where.readout is not None:

@@ -55,7 +55,7 @@ def test_what_the_motion_shows_is_right_and_what_it_does_not_is_named(motion, hi
 
 
 def test_a_partial_start_gives_way_to_a_full_one_as_soon_as_the_rig_turns():
-    hand = trajectory.hand_motion(4, T_imu_cam=MOUNT)
+    hand = trajectory.hand_motion(5, T_imu_cam=MOUNT)
     late = trajectory.Trajectory(
         Paused(hand.rotation, [Pause(0.5, 11.0)]),
         hand.position,
