@@ -112,6 +112,7 @@ def epipolar_fit(
     *,
     fit_lens: bool = False,
     max_step_s: float = 0.02,
+    most: int = _ITERATIONS,
 ) -> EpipolarFit | None:
     """Fit mounting, delay, gyro bias (and the focal length) to tracks.
 
@@ -124,6 +125,7 @@ def epipolar_fit(
         timeshift_s: Start of the delay, good to some 0.1 s.
         fit_lens: Fit the lens too, within what a rough lens may be off by.
         max_step_s: Largest change of the delay in one iteration, s.
+        most: Iterations.
 
     Returns:
         The fit; None where the tracks do not allow one. Sigmas are empirical (sandwich over half-second
@@ -133,7 +135,7 @@ def epipolar_fit(
     if pairs is None:
         return None
     fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens, max_step_s)
-    return fit.run(R_imu_cam.copy(), timeshift_s)
+    return fit.run(R_imu_cam.copy(), timeshift_s, most)
 
 
 def _make_pairs(frames: list[tuple[float, PointsFrame]]) -> _Pairs | None:
@@ -199,20 +201,21 @@ class _Fit:
     def _ray_change(self, rays: FloatArray) -> FloatArray:
         """D ray / d (fx fy cx cy, distortion) for a fixed pixel, shape (n, 3, 8).
 
-        The pixel stays: J_point d ray + J_lens d lens = 0, and the ray keeps its length.
+        The pixel stays: J_ray d ray + J_lens d lens = 0, and the ray keeps its length: since J_ray ray = 0,
+        d ray = -J_ray^T (J_ray J_ray^T)^-1 J_lens d lens does both.
         """
         with np.errstate(all="ignore"):
-            _, J_ray, J_lens = project_jacobians(rays, self.intrinsics, self.distortion, self.model)
-        square = np.concatenate([J_ray, rays[:, None, :]], axis=1)
-        right = np.concatenate([-J_lens, np.zeros((len(rays), 1, 8))], axis=1)
-        fine = np.isfinite(square).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2))
-        square[~fine], right[~fine] = np.eye(3), 0.0
-        return np.asarray(np.linalg.solve(square, right))
+            _, J, J_lens = project_jacobians(rays, self.intrinsics, self.distortion, self.model)
+            (a, b), c = (np.einsum("nk,njk->jn", J[:, 0], J)), np.einsum("nk,nk->n", J[:, 1], J[:, 1])
+            inverse = np.stack([c, -b, -b, a], axis=-1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
+            out = -np.swapaxes(J, 1, 2) @ (inverse @ J_lens)
+        out[~np.isfinite(out).all(axis=(1, 2))] = 0.0
+        return np.asarray(out)
 
-    def run(self, R: FloatArray, shift: float) -> EpipolarFit | None:
+    def run(self, R: FloatArray, shift: float, most: int) -> EpipolarFit | None:
         bias = np.zeros(3)
         weight = np.where(self.ok, 1.0, 0.0)
-        for step in range(_ITERATIONS):
+        for step in range(most):
             lin = self._linearise(R, shift, bias)
             if lin is None:
                 return None
