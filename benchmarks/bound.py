@@ -42,6 +42,7 @@ class BoundOptions:
         intrinsics: fx fy cx cy unknown.
         distortion: The four coefficients unknown.
         timeshift: Time shift unknown.
+        drift_prior: One-sigma prior of its drift, s/s; the time shift is then that at the end. 0: no drift.
         extrinsics: Lever arm and mounting unknown.
         readout: Rolling-shutter readout unknown.
         target_scale_prior: One-sigma relative prior of the target's size; 0: known.
@@ -57,6 +58,7 @@ class BoundOptions:
     intrinsics: bool = True
     distortion: bool = True
     timeshift: bool = True
+    drift_prior: float = 0.0
     extrinsics: bool = True
     readout: bool = False
     target_scale_prior: float = 0.0
@@ -113,6 +115,8 @@ class _Constants:
             c.add("r_imu_cam", 3, 3.0)
         if options.timeshift:
             c.add("timeshift", 1, 1.0)
+            if options.drift_prior > 0:
+                c.add("drift", 1, options.drift_prior)
         c.add("gravity", 3, 1e-7 if options.gravity == "known" else 10.0)
         if options.intrinsics:
             c.add("intrinsics", 4, 100.0)
@@ -256,7 +260,12 @@ def _snapshot(information: _Information, t_s: float) -> Bound:
         "gyro_bias": slice(9, 12),
         "accel_bias": slice(12, 15),
     }
-    return Bound(t_s, state | information.constants.slices, information.covariance())
+    places, covariance = information.constants.slices, information.covariance()
+    if "drift" in places:  # the shift at the end, where inside it is that at the start
+        to_end = np.eye(len(covariance))
+        to_end[places["timeshift"], places["drift"]] = t_s
+        covariance = to_end @ covariance @ to_end.T
+    return Bound(t_s, state | places, covariance)
 
 
 def _propagate(
@@ -294,6 +303,8 @@ def _update(
     for name, place in information.constants.slices.items():
         if name in by:
             full[:, place] = by[name]
+    if "drift" in information.constants.slices:
+        full[:, information.constants.slices["drift"]] = by["timeshift"] * frame.t_s
     if options.target_free:
         for n, identity in enumerate(ids):
             full[2 * n : 2 * n + 2, information.landmark_place(int(identity))] = by["points"][
@@ -351,6 +362,7 @@ CASES: dict[str, tuple[Callable[[int, float], SimulatedRun], BoundOptions]] = {
     "gravity magnitude known": (_board, BoundOptions()),
     "gravity known": (_board, BoundOptions(gravity="known")),
     "0.1 px": (_board, BoundOptions(gravity="free", corner_sigma_px=0.1)),
+    "clocks apart": (_board, BoundOptions(gravity="free", drift_prior=1e-4)),
     "stamp jitter 1 ms": (_board, BoundOptions(gravity="free", stamp_jitter_s=1e-3)),
     "target scale 0.1 %": (_board, BoundOptions(gravity="free", target_scale_prior=1e-3)),
     "IMU matrices 1 %, scale 0.2 %": (

@@ -127,6 +127,7 @@ def bound_options(case: Case, run: SimulatedRun) -> BoundOptions:
         BoundOptions(
             corner_sigma_px=run.options.corner_sigma_px,
             stamp_jitter_s=run.options.stamp_jitter_s,
+            drift_prior=1e-4 if case.skew_ppm else 0.0,
             intrinsics=not case.lens_known,
             distortion=not case.lens_known,
             target_free=case.target_free,

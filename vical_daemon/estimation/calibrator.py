@@ -217,7 +217,9 @@ class Calibrator:
         if anew:
             f.reopen(where.skew, SKEW_SIGMA)
             f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
-        self.judge.announce(f"{camera}: {self.watch.why}; the drift is now estimated too")
+        drift, sigma = f.state.cameras[camera].skew, float(np.linalg.norm(f.S[where.skew]))
+        told = f"by {1e6 * drift:+.0f} +- {1e6 * sigma:.0f} us a second; the drift is now estimated too"
+        self.judge.announce(f"{camera}: {self.watch.why}, {told}")
 
     def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """After a run of refused images: take attitude and position from the image, keep the calibration."""

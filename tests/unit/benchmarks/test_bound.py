@@ -173,6 +173,15 @@ def test_stamp_jitter_costs_time_shift_only():
     assert np.all(jittery.sigma("r_imu_cam") < 1.3 * calm.sigma("r_imu_cam"))
 
 
+def test_a_drift_doubles_the_sigma_of_the_newest_time_shift():
+    run = simulate(3, 6.0)
+    without, tiny, free = (bounds(run, BoundOptions(drift_prior=d))[0] for d in (0.0, 1e-12, 1.0))
+    assert tiny.sigma("timeshift") == pytest.approx(without.sigma("timeshift"), rel=1e-6)
+    # a line through even data: its end is known half as well as a mean
+    assert free.sigma("timeshift") / without.sigma("timeshift") == pytest.approx(2.0, rel=0.3)
+    assert free.sigma("p_imu_cam") == pytest.approx(without.sigma("p_imu_cam"), rel=0.2)
+
+
 def test_target_free_bound_shrinks_with_time_and_ignores_lost_tracks():
     run = simulate_tracks(1, 3.0, max_features=20)
     early, late = bounds(run, BoundOptions(target_free=True), [1.5, 3.0])
