@@ -20,28 +20,41 @@ from vical_daemon.estimation.retract import retract
 
 SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s, one sigma; two poor crystals."""
+CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
 SKEW_WALK = 1e-8
 """How such a drift wanders (temperature), s/s per sqrt(s)."""
 _APART = 0.05  # share of rigs whose clocks do not run alike
-_SURE = 0.99
+SURE = 0.99
+"""Probability from which on a drift is announced."""
 
 
 def apart(f: CalibrationFilter, camera: str) -> float:
     """Probability that this camera's clock drifts against the imu's; 1 where that was announced."""
-    if camera in f.drifting:
-        return 1.0
-    odds = _APART / (1.0 - _APART) * _evidence(f, camera)
+    return 1.0 if camera in f.drifting else probability(_evidence(f, camera))
+
+
+def evidence(skew: float, variance: float) -> float:
+    """Return how much more likely data are if a clock drifts than if it does not (Bayes factor).
+
+    Args:
+        skew: Drift as estimated with a prior of `SKEW_SIGMA`, s/s.
+        variance: Of that estimate.
+    """
+    return float(np.sqrt(variance) / SKEW_SIGMA * np.exp(0.5 * min(skew**2 / variance, 200.0)))
+
+
+def probability(bayes_factor: float) -> float:
+    """Return the probability of a drift."""
+    odds = _APART / (1.0 - _APART) * bayes_factor
     return odds / (1.0 + odds)
 
 
 def _evidence(f: CalibrationFilter, camera: str) -> float:
-    """How much more likely the data are if the clock drifts than if it does not (Bayes factor)."""
     index = f.layout.cameras[camera].skew
     if index is None:
         return 0.0
     variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index])
-    square = f.state.cameras[camera].skew ** 2 / variance
-    return float(np.sqrt(variance) / SKEW_SIGMA * np.exp(0.5 * min(square, 200.0)))
+    return evidence(f.state.cameras[camera].skew, variance)
 
 
 def in_doubt(f: CalibrationFilter, camera: str) -> bool:
@@ -51,7 +64,7 @@ def in_doubt(f: CalibrationFilter, camera: str) -> bool:
 
 def surely_apart(f: CalibrationFilter, camera: str) -> bool:
     """Whether the drift is beyond doubt."""
-    return apart(f, camera) > _SURE
+    return apart(f, camera) > SURE
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:

@@ -46,6 +46,7 @@ class Fit(NamedTuple):
         steps: Iterations done.
         used, refused: Observations.
         change: Calibration found minus the one carried in, shape (k,), active errors only.
+        span_s: From the first image, at which the calibration is compared, to the last.
         landmarks: How many.
         parallax_deg: Typical angle under which a landmark's rays cross.
     """
@@ -60,6 +61,7 @@ class Fit(NamedTuple):
     used: int
     refused: int
     change: FloatArray
+    span_s: float
     landmarks: int
     parallax_deg: float
 
@@ -258,6 +260,7 @@ class Bundle:
             int(good.sum()),
             int((~good).sum()) + len(w.bad),
             change,
+            w.span_s,
             len(seen.begin),
             self._parallax(seen),
         )

@@ -16,8 +16,9 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.retract import orthonormal
 from vical_daemon.estimation.state import CameraState
 
-ARM, TURN, SHIFT, LENS = slice(0, 3), slice(3, 6), 6, slice(7, 15)  # of the calibration's 15 errors
-FULL = 15
+# Of the calibration's 16 errors; the time shift is that at the first image, and drifts from there on.
+ARM, TURN, SHIFT, LENS, DRIFT = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15
+FULL = 16
 CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
 
 
@@ -25,7 +26,7 @@ CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 
 class Carry:
     """What is known at the first image of a window before its own data.
 
-    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of 15).
+    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of 16).
 
     Attributes:
         R: Attitude there; only its tilt matters.
@@ -33,7 +34,8 @@ class Carry:
         bias: [gyro, accel], shape (6,).
         camera: Calibration.
         root: W with W^T W = information of the errors, shape (d, d).
-        active: Which of the 15 calibration errors are estimated.
+        active: Which of the 16 calibration errors are estimated.
+        t_cam_s: Stamp of that image, s.
     """
 
     R: FloatArray
@@ -42,15 +44,31 @@ class Carry:
     camera: CameraState
     root: FloatArray
     active: BoolArray
+    t_cam_s: float
 
     def covariance(self) -> FloatArray:
         """Covariance of the errors, shape (d, d)."""
         inverse = np.linalg.inv(self.root)
         return np.asarray(inverse @ inverse.T)
 
+    def calibration(self) -> FloatArray:
+        """Covariance of the calibration's 16 errors, zero where not estimated, shape (16, 16)."""
+        full = np.zeros((FULL, FULL))
+        at = np.flatnonzero(self.active)
+        full[np.ix_(at, at)] = self.covariance()[CALIBRATION:, CALIBRATION:]
+        return full
+
+
+def later(active: BoolArray, seconds: float) -> FloatArray:
+    """Active calibration errors some seconds later, by those now: the drift carries into the time shift."""
+    G = np.eye(FULL)
+    G[SHIFT, DRIFT] = seconds
+    at = np.flatnonzero(active)
+    return np.asarray(G[np.ix_(at, at)])
+
 
 def calibration_difference(now: CameraState, then: CameraState) -> FloatArray:
-    """Errors [arm, turn (local), shift, lens 8] that lead from `then` to `now`, shape (15,)."""
+    """Errors [arm, turn (local), shift, lens 8, drift] that lead from `then` to `now`, shape (16,)."""
     return np.concatenate(
         [
             now.p_imu_cam - then.p_imu_cam,
@@ -58,19 +76,21 @@ def calibration_difference(now: CameraState, then: CameraState) -> FloatArray:
             [now.timeshift_s - then.timeshift_s],
             now.intrinsics - then.intrinsics,
             now.distortion - then.distortion,
+            [now.skew - then.skew],
         ]
     )
 
 
 def moved(camera: CameraState, d: FloatArray) -> CameraState:
-    """The camera with an error of 15 applied."""
+    """The camera with an error of 16 applied."""
     return replace(
         camera,
         R_imu_cam=orthonormal(camera.R_imu_cam @ so3.exp(d[TURN])),
         p_imu_cam=camera.p_imu_cam + d[ARM],
         timeshift_s=camera.timeshift_s + float(d[SHIFT]),
         intrinsics=camera.intrinsics + d[7:11],
-        distortion=camera.distortion + d[11:],
+        distortion=camera.distortion + d[11:15],
+        skew=camera.skew + float(d[DRIFT]),
     )
 
 
@@ -79,12 +99,12 @@ def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
 
     Args:
         window: Started window; its camera is the centre of the prior.
-        active: Which of the 15 calibration errors are estimated, shape (15,).
-        sigmas: Of the 15 calibration errors.
+        active: Which of the 16 calibration errors are estimated, shape (16,).
+        sigmas: Of the 16 calibration errors.
     """
     wide = np.concatenate([[1.0] * 2, [5.0] * 3, [0.02] * 3, [0.3] * 3, sigmas[np.flatnonzero(active)]])
-    R = window.R[0]
-    return Carry(R.copy(), R.T @ window.v[0], np.zeros(6), window.camera, np.diag(1.0 / wide), active)
+    R, t_s = window.R[0], window.frames[0][0]
+    return Carry(R.copy(), R.T @ window.v[0], np.zeros(6), window.camera, np.diag(1.0 / wide), active, t_s)
 
 
 def tangents(bearing: FloatArray) -> FloatArray:
@@ -105,19 +125,20 @@ def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Ca
     Args:
         window: Adjusted.
         covariance: Of [last image 9, last knot 6, active calibration errors].
-        active: Which of the 15 calibration errors are estimated.
+        active: Which of the 16 calibration errors are estimated.
     """
     k = int(np.count_nonzero(active))
-    R, v = window.R[-1], window.v[-1]
+    span_s, camera = window.span_s, window.camera
+    camera = replace(camera, timeshift_s=camera.timeshift_s + camera.skew * span_s)
+    R, v = window.last_at(camera.timeshift_s)
     J = np.zeros((CALIBRATION + k, 15 + k))
     speed = R.T @ v
     J[:2, :3] = tangents(R[2][None])[0].T
     J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R.T
     J[5:11, 9:15] = np.eye(6)
-    J[11:, 15:] = np.eye(k)
-    return Carry(
-        R.copy(), speed, window.bias[-1].copy(), window.camera, root_of(J @ covariance @ J.T), active
-    )
+    J[11:, 15:] = later(active, span_s)
+    root = root_of(J @ covariance @ J.T)
+    return Carry(R, speed, window.bias[-1].copy(), camera, root, active, window.frames[-1][0])
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

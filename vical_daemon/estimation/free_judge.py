@@ -8,8 +8,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.clock_drift import CLOCKS_IN_DOUBT, SURE, evidence, probability
 from vical_daemon.estimation.free_bundle import Fit
-from vical_daemon.estimation.free_carry import CALIBRATION, Carry
+from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry, later, moved
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import (
@@ -20,6 +21,7 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
+from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.trace import Trace
 
 _PATIENCE_S = 15.0
@@ -44,7 +46,7 @@ class FreeJudge:
     Args:
         options: Switches and targets.
         camera: Name of the camera.
-        active: Which of the 15 calibration errors are estimated.
+        active: Which of the 16 calibration errors are estimated.
     """
 
     def __init__(self, options: CalibrationOptions, camera: str, active: BoolArray) -> None:
@@ -68,6 +70,7 @@ class FreeJudge:
         self._ever_converged = False
         self._bumped = ""
         self._quiet = ""
+        self.drifting = False  # the clock of the camera is known to run apart from the imu's
 
     # ------------------------------------------------------------------ what happens
     def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
@@ -136,8 +139,36 @@ class FreeJudge:
         self._now_s, self._sigma_px = t_s, fit.sigma_px
         self._squares.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
+        self._watch_clocks(fit.carry)
         if self._trace.due(t_s):
             self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
+
+    def _watch_clocks(self, carry: Carry) -> None:
+        """Announce a drift that is beyond doubt."""
+        if self.drifting or not self.active[DRIFT] or probability(self._evidence(carry)) < SURE:
+            return
+        self.drifting = True
+        drift, sigma = 1e6 * carry.camera.skew, 1e6 * np.sqrt(carry.calibration()[DRIFT, DRIFT])
+        self.events.append(
+            f"{self.camera}: the time shift drifts: the clocks of camera and imu run at different rates, "
+            f"by {drift:+.0f} +- {sigma:.0f} us a second; the drift is now estimated too"
+        )
+
+    def _evidence(self, carry: Carry) -> float:
+        """For a drift against none; 0 where the time shift is not estimated."""
+        if not self.active[DRIFT]:
+            return 0.0
+        return evidence(carry.camera.skew, self.factor() * float(carry.calibration()[DRIFT, DRIFT]))
+
+    def _told(self, carry: Carry) -> tuple[CameraState, FloatArray]:
+        """Camera and covariance (16, 16) over both hypotheses about its clock; see `clock_drift`."""
+        camera, P = carry.camera, carry.calibration() * self.factor()
+        if self.drifting or not self.active[DRIFT]:
+            return camera, P
+        p = probability(self._evidence(carry))
+        sigma = float(np.sqrt(P[DRIFT, DRIFT]))
+        k, z = P[:, DRIFT] / sigma, camera.skew / sigma
+        return moved(camera, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(k, k)
 
     def closed(self) -> None:
         """A window is complete and agreed."""
@@ -149,7 +180,8 @@ class FreeJudge:
         For consistent sigmas, cov(new - old) = P_old - P_new.
         """
         P_old = carry.covariance()[CALIBRATION:, CALIBRATION:]
-        P_new = fit.carry.covariance()[CALIBRATION:, CALIBRATION:]
+        back = later(self.active, -fit.span_s)  # to the first image, where the change was taken
+        P_new = back @ fit.carry.covariance()[CALIBRATION:, CALIBRATION:] @ back.T
         scale = np.sqrt(np.diag(P_old))
         values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
         told = values > 0.02  # directions in which the window had something to say
@@ -169,7 +201,7 @@ class FreeJudge:
 
     def _matters(self, change: FloatArray) -> bool:
         """Whether a change is large enough to be a changed rig where the model itself fits poorly."""
-        full = np.zeros(15)
+        full = np.zeros(FULL)
         full[np.flatnonzero(self.active)] = change
         arm, turn, shift = np.linalg.norm(full[:3]), np.linalg.norm(full[3:6]), abs(full[6])
         return bool(arm > _BIG_M or turn > _BIG_RAD or shift > _BIG_S)
@@ -194,7 +226,8 @@ class FreeJudge:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
         missing = [] if camera is None or carry is None else self._missing(camera, carry)
-        self.status, reason, advice = self._decide(camera is not None, running, missing)
+        doubt = carry is not None and not self.drifting and self._evidence(carry) > 1.0
+        self.status, reason, advice = self._decide(camera is not None, running, missing, doubt)
         if advice and carry is not None:
             advice = shortcoming(self._motion, carry.camera.R_imu_cam, carry.bias[:3]) or advice
         self._ever_converged |= self.status == Status.CONVERGED
@@ -220,11 +253,8 @@ class FreeJudge:
         )
 
     def _camera(self, carry: Carry) -> CameraEstimate:
-        full = np.zeros((15, 15))
-        at = np.flatnonzero(self.active)
-        full[np.ix_(at, at)] = carry.covariance()[CALIBRATION:, CALIBRATION:] * self.factor()
+        c, full = self._told(carry)
         sigma = np.sqrt(np.diag(full))
-        c = carry.camera
         return CameraEstimate(
             PoseEstimate(
                 c.p_imu_cam.tolist(), so3.quat_from_matrix(c.R_imu_cam).tolist(), full[:6, :6].tolist()
@@ -235,7 +265,7 @@ class FreeJudge:
             sigma[7:11].tolist(),
             c.distortion_model,
             c.distortion.tolist(),
-            sigma[11:].tolist(),
+            sigma[11:15].tolist(),
             self._sigma_px
             * float(np.sqrt(sum(s for s, _ in self._squares) / max(sum(n for _, n in self._squares), 1))),
             self._sigma_px,
@@ -256,8 +286,10 @@ class FreeJudge:
             covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, carry.bias[:3]
         )
 
-    def _decide(self, known: bool, running: bool, missing: list[Missing]) -> tuple[Status, str, str]:
-        """Status, reason and guidance."""
+    def _decide(
+        self, known: bool, running: bool, missing: list[Missing], doubt: bool
+    ) -> tuple[Status, str, str]:
+        """Status, reason and guidance; `doubt`: the clocks may run apart."""
         if not known:
             return self._before_start()
         if not running and self._windows == 0:
@@ -274,6 +306,8 @@ class FreeJudge:
                 )
             if self.factor() > _MOST_FACTOR:
                 return Status.INCONSISTENT, "stretches of the data disagree more than their sigmas say", ""
+            if doubt:
+                return Status.CONVERGING, CLOCKS_IN_DOUBT + pause, ""
             return Status.CONVERGED, pause.strip(" ()"), ""
         worst = missing[0]
         if self._now_s - (self._started_s or 0.0) > _PATIENCE_S and worst.excess > _LOST:
@@ -305,7 +339,7 @@ class FreeJudge:
 
 def _said(change: FloatArray, active: BoolArray) -> str:
     """A change in words with figures: what moved by how much."""
-    full = np.zeros(15)
+    full = np.zeros(FULL)
     full[np.flatnonzero(active)] = change
     parts = []
     if active[0]:

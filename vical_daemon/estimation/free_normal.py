@@ -10,6 +10,7 @@ from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import project_jacobians
 from vical_daemon.estimation.free_carry import (
     ARM,
+    DRIFT,
     FULL,
     LENS,
     SHIFT,
@@ -82,7 +83,7 @@ class Problem:
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Landmarks in the camera frame at their observations, scaled by rho; and parts for derivatives."""
         w, cam = self.window, self.window.camera
-        late = cam.timeshift_s - w.shift_s + seen.row_s
+        late = cam.timeshift_s - w.shift_s + cam.skew * self._since(seen) + seen.row_s
         rates = w.rates()[seen.frame]
         R = w.R[seen.frame] @ so3.exp(rates * late[:, None])
         p = w.p[seen.frame] + w.v[seen.frame] * late[:, None]
@@ -92,6 +93,11 @@ class Problem:
         x_imu = np.einsum("nji,nj->ni", R, X)
         y = (x_imu - rho[:, None] * cam.p_imu_cam) @ cam.R_imu_cam
         return y, x_imu, R, rates
+
+    def _since(self, seen: Seen) -> FloatArray:
+        """Seconds from the first image to each observation."""
+        stamps = np.array([t for t, _ in self.window.frames])
+        return np.asarray((stamps - stamps[0])[seen.frame])
 
     def pixel_errors(self, seen: Seen) -> tuple[FloatArray, BoolArray, FloatArray]:
         """Whitened errors (N, 2), which are valid, and Huber weights."""
@@ -133,6 +139,7 @@ class Problem:
         spin = np.cross(x_imu, rates)[..., None] - rho * v_imu
         Jc[:, :, SHIFT] = np.matmul(JR, spin)[..., 0]
         Jc[:, :, LENS] = Jlens
+        Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since(seen)[:, None]
         Jc = Jc[:, :, self.active]
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]

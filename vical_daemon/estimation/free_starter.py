@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.free_carry import Carry
 from vical_daemon.estimation.free_start import free_start
@@ -165,11 +166,11 @@ def starting_camera(prior: CameraPrior) -> CameraState:
 
 
 def start_sigmas(camera: CameraState) -> FloatArray:
-    """How far each of the 15 calibration errors may be off at a start: many times what it is worth."""
+    """How far each of the 16 calibration errors may be off at a start: many times what it is worth."""
     f = float(camera.intrinsics[0])
     lens = [0.05 * f, 0.05 * f, 0.03 * f, 0.03 * f]
     distortion = [0.1, 0.1, 0.01, 0.01] if camera.distortion_model == "radtan" else [0.05] * 4
-    return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion)
+    return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA])
 
 
 def _known(known: Carry) -> tuple[CameraState, FloatArray, float]:
@@ -183,6 +184,7 @@ def _known(known: Carry) -> tuple[CameraState, FloatArray, float]:
         c.distortion_model,
         c.resolution,
         c.readout_s,
+        c.skew,
     )
     return copy, known.bias[:3].copy(), 5e-3
 

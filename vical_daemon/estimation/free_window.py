@@ -167,6 +167,15 @@ class Window:
         self.links, self.shift_s = links, self.camera.timeshift_s
         return True
 
+    def last_at(self, shift_s: float) -> tuple[FloatArray, FloatArray]:
+        """Attitude and velocity at the last image for a time shift a little beside that of the links."""
+        d = shift_s - self.shift_s
+        if len(self.frames) < 2:
+            return self.R[-1].copy(), self.v[-1].copy()
+        step_s = self.frames[-1][0] - self.frames[-2][0]
+        turned = self.R[-1] @ so3.exp(d * self.rates()[-1])
+        return turned, self.v[-1] + (d / step_s) * (self.v[-1] - self.v[-2])
+
     def stale(self) -> bool:
         """Whether the links hold for another time shift or other biases than are believed now."""
         used = np.array([np.concatenate([x.gyro_bias, x.accel_bias]) for x in self.links])

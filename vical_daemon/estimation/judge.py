@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.clock_drift import averaged
+from vical_daemon.estimation.clock_drift import CLOCKS_IN_DOUBT, averaged
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import imu_noise_doubt
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
@@ -230,11 +230,7 @@ class Judge:
             if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
                 return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
             if self.clocks_in_doubt:
-                return (
-                    Status.CONVERGING,
-                    "the time shift still moves: waiting to see whether the clocks drift",
-                    "",
-                )
+                return Status.CONVERGING, CLOCKS_IN_DOUBT, ""
             if not self._held_back_fine():
                 return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
             return Status.CONVERGED, "", ""

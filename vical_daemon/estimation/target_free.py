@@ -14,9 +14,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation.clock_drift import SKEW_WALK
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free_bundle import Bundle, Fit
-from vical_daemon.estimation.free_carry import CALIBRATION, Carry, first_carry, root_of
+from vical_daemon.estimation.free_carry import (
+    CALIBRATION,
+    DRIFT,
+    FULL,
+    LENS,
+    SHIFT,
+    Carry,
+    first_carry,
+    later,
+    root_of,
+)
 from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.free_reports import window_reports
 from vical_daemon.estimation.free_starter import Starter, start_sigmas
@@ -61,10 +72,10 @@ class TargetFreeCalibrator:
             )
         self.options = options
         self.camera, self.prior = next(iter(cameras.items()))
-        self.active = np.ones(15, dtype=bool)
+        self.active = np.ones(FULL, dtype=bool)
         self.active[:6] = "extrinsics" not in options.fix
-        self.active[6] = "timeshift" not in options.fix
-        self.active[7:] = "intrinsics" not in options.fix
+        self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
+        self.active[LENS] = "intrinsics" not in options.fix
         self.judge = FreeJudge(options, self.camera, self.active)
         self.starter = Starter(options, self.prior)
         self.window: Window | None = None
@@ -211,12 +222,19 @@ class TargetFreeCalibrator:
         wide = first_carry(window, self.active, sigmas)
         if known is None:
             return wide
+        away_s = wide.t_cam_s - known.t_cam_s
         keep = known.covariance()[5:, 5:]
+        G = later(self.active, away_s)
+        keep[6:] = G @ keep[6:]
+        keep[:, 6:] = keep[:, 6:] @ G.T
         keep[:3, :3] += 4e-4**2 * np.eye(3)
         keep[3:6, 3:6] += 5e-3**2 * np.eye(3)
         covariance = np.diag(np.diag(wide.root) ** -2.0)
         covariance[5:, 5:] = keep
-        return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
+        shift_s = known.camera.timeshift_s + known.camera.skew * away_s
+        camera = replace(known.camera, timeshift_s=shift_s)
+        window.camera = replace(window.camera, timeshift_s=shift_s)
+        return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=camera)
 
     # ------------------------------------------------------------------ windows
     def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> None:
@@ -276,7 +294,7 @@ class TargetFreeCalibrator:
             (c.R @ c.speed)[None],
             c.bias[None].copy(),
             [],
-            window.shift_s,
+            c.camera.timeshift_s,
             empty,
             gravity=window.gravity,
         )
@@ -287,13 +305,11 @@ class TargetFreeCalibrator:
         noise = self.options.imu_noise
         P[range(5, 8), range(5, 8)] += noise.gyro_walk**2 * knot_s
         P[range(8, 11), range(8, 11)] += noise.accel_walk**2 * knot_s
-        place = self._shift_place()
-        if place is not None:
-            P[place, place] += _SHIFT_WALK**2 * span_s
+        for error, walk in ((SHIFT, _SHIFT_WALK), (DRIFT, SKEW_WALK if self.judge.drifting else 0.0)):
+            if self.active[error]:
+                place = CALIBRATION + int(self.active[:error].sum())
+                P[place, place] += walk**2 * span_s
         return replace(carry, root=root_of(P))
-
-    def _shift_place(self) -> int | None:
-        return CALIBRATION + int(self.active[:6].sum()) if self.active[6] else None
 
     def _disagreed(self, carry: Carry) -> None:
         """A window contradicts what was known: once may be a bad window, twice is a changed rig."""

@@ -8,7 +8,15 @@ from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.epipolar_fit import epipolar_fit
 from vical_daemon.estimation.free_bundle import Bundle, _correlation
-from vical_daemon.estimation.free_carry import calibration_difference, first_carry, moved, tangents
+from vical_daemon.estimation.free_carry import (
+    DRIFT,
+    FULL,
+    calibration_difference,
+    first_carry,
+    later,
+    moved,
+    tangents,
+)
 from vical_daemon.estimation.free_start import free_start
 from vical_daemon.estimation.free_starter import start_sigmas
 from vical_daemon.estimation.imu_buffer import ImuBuffer
@@ -50,7 +58,7 @@ class Scene:
         self.rig = rig
 
     def window(self):
-        start = moved(self.camera, np.zeros(15))
+        start = moved(self.camera, np.zeros(FULL))
         start.p_imu_cam = np.zeros(3)
         return free_start(self.buffer, self.frames, start, self.rig.gyro_bias.value(0.0), self.noise, 9.80665)
 
@@ -135,14 +143,14 @@ def test_start_finds_lever_arm_and_speed_linearly(scene):
 
 def test_bundle_gradient_agrees_with_differences_of_the_cost(scene):
     window = scene.window()
-    active = np.ones(15, dtype=bool)
+    active = np.ones(FULL, dtype=bool)
     problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 50.0).problem
     seen, links = window.observe(), window.stacked()
     normal, order = problem.normal(seen, links), problem.order()
     rng = np.random.default_rng(2)
-    scales = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-5] + [0.01] * 4 + [1e-5] * 4)
-    for k in range(15):
-        step = np.zeros(15)
+    scales = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-5] + [0.01] * 4 + [1e-5] * 4 + [1e-5])
+    for k in range(FULL):
+        step = np.zeros(FULL)
         step[k] = scales[k] * rng.choice([-1.0, 1.0])
         camera = window.camera
         window.camera = moved(camera, step)
@@ -158,7 +166,7 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene):
 
 def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     window = scene.window()
-    active = np.arange(15) < 7
+    active = np.arange(FULL) < 7
     bundle = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 1.0)
     fit = bundle.solve(scene.buffer, 25)
     error = calibration_difference(fit.carry.camera, scene.camera)[:7]
@@ -169,8 +177,27 @@ def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     assert fit.spread < 1.15
 
 
+def test_a_drift_carries_into_the_time_shift_of_the_next_window(scene):
+    window = scene.window()
+    active = (np.arange(FULL) < 7) | (np.arange(FULL) == DRIFT)
+    fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 1.0).solve(
+        scene.buffer, 25
+    )
+    first, carry = window.camera, fit.carry
+    assert carry.camera.timeshift_s == pytest.approx(
+        first.timeshift_s + first.skew * window.span_s, abs=1e-12
+    )
+    at_end, shift, drift = carry.calibration(), 6, DRIFT
+    back = later(active, -window.span_s)
+    k = np.flatnonzero(active)
+    at_first = back @ at_end[np.ix_(k, k)] @ back.T
+    # drift and shift: an uncertain slope about the middle of the data
+    assert at_end[shift, drift] > 0.0 > at_first[6, 7]
+    assert abs(first.skew) < 4.0 * np.sqrt(at_end[drift, drift])
+
+
 def test_where_north_and_origin_are_changes_nothing(scene):
-    active = np.arange(15) < 7
+    active = np.arange(FULL) < 7
     results = []
     for turn in (0.0, 2.0):
         window = scene.window()
