@@ -51,6 +51,14 @@ class Carry:
         inverse = np.linalg.inv(self.root)
         return np.asarray(inverse @ inverse.T)
 
+    def at(self, t_cam_s: float) -> Carry:
+        """The same at another stamp of the camera's clock: its drift moves the time shift."""
+        seconds = t_cam_s - self.t_cam_s
+        camera = replace(self.camera, timeshift_s=self.camera.timeshift_s + self.camera.skew * seconds)
+        root = self.root.copy()
+        root[:, CALIBRATION:] = root[:, CALIBRATION:] @ later(self.active, -seconds)
+        return replace(self, camera=camera, root=root, t_cam_s=t_cam_s)
+
     def calibration(self) -> FloatArray:
         """Covariance of the calibration's 16 errors, zero where not estimated, shape (16, 16)."""
         full = np.zeros((FULL, FULL))

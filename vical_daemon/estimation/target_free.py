@@ -25,7 +25,6 @@ from vical_daemon.estimation.free_carry import (
     SHIFT,
     Carry,
     first_carry,
-    later,
     root_of,
 )
 from vical_daemon.estimation.free_judge import FreeJudge
@@ -222,19 +221,14 @@ class TargetFreeCalibrator:
         wide = first_carry(window, self.active, sigmas)
         if known is None:
             return wide
-        away_s = wide.t_cam_s - known.t_cam_s
+        known = known.at(wide.t_cam_s)
         keep = known.covariance()[5:, 5:]
-        G = later(self.active, away_s)
-        keep[6:] = G @ keep[6:]
-        keep[:, 6:] = keep[:, 6:] @ G.T
         keep[:3, :3] += 4e-4**2 * np.eye(3)
         keep[3:6, 3:6] += 5e-3**2 * np.eye(3)
         covariance = np.diag(np.diag(wide.root) ** -2.0)
         covariance[5:, 5:] = keep
-        shift_s = known.camera.timeshift_s + known.camera.skew * away_s
-        camera = replace(known.camera, timeshift_s=shift_s)
-        window.camera = replace(window.camera, timeshift_s=shift_s)
-        return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=camera)
+        window.camera = replace(window.camera, timeshift_s=known.camera.timeshift_s)
+        return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
 
     # ------------------------------------------------------------------ windows
     def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> None:
@@ -351,9 +345,10 @@ class TargetFreeCalibrator:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         gravity = [] if self.latest is None else [0.0, 0.0, -self.options.gravity_mps2]
-        return self.judge.estimate(
-            self._doubted or self.latest, running=self.window is not None, gravity=gravity
-        )
+        known = self._doubted or self.latest
+        if known is not None and self._buffer is not None:
+            known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
+        return self.judge.estimate(known, running=self.window is not None, gravity=gravity)
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration developed."""
