@@ -7,21 +7,18 @@ from collections import deque
 import numpy as np
 from scipy.stats import chi2
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.clock_drift import CLOCKS_IN_DOUBT, SURE, evidence, probability
+from vical_daemon.estimation.clock_drift import CLOCKS_IN_DOUBT, SURE, probability
 from vical_daemon.estimation.free_bundle import Fit
-from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry, later, moved
+from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry, later
+from vical_daemon.estimation.free_snapshot import camera_estimate, drift_evidence, imu_estimate
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
-    ImuEstimate,
-    PoseEstimate,
     Status,
     TracePoint,
 )
-from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.trace import Trace
 
 _PATIENCE_S = 15.0
@@ -145,7 +142,7 @@ class FreeJudge:
 
     def _watch_clocks(self, carry: Carry) -> None:
         """Announce a drift that is beyond doubt."""
-        if self.drifting or not self.active[DRIFT] or probability(self._evidence(carry)) < SURE:
+        if self.drifting or probability(self._evidence(carry)) < SURE:
             return
         self.drifting = True
         drift, sigma = 1e6 * carry.camera.skew, 1e6 * np.sqrt(carry.calibration()[DRIFT, DRIFT])
@@ -155,20 +152,7 @@ class FreeJudge:
         )
 
     def _evidence(self, carry: Carry) -> float:
-        """For a drift against none; 0 where the time shift is not estimated."""
-        if not self.active[DRIFT]:
-            return 0.0
-        return evidence(carry.camera.skew, self.factor() * float(carry.calibration()[DRIFT, DRIFT]))
-
-    def _told(self, carry: Carry) -> tuple[CameraState, FloatArray]:
-        """Camera and covariance (16, 16) over both hypotheses about its clock; see `clock_drift`."""
-        camera, P = carry.camera, carry.calibration() * self.factor()
-        if self.drifting or not self.active[DRIFT]:
-            return camera, P
-        p = probability(self._evidence(carry))
-        sigma = float(np.sqrt(P[DRIFT, DRIFT]))
-        k, z = P[:, DRIFT] / sigma, camera.skew / sigma
-        return moved(camera, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(k, k)
+        return drift_evidence(carry, self.factor())
 
     def closed(self) -> None:
         """A window is complete and agreed."""
@@ -245,7 +229,7 @@ class FreeJudge:
             self.frames_seen,
             self.imu_samples,
             {} if camera is None else {self.camera: camera},
-            None if carry is None else self._imu(carry),
+            None if carry is None else imu_estimate(carry),
             gravity,
             self.nis_per_dof(),
             refused / max(seen, 1),
@@ -253,32 +237,9 @@ class FreeJudge:
         )
 
     def _camera(self, carry: Carry) -> CameraEstimate:
-        c, full = self._told(carry)
-        sigma = np.sqrt(np.diag(full))
-        return CameraEstimate(
-            PoseEstimate(
-                c.p_imu_cam.tolist(), so3.quat_from_matrix(c.R_imu_cam).tolist(), full[:6, :6].tolist()
-            ),
-            float(c.timeshift_s),
-            float(sigma[6]),
-            c.intrinsics.tolist(),
-            sigma[7:11].tolist(),
-            c.distortion_model,
-            c.distortion.tolist(),
-            sigma[11:15].tolist(),
-            self._sigma_px
-            * float(np.sqrt(sum(s for s, _ in self._squares) / max(sum(n for _, n in self._squares), 1))),
-            self._sigma_px,
-            [],
-            float(c.readout_s),
-            0.0,
-        )
-
-    def _imu(self, carry: Carry) -> ImuEstimate:
-        sigma = np.sqrt(np.diag(carry.covariance())[5:11])
-        return ImuEstimate(
-            carry.bias[:3].tolist(), carry.bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist()
-        )
+        squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
+        rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
+        return camera_estimate(carry, self.factor(), self.drifting, self._sigma_px, rms_px)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
