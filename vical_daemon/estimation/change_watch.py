@@ -47,14 +47,14 @@ class ChangeWatch:
     _pose_taken_s: float = float("-inf")
     _started_s: float = float("inf")
     _drift: dict[str, DriftWatch] = field(default_factory=dict)
-    _next_s: float = float("-inf")
+    _next_s: dict[str, float] = field(default_factory=dict)  # when each camera's clock is looked at again
 
     def started(self, t_s: float) -> None:
         """A filter starts at `t_s`."""
         self._refused = 0
         self._pose_taken_s, self._started_s = float("-inf"), t_s
         self._drift.clear()
-        self._next_s = t_s + _DRIFT_AFTER_S
+        self._next_s.clear()
 
     @property
     def doubtful(self) -> bool:
@@ -86,9 +86,10 @@ class ChangeWatch:
     def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
         """See once a second whether the clocks run apart, or the time shift moves in another way."""
         index, t_s = f.layout.cameras[camera].timeshift, f.state.t_s
-        if index is None or camera in f.drifting or t_s < self._next_s:
+        due_s = self._next_s.get(camera, self._started_s + _DRIFT_AFTER_S)
+        if index is None or camera in f.drifting or t_s < due_s:
             return Action.NONE
-        self._next_s = t_s + _EVERY_S
+        self._next_s[camera] = t_s + _EVERY_S
         if surely_apart(f, camera):
             self._drift.pop(camera, None)
             self.why = "the time shift drifts: the clocks of camera and imu run at different rates"
