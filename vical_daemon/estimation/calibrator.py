@@ -218,7 +218,7 @@ class Calibrator:
             f.reopen(where.skew, SKEW_SIGMA)
             f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
         drift, sigma = f.state.cameras[camera].skew, float(np.linalg.norm(f.S[where.skew]))
-        told = f"by {1e6 * drift:+.0f} +- {1e6 * sigma:.0f} us a second; the drift is now estimated too"
+        told = f"by {1e6 * drift:+.1f} +- {1e6 * sigma:.1f} us a second; the drift is now estimated too"
         self.judge.announce(f"{camera}: {self.watch.why}, {told}")
 
     def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:

@@ -148,7 +148,7 @@ class FreeJudge:
         drift, sigma = 1e6 * carry.camera.skew, 1e6 * np.sqrt(carry.calibration()[DRIFT, DRIFT])
         self.events.append(
             f"{self.camera}: the time shift drifts: the clocks of camera and imu run at different rates, "
-            f"by {drift:+.0f} +- {sigma:.0f} us a second; the drift is now estimated too"
+            f"by {drift:+.1f} +- {sigma:.1f} us a second; the drift is now estimated too"
         )
 
     def _evidence(self, carry: Carry) -> float:
