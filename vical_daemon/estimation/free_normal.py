@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,8 @@ from vical_daemon.estimation.free_carry import (
     calibration_difference,
     tangents,
 )
-from vical_daemon.estimation.free_window import KNOT_S, Seen, Window
+from vical_daemon.estimation.free_window import KNOT_S, IntArray, Seen, Window
+from vical_daemon.estimation.imu_model import cross
 from vical_daemon.estimation.inertial_links import Links
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 
@@ -83,10 +85,16 @@ class Problem:
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Landmarks in the camera frame at their observations, scaled by rho; and parts for derivatives."""
         w, cam = self.window, self.window.camera
-        late = cam.timeshift_s - w.shift_s + cam.skew * self._since(seen) + seen.row_s
-        rates = w.rates()[seen.frame]
-        R = w.R[seen.frame] @ so3.exp(rates * late[:, None])
-        p = w.p[seen.frame] + w.v[seen.frame] * late[:, None]
+        rates = w.rates()
+        late = cam.timeshift_s - w.shift_s + cam.skew * self._since()
+        if cam.readout_s:  # each row has an instant of its own
+            late, rates, frame = late[seen.frame] + seen.row_s, rates[seen.frame], seen.frame
+            R = w.R[frame] @ so3.exp(rates * late[:, None])
+            p = w.p[frame] + w.v[frame] * late[:, None]
+        else:
+            R = (w.R @ so3.exp(rates * late[:, None]))[seen.frame]
+            p = (w.p + w.v * late[:, None])[seen.frame]
+            rates = rates[seen.frame]
         marks = w.landmarks
         rho = marks.inverse[seen.landmark]
         X = marks.bearing[seen.landmark] + rho[:, None] * (marks.anchor[seen.landmark] - p)
@@ -94,10 +102,10 @@ class Problem:
         y = (x_imu - rho[:, None] * cam.p_imu_cam) @ cam.R_imu_cam
         return y, x_imu, R, rates
 
-    def _since(self, seen: Seen) -> FloatArray:
-        """Seconds from the first image to each observation."""
+    def _since(self) -> FloatArray:
+        """Seconds from the first image to each, shape (F,)."""
         stamps = np.array([t for t, _ in self.window.frames])
-        return np.asarray((stamps - stamps[0])[seen.frame])
+        return np.asarray(stamps - stamps[0])
 
     def pixel_errors(self, seen: Seen) -> tuple[FloatArray, BoolArray, FloatArray]:
         """Whitened errors (N, 2), which are valid, and Huber weights."""
@@ -130,16 +138,16 @@ class Problem:
         marks = w.landmarks
         rho = marks.inverse[seen.landmark][:, None, None]
         Rt = np.swapaxes(R, 1, 2)
-        JR = Jy @ cam.R_imu_cam.T  # by the point in the imu frame
+        JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
         JW = JR @ Rt  # by the point in the world
-        Jf = np.concatenate([JR @ so3.hat(x_imu), -rho * JW], axis=2)
+        Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
         Jc = np.empty((len(e), 2, FULL))
-        Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, Jy @ so3.hat(y)
+        Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, cross(Jy, y[:, None])
         v_imu = np.matmul(Rt, w.v[seen.frame][..., None])
-        spin = np.cross(x_imu, rates)[..., None] - rho * v_imu
+        spin = cross(x_imu, rates)[..., None] - rho * v_imu
         Jc[:, :, SHIFT] = np.matmul(JR, spin)[..., 0]
         Jc[:, :, LENS] = Jlens
-        Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since(seen)[:, None]
+        Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
         Jc = Jc[:, :, self.active]
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
@@ -168,10 +176,9 @@ class Problem:
         F, K, k, L = len(w.frames), len(w.bias), len(self.active), len(seen.begin)
         order = Order(F, K, k)
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
-        JfT, JlT = np.swapaxes(Jf, 1, 2), np.swapaxes(Jl, 1, 2)
         begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
         Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
-        blocks = np.add.reduceat((JfT @ Jall)[by], fb)
+        blocks = _products(Jf[by], Jall[by], fb)
         pose = order.frames[:, :6]
         at = pose[fw]
         H[at[:, :, None], at[:, None, :]] += blocks[:, :, :6]
@@ -181,15 +188,16 @@ class Problem:
         flat = Jc.reshape(-1, k)
         H[order.calib[:, None], order.calib] += flat.T @ flat
         g[order.calib] += flat.T @ e.reshape(-1)
-        V = np.add.reduceat(JlT @ Jl, begin)
+        own = _products(Jl, np.concatenate([Jl, Jall[:, :, 6:]], axis=2), begin)
+        V = own[:, :, :3].copy()
         V[:, 2, 2] += _INVERSE_SIGMA**-2
-        gl = np.add.reduceat(np.matmul(JlT, e[..., None])[..., 0], begin)
+        gl = own[:, :, -1].copy()
         gl[:, 2] += w.landmarks.inverse * _INVERSE_SIGMA**-2
         cost += float((w.landmarks.inverse**2).sum()) * _INVERSE_SIGMA**-2
         W = np.zeros((L, 3, 6 * F + k))
-        W[:, :, 6 * F :] = np.add.reduceat(JlT @ Jc, begin)
+        W[:, :, 6 * F :] = own[:, :, 3:-1]
         poses = np.zeros((L, F, 3, 6))  # a landmark is seen once in an image
-        poses[seen.landmark, seen.frame] = JlT @ Jf
+        poses[seen.landmark, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf
         W[:, :, : 6 * F] = poses.transpose(0, 2, 1, 3).reshape(L, 3, 6 * F)
         cost += self._add_links(H, g, order, links)
         cost += self._add_prior(H, g, order)
@@ -258,3 +266,17 @@ class Problem:
         H[turn[:, None], turn] += _GAUGE * np.outer(up, up)
         H[place, place] += _GAUGE
         return float(e @ e)
+
+
+def _products(A: FloatArray, B: FloatArray, begin: IntArray) -> FloatArray:
+    """Sums of A_n^T B_n over groups of rows, (N, 2, a) and (N, 2, b) to (groups, a, b).
+
+    One product of long matrices a group: numpy takes three times as long for many small ones.
+    """
+    a, b = A.shape[2], B.shape[2]
+    A, B = A.reshape(-1, a), B.reshape(-1, b)
+    out = np.empty((len(begin), a, b))
+    edges = [*(2 * begin).tolist(), len(A)]
+    for k, (low, high) in enumerate(pairwise(edges)):
+        np.matmul(A[low:high].T, B[low:high], out=out[k])
+    return out
