@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,14 +25,22 @@ DISTORTION = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 SPLIT_S = 35.5
 
 
-def calibrate(items: list[tuple[int, object]], fix: frozenset[str], points: np.ndarray) -> CameraEstimate:
-    """Calibrate a stretch of (stamp, message) in order."""
+def calibrate(
+    items: list[tuple[int, object]],
+    fix: frozenset[str],
+    points: np.ndarray,
+    steady_s: list[float] | None = None,
+) -> CameraEstimate:
+    """Calibrate a stretch of (stamp, message) in order; `steady_s`: CPU of each image after the start."""
     prior = CameraPrior((752, 480), LENS, "radtan", DISTORTION)
     c = Calibrator(CalibrationOptions(fix=fix, imu_noise=NOISE), {"cam0": prior}, points)
     for _, item in items:
         if isinstance(item, PointsFrame):
+            started, before_s = c.filter is not None, time.process_time()
             c.add_points(replace(item, camera="cam0"))
             c.process()
+            if started and steady_s is not None:
+                steady_s.append(time.process_time() - before_s)
         else:
             c.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
     c.finish()
@@ -83,11 +92,16 @@ def main(argv: list[str]) -> int:
         return 1
     items, points = read(args.folder), load_target(args.folder / "target.yaml").points_m
     split = items[0][0] + int(SPLIT_S * 1e9)
-    print("| lens | lever arm mm | rotation deg | time shift us | largest z | z of lens / distortion |")
-    print("|---|---|---|---|---|---|")
+    print(
+        "| lens | lever arm mm | rotation deg | time shift us | largest z | z of lens / distortion "
+        "| CPU an image once started, ms: mean (median) |"
+    )
+    print("|---|---|---|---|---|---|---|")
     for name, fix in (("fixed", frozenset({"intrinsics"})), ("free", frozenset())):
         halves = [[i for i in items if (i[0] < split) == first] for first in (True, False)]
-        print(row(name, *(calibrate(h, fix, points) for h in halves)), flush=True)
+        steady_s: list[float] = []
+        cells = row(name, *(calibrate(h, fix, points, steady_s) for h in halves))
+        print(f"{cells} {1e3 * np.mean(steady_s):.1f} ({1e3 * np.median(steady_s):.1f}) |", flush=True)
     return 0
 
 
