@@ -74,6 +74,24 @@ def test_says_what_the_commands_promise(followed):
     assert subject.calibrator.trace("another") == []
 
 
+def test_metric_scale_and_the_direction_of_gravity_are_right_within_their_sigmas(followed):
+    run, subject, _ = followed
+    carry = subject.calibrator.latest
+    base_s = (int(run.t_imu_ns[0]) - run.options.epoch_ns) * 1e-9
+    t = np.array([carry.t_cam_s + carry.camera.timeshift_s + base_s])
+    R, v = run.rig.trajectory.R_world_imu(t)[0], run.rig.trajectory.v_world_imu(t)[0]
+    g = run.rig.gravity_world_mps2
+    up = -R.T @ g / np.linalg.norm(g)  # in the imu frame, which is what can be known
+    tilt = np.cross(carry.R[2], up)
+    P = carry.covariance()
+    assert np.linalg.norm(tilt) < 4.0 * np.sqrt(np.trace(P[:2, :2]))
+    assert np.sqrt(np.trace(P[:2, :2])) < np.deg2rad(0.1)
+    # the speed in metres: scale from the accelerometer alone
+    error = carry.speed - R.T @ v
+    assert error @ np.linalg.solve(P[2:5, 2:5], error) < chi2.isf(1e-3, 3)
+    assert np.sqrt(np.trace(P[2:5, 2:5])) < 0.02 * np.linalg.norm(v) + 5e-3
+
+
 def test_the_lens_is_found_too():
     run = simulated(seed=6, seconds=8.0)
     record = feed(run, subject_for(run, lens_known=False, seed=6))
