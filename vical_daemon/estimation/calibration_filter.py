@@ -43,6 +43,7 @@ from vical_daemon.estimation.target_view import Rates
 from vical_daemon.estimation.unshown_axes import UnshownAxes
 
 _EYE = np.eye(3)
+_TINY = 1e-30 * np.eye(9)  # noise densities may be told as zero
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
 
@@ -106,7 +107,7 @@ class CalibrationFilter:
             moved = move_by_derivatives(self.state, S, segment)
         else:
             moved = move_by_sigma_points(self.state, self.layout, S, segment)
-        Q = moved.influence.noise(self.imu_noise)
+        Q = moved.influence.noise(self.imu_noise) + _TINY
         if not straight:
             share = np.sqrt((moved.curved**2).sum(axis=1) / np.diag(Q)).max()
             self._motion_straight.measured(sigmas, float(share))

@@ -6,7 +6,6 @@ short lag (so that inertial data always bracket each image) -> `judge` says how 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
-from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, in_doubt
+from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, drift_told, in_doubt
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
@@ -73,9 +72,7 @@ class Calibrator:
             self._base_ns = t_imu_ns
             self._buffer = ImuBuffer(t_imu_ns)
         gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
-        if math.isfinite(sum(gyro_rps) + sum(specific_force_mps2)) and self._buffer.append(
-            (t_imu_ns - self._base_ns) * 1e-9, gyro, accel
-        ):
+        if self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
             self.judge.saw_imu(t_imu_ns, gyro, accel)
         else:
             self.judge.imu_refused += 1
@@ -218,8 +215,7 @@ class Calibrator:
             f.reopen(where.skew, SKEW_SIGMA)
             f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
         drift, sigma = f.state.cameras[camera].skew, float(np.linalg.norm(f.S[where.skew]))
-        told = f"by {1e6 * drift:+.1f} +- {1e6 * sigma:.1f} us a second; the drift is now estimated too"
-        self.judge.announce(f"{camera}: {self.watch.why}, {told}")
+        self.judge.announce(drift_told(camera, self.watch.why, drift, sigma))
 
     def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """After a run of refused images: take attitude and position from the image, keep the calibration."""

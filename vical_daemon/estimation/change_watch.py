@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.clock_drift import as_if_alike, surely_apart
+from vical_daemon.estimation.clock_drift import CLOCKS_APART, as_if_alike, surely_apart
 from vical_daemon.estimation.drift_watch import DriftWatch
 from vical_daemon.estimation.frame_report import FrameReport
 
@@ -21,7 +21,6 @@ _SOON_S = 4.0
 _SETTLE_S = 3.0  # after a start the innovations still move
 _DRIFT_FLOOR_S = 30e-6
 _DRIFT_AFTER_S = 2.0
-_EVERY_S = 1.0
 
 
 class Action(Enum):
@@ -47,14 +46,12 @@ class ChangeWatch:
     _pose_taken_s: float = float("-inf")
     _started_s: float = float("inf")
     _drift: dict[str, DriftWatch] = field(default_factory=dict)
-    _next_s: dict[str, float] = field(default_factory=dict)  # when each camera's clock is looked at again
 
     def started(self, t_s: float) -> None:
         """A filter starts at `t_s`."""
         self._refused = 0
         self._pose_taken_s, self._started_s = float("-inf"), t_s
         self._drift.clear()
-        self._next_s.clear()
 
     @property
     def doubtful(self) -> bool:
@@ -86,18 +83,18 @@ class ChangeWatch:
     def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
         """See once a second whether the clocks run apart, or the time shift moves in another way."""
         index, t_s = f.layout.cameras[camera].timeshift, f.state.t_s
-        due_s = self._next_s.get(camera, self._started_s + _DRIFT_AFTER_S)
-        if index is None or camera in f.drifting or t_s < due_s:
+        if index is None or camera in f.drifting or t_s < self._started_s + _DRIFT_AFTER_S:
             return Action.NONE
-        self._next_s[camera] = t_s + _EVERY_S
+        watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
+        if not watch.due(t_s):
+            return Action.NONE
         if surely_apart(f, camera):
-            self._drift.pop(camera, None)
-            self.why = "the time shift drifts: the clocks of camera and imu run at different rates"
+            self._drift.pop(camera)
+            self.why = CLOCKS_APART
             return Action.SKEW
         alike = as_if_alike(f, camera)
         variance = float(alike.S[index] @ alike.S[index])
         value = alike.state.cameras[camera].timeshift_s
-        watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
         if not watch.drifts(t_s, value, variance, f.consistency[camera].factor):
             return Action.NONE
         self._drift.pop(camera)

@@ -20,12 +20,18 @@ from vical_daemon.estimation.retract import retract
 
 SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s, one sigma; two poor crystals."""
+CLOCKS_APART = "the time shift drifts: the clocks of camera and imu run at different rates"
 CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
 SKEW_WALK = 1e-8
 """How such a drift wanders (temperature), s/s per sqrt(s)."""
 _APART = 0.05  # share of rigs whose clocks do not run alike
 SURE = 0.99
 """Probability from which on a drift is announced."""
+
+
+def drift_told(camera: str, why: str, skew: float, sigma: float) -> str:
+    """Return the announcement of a drift, s/s, with its sigma."""
+    return f"{camera}: {why}, by {1e6 * skew:+.1f} +- {1e6 * sigma:.1f} us a second; it is now estimated too"
 
 
 def apart(f: CalibrationFilter, camera: str) -> float:

@@ -31,6 +31,10 @@ class DriftWatch:
     doubtful: bool = False
     _past: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=_SPAN))
 
+    def due(self, t_s: float) -> bool:
+        """Whether it is time for the next estimate; more would only be more of the same."""
+        return not self._past or t_s >= self._past[-1][0] + _EVERY_S
+
     def drifts(self, t_s: float, value: float, variance: float, factor: float) -> bool:
         """Take the estimate at `t_s`; True when it has left where an earlier one said it would be.
 
@@ -40,7 +44,7 @@ class DriftWatch:
             variance: The filter's own.
             factor: Measured correlation factor (`Consistency.factor`), widens the test.
         """
-        if self._past and t_s < self._past[-1][0] + _EVERY_S:
+        if not self.due(t_s):
             return False
         far = max(
             (
@@ -52,7 +56,3 @@ class DriftWatch:
         self._past.append((t_s, value, variance))
         self.doubtful = bool(far > _DOUBT)
         return bool(far > _LIMIT)
-
-    def forget(self) -> None:
-        """Start anew (after the parameter was reopened)."""
-        self._past.clear()

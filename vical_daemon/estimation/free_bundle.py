@@ -45,8 +45,7 @@ class Fit(NamedTuple):
         spread: Square root of the images that share an error.
         steps: Iterations done.
         used, refused: Observations.
-        change: Calibration found minus the one carried in, shape (k,), active errors only.
-        span_s: From the first image, at which the calibration is compared, to the last.
+        change: Calibration found minus the one carried in, at the first image; active errors, shape (k,).
         landmarks: How many.
         parallax_deg: Typical angle under which a landmark's rays cross.
     """
@@ -61,7 +60,6 @@ class Fit(NamedTuple):
     used: int
     refused: int
     change: FloatArray
-    span_s: float
     landmarks: int
     parallax_deg: float
 
@@ -260,7 +258,6 @@ class Bundle:
             int(good.sum()),
             int((~good).sum()) + len(w.bad),
             change,
-            w.span_s,
             len(seen.begin),
             self._parallax(seen),
         )

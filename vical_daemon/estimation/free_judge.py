@@ -7,9 +7,15 @@ from collections import deque
 import numpy as np
 from scipy.stats import chi2
 
-from vical_daemon.estimation.clock_drift import CLOCKS_IN_DOUBT, SURE, probability
+from vical_daemon.estimation.clock_drift import (
+    CLOCKS_APART,
+    CLOCKS_IN_DOUBT,
+    SURE,
+    drift_told,
+    probability,
+)
 from vical_daemon.estimation.free_bundle import Fit
-from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry, later
+from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry
 from vical_daemon.estimation.free_snapshot import camera_estimate, drift_evidence, imu_estimate
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
@@ -113,7 +119,7 @@ class FreeJudge:
     def changed(self, why: str) -> None:
         """The rig is not what it was."""
         self.events.append(f"bumped: {why}" if self._ever_converged else f"started over: {why}")
-        self._bumped, self._quiet = why, ""
+        self._bumped, self._quiet, self.drifting = why, "", False
         self._started_s, self._windows = None, 0
         self._agreement.clear()
 
@@ -145,11 +151,8 @@ class FreeJudge:
         if self.drifting or probability(self._evidence(carry)) < SURE:
             return
         self.drifting = True
-        drift, sigma = 1e6 * carry.camera.skew, 1e6 * np.sqrt(carry.calibration()[DRIFT, DRIFT])
-        self.events.append(
-            f"{self.camera}: the time shift drifts: the clocks of camera and imu run at different rates, "
-            f"by {drift:+.1f} +- {sigma:.1f} us a second; the drift is now estimated too"
-        )
+        sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
+        self.events.append(drift_told(self.camera, CLOCKS_APART, carry.camera.skew, sigma))
 
     def _evidence(self, carry: Carry) -> float:
         return drift_evidence(carry, self.factor())
@@ -164,8 +167,8 @@ class FreeJudge:
         For consistent sigmas, cov(new - old) = P_old - P_new.
         """
         P_old = carry.covariance()[CALIBRATION:, CALIBRATION:]
-        back = later(self.active, -fit.span_s)  # to the first image, where the change was taken
-        P_new = back @ fit.carry.covariance()[CALIBRATION:, CALIBRATION:] @ back.T
+        # at the first image, where the change was taken
+        P_new = fit.carry.at(carry.t_cam_s).covariance()[CALIBRATION:, CALIBRATION:]
         scale = np.sqrt(np.diag(P_old))
         values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
         told = values > 0.02  # directions in which the window had something to say

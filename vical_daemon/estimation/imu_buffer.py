@@ -6,6 +6,7 @@ differences): straight lines would shorten a 3 Hz shake by 0.3 % at 100 Hz. [doc
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,7 @@ class ImuBuffer:
         return float(self._rows[self._start, 0]) if len(self) else np.inf
 
     def append(self, t_s: float, gyro: FloatArray, accel: FloatArray) -> bool:
-        """Add a reading; False (and nothing done) when it is not newer than the last."""
+        """Add a reading; False (and nothing done) when it is not newer than the last, or not finite."""
         if t_s <= self.newest_s:
             return False
         if self._stop == len(self._rows):
@@ -75,6 +76,8 @@ class ImuBuffer:
         row[0] = t_s
         row[1:4] = gyro
         row[4:7] = accel
+        if not math.isfinite(row.sum()):
+            return False
         self._stop += 1
         return True
 

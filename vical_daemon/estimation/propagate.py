@@ -25,7 +25,7 @@ from vical_daemon.estimation.state import (
     tilt_basis,
 )
 
-BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
+_BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
 _EYE = np.eye(3)
 
 
@@ -85,7 +85,7 @@ def move_by_derivatives(state: State, S: FloatArray, segment: ImuSegment) -> Mov
     F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = _EYE
     F[POSITION, VELOCITY] = T * _EYE
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
-    F[:, BIASES] = errors.by_bias()
+    F[:, _BIASES] = errors.by_bias()
     return Moved(
         R @ dR,
         state.p_world_imu + T * state.v_world_imu + (0.5 * T * T) * g + R @ dp,

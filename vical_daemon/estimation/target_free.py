@@ -97,8 +97,7 @@ class TargetFreeCalibrator:
             self._base_ns = t_imu_ns
             self._buffer = ImuBuffer(t_imu_ns)
         gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
-        fine = bool(np.isfinite(gyro).all() and np.isfinite(accel).all())
-        if fine and self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
+        if self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
             self.judge.saw_imu(t_imu_ns, gyro)
         else:
             self.judge.imu_refused += 1

@@ -165,6 +165,14 @@ def test_an_open_skew_carries_into_the_time_shift(recording):
     assert f.sigmas()[where.timeshift] == pytest.approx(np.hypot(sigma, 0.5e-3), rel=1e-3)
 
 
+def test_noise_densities_of_zero_are_taken_as_they_are(recording):
+    f, buffer, _ = build(recording)
+    f.imu_noise = ImuNoise(0.0, 0.0, 0.0, 0.0)
+    before = f.sigmas()
+    f.predict(buffer.segment(f.state.t_s, f.state.t_s + 0.05))
+    np.testing.assert_allclose(f.sigmas()[9:15], before[9:15], rtol=1e-9)
+
+
 def test_resetting_the_motion_keeps_the_calibration(recording):
     f, _, _ = build(recording)
     keep = f.sigmas()[9:]

@@ -12,6 +12,8 @@ from vical_mocks.trajectory import one_axis, still
 
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, points_frame
 from benchmarks.scores import nees
+from vical_daemon.estimation.free_carry import FULL
+from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
@@ -113,6 +115,13 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
     last = record.snapshots[-1]
     assert nees(last.error, last.covariance, 7) < chi2.isf(1e-4, 7)
     assert np.trace(last.covariance[:3, :3]) < np.trace(dark.covariance[:3, :3])
+
+
+def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
+    judge = FreeJudge(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
+    judge.drifting = True
+    judge.changed("the camera moved")
+    assert not judge.drifting
 
 
 def test_a_drifting_clock_is_followed_also_over_darkness():
