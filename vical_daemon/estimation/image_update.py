@@ -14,10 +14,13 @@ from vical_daemon.estimation.linearise import Image, Linear
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 
 _ITERATIONS = 5
+_LEAST = 4  # points for a correction
 _CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
 _CORNER_GATE = float(chi2.isf(1e-4, 2))
 _RESIDUAL_GATE = float(chi2.isf(2e-5, 2))
 _FRAME_GATE_P = 1e-9
+ABSURD = 1e8
+"""Normalised innovation squared of a correction that leads nowhere (1e4 sigmas); nan is absurd too."""
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
 Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
@@ -103,12 +106,14 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
     for step in range(_ITERATIONS):
         if step:
             lin = linearise(dx, S)
+            if (keep & lin.valid).sum() < _LEAST:  # about this step most points are behind the camera
+                break
             keep = keep & lin.valid
             # the innovation refers to the prior mean
             spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
         r = ((image.uv - lin.z).ravel() + offset) * weight
         fit = _correct(prior, spread, r, lin, weight, keep)
-        if curved_share(image, lin, fit.keep) < _CURVED:
+        if curved_share(image, lin, fit.keep) < _CURVED or not fit.nis < ABSURD:
             break
         step_size = unscented.solve_lower(fit.S, fit.dx - dx)
         S, dx, keep = fit.S, fit.dx, fit.keep
@@ -135,7 +140,7 @@ def _correct(
         e, shared, bent = np.split(c.solution, np.cumsum([len(prior), lin.shared.shape[1]]))
         left = (r - ways @ np.concatenate([spread @ e + lin.shared @ shared, bent])).reshape(-1, 2)
         bad = keep & ((left**2).sum(axis=1) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
-        if not bad.any() or (keep & ~bad).sum() < 4:
+        if not bad.any() or (keep & ~bad).sum() < _LEAST:
             break
         keep = keep & ~bad
     # Rows that no state moves are residuals like the rest, and say nothing about whether the innovations fit.

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from vical_daemon.estimation.seen_poses import Lens
 
 _VIEWS = 24
+_FEWEST, _LEAST_POINTS = 6, 12
+_OUTLIER = 6.0
 _STEPS = 15
+_Poses = list[tuple[FloatArray, FloatArray]]
 _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05])  # relative to fx for the first four
 
 
@@ -35,9 +38,23 @@ def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArra
         RMS residual, px; not-a-number when there were too few views (the lens is then left alone).
     """
     views = _spread(frames, lens)
-    if len(views) < 6:
+    if len(views) < _FEWEST:
         return float("nan")
-    poses = _poses(views, lens, target)
+    theta, poses, rms = _adjusted(views, _poses(views, lens, target), lens, target)
+    cleaned = [
+        _without_outliers(v, *pose, target, theta, lens.model) for v, pose in zip(views, poses, strict=True)
+    ]
+    if any(len(new.ids) < len(old.ids) for new, old in zip(cleaned, views, strict=True)):
+        theta, _, rms = _adjusted(cleaned, poses, lens, target)
+    if np.isfinite(rms) and 0.3 * lens.intrinsics[0] < theta[0] < 3.0 * lens.intrinsics[0]:
+        lens.intrinsics, lens.distortion = theta[:4], theta[4:]
+    return rms
+
+
+def _adjusted(
+    views: list[PointsFrame], poses: _Poses, lens: Lens, target: FloatArray
+) -> tuple[FloatArray, _Poses, float]:
+    """Lens (8,), poses and RMS residual in px after the adjustment, from a lens and poses."""
     theta = np.concatenate([lens.intrinsics, lens.distortion])
     scale = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(4)]) * _PRIOR
     prior, cost, damping = theta.copy(), np.inf, 1e-3
@@ -58,17 +75,25 @@ def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArra
         dtheta, dposes = last.solve((prior - best[0]) / scale**2, 1.0 / scale**2, damping)
         theta = best[0] + dtheta
         poses = [(R @ so3.exp(d[3:]), p + d[:3]) for (R, p), d in zip(best[1], dposes, strict=True)]
-    theta = best[0]
     count = sum(2 * len(v.ids) for v in views)
-    rms = float(np.sqrt(cost / max(count, 1)))
-    if np.isfinite(rms) and 0.3 * prior[0] < theta[0] < 3.0 * prior[0]:
-        lens.intrinsics, lens.distortion = theta[:4], theta[4:]
-    return rms
+    return best[0], best[1], float(np.sqrt(cost / max(count, 1)))
+
+
+def _without_outliers(
+    view: PointsFrame, R: FloatArray, p: FloatArray, target: FloatArray, theta: FloatArray, model: str
+) -> PointsFrame:
+    """The view without corners further off than six of the sigmas that half of them show."""
+    uv = project_jacobians(target[view.ids] @ R.T + p, theta[:4], theta[4:], model)[0]
+    far = np.linalg.norm(view.uv_px - uv, axis=1)
+    good = far <= _OUTLIER * np.median(far) / 1.1774  # the median of a Rayleigh distribution
+    if good.all() or good.sum() < _LEAST_POINTS:
+        return view
+    return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])
 
 
 def _spread(frames: list[PointsFrame], lens: Lens) -> list[PointsFrame]:
     """Choose views with many points that differ most in where the board lies in the image."""
-    good = [f for f in frames if len(f.ids) >= 12]
+    good = [f for f in frames if len(f.ids) >= _LEAST_POINTS]
     if len(good) <= _VIEWS:
         return good
     width, height = lens.resolution
@@ -83,7 +108,7 @@ def _spread(frames: list[PointsFrame], lens: Lens) -> list[PointsFrame]:
     return [good[i] for i in sorted(chosen)]
 
 
-def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> _Poses:
     poses, kept = [], []
     for v in views:
         rays, ok = unproject(v.uv_px, lens.intrinsics, lens.distortion, lens.model)
@@ -125,7 +150,7 @@ class _Normal:
 
 def _normal(
     views: list[PointsFrame],
-    poses: list[tuple[FloatArray, FloatArray]],
+    poses: _Poses,
     target: FloatArray,
     theta: FloatArray,
     model: str,

@@ -25,6 +25,7 @@ from vical_daemon.estimation.target_view import Rates, view
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
+_FAR_PX = 1e5  # pixels of a point beside the camera, not before it
 _TRUST = 100  # images for which a measurement of the second-order part holds
 
 
@@ -126,7 +127,8 @@ def by_sigma_points(
     """Statistical linearisation about `dx` with spread S (all in the chart of the prior)."""
     errors = dx + unscented.offsets(S)
     pixels = project_errors(state, layout, rates, image.camera, image.t_cam_s, image.points, image.uv, errors)
-    valid: BoolArray = np.asarray(np.isfinite(pixels).all(axis=(0, 2)))
+    with np.errstate(invalid="ignore"):  # nan is behind the camera
+        valid: BoolArray = np.asarray((np.abs(pixels) < _FAR_PX).all(axis=(0, 2)))
     flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
     m = unscented.moments(flat[1:] - flat[0])
     # the columns of S are the ways

@@ -22,7 +22,6 @@ from vical_daemon.estimation.state import (
     State,
     grp_from_rotation,
     rotation_from_grp,
-    tilt_basis,
 )
 
 _BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
@@ -79,7 +78,7 @@ def move_by_derivatives(state: State, S: FloatArray, segment: ImuSegment) -> Mov
     R, g = state.R_world_imu, state.gravity
     errors = influence(R, relative)
     F = np.zeros((9, len(S)))
-    tilt = -so3.hat(g) @ tilt_basis(g)
+    tilt = -so3.hat(g) @ state.tilt
     F[ATTITUDE, ATTITUDE] = dR.T
     F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ so3.hat(dp), -R @ so3.hat(dv)
     F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = _EYE

@@ -162,6 +162,11 @@ def wide_filter(
     )
 
 
+def _before_board_m(state: State, camera: str) -> float:
+    """How far a camera is from the plane of the board: sigma points must not put it behind."""
+    return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
+
+
 def start_sigmas(state: State, layout: Layout, *, partial: bool) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
@@ -169,7 +174,10 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool) -> FloatArray:
     """
     s = np.zeros(layout.size)
     # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
-    lever_arm, position, angle = (UNKNOWN_M, 3.0 * UNKNOWN_M, 0.03) if partial else (0.15, 0.1, 0.1)
+    lever_arm, position, angle = (UNKNOWN_M, 3.0 * UNKNOWN_M, 0.03)
+    if not partial:
+        before_m = min(_before_board_m(state, name) for name in layout.cameras)
+        lever_arm, position, angle = min(0.15, 0.35 * before_m), min(0.1, 0.25 * before_m), 0.1
     s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:

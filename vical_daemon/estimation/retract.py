@@ -22,7 +22,6 @@ from vical_daemon.estimation.state import (
     State,
     rotation_from_grp,
     rotation_of_grp,
-    tilt_basis,
     tilted_gravity,
 )
 
@@ -64,7 +63,7 @@ def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoi
         state.v_world_imu + errors[:, VELOCITY],
         state.gyro_bias + errors[:, GYRO_BIAS],
         state.accel_bias + errors[:, ACCEL_BIAS],
-        tilted_gravity(state.gravity, errors[:, GRAVITY]),
+        tilted_gravity(state.gravity, state.tilt, errors[:, GRAVITY]),
         gyro_matrix,
         accel_matrix,
     )
@@ -109,6 +108,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     scale = state.target_scale
     if layout.target_scale is not None:
         scale += float(dx[layout.target_scale])
+    tilted = rotation_of_grp(state.tilt @ dx[GRAVITY])
     return State(
         state.t_s,
         orthonormal(state.R_world_imu @ rotation_of_grp(dx[ATTITUDE])),
@@ -116,11 +116,12 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         state.v_world_imu + dx[VELOCITY],
         state.gyro_bias + dx[GYRO_BIAS],
         state.accel_bias + dx[ACCEL_BIAS],
-        rotation_of_grp(tilt_basis(state.gravity) @ dx[GRAVITY]) @ state.gravity,
+        tilted @ state.gravity,
         {name: _moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
         gyro_matrix,
         accel_matrix,
         scale,
+        tilted @ state.tilt,
     )
 
 

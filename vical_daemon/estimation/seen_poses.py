@@ -7,11 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation.camera_model import unproject
-from vical_daemon.estimation.measurements import CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import BoolArray, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.planar_pose import PlanarPose, planar_pose
 
 _MIN_POINTS = 8
 _MOST_POSES = 160
+_CLEANINGS = 3  # a gross outlier may hide lesser ones
+_FITS = 6.0
+_RAYLEIGH_MEDIAN = 1.1774
 
 
 @dataclass(slots=True)
@@ -70,10 +73,28 @@ def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) 
     if len(frame.ids) < _MIN_POINTS:
         return None
     rays, ok = unproject(frame.uv_px, lens.intrinsics, lens.distortion, lens.model)
-    found = planar_pose(target[frame.ids[ok]], rays[ok, :2] / rays[ok, 2:])
+    points, xy = target[frame.ids[ok]], rays[ok, :2] / rays[ok, 2:]
+    found = planar_pose(points, xy)
+    for _ in range(_CLEANINGS):
+        if not found.candidates:
+            return None
+        good = _fitting(found.candidates[0], points, xy)
+        if good.all() or good.sum() < _MIN_POINTS:
+            break
+        points, xy = points[good], xy[good]
+        found = planar_pose(points, xy)
     if not found.candidates or found.ambiguous:
         return None
     return SeenPose(t_cam_s, found.candidates[0], frame)
+
+
+def _fitting(pose: PlanarPose, points: FloatArray, xy: FloatArray) -> BoolArray:
+    """Which corners are where the pose has them, within six of the sigmas that half of them show."""
+    seen = points @ pose.R_cam_target.T + pose.p_cam_target
+    with np.errstate(all="ignore"):
+        far = np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy, axis=1)
+    fits: BoolArray = far <= _FITS * np.median(far) / _RAYLEIGH_MEDIAN
+    return fits
 
 
 class PoseCache:

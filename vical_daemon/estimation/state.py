@@ -126,6 +126,9 @@ class State:
         accel_matrix: M_a in f = M_a (f_m - b_a), lower triangular.
         cameras: By name.
         target_scale: True size of the board over its stated size.
+        tilt: Two unit vectors across gravity, shape (3, 2): the errors of its direction are turns about them.
+            They turn with it: a basis worked out anew from each gravity must jump somewhere, and the
+            covariance would not jump with it.
     """
 
     t_s: float
@@ -139,6 +142,11 @@ class State:
     gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     target_scale: float = 1.0
+    tilt: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        if not len(self.tilt):
+            self.tilt = tilt_basis(self.gravity)
 
 
 def rotation_from_grp(p: FloatArray) -> FloatArray:
@@ -199,16 +207,15 @@ def grp_from_rotation(R: FloatArray) -> FloatArray:
 
 
 def tilt_basis(gravity: FloatArray) -> FloatArray:
-    """Two unit vectors across gravity, shape (3, 2): the directions in which it can tilt."""
+    """Two unit vectors across gravity to begin with, shape (3, 2): the directions in which it can tilt."""
     x, y, z = gravity / np.sqrt(gravity @ gravity)
-    # Householder frame: continuous everywhere but at z = -1 (or +1 for the other half)
+    # Householder frame of the nearer half
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)
     b = x * y * a
     return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
 
 
-def tilted_gravity(gravity: FloatArray, tilt: FloatArray) -> FloatArray:
-    """Turn gravity by small angles about `tilt_basis` keeping its length; tilt shape (..., 2), rad."""
-    basis = tilt_basis(gravity)
+def tilted_gravity(gravity: FloatArray, basis: FloatArray, tilt: FloatArray) -> FloatArray:
+    """Turn gravity by small angles about `basis` keeping its length; tilt shape (..., 2), rad."""
     return (rotation_from_grp(tilt @ basis.T) @ gravity[:, None])[..., 0]

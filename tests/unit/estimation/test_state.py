@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation import state as st
+from vical_daemon.estimation.retract import retract
 
 
 def test_rotation_from_grp_is_scipys_rotation_from_mrp_and_back():
@@ -30,11 +31,27 @@ def test_tilt_basis_is_orthonormal_and_across_gravity(direction):
 
 def test_tilting_keeps_the_length_and_turns_by_the_angle():
     g = np.array([1.0, -9.0, 3.0])
-    tilted = st.tilted_gravity(g, np.array([[0.0, 0.0], [0.02, -0.01]]))
+    tilted = st.tilted_gravity(g, st.tilt_basis(g), np.array([[0.0, 0.0], [0.02, -0.01]]))
     np.testing.assert_allclose(tilted[0], g)
     assert np.linalg.norm(tilted[1]) == pytest.approx(np.linalg.norm(g), rel=1e-14)
     angle = np.arccos(tilted[1] @ g / (g @ g))
     assert angle == pytest.approx(np.hypot(0.02, 0.01), rel=1e-4)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 1.0, 1e-4), (1.0, 0.0, 1e-4), (0.6, -0.8, 1e-4)])
+def test_the_directions_of_tilt_turn_with_gravity_and_never_jump(direction):
+    layout = st.make_layout([], fix=frozenset(), estimate=frozenset())
+    z, eye = np.zeros(3), np.eye(3)
+    state = st.State(0.0, eye, z, z, z, z, 9.8 * np.array(direction), {})
+    first = state.tilt
+    for step in np.linspace(-1e-3, 1e-3, 11):  # back and forth through the horizontal
+        dx = np.zeros(layout.size)
+        dx[st.GRAVITY] = first.T @ np.cross(state.gravity / 9.8, [0.0, 0.0, step])
+        state = retract(state, layout, dx)
+        np.testing.assert_allclose(state.tilt.T @ state.tilt, np.eye(2), atol=1e-12)
+        np.testing.assert_allclose(state.gravity @ state.tilt, 0.0, atol=1e-12)
+        np.testing.assert_allclose(state.tilt, first, atol=5e-3)
+    assert state.gravity[2] * direction[2] < 0 or abs(state.gravity[2]) < 0.02
 
 
 def test_layout_has_no_overlap_and_covers_everything():
