@@ -88,6 +88,12 @@ CASES: dict[str, Case] = {
     "stamp jitter 1 ms": Case(simulation={"stamp_jitter_s": 1e-3}, trials=20),
     "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
     "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),
+    "target-free, stamp jitter 1 ms": Case(
+        lens_known=True, target_free=True, simulation={"stamp_jitter_s": 1e-3}, trials=20
+    ),
+    "target-free, 3 % outliers": Case(
+        lens_known=True, target_free=True, simulation={"outlier_fraction": 0.03}, trials=20
+    ),
     "target-free, skew 100 ppm": Case(lens_known=True, target_free=True, skew_ppm=100.0, trials=20),
 }
 

@@ -43,7 +43,9 @@ class Fit(NamedTuple):
         inertial: Squared whitened errors of the links over their number of rows.
         sigma_px: Pixel noise that was found.
         spread: Square root of the images that share an error.
+        jitter_s: Standard deviation of the images' stamps, s; 0 where none is seen.
         steps: Iterations done.
+        settled: The last of them changed nothing to speak of.
         used, refused: Observations.
         change: Calibration found minus the one carried in, at the first image; active errors, shape (k,).
         landmarks: How many.
@@ -56,7 +58,9 @@ class Fit(NamedTuple):
     inertial: float
     sigma_px: float
     spread: float
+    jitter_s: float
     steps: int
+    settled: bool
     used: int
     refused: int
     change: FloatArray
@@ -78,11 +82,14 @@ class Bundle:
         carry: What was known before.
         sigma_px: Pixel noise, first guess.
         spread: Square root of how many neighbouring images share an error of the pixels; see `_correlation`.
+        jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
     """
 
-    def __init__(self, window: Window, carry: Carry, sigma_px: float, spread: float = 1.0) -> None:
+    def __init__(
+        self, window: Window, carry: Carry, sigma_px: float, spread: float = 1.0, jitter_s: float = 0.0
+    ) -> None:
         self.window, self.carry = window, carry
-        self.problem = Problem(window, carry, sigma_px, spread)
+        self.problem = Problem(window, carry, sigma_px, spread, jitter_s)
         self.seen: Seen | None = None
 
     # ------------------------------------------------------------------ the loop
@@ -92,7 +99,8 @@ class Bundle:
         seen = w.observe()
         if len(seen.begin) < 8:
             return None
-        lam, steps, cleaned = 1e-7, 0, False
+        lam, steps, gain = 1e-7, 0, np.inf
+        cleaned = settled = False
         links = w.stacked()
         normal = self.problem.normal(seen, links)
         while steps < most:
@@ -102,9 +110,11 @@ class Bundle:
                 return None
             if cleaned and step.promise < _DONE:
                 self._apply(step)
-                break
-            if not cleaned and step.promise < _SMALL * normal.cost:
-                # close enough to tell what does not belong
+                settled = not self._doubts_stamps(seen, links)
+                if settled:
+                    break
+            elif not cleaned and min(step.promise, gain) < _SMALL * normal.cost:
+                # close enough to tell what does not belong; or stuck, because of it
                 self._apply(step)
                 cleaned = True
                 self._learn_noise(seen)
@@ -122,6 +132,7 @@ class Bundle:
                     if lam > 1e6:
                         break
                     continue
+                gain = normal.cost - trial.cost
                 normal, lam = trial, max(0.1 * lam, 1e-9)
                 if not w.stale():
                     continue
@@ -130,7 +141,8 @@ class Bundle:
                     return None
                 links = w.stacked()
             normal = self.problem.normal(seen, links)
-        return self._result(seen, links, normal, steps)
+        fit = self._result(seen, links, normal, steps)
+        return None if fit is None else fit._replace(settled=settled)
 
     def _save(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks]:
         w = self.window
@@ -198,6 +210,13 @@ class Bundle:
         w.landmarks = Landmarks(m.ids, m.anchor, bearing, inverse)
 
     # ------------------------------------------------------------------ noise, outliers, result
+    def _doubts_stamps(self, seen: Seen, links: Links) -> bool:
+        """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
+        if self.problem.jitter_s:
+            return False
+        self.problem.jitter_s = self.problem.stamps_doubted(seen, links)
+        return self.problem.jitter_s > 0.0
+
     def _learn_noise(self, seen: Seen) -> None:
         """Pixel noise such that the kept errors have the size that they should have."""
         e, ok, _ = self.problem.pixel_errors(seen)
@@ -243,7 +262,7 @@ class Bundle:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
         self.seen = seen
-        links_e = links.errors(w.R, w.p, w.v, w.bias[w.knots()], w.gravity)[0]
+        inertial, jitter_s = self.problem.links_left(links, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = calibration_difference(w.camera, self.carry.camera)[self.problem.active]
@@ -251,10 +270,12 @@ class Bundle:
             carried_out(w, covariance, self.carry.active),
             squares,
             max(self._dof(seen), 1),
-            float((links_e**2).mean()),
+            inertial,
             self.problem.sigma_px,
             self.problem.spread,
+            jitter_s,
             steps,
+            True,
             int(good.sum()),
             int((~good).sum()) + len(w.bad),
             change,

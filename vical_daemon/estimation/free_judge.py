@@ -25,6 +25,7 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
+from vical_daemon.estimation.stamp_jitter import jitter_told
 from vical_daemon.estimation.trace import Trace
 
 _PATIENCE_S = 15.0
@@ -73,6 +74,7 @@ class FreeJudge:
         self._ever_converged = False
         self._bumped = ""
         self._quiet = ""
+        self._jitter_told = False
         self.drifting = False  # the clock of the camera is known to run apart from the imu's
 
     # ------------------------------------------------------------------ what happens
@@ -157,9 +159,13 @@ class FreeJudge:
     def _evidence(self, carry: Carry) -> float:
         return drift_evidence(carry, self.factor())
 
-    def closed(self) -> None:
-        """A window is complete and agreed."""
+    def closed(self, jitter_s: float) -> None:
+        """A window is complete and agreed; it showed this jitter of the stamps."""
         self._windows += 1
+        told = jitter_told(self.camera, jitter_s)
+        if told and not self._jitter_told:
+            self._jitter_told = True
+            self.events.append(told)
 
     def agrees(self, fit: Fit, carry: Carry) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.

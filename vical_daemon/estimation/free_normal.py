@@ -20,13 +20,16 @@ from vical_daemon.estimation.free_carry import (
     calibration_difference,
     tangents,
 )
+from vical_daemon.estimation.free_jitter import Lateness, first_guess
 from vical_daemon.estimation.free_window import KNOT_S, IntArray, Seen, Window
 from vical_daemon.estimation.imu_model import cross
 from vical_daemon.estimation.inertial_links import Links
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.stamp_jitter import excess
 
 HUBER = 2.5  # sigmas (of the two axes together)
 _GAUGE = 1e10
+_LEAST_JITTER_S = 3e-5
 _INVERSE_SIGMA = 5.0  # 1/m: next to nothing is known about the depth of a new landmark
 
 
@@ -71,10 +74,14 @@ class Problem:
         carry: What was known before.
         sigma_px: Pixel noise.
         spread: Square root of how many neighbouring images share an error of the pixels.
+        jitter_s: Standard deviation of the images' stamps, s.
     """
 
-    def __init__(self, window: Window, carry: Carry, sigma_px: float, spread: float) -> None:
+    def __init__(
+        self, window: Window, carry: Carry, sigma_px: float, spread: float, jitter_s: float = 0.0
+    ) -> None:
         self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
+        self.jitter_s = jitter_s
         self.active = np.flatnonzero(carry.active)
 
     def order(self) -> Order:
@@ -143,9 +150,7 @@ class Problem:
         Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
         Jc = np.empty((len(e), 2, FULL))
         Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, cross(Jy, y[:, None])
-        v_imu = np.matmul(Rt, w.v[seen.frame][..., None])
-        spin = cross(x_imu, rates)[..., None] - rho * v_imu
-        Jc[:, :, SHIFT] = np.matmul(JR, spin)[..., 0]
+        Jc[:, :, SHIFT] = self._by_shift(seen, JR, R, x_imu, rates)
         Jc[:, :, LENS] = Jlens
         Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
         Jc = Jc[:, :, self.active]
@@ -154,6 +159,30 @@ class Problem:
         by_rho = np.matmul(JW, away[..., None])[..., 0] - JR @ cam.p_imu_cam
         Jl = np.concatenate([JW @ basis, by_rho[..., None]], axis=2)
         return self._assemble(seen, links, e, Jf, Jc, Jl, cost)
+
+    def _by_shift(
+        self, seen: Seen, JR: FloatArray, R: FloatArray, x_imu: FloatArray, rates: FloatArray
+    ) -> FloatArray:
+        """How pixels move with the time of the exposure: the imu turns and moves on, shape (N, 2)."""
+        rho = self.window.landmarks.inverse[seen.landmark]
+        forward = np.matmul(self.window.v[seen.frame, None], R)[:, 0]  # speed in the imu frame
+        moved = cross(x_imu, rates) - rho[:, None] * forward
+        return np.asarray(np.matmul(JR, moved[..., None])[..., 0])
+
+    def pixels_late(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
+        """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""
+        cam = self.window.camera
+        y, x_imu, R, rates = self._rays(seen)
+        with np.errstate(all="ignore"):
+            uv, Jy, _ = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)
+        e, ok, weight = self._weigh(seen, uv)
+        JR = (np.where(ok[:, None, None], Jy, 0.0).reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)
+        by_shift = self._by_shift(seen, JR, R, x_imu, rates) * (np.sqrt(weight) / self.sigma_px)[:, None]
+        F = len(self.window.frames)
+        size = np.bincount(seen.frame, (by_shift**2).sum(axis=1), F)
+        late = np.bincount(seen.frame, (by_shift * e * np.sqrt(weight)[:, None]).sum(axis=1), F)
+        shown = size > 0.0
+        return late[shown] / size[shown], self.spread**2 / size[shown]
 
     def _robust_cost(self, e: FloatArray, weight: FloatArray) -> float:
         """Sum of the Huber losses (e is weighted already: weight * size^2)."""
@@ -226,6 +255,10 @@ class Problem:
                 H[at[:, None], rows] += side
                 H[rows[:, None], at] += side.T
         cost = float((e**2).sum())
+        if self.jitter_s:
+            late = Lateness(w, e, J, self.jitter_s)
+            late.eliminate(H, g, J, self._of_links(order))
+            cost -= late.explained()
         information = np.repeat([w.noise.gyro_walk**-2, w.noise.accel_walk**-2], 3) / KNOT_S
         for m in range(len(w.bias) - 1):
             a, c = order.knots[m], order.knots[m + 1]
@@ -238,6 +271,37 @@ class Problem:
             g[c] += information * off
             cost += float(information @ off**2)
         return cost
+
+    def _of_links(self, order: Order) -> IntArray:
+        """Where the states of each link live: first image, second image, knot; shape (F - 1, 24)."""
+        knots = order.knots[self.window.knots()]
+        return np.concatenate([order.frames[:-1], order.frames[1:], knots], axis=1)
+
+    def stamps_doubted(self, seen: Seen, links: Links) -> float:
+        """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
+
+        A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.
+        """
+        w = self.window
+        by_links = first_guess(w, *links.errors(w.R, w.p, w.v, w.bias[w.knots()], w.gravity))
+        late, variance = self.pixels_late(seen)
+        return float(np.hypot(by_links, excess(late**2, variance)))
+
+    def links_left(self, links: Links, root: FloatArray) -> tuple[float, float]:
+        """Mean squared error of the links, and the jitter of the stamps that it shows, s.
+
+        Args:
+            links: Of the window.
+            root: Lower Cholesky factor of the normal matrix.
+        """
+        w = self.window
+        e, J = links.errors(w.R, w.p, w.v, w.bias[w.knots()], w.gravity)
+        if not self.jitter_s:
+            return float((e**2).mean()), 0.0
+        late = Lateness(w, e, J, self.jitter_s)
+        jitter_s = float(np.sqrt(late.mean_square(J, self._of_links(self.order()), root)))
+        left = (float((e**2).sum()) - late.explained()) / e.size
+        return left, jitter_s if jitter_s > _LEAST_JITTER_S else 0.0
 
     def _prior_errors(self) -> tuple[FloatArray, FloatArray]:
         """Errors (d,) of the carried knowledge and derivatives (d, 9 + 6 + k)."""

@@ -15,6 +15,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
 from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate
+from vical_daemon.estimation.stamp_jitter import jitter_told
 from vical_daemon.estimation.state import Layout
 from vical_daemon.estimation.trace import Trace
 
@@ -25,7 +26,6 @@ _LOST = 3.0  # a direction this far above its target after the patience is calle
 _NIS_BAD = 4.0
 _HELD_BACK_BAD = 9.0
 _HYSTERESIS = 2.0
-_TOLD_JITTER_S = 3e-4  # worth a word to the user
 _RECENT = 60
 _MOVE = "turn the rig about all three axes while moving it"
 
@@ -139,9 +139,8 @@ class Judge:
         good = report.residual_px[report.accepted]
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
-        jitter_s = f.jitter[report.camera].sigma_s
-        if jitter_s > _TOLD_JITTER_S:  # what to do about it is often a setting of the camera's driver
-            told = f"{report.camera}: the stamps of the images jitter by {1e3 * jitter_s:.1f} ms; allowed for"
+        told = jitter_told(report.camera, f.jitter[report.camera].sigma_s)
+        if told:
             self.announce(told, once=f"jitter {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:

@@ -20,6 +20,7 @@ _SIGNIFICANT = 5.0  # standard deviations above what stamps without jitter would
 _CLIP = 36.0  # squared standard deviations: outliers are not jitter
 _FLOOR_S = 2e-5
 _ROUNDS = 8
+_TOLD_S = 3e-4  # what to do about it is often a setting of the camera's driver
 
 
 @dataclass(slots=True)
@@ -58,10 +59,17 @@ class StampJitter:
         self._usual[place] = level * (1.0 / size + float(part @ part))
         self.images += 1
         if self.images >= _LEAST and self.images % _EVERY == 0:
-            self.sigma_s = _excess(self._square[: self.images], self._usual[: self.images])
+            self.sigma_s = excess(self._square[: self.images], self._usual[: self.images])
 
 
-def _excess(square: FloatArray, usual: FloatArray) -> float:
+def jitter_told(camera: str, jitter_s: float) -> str:
+    """Announcement of a jitter; empty where it is too small to be worth a word."""
+    if jitter_s < _TOLD_S:
+        return ""
+    return f"{camera}: the stamps of the images jitter by {1e3 * jitter_s:.1f} ms; allowed for"
+
+
+def excess(square: FloatArray, usual: FloatArray) -> float:
     """Standard deviation, s, that squared errors show beyond their usual variances; 0 if by chance."""
     ratio = np.minimum(square / usual, _CLIP)
     if ratio.mean() < 1.0 + _SIGNIFICANT * np.sqrt(2.0 / len(ratio)):

@@ -46,7 +46,7 @@ _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
-_STEPS_GROW, _STEPS_START = 6, 30
+_STEPS_GROW, _STEPS_START = 12, 30
 
 
 class TargetFreeCalibrator:
@@ -81,7 +81,7 @@ class TargetFreeCalibrator:
         self.carry: Carry | None = None  # before the window
         self.latest: Carry | None = None  # after its last adjustment
         self._closed = 0
-        self._noise = (options.corner_sigma_px, 1.0)  # px, and how long errors last
+        self._noise = (options.corner_sigma_px, 1.0, 0.0)  # px, how long errors last, jitter of stamps in s
         self._buffer: ImuBuffer | None = None
         self._base_ns = 0
         self._pending: list[tuple[float, PointsFrame]] = []
@@ -121,6 +121,11 @@ class TargetFreeCalibrator:
         self.judge.saw_points(t_cam_s, len(frame.ids))
         if len(frame.ids) >= 4:
             self._pending.append((t_cam_s, frame))
+
+    @property
+    def jitter_s(self) -> float:
+        """Standard deviation of the images' stamps as the last window showed it, s; 0 where none is seen."""
+        return self._noise[2]
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
@@ -198,7 +203,7 @@ class TargetFreeCalibrator:
         carry = self._carry_into(window, known)
         bundle = Bundle(window, carry, *self._noise)
         fit = bundle.solve(self._buffer, _STEPS_START)
-        if fit is None or not self.judge.fits(fit, first=True):
+        if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
             self.judge.waiting(
                 "the first seconds do not fit together yet: keep moving in all directions", True
             )
@@ -206,7 +211,7 @@ class TargetFreeCalibrator:
         last = window.frames[-1][0]
         self._pending = [x for x in self._pending if x[0] > last]
         self.window, self.carry, self.latest = window, carry, fit.carry
-        self._noise = (fit.sigma_px, fit.spread)
+        self._noise = (fit.sigma_px, fit.spread, fit.jitter_s)
         self._closed = 0 if known is None else self._closed
         self.judge.started(window.frames[0][0])
         self.judge.saw_fit(fit, last + window.shift_s)
@@ -243,14 +248,18 @@ class TargetFreeCalibrator:
         if len(window.frames) < 8:
             return
         bundle = Bundle(window, self.carry, *self._noise)
-        fit = bundle.solve(self._buffer, _STEPS_GROW)
+        fit = bundle.solve(self._buffer, 2 * _STEPS_GROW if _full(window) else _STEPS_GROW)
         if fit is None:
             self._lost("too few features can be followed")
+            return
+        if not fit.settled:  # gross outliers among the new features; the next images may tell
+            if _full(window):
+                self._lost("the features of the last seconds contradict each other")
             return
         if not self.judge.fits(fit):
             self._lost(self.judge.misfit)
             return
-        self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread)
+        self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread, fit.jitter_s)
         self.judge.saw_fit(fit, window.frames[-1][0] + window.shift_s)
         if _full(window):
             self._close(fit, bundle)
@@ -270,7 +279,7 @@ class TargetFreeCalibrator:
         if self._doubted is not None:
             self._doubted = None
         self._closed += 1
-        self.judge.closed()
+        self.judge.closed(fit.jitter_s)
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
         self.carry = self._aged(fit.carry, KNOT_S, window.span_s)
@@ -333,7 +342,7 @@ class TargetFreeCalibrator:
         if window is not None and self.carry is not None:
             if keep and window.span_s > _LEAST_S:
                 self._closed += 1
-                self.judge.closed()
+                self.judge.closed(self.jitter_s)
             else:
                 self.latest = self.carry if self._closed else None
         self.carry = None

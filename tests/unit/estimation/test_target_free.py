@@ -62,6 +62,33 @@ def test_every_answer_on_the_way_was_honest(followed):
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
 
 
+@pytest.mark.parametrize("jitter_s", [2e-4, 1e-3])
+def test_stamps_that_jitter_are_noticed_and_allowed_for(jitter_s):
+    run = simulated(seed=7, seconds=14.0, stamp_jitter_s=jitter_s)
+    subject = subject_for(run)
+    record = feed(run, subject)
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s
+    # 0.2 ms are less than one image shows here: seen or not, they do no harm
+    assert (0.65 if jitter_s > 5e-4 else 0.0) * jitter_s <= subject.calibrator.jitter_s < 1.5 * jitter_s
+    assert len([e for _, e in record.events if "jitter by" in e]) == (jitter_s == 1e-3)
+
+
+def test_good_stamps_are_believed(followed):
+    _, subject, record = followed
+    assert subject.calibrator.jitter_s == 0.0
+    assert not [e for _, e in record.events if "jitter" in e]
+
+
+@pytest.mark.parametrize("seed", [27, 31])
+def test_gross_outliers_and_broken_tracks_never_bend_an_answer(seed):
+    run = simulated(seed=seed, seconds=16.0, outlier_fraction=0.03, missing_fraction=0.1)
+    record = feed(run, subject_for(run))
+    assert record.snapshots
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
+
+
 def test_says_what_the_commands_promise(followed):
     run, subject, _ = followed
     estimate = subject.calibrator.estimate()

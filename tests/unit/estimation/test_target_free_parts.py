@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
+from vical_daemon.estimation import so3
 from vical_daemon.estimation.epipolar_fit import epipolar_fit
 from vical_daemon.estimation.free_bundle import Bundle, _correlation
 from vical_daemon.estimation.free_carry import (
@@ -19,6 +20,8 @@ from vical_daemon.estimation.free_carry import (
     moved,
     tangents,
 )
+from vical_daemon.estimation.free_jitter import Lateness
+from vical_daemon.estimation.free_normal import Order
 from vical_daemon.estimation.free_start import free_start
 from vical_daemon.estimation.free_starter import start_sigmas
 from vical_daemon.estimation.imu_buffer import ImuBuffer
@@ -166,6 +169,57 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s):
         assert slope == pytest.approx(
             wanted, rel=0.02, abs=0.02 * np.sqrt(normal.H[order.calib[k], order.calib[k]])
         ), k
+
+
+def test_late_images_move_the_errors_of_links_as_told(scene):
+    window = scene.window()
+    links, knots = window.stacked(), window.knots()
+    e, J = links.errors(window.R, window.p, window.v, window.bias[knots], window.gravity)
+    order = Order(len(window.frames), len(window.bias), 0)
+    at = np.concatenate([order.frames[:-1], order.frames[1:], order.knots[knots]], axis=1)
+    rates, push = window.rates(), np.gradient(window.v, [t for t, _ in window.frames], axis=0)
+    late = np.random.default_rng(4).normal(0.0, 1e-5, len(window.frames))[:, None]
+    moved_back = links.errors(
+        window.R @ so3.exp(-late * rates),
+        window.p - late * window.v,
+        window.v - late * push,
+        window.bias[knots],
+        window.gravity,
+    )[0]
+    # the same with the delays as unknowns of their own
+    F, size = len(window.frames), order.size
+    B = np.zeros((e.size, F))
+    for k in range(F):
+        alone = np.zeros((F, 1))
+        alone[k] = 1e-5
+        B[:, k] = (
+            links.errors(
+                window.R @ so3.exp(-alone * rates),
+                window.p - alone * window.v,
+                window.v - alone * push,
+                window.bias[knots],
+                window.gravity,
+            )[0]
+            - e
+        ).ravel() / 1e-5
+    np.testing.assert_allclose(
+        B @ late[:, 0], (moved_back - e).ravel(), atol=2e-3 * np.abs(moved_back - e).max()
+    )
+    wide = np.zeros((e.size, size))
+    for k in range(F - 1):
+        wide[9 * k : 9 * k + 9, at[k]] += J[k]
+    sigma_s = 5e-4
+    M = B.T @ B + np.eye(F) / sigma_s**2
+    gain = np.linalg.solve(M, B.T)
+    H, g = wide.T @ wide, wide.T @ e.ravel()
+    delays = Lateness(window, e, J, sigma_s)
+    wanted_H, wanted_g = H - wide.T @ B @ gain @ wide, g - wide.T @ B @ gain @ e.ravel()
+    delays.eliminate(H, g, J, at)
+    np.testing.assert_allclose(H, wanted_H, atol=1e-4 * np.abs(wanted_H).max())
+    np.testing.assert_allclose(g, wanted_g, atol=1e-4 * np.abs(wanted_g).max())
+    assert delays.explained() == pytest.approx(e.ravel() @ B @ gain @ e.ravel(), rel=1e-3)
+    wanted = -gain @ e.ravel()
+    np.testing.assert_allclose(delays.delays()[0], wanted, atol=3e-3 * np.abs(wanted).max())
 
 
 def test_adjusted_window_is_right_within_its_own_sigmas(scene):
