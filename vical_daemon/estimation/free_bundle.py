@@ -20,7 +20,9 @@ from vical_daemon.estimation.free_carry import (
     moved,
     tangents,
 )
-from vical_daemon.estimation.free_normal import HUBER, Normal, Problem
+from vical_daemon.estimation.free_inertial import links_left
+from vical_daemon.estimation.free_normal import Normal, Problem
+from vical_daemon.estimation.free_quality import correlation, parallax_deg
 from vical_daemon.estimation.free_window import Landmarks, Seen, Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial_links import Links
@@ -28,7 +30,6 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.state import CameraState
 
 _OUT = 4.5  # sigmas; an observation beyond is taken out
-_MEMORY = 25  # images over which an error of the pixels may last
 _DONE = 1.0  # a step that promises less than this of the sum of squares is the last
 _SMALL = 0.02  # of the sum of squares: from here on outliers stand out
 
@@ -81,7 +82,7 @@ class Bundle:
         window: Is changed in place.
         carry: What was known before.
         sigma_px: Pixel noise, first guess.
-        spread: Square root of how many neighbouring images share an error of the pixels; see `_correlation`.
+        spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
         jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
     """
 
@@ -228,7 +229,7 @@ class Bundle:
         self.problem.sigma_px = float(
             np.clip(self.problem.sigma_px * np.median(size) / 1.1774 / share, 0.02, 20.0)
         )
-        self.problem.spread = float(np.sqrt(_correlation(np.where(ok[:, None], e, 0.0), seen)))
+        self.problem.spread = float(np.sqrt(correlation(np.where(ok[:, None], e, 0.0), seen)))
 
     def _dof(self, seen: Seen) -> int:
         return 2 * len(seen.frame) - 3 * len(seen.begin) - 2 * len(self.window.frames)
@@ -262,7 +263,7 @@ class Bundle:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
         self.seen = seen
-        inertial, jitter_s = self.problem.links_left(links, np.tril(root))
+        inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = calibration_difference(w.camera, self.carry.camera)[self.problem.active]
@@ -280,43 +281,8 @@ class Bundle:
             int((~good).sum()) + len(w.bad),
             change,
             len(seen.begin),
-            self._parallax(seen),
+            parallax_deg(w, seen),
         )
-
-    def _parallax(self, seen: Seen) -> float:
-        """Median angle between the first and last ray of the landmarks, deg."""
-        w = self.window
-        last = np.concatenate([seen.begin[1:], [len(seen.frame)]]) - 1
-        m = w.landmarks
-        X = m.bearing + m.inverse[:, None] * m.anchor
-        ends = [X - m.inverse[:, None] * w.p[seen.frame[at]] for at in (seen.begin, last)]
-        a, b = (x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12) for x in ends)
-        return float(np.rad2deg(np.median(np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0)))))
-
-
-def _correlation(e: FloatArray, seen: Seen) -> float:
-    """By how much the variance of a track's mean error exceeds that of white noise: 1 + 2 sum rho_k.
-
-    Errors that stay with a feature from image to image (lens, tracker, blur) count once, not once an image.
-    The sum ends where the correlation is lost in its own noise. [Geyer, "Practical Markov chain Monte
-    Carlo", 1992, initial positive sequence]
-    """
-    size = np.sqrt((e**2).sum(axis=1, keepdims=True))
-    e = e * np.minimum(1.0, HUBER / np.maximum(size, 1e-9))
-    variance = float((e**2).mean())
-    total = 1.0
-    for k in range(1, _MEMORY):
-        if len(e) <= k:
-            break
-        same = (seen.landmark[k:] == seen.landmark[:-k]) & (seen.frame[k:] - seen.frame[:-k] == k)
-        count = int(same.sum())
-        if count < 50:
-            break
-        rho = float((e[k:][same] * e[:-k][same]).sum()) / (2.0 * count * max(variance, 1e-12))
-        if rho < 2.0 / np.sqrt(2.0 * count):
-            break
-        total += 2.0 * rho
-    return total
 
 
 def orthonormal_all(R: FloatArray) -> FloatArray:

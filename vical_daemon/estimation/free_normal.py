@@ -20,8 +20,9 @@ from vical_daemon.estimation.free_carry import (
     calibration_difference,
     tangents,
 )
-from vical_daemon.estimation.free_jitter import Lateness, first_guess
-from vical_daemon.estimation.free_window import KNOT_S, IntArray, Seen, Window
+from vical_daemon.estimation.free_inertial import Order, add_links, link_errors
+from vical_daemon.estimation.free_jitter import first_guess
+from vical_daemon.estimation.free_window import IntArray, Seen, Window
 from vical_daemon.estimation.imu_model import cross
 from vical_daemon.estimation.inertial_links import Links
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
@@ -29,7 +30,6 @@ from vical_daemon.estimation.stamp_jitter import excess
 
 HUBER = 2.5  # sigmas (of the two axes together)
 _GAUGE = 1e10
-_LEAST_JITTER_S = 3e-5
 _INVERSE_SIGMA = 5.0  # 1/m: next to nothing is known about the depth of a new landmark
 
 
@@ -51,19 +51,6 @@ class Normal(NamedTuple):
     W: FloatArray
     gl: FloatArray
     cost: float
-
-
-class Order:
-    """Places of the unknowns: images but the last, knots but the last, last image, last knot, calibration."""
-
-    def __init__(self, F: int, K: int, k: int) -> None:
-        self.size = 9 * F + 6 * K + k
-        self.tail = 9 * (F - 1) + 6 * (K - 1)
-        frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
-        knots = 9 * (F - 1) + np.arange(6 * (K - 1)).reshape(K - 1, 6)
-        self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
-        self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
-        self.calib = self.tail + 15 + np.arange(k)
 
 
 class Problem:
@@ -228,81 +215,20 @@ class Problem:
         poses = np.zeros((L, F, 3, 6))  # a landmark is seen once in an image
         poses[seen.landmark, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf
         W[:, :, : 6 * F] = poses.transpose(0, 2, 1, 3).reshape(L, 3, 6 * F)
-        cost += self._add_links(H, g, order, links)
+        cost += add_links(w, links, self.jitter_s, order, H, g)
         cost += self._add_prior(H, g, order)
         return Normal(H, g, V, W, gl, cost)
-
-    # ------------------------------------------------------------------ inertial part and prior
-    def _add_links(self, H: FloatArray, g: FloatArray, order: Order, links: Links) -> float:
-        w = self.window
-        knots = w.knots()
-        e, J = links.errors(w.R, w.p, w.v, w.bias[knots], w.gravity)
-        JT = np.swapaxes(J, 1, 2)
-        A, b = JT @ J, np.matmul(JT, e[..., None])[..., 0]
-        # neighbours share an image and many links a knot: even and odd links, then the knots one by one
-        for first in (0, 1):
-            at = np.concatenate([order.frames[first:-1:2], order.frames[first + 1 :: 2]], axis=1)
-            H[at[:, :, None], at[:, None, :]] += A[first::2, :18, :18]
-            g[at] += b[first::2, :18]
-        for knot in range(len(w.bias)):
-            own = np.flatnonzero(knots == knot)
-            rows = order.knots[knot]
-            H[rows[:, None], rows] += A[own, 18:, 18:].sum(axis=0)
-            g[rows] += b[own, 18:].sum(axis=0)
-            for first in (0, 9):
-                at = order.frames[own + first // 9].reshape(-1)
-                side = A[own, first : first + 9, 18:].reshape(-1, 6)
-                H[at[:, None], rows] += side
-                H[rows[:, None], at] += side.T
-        cost = float((e**2).sum())
-        if self.jitter_s:
-            late = Lateness(w, e, J, self.jitter_s)
-            late.eliminate(H, g, J, self._of_links(order))
-            cost -= late.explained()
-        information = np.repeat([w.noise.gyro_walk**-2, w.noise.accel_walk**-2], 3) / KNOT_S
-        for m in range(len(w.bias) - 1):
-            a, c = order.knots[m], order.knots[m + 1]
-            off = w.bias[m + 1] - w.bias[m]
-            H[a, a] += information
-            H[c, c] += information
-            H[a, c] -= information
-            H[c, a] -= information
-            g[a] -= information * off
-            g[c] += information * off
-            cost += float(information @ off**2)
-        return cost
-
-    def _of_links(self, order: Order) -> IntArray:
-        """Where the states of each link live: first image, second image, knot; shape (F - 1, 24)."""
-        knots = order.knots[self.window.knots()]
-        return np.concatenate([order.frames[:-1], order.frames[1:], knots], axis=1)
 
     def stamps_doubted(self, seen: Seen, links: Links) -> float:
         """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
 
         A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.
         """
-        w = self.window
-        by_links = first_guess(w, *links.errors(w.R, w.p, w.v, w.bias[w.knots()], w.gravity))
+        by_links = first_guess(self.window, *link_errors(self.window, links))
         late, variance = self.pixels_late(seen)
         return float(np.hypot(by_links, excess(late**2, variance)))
 
-    def links_left(self, links: Links, root: FloatArray) -> tuple[float, float]:
-        """Mean squared error of the links, and the jitter of the stamps that it shows, s.
-
-        Args:
-            links: Of the window.
-            root: Lower Cholesky factor of the normal matrix.
-        """
-        w = self.window
-        e, J = links.errors(w.R, w.p, w.v, w.bias[w.knots()], w.gravity)
-        if not self.jitter_s:
-            return float((e**2).mean()), 0.0
-        late = Lateness(w, e, J, self.jitter_s)
-        jitter_s = float(np.sqrt(late.mean_square(J, self._of_links(self.order()), root)))
-        left = (float((e**2).sum()) - late.explained()) / e.size
-        return left, jitter_s if jitter_s > _LEAST_JITTER_S else 0.0
-
+    # ------------------------------------------------------------------ prior
     def _prior_errors(self) -> tuple[FloatArray, FloatArray]:
         """Errors (d,) of the carried knowledge and derivatives (d, 9 + 6 + k)."""
         w, c = self.window, self.carry

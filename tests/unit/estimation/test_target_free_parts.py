@@ -10,7 +10,7 @@ from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.epipolar_fit import epipolar_fit
-from vical_daemon.estimation.free_bundle import Bundle, _correlation
+from vical_daemon.estimation.free_bundle import Bundle
 from vical_daemon.estimation.free_carry import (
     DRIFT,
     FULL,
@@ -20,8 +20,9 @@ from vical_daemon.estimation.free_carry import (
     moved,
     tangents,
 )
+from vical_daemon.estimation.free_inertial import Order
 from vical_daemon.estimation.free_jitter import Lateness
-from vical_daemon.estimation.free_normal import Order
+from vical_daemon.estimation.free_quality import correlation
 from vical_daemon.estimation.free_start import free_start
 from vical_daemon.estimation.free_starter import start_sigmas
 from vical_daemon.estimation.imu_buffer import ImuBuffer
@@ -284,9 +285,9 @@ def test_errors_that_last_are_counted_once():
         frame = np.tile(np.arange(frames), marks)
 
     wanted = (1 + memory) / (1 - memory)
-    assert _correlation(e.reshape(-1, 2), Seen) == pytest.approx(wanted, rel=0.15)
+    assert correlation(e.reshape(-1, 2), Seen) == pytest.approx(wanted, rel=0.15)
     white = rng.standard_normal((marks * frames, 2))
-    assert _correlation(white, Seen) < 1.15
+    assert correlation(white, Seen) < 1.15
 
 
 def test_tangents_are_orthonormal_everywhere():
