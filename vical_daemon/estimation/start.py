@@ -20,6 +20,7 @@ from vical_daemon.estimation.state import CameraState, Layout
 from vical_daemon.estimation.td_icp import TdIcpResult, td_icp
 
 _SHIFT_SIGMA_S = 1.0e-3
+_PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
 _ROTATION_SIGMA_RAD = np.deg2rad(1.0)
 _PARTIAL_STRETCH_S = 8.0
 _PARTIAL_MIN_S = 6.0
@@ -73,7 +74,8 @@ def attempt(data: StartData) -> StartResult:
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )
         found = _timing(data.buffer, poses, lens)
-        why = found.reason or _not_sure_yet(found)
+        long = poses[-1].t_cam_s - poses[0].t_cam_s > _PATIENCE_S
+        why = found.reason or _not_sure_yet(found, (2.0 if long else 1.0) * _SHIFT_SIGMA_S)
         if why:
             return StartResult(None, f"{name}: {why}", motion_missing=True)
         camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_cam_imu_s)
@@ -170,9 +172,9 @@ def _timing(buffer: ImuBuffer, poses: list[SeenPose], lens: Lens) -> TdIcpResult
     )
 
 
-def _not_sure_yet(result: TdIcpResult) -> str:
-    """Why TD-ICP's answer does not do yet; empty when it does."""
-    if result.timeshift_sigma_s > _SHIFT_SIGMA_S:
+def _not_sure_yet(result: TdIcpResult, most_s: float) -> str:
+    """Why TD-ICP's answer does not do yet, with time shifts known to `most_s`; empty when it does."""
+    if result.timeshift_sigma_s > most_s:
         known = 1e3 * result.timeshift_sigma_s
         return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
     if float(np.max(result.rotation_sigma_rad)) > _ROTATION_SIGMA_RAD:
