@@ -114,6 +114,8 @@ class Bundle:
                 settled = not self._doubts_stamps(seen, links)
                 if settled:
                     break
+                w.bad.clear()  # late images had looked like outliers
+                seen, cleaned, gain = w.observe(), False, np.inf
             elif not cleaned and min(step.promise, gain) < _SMALL * normal.cost:
                 # close enough to tell what does not belong; or stuck, because of it
                 self._apply(step)
