@@ -17,7 +17,6 @@ from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.image_update import (
-    ABSURD,
     ImageFit,
     corner_gate,
     curved_share,
@@ -153,8 +152,8 @@ class CalibrationFilter:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
-        if not fit.nis < min(frame_limit(fit.dof) * max(1.0, self.nis_level), ABSURD):
-            self.nis_level += 0.02 * (min(4.0 * self.nis_level, level) - self.nis_level)  # nan: the first
+        if fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level):
+            self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
                 image,
                 innovation,

@@ -144,8 +144,7 @@ class Bundle:
                     return None
                 links = w.stacked()
             normal = self.problem.normal(seen, links)
-        fit = self._result(seen, links, normal, steps)
-        return None if fit is None else fit._replace(settled=settled)
+        return self._result(seen, links, normal, steps, settled)
 
     def _save(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks]:
         w = self.window
@@ -248,7 +247,7 @@ class Bundle:
             w.bad.add((w.frames[seen.frame[n]][1].t_cam_ns, int(w.landmarks.ids[seen.landmark[n]])))
         return int(out.sum())
 
-    def _result(self, seen: Seen, links: Links, normal: Normal, steps: int) -> Fit | None:
+    def _result(self, seen: Seen, links: Links, normal: Normal, steps: int, settled: bool) -> Fit | None:
         w, order = self.window, self.problem.order()
         try:
             H = self._reduced(normal, 0.0)[0]
@@ -278,7 +277,7 @@ class Bundle:
             self.problem.spread,
             jitter_s,
             steps,
-            True,
+            settled,
             int(good.sum()),
             int((~good).sum()) + len(w.bad),
             change,

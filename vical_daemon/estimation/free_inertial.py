@@ -52,8 +52,7 @@ def add_links(
         Their sum of squares.
     """
     knots = window.knots()
-    late = Lateness(window, links, jitter_s) if jitter_s else None
-    e, J = (late.e, late.J) if late else link_errors(window, links)
+    e, J = link_errors(window, links)
     JT = np.swapaxes(J, 1, 2)
     A, b = JT @ J, np.matmul(JT, e[..., None])[..., 0]
     # neighbours share an image and many links a knot: even and odd links, then the knots one by one
@@ -72,8 +71,9 @@ def add_links(
             H[at[:, None], rows] += side
             H[rows[:, None], at] += side.T
     cost = float((e**2).sum()) + _add_walk(window, order, H, g)
-    if late:
-        late.eliminate(H, g, order.of_links(knots))
+    if jitter_s:
+        late = Lateness(window, e, J, jitter_s)
+        late.eliminate(H, g, J, order.of_links(knots))
         cost -= late.explained()
     return cost
 
@@ -107,9 +107,10 @@ def links_left(
         order: Places of the unknowns.
         root: Lower Cholesky factor of the normal matrix.
     """
+    e, J = link_errors(window, links)
     if not jitter_s:
-        return float((link_errors(window, links)[0] ** 2).mean()), 0.0
-    late = Lateness(window, links, jitter_s)
-    shown_s = float(np.sqrt(late.mean_square(order.of_links(window.knots()), root)))
-    left = (float((late.e**2).sum()) - late.explained()) / late.e.size
+        return float((e**2).mean()), 0.0
+    late = Lateness(window, e, J, jitter_s)
+    shown_s = float(np.sqrt(late.mean_square(J, order.of_links(window.knots()), root)))
+    left = (float((e**2).sum()) - late.explained()) / e.size
     return left, shown_s if shown_s > _LEAST_JITTER_S else 0.0

@@ -69,7 +69,7 @@ class FreeJudge:
         self._windows = 0
         self._squares: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
-        self._sigma_px = self._jitter_s = 0.0
+        self._sigma_px = self.jitter_s = 0.0
         self._trace = Trace()
         self._ever_converged = False
         self._bumped = ""
@@ -141,7 +141,7 @@ class FreeJudge:
 
     def saw_fit(self, fit: Fit, t_s: float) -> None:
         """Take the result of an adjustment."""
-        self._now_s, self._sigma_px, self._jitter_s = t_s, fit.sigma_px, fit.jitter_s
+        self._now_s, self._sigma_px, self.jitter_s = t_s, fit.sigma_px, fit.jitter_s
         self._squares.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
         self._watch_clocks(fit.carry)
@@ -159,10 +159,10 @@ class FreeJudge:
     def _evidence(self, carry: Carry) -> float:
         return drift_evidence(carry, self.factor())
 
-    def closed(self, jitter_s: float) -> None:
-        """A window is complete and agreed; it showed this jitter of the stamps."""
+    def closed(self) -> None:
+        """A window is complete and agreed."""
         self._windows += 1
-        told = jitter_told(self.camera, jitter_s)
+        told = jitter_told(self.camera, self.jitter_s)
         if told and not self._jitter_told:
             self._jitter_told = True
             self.events.append(told)
@@ -249,7 +249,7 @@ class FreeJudge:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
         factor = self.factor()
-        return camera_estimate(carry, factor, self.drifting, self._sigma_px, rms_px, self._jitter_s)
+        return camera_estimate(carry, factor, self.drifting, self._sigma_px, rms_px, self.jitter_s)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam

@@ -20,7 +20,7 @@ from vical_daemon.estimation.free_carry import (
     calibration_difference,
     tangents,
 )
-from vical_daemon.estimation.free_inertial import Order, add_links
+from vical_daemon.estimation.free_inertial import Order, add_links, link_errors
 from vical_daemon.estimation.free_jitter import first_guess
 from vical_daemon.estimation.free_window import IntArray, Seen, Window
 from vical_daemon.estimation.imu_model import cross
@@ -224,7 +224,7 @@ class Problem:
 
         A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.
         """
-        by_links = first_guess(self.window, links)
+        by_links = first_guess(self.window, *link_errors(self.window, links))
         late, variance = self.pixels_late(seen)
         return float(np.hypot(by_links, excess(late**2, variance)))
 

@@ -85,7 +85,6 @@ class Window:
         landmarks: What has been placed so far.
         gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
-        late_s: How much later than stamped the images were exposed, as believed last, s; see `free_jitter`.
     """
 
     camera: CameraState
@@ -100,7 +99,6 @@ class Window:
     landmarks: Landmarks
     gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
     bad: set[tuple[int, int]] = field(default_factory=set)
-    late_s: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def span_s(self) -> float:
@@ -125,13 +123,6 @@ class Window:
         raw = np.array([self.links[0].rate_begin, *(x.rate_end for x in self.links)])
         knots = self.knots()
         return np.asarray(raw - self.bias[np.concatenate([knots[:1], knots]), :3])
-
-    def accelerations(self) -> FloatArray:
-        """Acceleration at each image, in the world, m/s^2, shape (F, 3)."""
-        raw = np.array([self.links[0].force_begin, *(x.force_end for x in self.links)])
-        knots = self.knots()
-        force = raw - self.bias[np.concatenate([knots[:1], knots]), 3:]
-        return np.asarray(np.matmul(self.R, force[..., None])[..., 0] + self.gravity)
 
     def extend(self, buffer: ImuBuffer, frames: list[tuple[float, PointsFrame]]) -> int:
         """Add images, carrying the motion on by inertial data; return how many could be added."""

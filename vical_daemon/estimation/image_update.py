@@ -19,8 +19,6 @@ _CURVED = 0.1  # iterate while the second-order part exceeds this share of the c
 _CORNER_GATE = float(chi2.isf(1e-4, 2))
 _RESIDUAL_GATE = float(chi2.isf(2e-5, 2))
 _FRAME_GATE_P = 1e-9
-ABSURD = 1e8
-"""Normalised innovation squared of a correction that leads nowhere (1e4 sigmas); nan is absurd too."""
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
 Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
@@ -113,7 +111,7 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
             spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
         r = ((image.uv - lin.z).ravel() + offset) * weight
         fit = _correct(prior, spread, r, lin, weight, keep)
-        if curved_share(image, lin, fit.keep) < _CURVED or not fit.nis < ABSURD:
+        if curved_share(image, lin, fit.keep) < _CURVED:
             break
         step_size = unscented.solve_lower(fit.S, fit.dx - dx)
         S, dx, keep = fit.S, fit.dx, fit.keep

@@ -32,7 +32,6 @@ class Link:
         root_information: W with W^T W = inverse covariance of [rotation, velocity, position], (9, 9).
         gyro_bias, accel_bias: Where it was integrated.
         rate_begin, rate_end: Measured rates (bias not removed) at both ends, rad/s.
-        force_begin, force_end: The same of the specific force, m/s^2.
     """
 
     dt_s: float
@@ -45,8 +44,6 @@ class Link:
     accel_bias: FloatArray
     rate_begin: FloatArray
     rate_end: FloatArray
-    force_begin: FloatArray
-    force_end: FloatArray
 
 
 def make_link(
@@ -75,8 +72,6 @@ def make_link(
         accel_bias.copy(),
         segment.gyro[0],
         segment.gyro[-1],
-        segment.accel[0],
-        segment.accel[-1],
     )
 
 

@@ -13,14 +13,13 @@ import numpy as np
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import project_jacobians, unproject
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
-from vical_daemon.estimation.planar_pose import planar_pose
+from vical_daemon.estimation.planar_pose import belonging, planar_pose
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.seen_poses import Lens
 
 _VIEWS = 24
 _FEWEST, _LEAST_POINTS = 6, 12
-_OUTLIER = 6.0
 _STEPS = 15
 _Poses = list[tuple[FloatArray, FloatArray]]
 _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05])  # relative to fx for the first four
@@ -82,10 +81,10 @@ def _adjusted(
 def _without_outliers(
     view: PointsFrame, R: FloatArray, p: FloatArray, target: FloatArray, theta: FloatArray, model: str
 ) -> PointsFrame:
-    """The view without corners further off than six of the sigmas that half of them show."""
+    """The view without the corners that do not belong."""
     uv = project_jacobians(target[view.ids] @ R.T + p, theta[:4], theta[4:], model)[0]
     far = np.linalg.norm(view.uv_px - uv, axis=1)
-    good = far <= _OUTLIER * np.median(far) / 1.1774  # the median of a Rayleigh distribution
+    good = belonging(far)
     if good.all() or good.sum() < _LEAST_POINTS:
         return view
     return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])

@@ -94,6 +94,16 @@ def planar_pose(points_m: FloatArray, xy: FloatArray, sigma: float | None = None
     return _rank(R, p, rms, information, len(xy), sigma)
 
 
+def belonging(far: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which points lie within six sigmas of where they should, by the sigma that half of them show.
+
+    Args:
+        far: Distance of each point from its place, shape (n,).
+    """
+    sigma = np.median(far) / 1.1774  # the median of a Rayleigh distribution
+    return np.asarray(far <= 6.0 * sigma)
+
+
 def _homography(plane: FloatArray, xy: FloatArray) -> FloatArray | None:
     """Normalised DLT: xy ~ H [X Y 1]', scaled to H[2, 2] = 1; the board is centred, so H[2, 2] > 0."""
     s_plane = np.sqrt(2.0 / np.mean(np.einsum("ij,ij->i", plane, plane)))

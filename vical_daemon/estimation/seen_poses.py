@@ -8,13 +8,11 @@ import numpy as np
 
 from vical_daemon.estimation.camera_model import unproject
 from vical_daemon.estimation.measurements import BoolArray, CameraPrior, FloatArray, PointsFrame
-from vical_daemon.estimation.planar_pose import PlanarPose, planar_pose
+from vical_daemon.estimation.planar_pose import PlanarPose, belonging, planar_pose
 
 _MIN_POINTS = 8
 _MOST_POSES = 160
 _CLEANINGS = 3  # a gross outlier may hide lesser ones
-_FITS = 6.0
-_RAYLEIGH_MEDIAN = 1.1774
 
 
 @dataclass(slots=True)
@@ -89,12 +87,11 @@ def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) 
 
 
 def _fitting(pose: PlanarPose, points: FloatArray, xy: FloatArray) -> BoolArray:
-    """Which corners are where the pose has them, within six of the sigmas that half of them show."""
+    """Which corners are where the pose has them."""
     seen = points @ pose.R_cam_target.T + pose.p_cam_target
     with np.errstate(all="ignore"):
         far = np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy, axis=1)
-    fits: BoolArray = far <= _FITS * np.median(far) / _RAYLEIGH_MEDIAN
-    return fits
+    return belonging(far)
 
 
 class PoseCache:

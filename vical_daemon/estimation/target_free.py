@@ -122,11 +122,6 @@ class TargetFreeCalibrator:
         if len(frame.ids) >= 4:
             self._pending.append((t_cam_s, frame))
 
-    @property
-    def jitter_s(self) -> float:
-        """Standard deviation of the images' stamps as the last window showed it, s; 0 where none is seen."""
-        return self._noise[2]
-
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
         """Do what can be done with what has arrived; reports on the images of windows that are complete."""
@@ -279,7 +274,7 @@ class TargetFreeCalibrator:
         if self._doubted is not None:
             self._doubted = None
         self._closed += 1
-        self.judge.closed(fit.jitter_s)
+        self.judge.closed()
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
         self.carry = self._aged(fit.carry, KNOT_S, window.span_s)
@@ -342,7 +337,7 @@ class TargetFreeCalibrator:
         if window is not None and self.carry is not None:
             if keep and window.span_s > _LEAST_S:
                 self._closed += 1
-                self.judge.closed(self.jitter_s)
+                self.judge.closed()
             else:
                 self.latest = self.carry if self._closed else None
         self.carry = None

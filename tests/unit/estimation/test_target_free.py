@@ -70,13 +70,13 @@ def test_stamps_that_jitter_are_noticed_and_allowed_for(jitter_s):
     for shot in record.snapshots:
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s
     # 0.2 ms are less than one image shows here: seen or not, they do no harm
-    assert (0.65 if jitter_s > 5e-4 else 0.0) * jitter_s <= subject.calibrator.jitter_s < 1.5 * jitter_s
+    assert (0.65 if jitter_s > 5e-4 else 0.0) * jitter_s <= subject.calibrator.judge.jitter_s < 1.5 * jitter_s
     assert len([e for _, e in record.events if "jitter by" in e]) == (jitter_s == 1e-3)
 
 
 def test_good_stamps_are_believed(followed):
     _, subject, record = followed
-    assert subject.calibrator.jitter_s == 0.0
+    assert subject.calibrator.judge.jitter_s == 0.0
     assert not [e for _, e in record.events if "jitter" in e]
 
 
