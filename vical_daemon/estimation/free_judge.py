@@ -249,7 +249,7 @@ class FreeJudge:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
         factor = self.factor()
-        return camera_estimate(carry, factor, self.drifting, self._sigma_px, rms_px, self.jitter_s)
+        return camera_estimate(carry, factor, self.drifting, self._sigma_px, rms_px)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam

@@ -11,10 +11,6 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import CameraState
 
-_BENT = 120.0  # 1/s
-"""Error of the time shift over the squared jitter of the stamps, seen in simulation at 20 images a second and
-more (0.1 ms at 1 ms); at 10 a second there is none. Where it comes from is not understood; it is told."""
-
 
 def drift_evidence(carry: Carry, factor: float) -> float:
     """Return how much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated.
@@ -29,7 +25,7 @@ def drift_evidence(carry: Carry, factor: float) -> float:
 
 
 def camera_estimate(
-    carry: Carry, factor: float, drifting: bool, sigma_px: float, rms_px: float, jitter_s: float
+    carry: Carry, factor: float, drifting: bool, sigma_px: float, rms_px: float
 ) -> CameraEstimate:
     """The camera as it is known.
 
@@ -39,7 +35,6 @@ def camera_estimate(
         drifting: Its clock is known to run apart from the imu's.
         sigma_px: Pixel noise.
         rms_px: RMS of the residuals.
-        jitter_s: Of the images' stamps, s.
     """
     camera, covariance = _told(carry, factor, drifting)
     sigma = np.sqrt(np.diag(covariance))
@@ -47,7 +42,7 @@ def camera_estimate(
     return CameraEstimate(
         PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), covariance[:6, :6].tolist()),
         float(camera.timeshift_s),
-        float(np.hypot(sigma[SHIFT], _BENT * jitter_s**2)),
+        float(sigma[SHIFT]),
         camera.intrinsics.tolist(),
         sigma[LENS][:4].tolist(),
         camera.distortion_model,

@@ -34,8 +34,9 @@ from vical_daemon.estimation.free_window import KNOT_S, Landmarks, Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.thinning import Thinning
 
-MAX_RATE_HZ = 21.0  # images beyond are thinned: neighbours add little and the window's cost is quadratic
+MAX_RATE_HZ = 23.0  # images beyond are thinned
 STEP_S = 1.5  # the window is adjusted again after this much new data
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
 WINDOW_S = 6.0
@@ -85,7 +86,8 @@ class TargetFreeCalibrator:
         self._buffer: ImuBuffer | None = None
         self._base_ns = 0
         self._pending: list[tuple[float, PointsFrame]] = []
-        self._taken_s = -np.inf
+        self._newest_s = -np.inf  # stamp of the last image, used or not
+        self._thinning = Thinning(MAX_RATE_HZ)
         self._doubted: Carry | None = None
         self._reports: list[FrameReport] = []
         self._gap_follows = False  # the images that are ready are the last before a hole
@@ -108,12 +110,12 @@ class TargetFreeCalibrator:
             self.judge.frames_ignored += 1
             return
         t_cam_s = (frame.t_cam_ns - self._base_ns) * 1e-9
-        if t_cam_s <= self._taken_s:
+        if t_cam_s <= self._newest_s:
             self.judge.frames_ignored += 1
             return
-        if t_cam_s - self._taken_s < 1.0 / MAX_RATE_HZ:
+        self._newest_s = t_cam_s
+        if not self._thinning.takes(t_cam_s):
             return
-        self._taken_s = t_cam_s
         ok: BoolArray = np.asarray(np.isfinite(frame.uv_px).all(axis=1))
         _, first = np.unique(frame.ids, return_index=True)
         ok[np.setdiff1d(np.arange(len(ok)), first)] = False
