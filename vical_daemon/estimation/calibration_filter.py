@@ -163,6 +163,7 @@ class CalibrationFilter:
         self.nis_level += 0.05 * (level - self.nis_level)
         self._measure(image, lin, fit)
         self._accept(fit.S, fit.dx)
+        self._pay_for_jitter(image.camera)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None]
@@ -189,6 +190,15 @@ class CalibrationFilter:
         if index is not None and jitter is not None and jitter.sigma_s:
             lin.shared = lin.by_error[:, index, None] * jitter.sigma_s
         return lin
+
+    def _pay_for_jitter(self, camera: str) -> None:
+        """Take back what the images of before, used with less jitter than is known by now, told too much."""
+        index, jitter = self.layout.cameras[camera].timeshift, self.jitter.get(camera)
+        owed = jitter.owed() if index is not None and jitter is not None else 0.0
+        if owed:
+            column = np.zeros(self.layout.size)
+            column[index] = np.sqrt(owed)
+            self.loosen(column)
 
     def _measure(self, image: Image, lin: Linear, fit: ImageFit) -> None:
         """What an image says about stamps and lens before it is used."""

@@ -11,7 +11,7 @@ import numpy as np
 from vical_daemon.estimation import so3, unscented
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.clock_drift import SKEW_SIGMA
-from vical_daemon.estimation.consistency import Consistency
+from vical_daemon.estimation.consistency import MODES, Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.initialise import HELD_M
@@ -33,6 +33,8 @@ from vical_daemon.estimation.unshown_axes import UNKNOWN_M, UnshownAxes
 
 _MOST_RUNS = 6
 _STANDS = 3.0  # sigmas by which the answer may have moved: the next run moves it by a tenth of that
+_CHANCE = 2.0  # standard deviations of it up to which larger innovations are not the stamps' fault
+_DOUBTED_S = 2e-3  # jitter; a larger one is that of a broken driver
 REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
 
 Frames = list[tuple[float, PointsFrame]]
@@ -54,6 +56,9 @@ def rehearsed(
     image on, and nothing is lost to its curvature. Where the answer still moved a lot, the last run was not
     straight either (lever arms that are hardly shown), and there is another one.
 
+    Where images then miss by more than their noise, or nothing holds together, it is done again with stamps
+    that may jitter, and that counts if all fits then: believed, they had put delays off by ten sigmas.
+
     Args:
         state: Where the start thinks the rig is, and its calibration.
         frames: (stamp in the camera's clock in s, points) of the start, in order.
@@ -63,13 +68,31 @@ def rehearsed(
     Returns:
         The filter, or None where the start does not hold together.
     """
+    believed = _rehearse(state, frames, make, step, 0.0)
+    if believed is not None and _fits(believed):
+        return believed
+    doubted = _rehearse(state, frames, make, step, _DOUBTED_S)
+    if doubted is not None and _fits(doubted) and any(j.sigma_s for j in doubted.jitter.values()):
+        return doubted
+    return believed
+
+
+def _rehearse(
+    state: State, frames: Frames, make: Callable[[State], CalibrationFilter], step: Step, doubted_s: float
+) -> CalibrationFilter | None:
+    """The runs; until the noise is known, stamps are allowed a jitter of `doubted_s`."""
     trial, last = make(deepcopy(state)), None
+    _doubt(trial, doubted_s)
     for _ in range(_MOST_RUNS):
         if not _holds_together(trial, frames, step):
             return None
         fresh = _about(trial, state, make)
-        if last is not None:
+        if last is None:
+            _doubt(fresh, doubted_s)
+        else:
             fresh.jitter, fresh.consistency = trial.jitter, trial.consistency
+            for jitter in fresh.jitter.values():
+                jitter.begin()
             for consistency in fresh.consistency.values():
                 consistency.settle()
         stands = last is not None and _moved(last, trial) < _STANDS
@@ -77,6 +100,19 @@ def rehearsed(
         if stands:
             break
     return trial
+
+
+def _fits(trial: CalibrationFilter) -> bool:
+    """Whether innovations have their size, but for what chance adds in so few images."""
+    return all(
+        c.level < 1.0 + _CHANCE * np.sqrt(2.0 / (MODES * max(c.images, 1)))
+        for c in trial.consistency.values()
+    )
+
+
+def _doubt(trial: CalibrationFilter, jitter_s: float) -> None:
+    if jitter_s:
+        trial.jitter = {name: StampJitter.assumed(jitter_s) for name in trial.jitter}
 
 
 def _moved(before: CalibrationFilter, after: CalibrationFilter) -> float:
