@@ -41,7 +41,7 @@ class EpipolarFit:
         gyro_bias: rad/s, shape (3,).
         intrinsics: fx fy cx cy, px; as given unless the lens was fitted.
         distortion: Four coefficients; likewise.
-        rotation_sigma_rad: Of the mounting, local axes, rad, shape (3,).
+        rotation_covariance: Of the mounting, about the camera's axes, rad^2, shape (3, 3).
         timeshift_sigma_s: s.
         error: RMS epipolar error of the pairs used, in focal lengths.
         inliers: Share of the feature pairs that fit.
@@ -52,7 +52,7 @@ class EpipolarFit:
     gyro_bias: FloatArray
     intrinsics: FloatArray
     distortion: FloatArray
-    rotation_sigma_rad: FloatArray
+    rotation_covariance: FloatArray
     timeshift_sigma_s: float
     error: float
     inliers: float
@@ -353,7 +353,7 @@ class _Fit:
             bias,
             self.intrinsics,
             self.distortion,
-            sigma[:3],
+            covariance[:3, :3],
             float(sigma[3]),
             error,
             float(good[self.ok].mean()),

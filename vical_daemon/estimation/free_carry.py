@@ -19,6 +19,7 @@ from vical_daemon.estimation.state import CameraState
 # Of the calibration's 16 errors; the time shift is that at the first image, and drifts from there on.
 ARM, TURN, SHIFT, LENS, DRIFT = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15
 FULL = 16
+_HELD_M = 1e-4
 CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
 
 
@@ -115,6 +116,16 @@ def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
     return Carry(R.copy(), R.T @ window.v[0], np.zeros(6), window.camera, np.diag(1.0 / wide), active, t_s)
 
 
+def held_along(carry: Carry, axis: FloatArray) -> Carry:
+    """The same with the lever arm as good as known along an axis of the imu (unit, shape (3,))."""
+    if not carry.active[:3].all():
+        return carry
+    row = np.zeros((1, len(carry.root)))
+    row[0, CALIBRATION : CALIBRATION + 3] = axis / _HELD_M
+    stacked = np.vstack([carry.root, row])
+    return replace(carry, root=np.linalg.qr(stacked)[1])
+
+
 def tangents(bearing: FloatArray) -> FloatArray:
     """Two directions across each unit vector, shape (n, 3, 2); smooth but at one pole."""
     x, y, z = bearing[:, 0], bearing[:, 1], bearing[:, 2]
@@ -151,4 +162,6 @@ def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Ca
 
 def root_of(covariance: FloatArray) -> FloatArray:
     """W with W^T W = inverse of a covariance."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance + 1e-20 * np.eye(len(covariance)))))
+    scale = np.sqrt(np.diag(covariance))  # pixels beside microseconds
+    root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-14 * np.eye(len(scale)))
+    return np.asarray(np.linalg.inv(root) / scale)

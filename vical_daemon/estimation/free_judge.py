@@ -76,6 +76,7 @@ class FreeJudge:
         self._quiet = ""
         self._jitter_told = False
         self.drifting = False  # the clock of the camera is known to run apart from the imu's
+        self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
     def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
@@ -249,7 +250,7 @@ class FreeJudge:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
         factor = self.factor()
-        return camera_estimate(carry, factor, self.drifting, self._sigma_px, rms_px)
+        return camera_estimate(carry, factor, self.drifting, self._sigma_px, rms_px, self.held)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam

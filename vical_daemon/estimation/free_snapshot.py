@@ -10,6 +10,7 @@ from vical_daemon.estimation.free_carry import DRIFT, LENS, SHIFT, Carry, moved
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import CameraState
+from vical_daemon.estimation.unshown_axes import held_covariance
 
 
 def drift_evidence(carry: Carry, factor: float) -> float:
@@ -25,7 +26,12 @@ def drift_evidence(carry: Carry, factor: float) -> float:
 
 
 def camera_estimate(
-    carry: Carry, factor: float, drifting: bool, sigma_px: float, rms_px: float
+    carry: Carry,
+    factor: float,
+    drifting: bool,
+    sigma_px: float,
+    rms_px: float,
+    held: FloatArray | None = None,
 ) -> CameraEstimate:
     """The camera as it is known.
 
@@ -35,8 +41,11 @@ def camera_estimate(
         drifting: Its clock is known to run apart from the imu's.
         sigma_px: Pixel noise.
         rms_px: RMS of the residuals.
+        held: Axis of the imu along which the lever arm is not known, unit, shape (3,); None: there is none.
     """
     camera, covariance = _told(carry, factor, drifting)
+    if held is not None:
+        covariance[:3, :3] += held_covariance(np.outer(held, held))
     sigma = np.sqrt(np.diag(covariance))
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(

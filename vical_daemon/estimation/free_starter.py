@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.free_carry import Carry
-from vical_daemon.estimation.free_start import free_start
+from vical_daemon.estimation.free_partial import mounting_about, still_axis
+from vical_daemon.estimation.free_start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.free_window import Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
@@ -18,8 +21,19 @@ from vical_daemon.estimation.track_orientations import track_orientations
 
 Frames = list[tuple[float, PointsFrame]]
 
+
+class _Found(NamedTuple):
+    """What rotations say, or what was known before."""
+
+    camera: CameraState
+    gyro_bias: FloatArray
+    arm_sigma_m: float
+    about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
+
+
 _SPAN_S, _LONG_SPAN_S = 5.0, 8.0
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
+_PARTIAL_S = 6.0  # before, a second axis may come yet
 _EVERY_S, _EVERY_MOST_S = 1.0, 4.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
@@ -37,11 +51,17 @@ class Starter:
     Args:
         options: Switches and noise.
         prior: What is known about the camera.
+
+    Attributes:
+        motion_missing: What the last attempt lacked was motion, not time.
+        held: Axis of the imu along which the lever arm is not known and stays as it is, unit, shape (3,): the
+            last start was a partial one. None: all of it shows.
     """
 
     def __init__(self, options: CalibrationOptions, prior: CameraPrior) -> None:
         self.options, self.prior = options, prior
         self.motion_missing = False
+        self.held: FloatArray | None = None
         self._next_s = -np.inf
         self._every_s = _EVERY_S
 
@@ -79,23 +99,44 @@ class Starter:
         self.motion_missing = True
         if _still(usable):
             return "the camera stands still: move the rig to and fro while turning it"
+        if known is None:
+            self.held = None
         found = self._rotations(buffer, usable) if known is None else _known(known)
         if isinstance(found, str):
             return found
-        camera, bias, arm_sigma = found
-        usable = [x for x in usable if buffer.oldest_s < x[0] + camera.timeshift_s < buffer.newest_s - 5e-3]
-        if len(usable) < 20:
+        return self._structure(buffer, usable, found)
+
+    def _structure(self, buffer: ImuBuffer, frames: Frames, found: _Found) -> Window | str:
+        """Speed, scale, lever arm and points; after turns about one axis the mounting about it, too."""
+        camera = found.camera
+        frames = [x for x in frames if buffer.oldest_s < x[0] + camera.timeshift_s < buffer.newest_s - 5e-3]
+        if len(frames) < 20:
             return "inertial data do not cover the images: are both stamped by the same clock?"
         noise, gravity = self.options.imu_noise, self.options.gravity_mps2
-        return free_start(buffer, usable, camera, bias, noise, gravity, arm_sigma)
+        held = self.held if found.about is None else found.about
+        arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, np.zeros(3) if held is None else held)
+        try:
+            start = LinearStart(buffer, frames, camera, found.gyro_bias, noise, gravity)
+            if found.about is not None:
+                camera.R_imu_cam = mounting_about(start, camera.R_imu_cam, arm)
+            window = start.window(arm)
+        except NoStartError as error:
+            return str(error)
+        self.held = held
+        return window
 
-    def _rotations(self, buffer: ImuBuffer, frames: Frames) -> tuple[CameraState, FloatArray, float] | str:
+    def _rotations(self, buffer: ImuBuffer, frames: Frames) -> _Found | str:
         """Mounting, delay, lens and gyro bias from the epipolar constraint; or why not."""
         camera = starting_camera(self.prior)
         rows = buffer.rows
         reach = (rows[:, 0] > frames[0][0] - 2.0) & (rows[:, 0] < frames[-1][0] + 2.0)
         t, gyro = rows[reach, 0], rows[reach, 1:4]
-        seeds, reason = self._seeds(t, gyro, frames, camera)
+        given = self.prior.T_imu_cam if "extrinsics" in self.options.fix else None
+        inside = (t > frames[0][0]) & (t < frames[-1][0])
+        one_axis = still_axis(t[inside], gyro[inside], np.zeros(3)) is not None
+        if one_axis and given is None and frames[-1][0] - frames[0][0] < _PARTIAL_S:
+            return "the rig turns about one axis only so far: turn it about a second one"
+        seeds, reason = self._seeds(t, gyro, frames, camera, look_around=not one_axis)
         lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
         free_lens = "intrinsics" not in self.options.fix
         if free_lens and len(seeds) > _FULL_FITS:  # look around with the lens as given: three times quicker
@@ -108,21 +149,25 @@ class Starter:
                 reason or "too few features are followed from image to image: more texture or light is needed"
             )
         best = min(good, key=_misfit)
-        why = _not_sure_yet(best)
-        if why:
+        about = None
+        why = _not_sure_yet(best, mounting_known=given is not None)
+        if why and frames[-1][0] - frames[0][0] > _PARTIAL_S:
+            inside = (t > frames[0][0] + best.timeshift_s) & (t < frames[-1][0] + best.timeshift_s)
+            about = _only_unsure_about(best, still_axis(t[inside], gyro[inside], best.gyro_bias))
+        if why and about is None:
             return reason or why
         camera.R_imu_cam, camera.timeshift_s = best.R_imu_cam, best.timeshift_s
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
         sigma = 0.2
-        if self.prior.T_imu_cam is not None and "extrinsics" in self.options.fix:
-            camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in self.prior.T_imu_cam)
+        if given is not None:
+            camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in given)
             sigma = 1e-4
         if self.prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
             camera.timeshift_s = self.prior.timeshift_cam_imu_s
-        return camera, best.gyro_bias, sigma
+        return _Found(camera, best.gyro_bias, sigma, about)
 
     def _seeds(
-        self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState
+        self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState, *, look_around: bool
     ) -> tuple[list[tuple[FloatArray, float]], str]:
         """Places from which to start the fit, and what TD-ICP has to say against its own."""
         seeds: list[tuple[FloatArray, float]] = []
@@ -142,7 +187,7 @@ class Starter:
         seeds.append((R, shift))
         if self.prior.T_imu_cam is not None:
             seeds.append((self.prior.T_imu_cam[0].copy(), shift))
-        if result.status != "ok":  # one axis may be off by far: look around
+        if result.status != "ok" and look_around:  # one axis may be off by far
             tilt = np.deg2rad(20.0)
             seeds += [(R @ so3.exp(s * tilt * axis), shift) for axis in np.eye(3) for s in (-1.0, 1.0)]
         return seeds, ""
@@ -173,7 +218,7 @@ def start_sigmas(camera: CameraState) -> FloatArray:
     return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA])
 
 
-def _known(known: Carry) -> tuple[CameraState, FloatArray, float]:
+def _known(known: Carry) -> _Found:
     c = known.camera
     copy = CameraState(
         c.R_imu_cam.copy(),
@@ -186,7 +231,7 @@ def _known(known: Carry) -> tuple[CameraState, FloatArray, float]:
         c.readout_s,
         c.skew,
     )
-    return copy, known.bias[:3].copy(), 5e-3
+    return _Found(copy, known.bias[:3].copy(), 5e-3)
 
 
 def _misfit(fit: EpipolarFit) -> float:
@@ -203,9 +248,19 @@ def _best_apart(fits: list[EpipolarFit]) -> list[tuple[FloatArray, float]]:
     return out
 
 
-def _not_sure_yet(fit: EpipolarFit) -> str:
-    worst = float(np.max(fit.rotation_sigma_rad))
-    if worst > _ROTATION_SIGMA_RAD:
+def _only_unsure_about(fit: EpipolarFit, axis: FloatArray | None) -> FloatArray | None:
+    """The axis of the imu that kept its direction, where the mounting is known but for a turn about it."""
+    if axis is None or fit.timeshift_sigma_s > _SHIFT_SIGMA_S:
+        return None
+    along = fit.R_imu_cam.T @ axis
+    across = np.eye(3) - np.outer(along, along)
+    worst = np.sqrt(np.linalg.eigvalsh(across @ fit.rotation_covariance @ across)[-1])
+    return axis if worst < _ROTATION_SIGMA_RAD else None
+
+
+def _not_sure_yet(fit: EpipolarFit, *, mounting_known: bool) -> str:
+    worst = float(np.sqrt(np.max(np.diag(fit.rotation_covariance))))
+    if worst > _ROTATION_SIGMA_RAD and not mounting_known:
         return (
             f"mounting rotation known to {np.rad2deg(worst):.1f} deg so far: turn the rig about a second axis"
         )

@@ -25,6 +25,7 @@ from vical_daemon.estimation.free_carry import (
     SHIFT,
     Carry,
     first_carry,
+    held_along,
     root_of,
 )
 from vical_daemon.estimation.free_judge import FreeJudge
@@ -35,6 +36,7 @@ from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.thinning import Thinning
+from vical_daemon.estimation.unshown_axes import has_turned
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
 STEP_S = 1.5  # the window is adjusted again after this much new data
@@ -210,6 +212,7 @@ class TargetFreeCalibrator:
         self.window, self.carry, self.latest = window, carry, fit.carry
         self._noise = (fit.sigma_px, fit.spread, fit.jitter_s)
         self._closed = 0 if known is None else self._closed
+        self.judge.held = self.starter.held
         self.judge.started(window.frames[0][0])
         self.judge.saw_fit(fit, last + window.shift_s)
         if _full(window):
@@ -221,7 +224,7 @@ class TargetFreeCalibrator:
         sigmas = start_sigmas(window.camera)
         wide = first_carry(window, self.active, sigmas)
         if known is None:
-            return wide
+            return wide if self.starter.held is None else held_along(wide, self.starter.held)
         known = known.at(wide.t_cam_s)
         keep = known.covariance()[5:, 5:]
         keep[:3, :3] += 4e-4**2 * np.eye(3)
@@ -255,6 +258,9 @@ class TargetFreeCalibrator:
             return
         if not self.judge.fits(fit):
             self._lost(self.judge.misfit)
+            return
+        if self.starter.held is not None and has_turned(window.R, self.starter.held):
+            self._start_whole()
             return
         self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread, fit.jitter_s)
         self.judge.saw_fit(fit, window.frames[-1][0] + window.shift_s)
@@ -331,6 +337,15 @@ class TargetFreeCalibrator:
         self._closed = 0
         self.judge.changed(why)
         self.window = self.carry = None
+
+    def _start_whole(self) -> None:
+        """After a partial start, the rig turns about a second axis: all of the calibration will show."""
+        self.window = self.carry = self.latest = self.judge.held = None
+        self._closed = 0
+        self.starter.again()
+        self.judge.lost(
+            "the rig turns about a second axis now: starting anew, with all of the lever arm", None
+        )
 
     def _lost(self, why: str, *, keep: bool = False) -> None:
         """Go back to waiting; the calibration stays as before this window, or as adjusted last (`keep`)."""

@@ -13,9 +13,9 @@ _LATEST = 31  # intervals that tell the rate
 class Thinning:
     """Takes every n-th image, n by the camera's rate.
 
-    Images are counted. To leave out an image because its stamp comes too soon after the last would be to choose
-    by the stamp's error: with 1 ms of jitter, images stamped early went and images stamped late stayed, which
-    bent the time shift by 0.1 ms.
+    Images are counted. To leave out an image because its stamp comes too soon after the last would be to
+    choose by the stamp's error: with 1 ms of jitter, images stamped early went and images stamped late
+    stayed, which bent the time shift by 0.1 ms.
 
     Args:
         most_hz: Images wanted per second, at most.

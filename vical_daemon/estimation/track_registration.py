@@ -130,7 +130,7 @@ def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -
     offsets = np.array(
         [[*so3.log(best.R_imu_cam.T @ f.R_imu_cam), f.timeshift_s - best.timeshift_s] for _, f in fits]
     )
-    sigmas = np.array([[*f.rotation_sigma_rad, f.timeshift_sigma_s] for _, f in fits])
+    sigmas = np.array([[*np.sqrt(np.diag(f.rotation_covariance)), f.timeshift_sigma_s] for _, f in fits])
     weight = sigmas**-2.0
     mean = np.sum(weight * offsets, axis=0) / weight.sum(axis=0)
     factor = np.array([_SHORT_ROTATION] * 3 + [_SHORT_SHIFT])

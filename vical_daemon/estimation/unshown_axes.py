@@ -74,7 +74,20 @@ class UnshownAxes:
     def covariance(self) -> FloatArray:
         """What is not known of a lever arm beyond the filter's own covariance, m^2, shape (3, 3)."""
         held = self.projector
-        if not held.any():
-            return held
-        out: FloatArray = UNKNOWN_M**2 * held + BENT_M**2 * (np.eye(3) - held)
-        return out
+        return held_covariance(held) if held.any() else held
+
+
+def has_turned(R_world_imu: FloatArray, axis: FloatArray) -> bool:
+    """Whether an axis of the imu (3,) left its direction in a stretch of attitudes (n, 3, 3)."""
+    mean = R_world_imu.mean(axis=0) @ axis
+    return bool(1.0 - mean @ mean > STILL_RAD**2)
+
+
+def held_covariance(projector: FloatArray) -> FloatArray:
+    """What holding a lever arm along some axes leaves unknown of it, m^2, shape (3, 3).
+
+    Args:
+        projector: Onto the axes, imu frame, shape (3, 3).
+    """
+    out: FloatArray = UNKNOWN_M**2 * projector + BENT_M**2 * (np.eye(3) - projector)
+    return out
