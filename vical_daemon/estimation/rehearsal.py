@@ -57,7 +57,9 @@ def rehearsed(
     straight either (lever arms that are hardly shown), and there is another one.
 
     Where images then miss by more than their noise, or nothing holds together, it is done again with stamps
-    that may jitter, and that counts if all fits then: believed, they had put delays off by ten sigmas.
+    that may jitter. If all fits then, that counts where they do (believed, they had put delays off by ten
+    sigmas), and where nothing held together before: corners so many and sharp that a first run far from
+    straight had refused all that followed.
 
     Args:
         state: Where the start thinks the rig is, and its calibration.
@@ -72,9 +74,10 @@ def rehearsed(
     if believed is not None and _fits(believed):
         return believed
     doubted = _rehearse(state, frames, make, step, _DOUBTED_S)
-    if doubted is not None and _fits(doubted) and any(j.sigma_s for j in doubted.jitter.values()):
-        return doubted
-    return believed
+    if doubted is None or not _fits(doubted):
+        return believed
+    jitters = any(j.sigma_s for j in doubted.jitter.values())
+    return doubted if jitters or believed is None else believed
 
 
 def _rehearse(
