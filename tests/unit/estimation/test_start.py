@@ -6,6 +6,7 @@ from vical_mocks.points import board_points, simulate
 from vical_mocks.rig import nominal_gravity, reference_rig
 from vical_mocks.trajectory import hand_motion
 
+from benchmarks.detection import APRILGRID, rig_before
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, points_frame
 from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
@@ -85,3 +86,14 @@ def test_the_first_lens_is_not_bent_by_outliers(dirty):
         assert rms == pytest.approx(0.5, rel=0.3)
         focal.append(lens.intrinsics[0])
     assert focal == pytest.approx([520.0, 520.0], abs=6.0)
+
+
+def test_very_sharp_corners_start_at_once():
+    """With 0.01 px a first run, far from straight, refused what followed: 7 s until the first answer."""
+    rig = rig_before(APRILGRID, 0.8, 4, timeshift_cam_imu_s=-0.027)
+    run = simulate(4, 6.0, rig=rig, points_m=APRILGRID.points_m, corner_sigma_px=0.01)
+    prior = camera_prior(run, 4, StartErrors(0.10, 15.0), exact_lens=False)
+    subject = CalibratorSubject(CalibrationOptions(imu_noise=imu_noise(run)), prior, run.points_m)
+    record = feed(run, subject)
+    assert record.started_s() <= 5.5
+    within(record, 4.0)
