@@ -137,3 +137,14 @@ def test_the_mounting_about_an_axis_is_searched_all_the_way_round(turn_deg):
 def test_a_mounting_that_does_not_show_is_not_invented():
     with pytest.raises(NoStartError, match="second axis"):
         mounting_about(Valley(np.eye(3), 1e-3), np.eye(3), Arm())
+
+
+def test_a_cart_does_not_stretch_the_lens_that_it_cannot_show():
+    """A longer focal length across the floor makes every angle there smaller: no reason to believe it."""
+    run = run_of(trajectory.planar(1, T_imu_cam=MOUNT), seconds=9.0)
+    subject = subject_for(run, lens_known=False)
+    feed(run, subject)
+    camera = subject.calibrator.estimate().cameras["cam0"]
+    off = np.array(camera.intrinsics) - run.rig.lens.intrinsics
+    assert np.all(np.abs(off) < 4.0 * np.array(camera.intrinsics_sigma))
+    assert camera.intrinsics_sigma[1] > 5.0 * camera.intrinsics_sigma[0]
