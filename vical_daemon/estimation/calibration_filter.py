@@ -44,6 +44,7 @@ from vical_daemon.estimation.unshown_axes import UnshownAxes
 
 _EYE = np.eye(3)
 _TINY = 1e-30 * np.eye(9)  # noise densities may be told as zero
+_SLOPE_S = 0.02
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
 
@@ -138,7 +139,11 @@ class CalibrationFilter:
         state = self.state
         omega = state.gyro_matrix @ (segment.gyro[-1] - state.gyro_bias)
         force = state.accel_matrix @ (segment.accel[-1] - state.accel_bias)
-        self.rates = Rates(omega, state.R_world_imu @ force + state.gravity)
+        accel = state.R_world_imu @ force + state.gravity
+        if any(c.readout_s for c in state.cameras.values()):
+            self.rates = Rates(omega, accel, state.gyro_matrix @ _late_slope(segment.t_s, segment.gyro))
+        else:
+            self.rates = Rates(omega, accel)
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -334,3 +339,11 @@ class CalibrationFilter:
         """Covariance of chosen errors, shape (k, k)."""
         part = self.S[rows]
         return np.asarray(part @ part.T)
+
+
+def _late_slope(t_s: FloatArray, values: FloatArray) -> FloatArray:
+    """Derivative of readings (n, 3) over the last hundredths of a second, by least squares."""
+    recent = slice(max(int(np.searchsorted(t_s, t_s[-1] - _SLOPE_S)) - 1, 0), None)
+    t = t_s[recent] - t_s[recent].mean()
+    square = float(t @ t)
+    return np.asarray(t @ values[recent] / square) if square > 0.0 else np.zeros(3)

@@ -83,8 +83,10 @@ class Problem:
         late = cam.timeshift_s - w.shift_s + cam.skew * self._since()
         if cam.readout_s:  # each row has an instant of its own
             late, rates, frame = late[seen.frame] + seen.row_s, rates[seen.frame], seen.frame
-            R = w.R[frame] @ so3.exp(rates * late[:, None])
-            p = w.p[frame] + w.v[frame] * late[:, None]
+            alpha, accel = w.accelerations()
+            half = 0.5 * (late * late)[:, None]
+            R = w.R[frame] @ so3.exp(rates * late[:, None] + half * alpha[frame])
+            p = w.p[frame] + w.v[frame] * late[:, None] + half * accel[frame]
         else:
             R = (w.R @ so3.exp(rates * late[:, None]))[seen.frame]
             p = (w.p + w.v * late[:, None])[seen.frame]

@@ -124,6 +124,13 @@ class Window:
         knots = self.knots()
         return np.asarray(raw - self.bias[np.concatenate([knots[:1], knots]), :3])
 
+    def accelerations(self) -> tuple[FloatArray, FloatArray]:
+        """Angular (imu frame) and linear (world) acceleration at each image, shapes (F, 3)."""
+        if len(self.frames) < 2:
+            return np.zeros_like(self.v), np.zeros_like(self.v)
+        t = np.array([s for s, _ in self.frames])
+        return np.gradient(self.rates(), t, axis=0), np.gradient(self.v, t, axis=0)
+
     def extend(self, buffer: ImuBuffer, frames: list[tuple[float, PointsFrame]]) -> int:
         """Add images, carrying the motion on by inertial data; return how many could be added."""
         R, p, v = [self.R], [self.p], [self.v]

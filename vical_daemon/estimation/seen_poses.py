@@ -23,6 +23,7 @@ class Lens:
     distortion: FloatArray
     model: str
     resolution: tuple[int, int]
+    readout_s: float = 0.0
 
     @classmethod
     def from_prior(cls, prior: CameraPrior) -> Lens:
@@ -34,6 +35,7 @@ class Lens:
             np.array(prior.distortion if prior.distortion is not None else (0.0,) * 4, dtype=np.float64),
             prior.distortion_model,
             prior.resolution,
+            prior.readout_s,
         )
 
 
@@ -112,11 +114,11 @@ class PoseCache:
 
         Args:
             frames: All there are: what is found of others is forgotten.
-            lens: In use.
+            lens: In use; with the readout that the frames were freed from.
             target: Points of the target, m, shape (n, 3).
             since_s: Older frames are left out, s.
         """
-        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist())
+        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist(), lens.readout_s)
         if key != self._lens:
             self._lens, self._poses = key, {}
         known = {f.t_cam_ns: self._poses[f.t_cam_ns] for _, f in frames if f.t_cam_ns in self._poses}
