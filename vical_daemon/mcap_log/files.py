@@ -24,11 +24,15 @@ class LockedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.error: OSError | None = None
-        try:
-            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            raise LogError(f"cannot create {path}: {describe(error)}") from None
-        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._fd = -1
+        while self._fd < 0:  # whoever cleans up may take it for a leftover before it is locked
+            try:
+                self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            except OSError as error:
+                raise LogError(f"cannot create {path}: {describe(error)}") from None
+            fcntl.flock(self._fd, fcntl.LOCK_EX)
+            if os.fstat(self._fd).st_nlink == 0:
+                self.close()
         self._position = 0
         self.size = 0
 
@@ -81,6 +85,28 @@ def is_being_written(path: Path) -> bool:
         return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def remove_if_empty(path: Path) -> bool:
+    """Remove a file in which a recorder that is gone wrote nothing; whether there is nothing left to recover.
+
+    The lock is held while it is looked at and removed: a recorder that has just made it finds it gone and
+    makes another (`LockedFile`).
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(descriptor).st_size == 0:
+            path.unlink(missing_ok=True)
+            return True
     except BlockingIOError:
         return True
     finally:

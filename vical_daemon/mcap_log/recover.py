@@ -14,6 +14,7 @@ from vical_daemon.mcap_log.files import (
     describe,
     is_being_written,
     publish,
+    remove_if_empty,
     sync_folder,
 )
 from vical_daemon.mcap_log.reader import LogChannel, LogReader
@@ -77,10 +78,7 @@ def recover_folder(folder: Path) -> list[Recovery]:
     for leftover in folder.glob(f"*{_TEMPORARY}"):
         leftover.unlink(missing_ok=True)
     for part in sorted(folder.glob(f"*.mcap{PART_SUFFIX}")):
-        if is_being_written(part):
-            continue
-        if part.stat().st_size == 0:
-            part.unlink()
+        if is_being_written(part) or remove_if_empty(part):
             continue
         output = recovered_name(part)
         try:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import struct
+import threading
 import zlib
 from pathlib import Path
 
@@ -258,6 +260,45 @@ def test_locked_file_says_so(tmp_path):
     file.close()
     assert not is_being_written(tmp_path / "x")
     assert not is_being_written(tmp_path / "nothing")
+
+
+def test_a_file_just_made_is_not_taken_for_a_leftover(tmp_path):
+    """Between making and locking it is empty and nobody's: cleaning up then took the recording away."""
+    stop = threading.Event()
+
+    def clean():
+        while not stop.is_set():
+            recover_folder(tmp_path)
+
+    cleaner = threading.Thread(target=clean)
+    cleaner.start()
+    try:
+        for k in range(300):
+            part = tmp_path / f"{k}.mcap.part"
+            file = LockedFile(part)
+            file.write(b"data")
+            assert part.stat().st_size == 4
+            part.rename(tmp_path / f"{k}.done")
+            file.close()
+    finally:
+        stop.set()
+        cleaner.join()
+
+
+def test_a_cleaner_between_making_and_locking_costs_a_second_attempt(tmp_path, monkeypatch):
+    part, real = tmp_path / "a.mcap.part", fcntl.flock
+
+    def late(descriptor, how):
+        monkeypatch.setattr(fcntl, "flock", real)
+        assert recover_folder(tmp_path) == []
+        assert not part.exists()
+        real(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    file = LockedFile(part)
+    assert part.exists()
+    assert is_being_written(part)
+    file.close()
 
 
 def test_mutated_files_never_raise(log, tmp_path, rng_bus):
