@@ -139,11 +139,10 @@ class CalibrationFilter:
         state = self.state
         omega = state.gyro_matrix @ (segment.gyro[-1] - state.gyro_bias)
         force = state.accel_matrix @ (segment.accel[-1] - state.accel_bias)
-        accel = state.R_world_imu @ force + state.gravity
-        if any(c.readout_s for c in state.cameras.values()):
-            self.rates = Rates(omega, accel, state.gyro_matrix @ _late_slope(segment.t_s, segment.gyro))
-        else:
-            self.rates = Rates(omega, accel)
+        alpha = self.rates.alpha
+        if segment.t_s[-1] > segment.t_s[0] and any(c.readout_s for c in state.cameras.values()):
+            alpha = state.gyro_matrix @ _late_slope(segment.t_s, segment.gyro)
+        self.rates = Rates(omega, state.R_world_imu @ force + state.gravity, alpha)
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -345,5 +344,4 @@ def _late_slope(t_s: FloatArray, values: FloatArray) -> FloatArray:
     """Derivative of readings (n, 3) over the last hundredths of a second, by least squares."""
     recent = slice(max(int(np.searchsorted(t_s, t_s[-1] - _SLOPE_S)) - 1, 0), None)
     t = t_s[recent] - t_s[recent].mean()
-    square = float(t @ t)
-    return np.asarray(t @ values[recent] / square) if square > 0.0 else np.zeros(3)
+    return np.asarray(t @ values[recent] / (t @ t))

@@ -154,11 +154,10 @@ class Calibrator:
         t_s = t_cam_s + f.state.cameras[frame.camera].timeshift_s
         if t_s < f.state.t_s - LATE_S:
             return None
-        if t_s > f.state.t_s:
-            segment = self._buffer.segment(f.state.t_s, t_s)
-            if segment is None:
-                return None
-            f.predict(segment)
+        segment = self._buffer.segment(f.state.t_s, max(t_s, f.state.t_s))
+        if segment is None:
+            return None
+        f.predict(segment)  # of no length at the first image: that one, too, must know how the rig turns
         if len(frame.ids) < 4:
             return None
         return f.update(f.image(frame, t_cam_s, self.target[frame.ids]))

@@ -18,7 +18,7 @@ from vical_daemon.estimation.planar_pose import belonging, planar_pose
 if TYPE_CHECKING:
     from vical_daemon.estimation.seen_poses import Lens
 
-_VIEWS = 24
+MOST_VIEWS = 24
 _FEWEST, _LEAST_POINTS = 6, 12
 _STEPS = 15
 _Poses = list[tuple[FloatArray, FloatArray]]
@@ -93,7 +93,7 @@ def _without_outliers(
 def _spread(frames: list[PointsFrame], lens: Lens) -> list[PointsFrame]:
     """Choose views with many points that differ most in where the board lies in the image."""
     good = [f for f in frames if len(f.ids) >= _LEAST_POINTS]
-    if len(good) <= _VIEWS:
+    if len(good) <= MOST_VIEWS:
         return good
     width, height = lens.resolution
     features = np.array(
@@ -101,7 +101,7 @@ def _spread(frames: list[PointsFrame], lens: Lens) -> list[PointsFrame]:
     ) / np.array([width, height, width, height, width, height])
     chosen = [int(np.argmax([len(f.ids) for f in good]))]
     distance = np.linalg.norm(features - features[chosen[0]], axis=1)
-    while len(chosen) < _VIEWS:
+    while len(chosen) < MOST_VIEWS:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
     return [good[i] for i in sorted(chosen)]

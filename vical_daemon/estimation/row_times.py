@@ -9,6 +9,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 
@@ -45,7 +46,9 @@ def at_middle_row(frames: Frames, readout_s: float, height: int) -> Frames:
     return out
 
 
-def _step(a: tuple[float, PointsFrame], b: tuple[float, PointsFrame]) -> tuple[np.ndarray, FloatArray]:
+def _step(
+    a: tuple[float, PointsFrame], b: tuple[float, PointsFrame]
+) -> tuple[npt.NDArray[np.int64], FloatArray]:
     """Which corners both images show, and how fast they move, px/s."""
     dt_s = b[0] - a[0]
     if not 0.0 < dt_s < _MAX_STEP_S:

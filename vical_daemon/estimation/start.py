@@ -12,7 +12,7 @@ import numpy as np
 
 from vical_daemon.estimation.accel_alignment import align
 from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
+from vical_daemon.estimation.intrinsics_start import MOST_VIEWS, estimate_intrinsics
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.motion_start import StartResult, motion_start
 from vical_daemon.estimation.row_times import at_middle_row
@@ -152,9 +152,10 @@ def _readout(data: StartData, name: str, lens: Lens) -> float:
         return given
     tried = np.unique([given, *_READOUTS_S])
     squares = np.array([_bent(data, name, lens, float(r)) for r in tried]) ** 2
-    least, corners = int(np.argmin(squares)), 2 * sum(len(f.ids) for _, f in data.frames[name])
+    least, sizes = int(np.argmin(squares)), [len(f.ids) for _, f in data.frames[name]]
+    numbers = 2.0 * float(np.mean(sizes)) * min(len(sizes), MOST_VIEWS)
     was = squares[int(np.searchsorted(tried, given))]
-    if not was - squares[least] > _SIGNIFICANT * squares[least] / corners:
+    if not was - squares[least] > _SIGNIFICANT * squares[least] / numbers:
         return given
     if not 0 < least < len(tried) - 1:
         return float(tried[least])
