@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 PART_SUFFIX = ".part"
@@ -77,40 +79,42 @@ def describe(error: OSError) -> str:
     return error.strerror or str(error)
 
 
+@contextmanager
+def _locked(path: Path, how: int) -> Iterator[int]:
+    """Hold the lock of a file that nobody is writing; BlockingIOError: somebody is."""
+    access = os.O_RDWR if how == fcntl.LOCK_EX else os.O_RDONLY
+    descriptor = os.open(path, access | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
 def is_being_written(path: Path) -> bool:
     """Tell whether a living process holds the lock of a file."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        with _locked(path, fcntl.LOCK_SH):
+            return False
     except BlockingIOError:
         return True
-    finally:
-        os.close(descriptor)
-    return False
+    except OSError:
+        return False
 
 
-def remove_if_empty(path: Path) -> bool:
-    """Remove a file in which a recorder that is gone wrote nothing; whether there is nothing left to recover.
+def holds_data(path: Path) -> bool:
+    """Whether a recorder that is gone left data in a file; one that it left empty is removed.
 
     The lock is held while it is looked at and removed: a recorder that has just made it finds it gone and
     makes another (`LockedFile`).
     """
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-    except OSError:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.fstat(descriptor).st_size == 0:
+        with _locked(path, fcntl.LOCK_EX) as descriptor:
+            if os.fstat(descriptor).st_size:
+                return True
             path.unlink(missing_ok=True)
-            return True
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
+    except OSError:  # being written, or gone
+        pass
     return False
 
 

@@ -12,9 +12,9 @@ from vical_daemon.mcap_log.files import (
     PART_SUFFIX,
     LogError,
     describe,
+    holds_data,
     is_being_written,
     publish,
-    remove_if_empty,
     sync_folder,
 )
 from vical_daemon.mcap_log.reader import LogChannel, LogReader
@@ -78,7 +78,7 @@ def recover_folder(folder: Path) -> list[Recovery]:
     for leftover in folder.glob(f"*{_TEMPORARY}"):
         leftover.unlink(missing_ok=True)
     for part in sorted(folder.glob(f"*.mcap{PART_SUFFIX}")):
-        if is_being_written(part) or remove_if_empty(part):
+        if not holds_data(part):
             continue
         output = recovered_name(part)
         try:
