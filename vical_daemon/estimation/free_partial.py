@@ -35,13 +35,14 @@ def still_axis(t_s: FloatArray, gyro_rps: FloatArray, bias_rps: FloatArray) -> F
     return axes[0] if len(axes) == 1 else None
 
 
-def mounting_about(start: LinearStart, R_imu_cam: FloatArray, arm: ArmPrior) -> FloatArray:
-    """Find the mounting among those turned about the axis along which the lever arm is held.
+def mounting_about(start: LinearStart, axis: FloatArray, R_imu_cam: FloatArray, arm: ArmPrior) -> FloatArray:
+    """Find the mounting among those turned about an axis.
 
     Args:
         start: The stretch.
+        axis: Of the imu, unit, shape (3,).
         R_imu_cam: Mounting, right but for a turn about that axis, shape (3, 3).
-        arm: Lever arm, with the axis.
+        arm: What is known of the lever arm.
 
     Returns:
         The mounting, shape (3, 3), good to a degree or so.
@@ -52,7 +53,7 @@ def mounting_about(start: LinearStart, R_imu_cam: FloatArray, arm: ArmPrior) -> 
     angles = np.arange(-np.pi, np.pi - 1e-9, _STEP_RAD)
 
     def misfit(angle: float, rounds: int) -> float:
-        return start.misfit(so3.exp(angle * arm.held) @ R_imu_cam, arm, rounds)
+        return start.misfit(so3.exp(angle * axis) @ R_imu_cam, arm, rounds)
 
     found = np.array([misfit(a, _ROUGH_ROUNDS) for a in angles])
     best = float(angles[np.argmin(found)])
@@ -64,7 +65,7 @@ def mounting_about(start: LinearStart, R_imu_cam: FloatArray, arm: ArmPrior) -> 
         )
     for step in (_STEP_RAD / 2.0, _FINE_RAD):
         best += _vertex(step, *(misfit(best + x, _ROUNDS) ** 2 for x in (-step, 0.0, step)))
-    return np.asarray(so3.exp(best * arm.held) @ R_imu_cam)
+    return np.asarray(so3.exp(best * axis) @ R_imu_cam)
 
 
 def _vertex(step: float, low: float, middle: float, high: float) -> float:

@@ -11,7 +11,7 @@ unknown camera-IMU calibration", 2012]
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -43,17 +43,18 @@ class ArmPrior:
     Attributes:
         p_imu_cam: Lever arm, m, shape (3,).
         sigma_m: How far it may be off.
-        held: Direction in the imu frame along which it stays as it is, unit, shape (3,); zeros: none.
+        held: Direction in the imu frame along which it stays as it is, unit, shape (3,); None: none.
     """
 
     p_imu_cam: FloatArray
     sigma_m: float = 0.2
-    held: FloatArray = field(default_factory=lambda: np.zeros(3))
+    held: FloatArray | None = None
 
     def information(self) -> FloatArray:
         """Of z = (v0, gravity, lever arm, accel bias), shape (12, 12)."""
         out = np.diag([0.0] * 6 + [self.sigma_m**-2] * 3 + [_BIAS_SIGMA**-2] * 3)
-        out[6:9, 6:9] += np.outer(self.held, self.held) / _HELD_M**2
+        if self.held is not None:
+            out[6:9, 6:9] += np.outer(self.held, self.held) / _HELD_M**2
         return out
 
 

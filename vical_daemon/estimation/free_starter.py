@@ -114,11 +114,11 @@ class Starter:
             return "inertial data do not cover the images: are both stamped by the same clock?"
         noise, gravity = self.options.imu_noise, self.options.gravity_mps2
         held = self.held if found.about is None else found.about
-        arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, np.zeros(3) if held is None else held)
+        arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, held)
         try:
             start = LinearStart(buffer, frames, camera, found.gyro_bias, noise, gravity)
             if found.about is not None:
-                camera.R_imu_cam = mounting_about(start, camera.R_imu_cam, arm)
+                camera.R_imu_cam = mounting_about(start, found.about, camera.R_imu_cam, arm)
             window = start.window(arm)
         except NoStartError as error:
             return str(error)

@@ -279,8 +279,7 @@ class TargetFreeCalibrator:
         if self._closed and not self.judge.agrees(fit, carry):
             self._disagreed(carry)
             return
-        if self._doubted is not None:
-            self._doubted = None
+        self._doubted = None
         self._closed += 1
         self.judge.closed()
         if bundle.seen is not None:
@@ -340,7 +339,7 @@ class TargetFreeCalibrator:
 
     def _start_whole(self) -> None:
         """After a partial start, the rig turns about a second axis: all of the calibration will show."""
-        self.window = self.carry = self.latest = self.judge.held = None
+        self.window = self.carry = self.latest = self._doubted = None
         self._closed = 0
         self.starter.again()
         self.judge.lost(

@@ -14,7 +14,7 @@ from benchmarks.feed import feed
 from tests.unit.estimation.test_target_free import subject_for
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.free_partial import mounting_about, still_axis
-from vical_daemon.estimation.free_start import NoStartError
+from vical_daemon.estimation.free_start import ArmPrior, NoStartError
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -122,21 +122,21 @@ class Valley:
         return np.hypot(1e-3, self.contrast * off)
 
 
-class Arm:
-    held = np.array([0.0, 0.6, 0.8])
+AXIS = np.array([0.0, 0.6, 0.8])
+ARM = ArmPrior(np.zeros(3), held=AXIS)
 
 
 @pytest.mark.parametrize("turn_deg", [-170.0, -31.0, 4.0, 100.0])
 def test_the_mounting_about_an_axis_is_searched_all_the_way_round(turn_deg):
     R = Rotation.random(rng=3).as_matrix()
-    wrong = so3.exp(np.deg2rad(turn_deg) * Arm.held) @ R
-    found = mounting_about(Valley(R, 0.01), wrong, Arm())
+    wrong = so3.exp(np.deg2rad(turn_deg) * AXIS) @ R
+    found = mounting_about(Valley(R, 0.01), AXIS, wrong, ARM)
     assert np.linalg.norm(so3.log(R.T @ found)) < np.deg2rad(0.5)
 
 
 def test_a_mounting_that_does_not_show_is_not_invented():
     with pytest.raises(NoStartError, match="second axis"):
-        mounting_about(Valley(np.eye(3), 1e-3), np.eye(3), Arm())
+        mounting_about(Valley(np.eye(3), 1e-3), AXIS, np.eye(3), ARM)
 
 
 def test_a_cart_does_not_stretch_the_lens_that_it_cannot_show():
