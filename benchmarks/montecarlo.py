@@ -86,6 +86,7 @@ CASES: dict[str, Case] = {
     "gravity told 0.02 m/s^2 wrong": Case(gravity_error_mps2=0.02, trials=20),
     "skew 100 ppm": Case(skew_ppm=100.0, trials=20),
     "stamp jitter 1 ms": Case(simulation={"stamp_jitter_s": 1e-3}, trials=20),
+    "whole images off by 0.3 px": Case(simulation={"frame_sigma_px": 0.3}, trials=20),
     "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
     "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),
     "target-free, stamp jitter 1 ms": Case(
@@ -134,6 +135,7 @@ def bound_options(case: Case, run: SimulatedRun) -> BoundOptions:
         BoundOptions(
             corner_sigma_px=run.options.corner_sigma_px,
             stamp_jitter_s=run.options.stamp_jitter_s,
+            frame_sigma_px=run.options.frame_sigma_px,
             drift_prior=1e-4 if case.skew_ppm else 0.0,
             intrinsics=not case.lens_known,
             distortion=not case.lens_known,

@@ -36,15 +36,14 @@ from vical_daemon.estimation.linearise import (
 )
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.rates import Rates, rates_after
 from vical_daemon.estimation.retract import orthonormal, retract
-from vical_daemon.estimation.stamp_jitter import StampJitter
+from vical_daemon.estimation.shared_errors import SharedErrors, shared_ways
 from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, State
-from vical_daemon.estimation.target_view import Rates
 from vical_daemon.estimation.unshown_axes import UnshownAxes
 
 _EYE = np.eye(3)
 _TINY = 1e-30 * np.eye(9)  # noise densities may be told as zero
-_SLOPE_S = 0.02
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
 
@@ -62,7 +61,7 @@ class CalibrationFilter:
             slow change of the mounting), shape (n,).
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
-        jitter: Measured random error of the stamps, by camera.
+        shared: Measured errors that the corners of an image share, by camera.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         rates: Rates at the state's instant.
@@ -77,7 +76,7 @@ class CalibrationFilter:
     walk: FloatArray
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
-    jitter: dict[str, StampJitter] = field(default_factory=dict)
+    shared: dict[str, SharedErrors] = field(default_factory=dict)
     unshown: UnshownAxes | None = None
     drifting: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
@@ -89,14 +88,14 @@ class CalibrationFilter:
     def predict(self, segment: ImuSegment) -> None:
         """Propagate to the end of a segment that starts at the state's instant."""
         if len(segment.t_s) < 2 or segment.t_s[-1] <= segment.t_s[0]:
-            self._set_rates(segment)
+            self.rates = rates_after(self.state, segment, self.rates)
             return
         state = self.state
         moved, Q = self._moved(segment)
         self._grow(moved, Q)
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         state.t_s = float(segment.t_s[-1])
-        self._set_rates(segment)
+        self.rates = rates_after(state, segment, self.rates)
 
     def _moved(self, segment: ImuSegment) -> tuple[Moved, FloatArray]:
         """The motion at the end of a segment and the covariance of the noise gathered on the way."""
@@ -134,15 +133,6 @@ class CalibrationFilter:
         if len(drift):
             A[drift, at + 15 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
         self.S = unscented.lower_root(A)
-
-    def _set_rates(self, segment: ImuSegment) -> None:
-        state = self.state
-        omega = state.gyro_matrix @ (segment.gyro[-1] - state.gyro_bias)
-        force = state.accel_matrix @ (segment.accel[-1] - state.accel_bias)
-        alpha = self.rates.alpha
-        if segment.t_s[-1] > segment.t_s[0] and any(c.readout_s for c in state.cameras.values()):
-            alpha = state.gyro_matrix @ _late_slope(segment.t_s, segment.gyro)
-        self.rates = Rates(omega, state.R_world_imu @ force + state.gravity, alpha)
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -188,24 +178,24 @@ class CalibrationFilter:
             predicted_px=predicted,
         )
 
-    def _with_jitter(self, image: Image, lin: Linear) -> Linear:
-        """The linearised image with the noise that its corners share: the jitter of its stamp."""
-        index, jitter = self.layout.cameras[image.camera].timeshift, self.jitter.get(image.camera)
-        if index is not None and jitter is not None and jitter.sigma_s:
-            lin.shared = lin.by_error[:, index, None] * jitter.sigma_s
+    def _with_shared(self, image: Image, lin: Linear) -> Linear:
+        """The linearised image with the noise that its corners share."""
+        shared = self.shared.get(image.camera)
+        if shared is not None and (shared.jitter_s or shared.shift_px):
+            lin.shared = lin.by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas)
         return lin
 
     def _pay_for_jitter(self, camera: str) -> None:
         """Take back what the images of before, used with less jitter than is known by now, told too much."""
-        index, jitter = self.layout.cameras[camera].timeshift, self.jitter.get(camera)
-        owed = jitter.owed() if index is not None and jitter is not None else 0.0
+        index, shared = self.layout.cameras[camera].timeshift, self.shared.get(camera)
+        owed = shared.owed() if index is not None and shared is not None else 0.0
         if owed:
             column = np.zeros(self.layout.size)
             column[index] = np.sqrt(owed)
             self.loosen(column)
 
     def _measure(self, image: Image, lin: Linear, fit: ImageFit) -> None:
-        """What an image says about stamps and lens before it is used."""
+        """What an image says about shared errors and lens before it is used."""
         where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
         if lin.curved.size:  # the fit may be linearised elsewhere
             rows, sigma = rows_of(fit.keep), image.sigma_px[fit.keep]
@@ -213,11 +203,11 @@ class CalibrationFilter:
             innovation = ((image.uv - lin.z)[fit.keep] / sigma[:, None]).ravel()
         else:
             ways, innovation = fit.ways, fit.r
-        jitter, agreement = self.jitter.get(image.camera), self.agreement.get(image.camera)
-        if jitter is not None and where.timeshift is not None:
+        shared, agreement = self.shared.get(image.camera), self.agreement.get(image.camera)
+        if shared is not None:
             level = self.consistency[image.camera].level
-            by_shift = ways @ lin.by_error[:, where.timeshift]
-            jitter.learn(innovation, by_shift, (by_shift @ ways) @ lin.spread, level)
+            by_shared = ways @ (lin.by_error @ shared_ways(self.state, self.layout, image.camera))
+            shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
         if agreement is not None and where.intrinsics is not None and where.distortion is not None:
             lens = slice(where.intrinsics.start, where.distortion.stop)
             values = np.concatenate([camera.intrinsics, camera.distortion])
@@ -263,7 +253,7 @@ class CalibrationFilter:
         straight = self._view_straight.setdefault(image.camera, Straightness())
         sigmas = self.sigmas()
         if not rolling and straight.holds(sigmas):
-            return self._with_jitter(
+            return self._with_shared(
                 image, by_derivatives(self.state, self.layout, self.rates, image, self.S)
             )
         lin = self._by_points(image, np.zeros(self.layout.size), self.S)
@@ -272,7 +262,7 @@ class CalibrationFilter:
 
     def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
         lin = by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
-        return self._with_jitter(image, lin)
+        return self._with_shared(image, lin)
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
@@ -338,10 +328,3 @@ class CalibrationFilter:
         """Covariance of chosen errors, shape (k, k)."""
         part = self.S[rows]
         return np.asarray(part @ part.T)
-
-
-def _late_slope(t_s: FloatArray, values: FloatArray) -> FloatArray:
-    """Derivative of readings (n, 3) over the last hundredths of a second, by least squares."""
-    recent = slice(max(int(np.searchsorted(t_s, t_s[-1] - _SLOPE_S)) - 1, 0), None)
-    t = t_s[recent] - t_s[recent].mean()
-    return np.asarray(t @ values[recent] / (t @ t))

@@ -139,7 +139,7 @@ class Judge:
         good = report.residual_px[report.accepted]
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
-        told = jitter_told(report.camera, f.jitter[report.camera].sigma_s)
+        told = jitter_told(report.camera, f.shared[report.camera].jitter_s)
         if told:
             self.announce(told, once=f"jitter {report.camera}")
 

@@ -19,9 +19,10 @@ from vical_daemon.estimation import so3, unscented
 from vical_daemon.estimation.camera_model import project_jacobians
 from vical_daemon.estimation.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
+from vical_daemon.estimation.rates import Rates
 from vical_daemon.estimation.retract import camera_points, pose_points
 from vical_daemon.estimation.state import ATTITUDE, POSITION, VELOCITY, Layout, State
-from vical_daemon.estimation.target_view import Rates, view
+from vical_daemon.estimation.target_view import view
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again

@@ -17,7 +17,7 @@ from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.initialise import HELD_M
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
-from vical_daemon.estimation.stamp_jitter import StampJitter
+from vical_daemon.estimation.shared_errors import SharedErrors
 from vical_daemon.estimation.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -76,8 +76,8 @@ def rehearsed(
     doubted = _rehearse(state, frames, make, step, _DOUBTED_S)
     if doubted is None or not _fits(doubted):
         return believed
-    jitters = any(j.sigma_s for j in doubted.jitter.values())
-    return doubted if jitters or believed is None else believed
+    shared = any(e.jitter_s or e.shift_px for e in doubted.shared.values())
+    return doubted if shared or believed is None else believed
 
 
 def _rehearse(
@@ -93,9 +93,9 @@ def _rehearse(
         if last is None:
             _doubt(fresh, doubted_s)
         else:
-            fresh.jitter, fresh.consistency = trial.jitter, trial.consistency
-            for jitter in fresh.jitter.values():
-                jitter.begin()
+            fresh.shared, fresh.consistency = trial.shared, trial.consistency
+            for shared in fresh.shared.values():
+                shared.begin()
             for consistency in fresh.consistency.values():
                 consistency.settle()
         stands = last is not None and _moved(last, trial) < _STANDS
@@ -115,7 +115,7 @@ def _fits(trial: CalibrationFilter) -> bool:
 
 def _doubt(trial: CalibrationFilter, jitter_s: float) -> None:
     if jitter_s:
-        trial.jitter = {name: StampJitter.assumed(jitter_s) for name in trial.jitter}
+        trial.shared = {name: SharedErrors.assumed(jitter_s, 0.0) for name in trial.shared}
 
 
 def _moved(before: CalibrationFilter, after: CalibrationFilter) -> float:
@@ -186,7 +186,7 @@ def wide_filter(
             held = unshown.projector
             root[where.position, where.position] = UNKNOWN_M * (np.eye(3) - held) + HELD_M * held
     agreement = {name: LensAgreement() for name in layout.cameras}
-    jitter = {name: StampJitter() for name in layout.cameras}
+    shared = {name: SharedErrors() for name in layout.cameras}
     return CalibrationFilter(
         state,
         layout,
@@ -196,7 +196,7 @@ def wide_filter(
         walk,
         consistency,
         agreement,
-        jitter,
+        shared,
         unshown,
     )
 

@@ -7,30 +7,14 @@ R Exp(omega d), p + v d + a d^2 / 2. [docs/math/filter.md, eq. (7)]
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import project
 from vical_daemon.estimation.imu_model import Motion, cross
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.rates import Rates
 from vical_daemon.estimation.retract import CameraPoints
-
-
-class Rates(NamedTuple):
-    """Nominal rates at the state's instant, for moving the pose over the uncertain part of the delay.
-
-    Attributes:
-        omega: Angular rate in the imu frame, rad/s, shape (3,).
-        accel: Acceleration in the world (gravity included), m/s^2, shape (3,).
-        alpha: Angular acceleration in the imu frame, rad/s^2, shape (3,); needed by the rows of a rolling
-            shutter only: half a readout of 20 ms later a hand turned by 0.1 deg more than its rate says.
-    """
-
-    omega: FloatArray
-    accel: FloatArray
-    alpha: FloatArray = np.zeros(3)
 
 
 def moved(motion: Motion, rates: Rates, delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:

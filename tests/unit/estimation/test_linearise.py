@@ -14,8 +14,8 @@ from vical_daemon.estimation.linearise import (
     view_derivatives,
 )
 from vical_daemon.estimation.propagate import move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.rates import Rates
 from vical_daemon.estimation.state import CameraState, State, make_layout
-from vical_daemon.estimation.target_view import Rates
 
 BOARD = np.stack([*np.meshgrid(np.arange(5) * 0.05, np.arange(4) * 0.05), np.zeros((4, 5))], axis=-1)
 

@@ -11,9 +11,10 @@ from vical_mocks.trajectory import hand_motion
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.imu_model import Motion
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
+from vical_daemon.estimation.rates import Rates
 from vical_daemon.estimation.retract import CameraPoints
 from vical_daemon.estimation.row_times import at_middle_row
-from vical_daemon.estimation.target_view import Rates, view
+from vical_daemon.estimation.target_view import view
 
 READOUT_S = 0.02
 
