@@ -133,7 +133,7 @@ class Problem:
         e = e / self.spread
         marks = w.landmarks
         rho = marks.inverse[seen.landmark][:, None, None]
-        Rt = np.swapaxes(R, 1, 2)
+        Rt = np.ascontiguousarray(np.swapaxes(R, 1, 2))  # three times as fast below
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
         JW = JR @ Rt  # by the point in the world
         Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
@@ -145,7 +145,7 @@ class Problem:
         Jc = Jc[:, :, self.active]
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
-        by_rho = np.matmul(JW, away[..., None])[..., 0] - JR @ cam.p_imu_cam
+        by_rho = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
         Jl = np.concatenate([JW @ basis, by_rho[..., None]], axis=2)
         return self._assemble(seen, links, e, Jf, Jc, Jl, cost)
 
@@ -154,9 +154,9 @@ class Problem:
     ) -> FloatArray:
         """How pixels move with the time of the exposure: the imu turns and moves on, shape (N, 2)."""
         rho = self.window.landmarks.inverse[seen.landmark]
-        forward = np.matmul(self.window.v[seen.frame, None], R)[:, 0]  # speed in the imu frame
+        forward = np.einsum("nj,nji->ni", self.window.v[seen.frame], R)  # speed in the imu frame
         moved = cross(x_imu, rates) - rho[:, None] * forward
-        return np.asarray(np.matmul(JR, moved[..., None])[..., 0])
+        return np.asarray(np.einsum("nij,nj->ni", JR, moved))
 
     def pixels_late(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
         """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""
@@ -196,7 +196,8 @@ class Problem:
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
         begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
         Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
-        blocks = _products(Jf[by], Jall[by], fb)
+        sorted_J = Jall[by]
+        blocks = _products(sorted_J[:, :, :6], sorted_J, fb)
         pose = order.frames[:, :6]
         at = pose[fw]
         H[at[:, :, None], at[:, None, :]] += blocks[:, :, :6]
@@ -214,9 +215,8 @@ class Problem:
         cost += float((w.landmarks.inverse**2).sum()) * _INVERSE_SIGMA**-2
         W = np.zeros((L, 3, 6 * F + k))
         W[:, :, 6 * F :] = own[:, :, 3:-1]
-        poses = np.zeros((L, F, 3, 6))  # a landmark is seen once in an image
-        poses[seen.landmark, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf
-        W[:, :, : 6 * F] = poses.transpose(0, 2, 1, 3).reshape(L, 3, 6 * F)
+        by_frame = W[:, :, : 6 * F].reshape(L, 3, F, 6)  # the same memory
+        by_frame[seen.landmark, :, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf  # seen once in an image
         cost += add_links(w, links, self.jitter_s, order, H, g)
         cost += self._add_prior(H, g, order)
         return Normal(H, g, V, W, gl, cost)

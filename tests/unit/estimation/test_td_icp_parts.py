@@ -11,7 +11,7 @@ from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.rotation_curves import GyroCurve, OrientationCurve, cumulative_product
 from vical_daemon.estimation.td_icp import TdIcpOptions
 from vical_daemon.estimation.td_icp_monitor import DelayMonitor
-from vical_daemon.estimation.track_orientations import relative_rotation, track_orientations
+from vical_daemon.estimation.track_orientations import relative_rotations, track_orientations
 
 
 def _rate(t):
@@ -90,9 +90,22 @@ def _views(seed, n=80, translation=0.15):
 def test_rotation_between_views_of_unknown_points_is_exact_without_noise():
     for seed in range(8):
         first, second, R = _views(seed)
-        found, covariance = relative_rotation(first, second)
+        ((found, covariance),) = relative_rotations([(first, second)])
         assert np.linalg.norm(so3.log(R.T @ found)) < 1e-6
         assert np.all(np.linalg.eigvalsh(covariance) > 0)
+
+
+def test_pairs_of_views_do_not_depend_on_those_they_are_solved_with():
+    rng = np.random.default_rng(5)
+    pairs = []
+    for seed, n in enumerate([80, 12, 31] * 12):  # more than are taken at once, of odd and even numbers
+        first, second, _ = _views(seed, n)
+        pairs.append((first, second + 1e-3 * rng.standard_normal(second.shape)))
+    for pair, (R, covariance) in zip(pairs, relative_rotations(pairs), strict=True):
+        ((alone, alone_covariance),) = relative_rotations([pair])
+        np.testing.assert_allclose(R, alone, atol=1e-9)
+        np.testing.assert_allclose(covariance, alone_covariance, rtol=1e-6)
+    assert relative_rotations([]) == []
 
 
 def test_tracks_become_chains_that_end_where_features_do():
