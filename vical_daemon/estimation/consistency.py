@@ -34,8 +34,8 @@ _MAX_SCALE = 16.0
 _CLIP = 6.0
 _DEAD_BAND = 1.3
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
-_CUSUM_DRIFT = 1.8
-_CUSUM_LIMIT = 8.0
+_CUSUM_DRIFT = 1.6
+_CUSUM_LIMIT = 9.0
 
 
 def modes(uv: FloatArray) -> FloatArray:
@@ -142,8 +142,8 @@ class Consistency:
             return
         self.images += 1
         ratio = float(normal @ normal) / MODES
-        # One-sided CUSUM: at the usual level it drifts down by 0.8 an image; the chance that eight
-        # degrees of freedom drive it to 8 is below 1e-10 an image.
+        # One-sided CUSUM: at the usual level it drifts down by 0.6 an image; the chance that eight
+        # degrees of freedom drive it to 9 is below 1e-10 an image.
         self.alarm = max(0.0, self.alarm + min(ratio / self.level, 5.0) - _CUSUM_DRIFT)
         self._move_scale(ratio)
         self._remember(normal)

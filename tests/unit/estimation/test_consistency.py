@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
+from vical_daemon.estimation import consistency
 from vical_daemon.estimation.consistency import Consistency, modes
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.drift_watch import DriftWatch
@@ -12,12 +14,12 @@ SIGMA = np.full(len(UV), 0.5)
 LINEAR = np.zeros((2 * len(UV), 3))
 
 
-def feed(consistency, rng, frames, size=1.0, common=None):
+def feed(c, rng, frames, size=1.0, common=None):
     for k in range(frames):
         e = 0.5 * size * rng.normal(size=UV.shape)
         if common is not None:
             e = e + (modes(UV) @ common[k]).reshape(-1, 2)
-        consistency.learn(UV, e, LINEAR, np.eye(LINEAR.shape[1]), SIGMA * np.sqrt(consistency.scale))
+        c.learn(UV, e, LINEAR, np.eye(LINEAR.shape[1]), SIGMA * np.sqrt(c.scale))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -54,6 +56,24 @@ def test_a_jump_is_an_alarm_within_half_a_second():
         if c.alarmed:
             return
     pytest.fail("no alarm")
+
+
+def test_most_small_changes_are_an_alarm_within_two_seconds():
+    """Innovations of twice their variance; what is not noticed soon is taken for noise, by the scale."""
+    delays = []
+    for seed in range(20):
+        c, rng = Consistency(), np.random.default_rng(seed)
+        feed(c, rng, 400)
+        while not c.alarmed and c.images < 600:
+            feed(c, rng, 1, size=np.sqrt(2.0))
+        delays.append(c.images - 390)
+    assert np.median(delays) <= 40
+
+
+def test_chance_is_no_alarm():
+    """Chernoff: exp(-h limit) with E exp(h (ratio - drift)) = 1, ratio of eight degrees of freedom."""
+    h = brentq(lambda h: -4.0 * np.log(1.0 - h / 4.0) - h * consistency._CUSUM_DRIFT, 0.1, 3.99)
+    assert np.exp(-h * consistency._CUSUM_LIMIT) < 1e-10
 
 
 def test_corner_noise_is_learnt_and_outliers_cannot_blow_it_up():
