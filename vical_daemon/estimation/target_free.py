@@ -14,24 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.clock_drift import SKEW_WALK
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free_bundle import Bundle, Fit
-from vical_daemon.estimation.free_carry import (
-    CALIBRATION,
-    DRIFT,
-    FULL,
-    LENS,
-    SHIFT,
-    Carry,
-    first_carry,
-    held_along,
-    root_of,
-)
+from vical_daemon.estimation.free_carry import DRIFT, FULL, LENS, SHIFT, Carry
+from vical_daemon.estimation.free_handover import afresh, aged, next_window
 from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.free_reports import window_reports
-from vical_daemon.estimation.free_starter import Starter, start_sigmas
-from vical_daemon.estimation.free_window import KNOT_S, Landmarks, Window
+from vical_daemon.estimation.free_starter import Starter
+from vical_daemon.estimation.free_window import Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
@@ -48,7 +38,6 @@ _MIN_PARALLAX_DEG = 0.4
 _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
-_SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
 _STEPS_GROW, _STEPS_START = 12, 30
 
 
@@ -199,7 +188,7 @@ class TargetFreeCalibrator:
             self.judge.waiting(attempt, self.starter.motion_missing)
             return False
         window = attempt
-        carry = self._carry_into(window, known)
+        carry = afresh(window, known, self.active, self.starter.held)
         bundle = Bundle(window, carry, *self._noise)
         fit = bundle.solve(self._buffer, _STEPS_START)
         if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
@@ -218,21 +207,6 @@ class TargetFreeCalibrator:
         if _full(window):
             self._close(fit, bundle)
         return True
-
-    def _carry_into(self, window: Window, known: Carry | None) -> Carry:
-        """Prior of a window that starts afresh: wide, or the calibration and biases known before."""
-        sigmas = start_sigmas(window.camera)
-        wide = first_carry(window, self.active, sigmas)
-        if known is None:
-            return wide if self.starter.held is None else held_along(wide, self.starter.held)
-        known = known.at(wide.t_cam_s)
-        keep = known.covariance()[5:, 5:]
-        keep[:3, :3] += 4e-4**2 * np.eye(3)
-        keep[3:6, 3:6] += 5e-3**2 * np.eye(3)
-        covariance = np.diag(np.diag(wide.root) ** -2.0)
-        covariance[5:, 5:] = keep
-        window.camera = replace(window.camera, timeshift_s=known.camera.timeshift_s)
-        return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
 
     # ------------------------------------------------------------------ windows
     def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> None:
@@ -284,36 +258,9 @@ class TargetFreeCalibrator:
         self.judge.closed()
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
-        self.carry = self._aged(fit.carry, KNOT_S, window.span_s)
-        t, last = window.frames[-1]
-        none = PointsFrame(last.camera, last.t_cam_ns, last.ids[:0], last.uv_px[:0])
-        c = self.carry
-        empty = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-        self.window = Window(
-            c.camera,
-            self.options.imu_noise,
-            [(t, none)],
-            c.R[None],
-            np.zeros((1, 3)),
-            (c.R @ c.speed)[None],
-            c.bias[None].copy(),
-            [],
-            c.camera.timeshift_s,
-            empty,
-            gravity=window.gravity,
-        )
-
-    def _aged(self, carry: Carry, knot_s: float, span_s: float) -> Carry:
-        """Let biases and delay walk a little before the next window."""
-        P = carry.covariance()
-        noise = self.options.imu_noise
-        P[range(5, 8), range(5, 8)] += noise.gyro_walk**2 * knot_s
-        P[range(8, 11), range(8, 11)] += noise.accel_walk**2 * knot_s
-        for error, walk in ((SHIFT, _SHIFT_WALK), (DRIFT, SKEW_WALK if self.judge.drifting else 0.0)):
-            if self.active[error]:
-                place = CALIBRATION + int(self.active[:error].sum())
-                P[place, place] += walk**2 * span_s
-        return replace(carry, root=root_of(P))
+        drifting, noise = self.judge.drifting, self.options.imu_noise
+        self.carry = aged(fit.carry, noise, self.active, window.span_s, drifting=drifting)
+        self.window = next_window(window, self.carry)
 
     def _disagreed(self, carry: Carry) -> None:
         """A window contradicts what was known: once may be a bad window, twice is a changed rig."""
