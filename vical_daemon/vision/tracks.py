@@ -53,6 +53,15 @@ class TrackOptions:
     sigma_floor_px: float = 0.15
 
 
+@dataclass(frozen=True)
+class _Picture:
+    """A picture, the same at half the size, and its stamp, ns."""
+
+    gray: Gray
+    half: Gray
+    t_ns: int | None
+
+
 @dataclass
 class _Features:
     """The features alive, as columns."""
@@ -103,7 +112,7 @@ class FeatureTracker:
         self.predictor = predictor or FlowPredictor()
         self.lost_epipolar = 0
         self._features = _Features()
-        self._last: tuple[Gray, int | None] | None = None
+        self._last: _Picture | None = None
         self._frame = 0
         self._next_id = 0
         self._fast = cv2.FastFeatureDetector.create(self.options.fast_threshold, True)
@@ -123,38 +132,41 @@ class FeatureTracker:
         """
         gray = as_gray(image)
         smooth = cv2.GaussianBlur(gray, (5, 5), SMOOTHING_PX).astype(np.float32)
-        if self._last is not None and self._last[0].shape != gray.shape:
+        now = _Picture(gray, cv2.pyrDown(gray), t_ns)
+        if self._last is not None and self._last.gray.shape != gray.shape:
             self._features, self._last = _Features(), None
         self._frame += 1
         if self._last is not None and len(self._features.ids):
-            self._follow(self._last[0], gray, self._last[1], t_ns)
+            self._follow(self._last, now)
             self._align(smooth)
             self._check_epipolar()
         self._refill(gray, smooth)
-        self._last = (gray, t_ns)
+        self._last = now
         if not len(self._features.ids):
             return None
         features = self._features
         sigma = np.sqrt(features.sigma**2 + features.drift**2 + self.options.sigma_floor_px**2)
         return Detection(features.ids.copy(), features.uv.copy(), sigma)
 
-    def _follow(self, before: Gray, now: Gray, t_before: int | None, t_now: int | None) -> None:
+    def _follow(self, before: _Picture, now: _Picture) -> None:
         features, options = self._features, self.options
-        height, width = now.shape
-        guess = self.predictor.predict(features.uv, t_before, t_now)
-        uv, good = self._flow(before, now, features.uv, guess, options.levels, options.window_px)
+        height, width = now.gray.shape
+        guess = self.predictor.predict(features.uv, before.t_ns, now.t_ns)
+        uv, good = self._flow(before.gray, now.gray, features.uv, guess, options.levels, options.window_px)
         border = options.border_px
         good &= ((uv > border) & (uv < np.array([width, height]) - 1 - border)).all(axis=1)
         good &= self._comes_back(before, now, features.uv, uv)
-        self.predictor.learn(features.uv[good], uv[good], t_before, t_now)
+        self.predictor.learn(features.uv[good], uv[good], before.t_ns, now.t_ns)
         features.uv = uv
         features.keep(good)
 
-    def _comes_back(self, before: Gray, now: Gray, uv_before: FloatArray, uv_now: FloatArray) -> BoolArray:
+    def _comes_back(
+        self, before: _Picture, now: _Picture, uv_before: FloatArray, uv_now: FloatArray
+    ) -> BoolArray:
         """Whether the way back ends where the feature came from; at half the size, at a third of the cost."""
         back, good = self._flow(
-            cv2.pyrDown(now),
-            cv2.pyrDown(before),
+            now.half,
+            before.half,
             0.5 * uv_now,
             0.5 * uv_before,
             0,
