@@ -74,7 +74,7 @@ def decode_calibration(data: bytes) -> CalibrationMessage:
     t_ns, camera = reader.header()
     status = reader.string()
     if status not in set(Status):
-        raise MessageError(f"calibration status '{status}' does not exist")
+        raise MessageError(f"calibration status {status!r} does not exist")
     reason, guidance, events = reader.string(), reader.string(), reader.strings()
     progress, duration_s = reader.scalar("d"), reader.scalar("d")
     frames, imu_samples = reader.scalar("Q"), reader.scalar("Q")

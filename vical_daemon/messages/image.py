@@ -57,7 +57,7 @@ class ImageMessage:
             MessageError: A pixel format that this program does not know.
         """
         if self.encoding not in _ENCODINGS:
-            raise MessageError(f"pixel format '{self.encoding}' is not supported; use mono8, mono16 or bgr8")
+            raise MessageError(f"pixel format {self.encoding!r} is not supported; use mono8, mono16 or bgr8")
         code, channels = _ENCODINGS[self.encoding]
         dtype = np.dtype((">" if self.big_endian else "<") + code)
         if self.step < self.width * channels * dtype.itemsize or self.step % dtype.itemsize:
@@ -117,7 +117,7 @@ def encode_image(stamp_ns: int, frame_id: str, image: npt.NDArray[Any], encoding
     code, channels = _ENCODINGS.get(encoding, ("", 0))
     shape_channels = 1 if image.ndim == 2 else image.shape[-1]
     if not code or image.ndim not in (2, 3) or image.dtype != np.dtype(code) or shape_channels != channels:
-        raise MessageError(f"image of shape {image.shape}, {image.dtype} cannot be sent as '{encoding}'")
+        raise MessageError(f"image of shape {image.shape}, {image.dtype} cannot be sent as {encoding!r}")
     height, width = image.shape[:2]
     writer = CdrWriter()
     writer.header(stamp_ns, frame_id)

@@ -347,6 +347,18 @@ def test_hostile_bytes_raise_only_message_error(decode, data):
         assert type(outcome) is type(decode(GOOD[decode]))
 
 
+def test_what_a_refusal_quotes_stays_on_one_line():
+    """Found by the test above, once in some thousand runs."""
+    estimate = GOOD[m.decode_calibration].replace(b"converged", b"\nonverged")
+    with pytest.raises(m.MessageError, match=r"^calibration status '\\nonverged' does not exist$"):
+        m.decode_calibration(estimate)
+    picture = m.encode_image(STAMP_NS, "cam0", np.zeros((2, 2), np.uint8), "mono8").replace(
+        b"mono8", b"mo\no8"
+    )
+    with pytest.raises(m.MessageError, match=r"'mo\\no8'"):
+        m.decode_image(picture).pixels()
+
+
 def test_imu_that_is_not_finite_is_refused():
     with pytest.raises(m.MessageError, match="finite"):
         m.decode_imu(m.encode_imu(0, "imu0", (float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0)))
