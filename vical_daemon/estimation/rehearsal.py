@@ -115,7 +115,7 @@ def _fits(trial: CalibrationFilter) -> bool:
 
 def _doubt(trial: CalibrationFilter, jitter_s: float) -> None:
     if jitter_s:
-        trial.shared = {name: SharedErrors.assumed(jitter_s, 0.0) for name in trial.shared}
+        trial.shared = {name: SharedErrors.assumed(jitter_s) for name in trial.shared}
 
 
 def _moved(before: CalibrationFilter, after: CalibrationFilter) -> float:

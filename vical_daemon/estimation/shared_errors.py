@@ -51,9 +51,9 @@ class SharedErrors:
     _assumed: bool = False
 
     @classmethod
-    def assumed(cls, jitter_s: float, shift_px: float) -> SharedErrors:
-        """Errors that are allowed for until `begin` puts in their place what the images said."""
-        return cls(jitter_s, shift_px, _assumed=True)
+    def assumed(cls, jitter_s: float) -> SharedErrors:
+        """A jitter that is allowed for until `begin` puts in its place what the images said."""
+        return cls(jitter_s, _assumed=True)
 
     def begin(self) -> None:
         """Go on with what was learnt, in a filter that has used none of these images."""

@@ -153,7 +153,7 @@ def _readout(data: StartData, name: str, lens: Lens) -> float:
     tried = np.unique([given, *_READOUTS_S])
     squares = np.array([_bent(data, name, lens, float(r)) for r in tried]) ** 2
     least, sizes = int(np.argmin(squares)), [len(f.ids) for _, f in data.frames[name]]
-    numbers = 2.0 * float(np.mean(sizes)) * min(len(sizes), MOST_VIEWS)
+    numbers = 2.0 * sum(sizes) * min(1.0, MOST_VIEWS / max(len(sizes), 1))
     was = squares[int(np.searchsorted(tried, given))]
     if not was - squares[least] > _SIGNIFICANT * squares[least] / numbers:
         return given

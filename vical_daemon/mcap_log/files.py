@@ -113,8 +113,10 @@ def holds_data(path: Path) -> bool:
             if os.fstat(descriptor).st_size:
                 return True
             path.unlink(missing_ok=True)
-    except OSError:  # being written, or gone
-        pass
+    except (BlockingIOError, FileNotFoundError):  # being written, or gone
+        return False
+    except OSError:  # somebody else's: whoever reads it will say what is wrong, if anything
+        return True
     return False
 
 

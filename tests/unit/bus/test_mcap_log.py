@@ -301,6 +301,21 @@ def test_a_cleaner_between_making_and_locking_costs_a_second_attempt(tmp_path, m
     file.close()
 
 
+def test_a_leftover_that_may_only_be_read_is_recovered(log, tmp_path, monkeypatch):
+    part, real = tmp_path / "a.mcap.part", os.open
+    part.write_bytes(log.read_bytes())
+
+    def refused(path, flags, *mode, **rest):
+        if Path(path) == part and flags & os.O_RDWR:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return real(path, flags, *mode, **rest)
+
+    monkeypatch.setattr(os, "open", refused)
+    (done,) = recover_folder(tmp_path)
+    assert done.output.exists()
+    assert not part.exists()
+
+
 def test_mutated_files_never_raise(log, tmp_path, rng_bus):
     whole = log.read_bytes()
     path = tmp_path / "m.mcap"

@@ -144,7 +144,7 @@ def test_images_used_before_the_jitter_was_known_pay_for_it_once():
 
 def test_an_assumed_jitter_gives_way_to_what_the_images_said():
     rng = np.random.default_rng(9)
-    assumed = {0.0: SharedErrors.assumed(2e-3, 0.0), 6e-4: SharedErrors.assumed(2e-3, 0.0)}
+    assumed = {0.0: SharedErrors.assumed(2e-3), 6e-4: SharedErrors.assumed(2e-3)}
     for true, jitter in assumed.items():
         for _ in range(40):
             size = 1.0 / 50e-6
