@@ -95,6 +95,27 @@ CASES: dict[str, Case] = {
     "target-free, 3 % outliers": Case(
         lens_known=True, target_free=True, simulation={"outlier_fraction": 0.03}, trials=20
     ),
+    "target-free, readout of 20 ms to be found": Case(
+        lens_known=True,
+        target_free=True,
+        rig={"readout_s": 0.02},
+        bound={"readout": True},
+        estimate=frozenset({"readout"}),
+        trials=20,
+    ),
+    "target-free, imu matrices 1 % off": Case(
+        lens_known=True,
+        target_free=True,
+        rig={
+            "gyro_matrix": np.eye(3)
+            + 0.01 * np.array([[0.8, -0.5, 1.0], [0.3, -1.2, 0.4], [-0.9, 0.7, 0.6]]),
+            "accel_matrix": np.eye(3)
+            + 0.01 * np.array([[-0.7, 0.0, 0.0], [0.9, 1.1, 0.0], [-0.4, 0.6, 0.5]]),
+        },
+        bound={"imu_matrix_prior": 0.01},
+        estimate=frozenset({"imu_intrinsics"}),
+        trials=20,
+    ),
     "target-free, skew 100 ppm": Case(lens_known=True, target_free=True, skew_ppm=100.0, trials=20),
 }
 

@@ -87,8 +87,9 @@ def input_keys(config: Config) -> list[str]:
 
 def _target_free(options: CalibrationOptions, priors: dict[str, CameraPrior]) -> Estimator:
     from vical_daemon.estimation.target_free import TargetFreeCalibrator
+    from vical_daemon.estimation.target_free_rig import TargetFreeRig
 
     try:
-        return TargetFreeCalibrator(options, priors)
+        return TargetFreeCalibrator(options, priors) if len(priors) == 1 else TargetFreeRig(options, priors)
     except ValueError as error:
         raise ConfigError(str(error)) from error

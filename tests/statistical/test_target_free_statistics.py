@@ -12,6 +12,7 @@ from vical_mocks.tracks import simulate_tracks
 from benchmarks.bound import BoundOptions, bounds
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from benchmarks.scores import nees
+from vical_daemon.estimation.free_carry import IMU
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 pytestmark = [pytest.mark.statistical, pytest.mark.timeout(600)]
@@ -59,3 +60,45 @@ def test_sigmas_are_near_the_bound_and_not_below(trials):
     )
     assert 0.97 < np.median(ratio) < 1.35
     assert ratio.min() > 0.9
+
+
+def with_blocks(seed):
+    """Readout and matrices of the imu unknown: normalised squared errors of the 7, the readout, the 15."""
+    rng = np.random.default_rng([seed, 94])
+    lower = np.eye(3) + np.tril(0.01 * rng.standard_normal((3, 3)))
+    rig = reference_rig(
+        seed,
+        timeshift_cam_imu_s=float(rng.uniform(-0.05, 0.05)),
+        readout_s=float(rng.uniform(-0.03, 0.03)),
+        gyro_matrix=np.eye(3) + 0.01 * rng.standard_normal((3, 3)),
+        accel_matrix=np.linalg.inv(lower),
+    )
+    run = simulate_tracks(seed, SECONDS, rig=rig, camera_rate_hz=CAMERA_HZ, max_features=40)
+    prior = camera_prior(run, seed, StartErrors(), exact_lens=True)
+    estimate = frozenset({"readout", "imu_intrinsics"})
+    options = CalibrationOptions(
+        fix=frozenset({"intrinsics"}), estimate=estimate, target_free=True, imu_noise=imu_noise(run)
+    )
+    subject = CalibratorSubject(options, prior, None)
+    last = feed(run, subject).snapshots[-1]
+    told = subject.calibrator.estimate()
+    camera, carry = told.cameras["cam0"], subject.calibrator.latest
+    matrices = np.concatenate(
+        [
+            (np.array(told.imu.gyro_matrix) - np.linalg.inv(rig.gyro_matrix)).ravel(),
+            (np.array(told.imu.accel_matrix) - lower)[np.tril_indices(3)],
+        ]
+    )
+    P = carry.calibration()[IMU, IMU]
+    return (
+        nees(last.error, last.covariance, 7),
+        ((camera.readout_s - rig.readout_s) / camera.readout_sigma_s) ** 2,
+        matrices @ np.linalg.solve(P, matrices),
+    )
+
+
+def test_optional_blocks_are_as_good_as_they_say():
+    found = np.array([with_blocks(seed) for seed in range(300, 300 + TRIALS)])
+    for squares, dof in zip(found.T, (7, 1, 15), strict=True):
+        low, high = chi2.ppf([0.0005, 0.9995], dof * TRIALS)
+        assert low < squares.sum() < high, dof

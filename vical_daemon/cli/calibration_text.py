@@ -20,6 +20,9 @@ def describe(result: dict[str, Any]) -> str:
         lines.append(
             _row("accelerometer bias", imu["accel_bias_mps2"], imu.get("accel_bias_sigma_mps2"), "m/s^2", 4)
         )
+        for key, label in (("gyro_matrix", "gyro matrix"), ("accel_matrix", "accel. matrix")):
+            for axis, row in zip("xyz", imu.get(key) or [], strict=False):
+                lines.append(_row(f"{label} {axis}", row, None, "", 5))
         lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
     lines += [
         "",
@@ -53,6 +56,9 @@ def _camera_lines(camera: dict[str, Any]) -> list[str]:
         _row(camera["distortion_model"], camera["distortion"], camera["distortion_sigma"], "", 5),
         f"  {'reprojection rms':<22}{camera['reprojection_rms_px']:.3f} px",
     ]
+    if camera.get("readout_s") or camera.get("readout_sigma_s"):
+        readout = (1e3 * camera["readout_s"], 1e3 * camera["readout_sigma_s"])
+        lines.insert(5, _row("readout", [readout[0]], [readout[1]], "ms", 3) + "  (first row to last)")
     lines += [f"  withheld: {what}" for what in camera["unobservable"]]
     return lines
 

@@ -14,6 +14,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.free_carry import (
     FULL,
+    IMU,
     Carry,
     calibration_difference,
     carried_out,
@@ -76,6 +77,9 @@ class _Step(NamedTuple):
     states: FloatArray
     landmarks: FloatArray  # (L, 3)
     promise: float  # by how much the sum of squares should fall
+
+
+_Saved = tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray]
 
 
 class Bundle:
@@ -152,15 +156,13 @@ class Bundle:
             normal = self.problem.normal(seen, links)
         return self._result(seen, links, normal, steps, settled)
 
-    def _save(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks]:
+    def _save(self) -> _Saved:
         w = self.window
-        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks
+        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu
 
-    def _restore(
-        self, s: tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks]
-    ) -> None:
+    def _restore(self, s: _Saved) -> None:
         w = self.window
-        w.R, w.p, w.v, w.bias, w.camera, w.landmarks = s
+        w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu = s
 
     # ------------------------------------------------------------------ step
     def _reduced(self, normal: Normal, lam: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -213,7 +215,7 @@ class Bundle:
         w.bias = w.bias + dx[order.knots]
         full = np.zeros(FULL)
         full[self.problem.active] = dx[order.calib]
-        w.camera = moved(w.camera, full)
+        w.camera, w.imu = moved(w.camera, full), w.imu + full[IMU][: len(w.imu)]
         m = w.landmarks
         bearing = m.bearing + np.matmul(tangents(m.bearing), dl[:, :2, None])[..., 0]
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
@@ -276,7 +278,7 @@ class Bundle:
         inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
-        change = calibration_difference(w.camera, self.carry.camera)[self.problem.active]
+        change = calibration_difference(w, self.carry)[self.problem.active]
         return Fit(
             carried_out(w, covariance, self.carry.active),
             squares,

@@ -12,13 +12,14 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.free_window import Window
+from vical_daemon.estimation.imu_scale import ENTRIES
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.retract import orthonormal
 from vical_daemon.estimation.state import CameraState
 
-# Of the calibration's 16 errors; the time shift is that at the first image, and drifts from there on.
-ARM, TURN, SHIFT, LENS, DRIFT = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15
-FULL = 16
+# Of the calibration's errors; the time shift is that at the first image, and drifts from there on.
+ARM, TURN, SHIFT, LENS, DRIFT, READOUT, IMU = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15, 16, slice(17, 32)
+FULL = 32
 _HELD_M = 1e-4
 CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
 
@@ -27,7 +28,7 @@ CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 
 class Carry:
     """What is known at the first image of a window before its own data.
 
-    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of 16).
+    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of `FULL`).
 
     Attributes:
         R: Attitude there; only its tilt matters.
@@ -35,8 +36,9 @@ class Carry:
         bias: [gyro, accel], shape (6,).
         camera: Calibration.
         root: W with W^T W = information of the errors, shape (d, d).
-        active: Which of the 16 calibration errors are estimated.
+        active: Which of the calibration errors are estimated, shape (FULL,).
         t_cam_s: Stamp of that image, s.
+        imu: Entries of the imu's matrices, see `Window`.
     """
 
     R: FloatArray
@@ -46,6 +48,7 @@ class Carry:
     root: FloatArray
     active: BoolArray
     t_cam_s: float
+    imu: FloatArray
 
     def covariance(self) -> FloatArray:
         """Covariance of the errors, shape (d, d)."""
@@ -61,7 +64,7 @@ class Carry:
         return replace(self, camera=camera, root=root, t_cam_s=t_cam_s)
 
     def calibration(self) -> FloatArray:
-        """Covariance of the calibration's 16 errors, zero where not estimated, shape (16, 16)."""
+        """Covariance of the calibration's errors, zero where not estimated, shape (FULL, FULL)."""
         full = np.zeros((FULL, FULL))
         at = np.flatnonzero(self.active)
         full[np.ix_(at, at)] = self.covariance()[CALIBRATION:, CALIBRATION:]
@@ -76,8 +79,8 @@ def later(active: BoolArray, seconds: float) -> FloatArray:
     return np.asarray(G[np.ix_(at, at)])
 
 
-def calibration_difference(now: CameraState, then: CameraState) -> FloatArray:
-    """Errors [arm, turn (local), shift, lens 8, drift] that lead from `then` to `now`, shape (16,)."""
+def camera_difference(now: CameraState, then: CameraState) -> FloatArray:
+    """Errors [arm, turn (local), shift, lens 8, drift, readout] from `then` to `now`, shape (17,)."""
     return np.concatenate(
         [
             now.p_imu_cam - then.p_imu_cam,
@@ -85,13 +88,19 @@ def calibration_difference(now: CameraState, then: CameraState) -> FloatArray:
             [now.timeshift_s - then.timeshift_s],
             now.intrinsics - then.intrinsics,
             now.distortion - then.distortion,
-            [now.skew - then.skew],
+            [now.skew - then.skew, now.readout_s - then.readout_s],
         ]
     )
 
 
+def calibration_difference(window: Window, carry: Carry) -> FloatArray:
+    """Errors of the calibration that lead from what was carried in to the window's, shape (FULL,)."""
+    imu = window.imu - carry.imu if len(window.imu) else np.zeros(ENTRIES)
+    return np.concatenate([camera_difference(window.camera, carry.camera), imu])
+
+
 def moved(camera: CameraState, d: FloatArray) -> CameraState:
-    """The camera with an error of 16 applied."""
+    """The camera with errors of the calibration applied, shape (FULL,)."""
     return replace(
         camera,
         R_imu_cam=orthonormal(camera.R_imu_cam @ so3.exp(d[TURN])),
@@ -100,6 +109,7 @@ def moved(camera: CameraState, d: FloatArray) -> CameraState:
         intrinsics=camera.intrinsics + d[7:11],
         distortion=camera.distortion + d[11:15],
         skew=camera.skew + float(d[DRIFT]),
+        readout_s=camera.readout_s + float(d[READOUT]),
     )
 
 
@@ -108,12 +118,13 @@ def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
 
     Args:
         window: Started window; its camera is the centre of the prior.
-        active: Which of the 16 calibration errors are estimated, shape (16,).
-        sigmas: Of the 16 calibration errors.
+        active: Which of the calibration errors are estimated, shape (FULL,).
+        sigmas: Of the calibration errors, shape (FULL,).
     """
     wide = np.concatenate([[1.0] * 2, [5.0] * 3, [0.02] * 3, [0.3] * 3, sigmas[np.flatnonzero(active)]])
     R, t_s = window.R[0], window.frames[0][0]
-    return Carry(R.copy(), R.T @ window.v[0], np.zeros(6), window.camera, np.diag(1.0 / wide), active, t_s)
+    root, speed = np.diag(1.0 / wide), R.T @ window.v[0]
+    return Carry(R.copy(), speed, np.zeros(6), window.camera, root, active, t_s, window.imu)
 
 
 def held_along(carry: Carry, axis: FloatArray) -> Carry:
@@ -144,7 +155,7 @@ def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Ca
     Args:
         window: Adjusted.
         covariance: Of [last image 9, last knot 6, active calibration errors].
-        active: Which of the 16 calibration errors are estimated.
+        active: Which of the calibration errors are estimated, shape (FULL,).
     """
     k = int(np.count_nonzero(active))
     span_s, camera = window.span_s, window.camera
@@ -157,7 +168,7 @@ def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Ca
     J[5:11, 9:15] = np.eye(6)
     J[11:, 15:] = later(active, span_s)
     root = root_of(J @ covariance @ J.T)
-    return Carry(R, speed, window.bias[-1].copy(), camera, root, active, window.frames[-1][0])
+    return Carry(R, speed, window.bias[-1].copy(), camera, root, active, window.frames[-1][0], window.imu)
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

@@ -75,4 +75,5 @@ def next_window(window: Window, carry: Carry) -> Window:
         carry.camera.timeshift_s,
         empty,
         gravity=window.gravity,
+        imu=window.imu,
     )

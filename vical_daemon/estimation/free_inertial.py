@@ -13,9 +13,16 @@ _LEAST_JITTER_S = 3e-5
 
 
 class Order:
-    """Places of the unknowns: images but the last, knots but the last, last image, last knot, calibration."""
+    """Places of the unknowns: images but the last, knots but the last, last image, last knot, calibration.
 
-    def __init__(self, F: int, K: int, k: int) -> None:
+    Args:
+        F: Images.
+        K: Knots.
+        k: Calibration errors.
+        imu: How many of them, the last ones, are entries of the imu's matrices.
+    """
+
+    def __init__(self, F: int, K: int, k: int, imu: int = 0) -> None:
         self.size = 9 * F + 6 * K + k
         self.tail = 9 * (F - 1) + 6 * (K - 1)
         frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
@@ -23,16 +30,18 @@ class Order:
         self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
         self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
         self.calib = self.tail + 15 + np.arange(k)
+        self.imu = self.calib[k - imu :]
 
     def of_links(self, knots: IntArray) -> IntArray:
-        """Where the states of each link live: first image, second image, knot; shape (F - 1, 24)."""
-        return np.concatenate([self.frames[:-1], self.frames[1:], self.knots[knots]], axis=1)
+        """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 39)."""
+        entries = np.broadcast_to(self.imu, (len(knots), len(self.imu)))
+        return np.concatenate([self.frames[:-1], self.frames[1:], self.knots[knots], entries], axis=1)
 
 
 def link_errors(window: Window, links: Links) -> tuple[FloatArray, FloatArray]:
-    """Whitened errors (F - 1, 9) of the links and derivatives (F - 1, 9, 24) about the present values."""
+    """Whitened errors (F - 1, 9) of the links about the present values; derivatives (F - 1, 9, 24 or 39)."""
     w = window
-    return links.errors(w.R, w.p, w.v, w.bias[w.knots()], w.gravity)
+    return links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
 
 
 def add_links(
@@ -63,19 +72,31 @@ def add_links(
     for knot in range(len(window.bias)):
         own = np.flatnonzero(knots == knot)
         rows = order.knots[knot]
-        H[rows[:, None], rows] += A[own, 18:, 18:].sum(axis=0)
-        g[rows] += b[own, 18:].sum(axis=0)
+        H[rows[:, None], rows] += A[own, 18:24, 18:24].sum(axis=0)
+        g[rows] += b[own, 18:24].sum(axis=0)
         for first in (0, 9):
             at = order.frames[own + first // 9].reshape(-1)
-            side = A[own, first : first + 9, 18:].reshape(-1, 6)
-            H[at[:, None], rows] += side
-            H[rows[:, None], at] += side.T
+            _add_side(H, at, rows, A[own, first : first + 9, 18:24].reshape(-1, 6))
+        if len(order.imu):
+            _add_side(H, rows, order.imu, A[own, 18:24, 24:].sum(axis=0))
+    if len(order.imu):
+        H[order.imu[:, None], order.imu] += A[:, 24:, 24:].sum(axis=0)
+        g[order.imu] += b[:, 24:].sum(axis=0)
+        for first, frames in ((0, order.frames[:-1]), (9, order.frames[1:])):
+            side = A[:, first : first + 9, 24:].reshape(-1, len(order.imu))
+            _add_side(H, frames.reshape(-1), order.imu, side)
     cost = float((e**2).sum()) + _add_walk(window, order, H, g)
     if jitter_s:
         late = Lateness(window, e, J, jitter_s)
         late.eliminate(H, g, J, order.of_links(knots))
         cost -= late.explained()
     return cost
+
+
+def _add_side(H: FloatArray, rows: IntArray, columns: IntArray, block: FloatArray) -> None:
+    """Add a block beside the diagonal, and its mirror image."""
+    H[rows[:, None], columns] += block
+    H[columns[:, None], rows] += block.T
 
 
 def _add_walk(window: Window, order: Order, H: FloatArray, g: FloatArray) -> float:

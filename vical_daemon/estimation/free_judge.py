@@ -50,7 +50,7 @@ class FreeJudge:
     Args:
         options: Switches and targets.
         camera: Name of the camera.
-        active: Which of the 16 calibration errors are estimated.
+        active: Which of the calibration errors are estimated, shape (FULL,).
     """
 
     def __init__(self, options: CalibrationOptions, camera: str, active: BoolArray) -> None:
@@ -202,7 +202,7 @@ class FreeJudge:
 
     def factor(self) -> float:
         """Measured variance over the stated one, at least 1 (a prior of a few windows says 1)."""
-        dof = 15.0 if self.active[7] else 7.0
+        dof = float(np.count_nonzero(self.active)) - float(self.active[DRIFT])
         total = sum(s for s, _ in self._agreement) + _PRIOR_WINDOWS * dof
         return max(1.0, total / (sum(n for _, n in self._agreement) + _PRIOR_WINDOWS * dof))
 

@@ -14,6 +14,7 @@ from vical_daemon.estimation.free_carry import (
     DRIFT,
     FULL,
     LENS,
+    READOUT,
     SHIFT,
     TURN,
     Carry,
@@ -73,7 +74,8 @@ class Problem:
 
     def order(self) -> Order:
         """Places of the unknowns."""
-        return Order(len(self.window.frames), len(self.window.bias), len(self.active))
+        w = self.window
+        return Order(len(w.frames), len(w.bias), len(self.active), len(w.imu))
 
     # ------------------------------------------------------------------ pixels
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -82,7 +84,8 @@ class Problem:
         rates = w.rates()
         late = cam.timeshift_s - w.shift_s + cam.skew * self._since()
         if cam.readout_s:  # each row has an instant of its own
-            late, rates, frame = late[seen.frame] + seen.row_s, rates[seen.frame], seen.frame
+            late, frame = late[seen.frame] + cam.readout_s * seen.row, seen.frame
+            rates = rates[frame]
             alpha, accel = w.accelerations()
             half = 0.5 * (late * late)[:, None]
             R = w.R[frame] @ so3.exp(rates * late[:, None] + half * alpha[frame])
@@ -137,11 +140,12 @@ class Problem:
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
         JW = JR @ Rt  # by the point in the world
         Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
-        Jc = np.empty((len(e), 2, FULL))
+        Jc = np.zeros((len(e), 2, FULL))
         Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, cross(Jy, y[:, None])
         Jc[:, :, SHIFT] = self._by_shift(seen, JR, R, x_imu, rates)
         Jc[:, :, LENS] = Jlens
         Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
+        Jc[:, :, READOUT] = Jc[:, :, SHIFT] * seen.row[:, None]
         Jc = Jc[:, :, self.active]
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
@@ -191,8 +195,8 @@ class Problem:
         cost: float,
     ) -> Normal:
         w = self.window
-        F, K, k, L = len(w.frames), len(w.bias), len(self.active), len(seen.begin)
-        order = Order(F, K, k)
+        F, k, L = len(w.frames), len(self.active), len(seen.begin)
+        order = self.order()
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
         begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
         Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
@@ -238,7 +242,7 @@ class Problem:
         up, now = c.R[2], R0[2]
         B = tangents(up[None])[0]
         speed = R0.T @ v0
-        calibration = calibration_difference(w.camera, c.camera)[self.active]
+        calibration = calibration_difference(w, c)[self.active]
         e = np.concatenate([B.T @ np.cross(now, up), speed - c.speed, w.bias[0] - c.bias, calibration])
         J = np.zeros((len(e), 15 + len(self.active)))
         J[:2, :3] = B.T

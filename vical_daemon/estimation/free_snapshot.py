@@ -6,7 +6,8 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.clock_drift import evidence, probability
-from vical_daemon.estimation.free_carry import DRIFT, LENS, SHIFT, Carry, moved
+from vical_daemon.estimation.free_carry import DRIFT, LENS, READOUT, SHIFT, Carry, moved
+from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import CameraState
@@ -61,12 +62,12 @@ def camera_estimate(
         sigma_px,
         [],
         float(camera.readout_s),
-        0.0,
+        float(sigma[READOUT]),
     )
 
 
 def _told(carry: Carry, factor: float, drifting: bool) -> tuple[CameraState, FloatArray]:
-    """Camera and covariance (16, 16) over both hypotheses about its clock; see `clock_drift`."""
+    """Camera and covariance (FULL, FULL) over both hypotheses about its clock; see `clock_drift`."""
     camera, P = carry.camera, carry.calibration() * factor
     if drifting or not carry.active[DRIFT]:
         return camera, P
@@ -77,8 +78,8 @@ def _told(carry: Carry, factor: float, drifting: bool) -> tuple[CameraState, Flo
 
 
 def imu_estimate(carry: Carry) -> ImuEstimate:
-    """Biases and their sigmas."""
+    """Biases and their sigmas; where estimated, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[5:11])
-    return ImuEstimate(
-        carry.bias[:3].tolist(), carry.bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist()
-    )
+    told = [m.tolist() for m in matrices(carry.imu)] if len(carry.imu) else [[], []]
+    bias = carry.bias
+    return ImuEstimate(bias[:3].tolist(), bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist(), *told)

@@ -84,14 +84,14 @@ class LinearStart:
         buffer: ImuBuffer,
         frames: list[tuple[float, PointsFrame]],
         camera: CameraState,
-        gyro_bias: FloatArray,
+        imu: FloatArray,
         noise: ImuNoise,
         gravity_mps2: float,
     ) -> None:
         shift = camera.timeshift_s
         links: list[Link] = []
         for (t0, _), (t1, _) in pairwise(frames):
-            link = make_link(buffer, t0 + shift, t1 + shift, gyro_bias, np.zeros(3), noise)
+            link = make_link(buffer, t0 + shift, t1 + shift, imu, noise)
             if link is None:
                 raise NoStartError("inertial data do not cover the images")
             links.append(link)
@@ -102,7 +102,7 @@ class LinearStart:
         window = Window(
             camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift, none
         )
-        window.bias[:, :3] = gyro_bias
+        window.bias[:, :3], window.imu = imu[:3], imu[6:]
         window.fit_knots()
         self._seen = window.observe()
         if len(self._seen.begin) < _MIN_FEATURES:
@@ -204,9 +204,9 @@ def _centres(links: list[Link]) -> tuple[FloatArray, FloatArray, FloatArray]:
     all_A[0][:, 6:9] = np.eye(3)
     for x in links:
         P = P + x.dt_s * V + R @ x.dp
-        PB = PB + x.dt_s * VB + R @ x.by_bias[6:9, 3:]
+        PB = PB + x.dt_s * VB + R @ x.by_imu[6:9, 3:6]
         V = V + R @ x.dv
-        VB = VB + R @ x.by_bias[3:6, 3:]
+        VB = VB + R @ x.by_imu[3:6, 3:6]
         R = R @ x.dR
         T += x.dt_s
         A = np.concatenate([T * np.eye(3), 0.5 * T * T * np.eye(3), R, PB], axis=1)

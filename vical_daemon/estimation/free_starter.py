@@ -14,6 +14,7 @@ from vical_daemon.estimation.free_partial import mounting_about, still_axis
 from vical_daemon.estimation.free_start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.free_window import Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_scale import ENTRIES
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.td_icp import td_icp
@@ -26,7 +27,7 @@ class _Found(NamedTuple):
     """What rotations say, or what was known before."""
 
     camera: CameraState
-    gyro_bias: FloatArray
+    imu: FloatArray  # biases, and entries of the matrices where they are estimated, see `Link`
     arm_sigma_m: float
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 
@@ -37,6 +38,8 @@ _PARTIAL_S = 6.0  # before, a second axis may come yet
 _EVERY_S, _EVERY_MOST_S = 1.0, 4.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
+_READOUT_SIGMA_S = 0.015
+_IMU_SIGMA = 0.01  # scale and misalignment
 _MIN_TRACKS = 12
 _FULL_FITS = 2
 _ROUGH_STEPS = 8
@@ -116,7 +119,7 @@ class Starter:
         held = self.held if found.about is None else found.about
         arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, held)
         try:
-            start = LinearStart(buffer, frames, camera, found.gyro_bias, noise, gravity)
+            start = LinearStart(buffer, frames, camera, found.imu, noise, gravity)
             if found.about is not None:
                 camera.R_imu_cam = mounting_about(start, found.about, camera.R_imu_cam, arm)
             window = start.window(arm)
@@ -164,7 +167,8 @@ class Starter:
             sigma = 1e-4
         if self.prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
             camera.timeshift_s = self.prior.timeshift_cam_imu_s
-        return _Found(camera, best.gyro_bias, sigma, about)
+        entries = ENTRIES if "imu_intrinsics" in self.options.estimate else 0
+        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + entries)]), sigma, about)
 
     def _seeds(
         self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState, *, look_around: bool
@@ -211,11 +215,12 @@ def starting_camera(prior: CameraPrior) -> CameraState:
 
 
 def start_sigmas(camera: CameraState) -> FloatArray:
-    """How far each of the 16 calibration errors may be off at a start: many times what it is worth."""
+    """How far each calibration error may be off at a start: many times what it is worth; shape (FULL,)."""
     f = float(camera.intrinsics[0])
     lens = [0.05 * f, 0.05 * f, 0.03 * f, 0.03 * f]
     distortion = [0.1, 0.1, 0.01, 0.01] if camera.distortion_model == "radtan" else [0.05] * 4
-    return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA])
+    imu = [_IMU_SIGMA] * ENTRIES
+    return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA, _READOUT_SIGMA_S] + imu)
 
 
 def _known(known: Carry) -> _Found:
@@ -231,7 +236,7 @@ def _known(known: Carry) -> _Found:
         c.readout_s,
         c.skew,
     )
-    return _Found(copy, known.bias[:3].copy(), 5e-3)
+    return _Found(copy, np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
 
 
 def _misfit(fit: EpipolarFit) -> float:

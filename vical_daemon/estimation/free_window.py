@@ -17,6 +17,7 @@ import numpy.typing as npt
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import unproject
 from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.inertial_links import Link, Links, make_link
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.state import CameraState
@@ -36,7 +37,7 @@ class Seen(NamedTuple):
         frame: Index of the image, shape (N,).
         landmark: Index of the landmark, shape (N,).
         uv: Pixels, shape (N, 2).
-        row_s: How much later than the middle row the point was exposed, s, shape (N,).
+        row: Its row from the middle one, over their number: by as much of the readout it is late, shape (N,).
         begin: First observation of each landmark, shape (L,).
         by_frame: Order that sorts the observations by image.
         frame_begin: First of each image in that order; only images with observations.
@@ -46,7 +47,7 @@ class Seen(NamedTuple):
     frame: IntArray
     landmark: IntArray
     uv: FloatArray
-    row_s: FloatArray
+    row: FloatArray
     begin: IntArray
     by_frame: IntArray
     frame_begin: IntArray
@@ -85,6 +86,7 @@ class Window:
         landmarks: What has been placed so far.
         gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
+        imu: Entries of the imu's matrices (`imu_scale`) where they are estimated, shape (15,); else empty.
     """
 
     camera: CameraState
@@ -99,6 +101,7 @@ class Window:
     landmarks: Landmarks
     gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
     bad: set[tuple[int, int]] = field(default_factory=set)
+    imu: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def span_s(self) -> float:
@@ -122,7 +125,15 @@ class Window:
         """Angular rate at each image, bias removed, rad/s, shape (F, 3)."""
         raw = np.array([self.links[0].rate_begin, *(x.rate_end for x in self.links)])
         knots = self.knots()
-        return np.asarray(raw - self.bias[np.concatenate([knots[:1], knots]), :3])
+        rates = np.asarray(raw - self.bias[np.concatenate([knots[:1], knots]), :3])
+        return rates @ matrices(self.imu)[0].T if len(self.imu) else rates
+
+    def imu_by_link(self) -> FloatArray:
+        """Bias in force on each link, and entries of the matrices, shape (F - 1, 6) or (F - 1, 21)."""
+        bias = self.bias[self.knots()]
+        if not len(self.imu):
+            return bias
+        return np.concatenate([bias, np.broadcast_to(self.imu, (len(bias), len(self.imu)))], axis=1)
 
     def accelerations(self) -> tuple[FloatArray, FloatArray]:
         """Angular (imu frame) and linear (world) acceleration at each image, shapes (F, 3)."""
@@ -138,8 +149,8 @@ class Window:
         added = 0
         for t, frame in frames:
             before = self.frames[-1][0] + self.shift_s
-            b = self.bias[-1]
-            link = make_link(buffer, before, t + self.shift_s, b[:3], b[3:], self.noise)
+            imu = np.concatenate([self.bias[-1], self.imu])
+            link = make_link(buffer, before, t + self.shift_s, imu, self.noise)
             if link is None:
                 break
             at = carried(link, *at, self.gravity)
@@ -154,14 +165,11 @@ class Window:
 
     def relink(self, buffer: ImuBuffer) -> bool:
         """Integrate anew at the present time shift and biases; False where inertial data do not reach."""
-        d = self.camera.timeshift_s - self.shift_s
-        knots = self.knots()
+        shift_s = self.camera.timeshift_s
+        d = shift_s - self.shift_s
         links: list[Link] = []
-        for k, ((t0, _), (t1, _)) in enumerate(pairwise(self.frames)):
-            b = self.bias[knots[k]]
-            link = make_link(
-                buffer, t0 + self.camera.timeshift_s, t1 + self.camera.timeshift_s, b[:3], b[3:], self.noise
-            )
+        for ((t0, _), (t1, _)), imu in zip(pairwise(self.frames), self.imu_by_link(), strict=True):
+            link = make_link(buffer, t0 + shift_s, t1 + shift_s, imu, self.noise)
             if link is None:
                 return False
             links.append(link)
@@ -185,12 +193,12 @@ class Window:
 
     def stale(self) -> bool:
         """Whether the links hold for another time shift or other biases than are believed now."""
-        used = np.array([np.concatenate([x.gyro_bias, x.accel_bias]) for x in self.links])
-        off = np.abs(self.bias[self.knots()] - used)
+        off = np.abs(self.imu_by_link() - np.array([x.imu for x in self.links]))
         return (
             abs(self.camera.timeshift_s - self.shift_s) > 3e-4
             or float(off[:, :3].max()) > 5e-3
-            or float(off[:, 3:].max()) > 0.5
+            or float(off[:, 3:6].max()) > 0.5
+            or float(off[:, 6:].max(initial=0.0)) > 5e-3
         )
 
     def stacked(self) -> Links:
@@ -239,8 +247,8 @@ def _listed(frame: IntArray, landmark: IntArray, uv: FloatArray, camera: CameraS
     by_frame = np.argsort(frame, kind="stable")
     sorted_frames = frame[by_frame]
     frame_begin = np.flatnonzero(np.diff(sorted_frames, prepend=-1))
-    row_s = camera.readout_s * (uv[:, 1] / camera.resolution[1] - 0.5)
-    return Seen(frame, landmark, uv, row_s, begin, by_frame, frame_begin, sorted_frames[frame_begin])
+    row = uv[:, 1] / camera.resolution[1] - 0.5
+    return Seen(frame, landmark, uv, row, begin, by_frame, frame_begin, sorted_frames[frame_begin])
 
 
 def carried(

@@ -14,6 +14,7 @@ import numpy as np
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.imu_model import influence, strapdown
+from vical_daemon.estimation.imu_scale import by_entries, matrices
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
@@ -28,9 +29,10 @@ class Link:
     Attributes:
         dt_s: Length, s.
         dR, dv, dp: Relative rotation, and integrals of the specific force without gravity.
-        by_bias: Derivatives of [rotation (local), velocity, position] by [gyro, accel] bias, shape (9, 6).
+        by_imu: Derivatives of [rotation (local), velocity, position] by [gyro, accel] bias, and by entries of
+            the matrices (`imu_scale`) where they are estimated, shape (9, 6) or (9, 21).
         root_information: W with W^T W = inverse covariance of [rotation, velocity, position], (9, 9).
-        gyro_bias, accel_bias: Where it was integrated.
+        imu: Biases (and entries) for which it was integrated, shape (6,) or (21,).
         rate_begin, rate_end: Measured rates (bias not removed) at both ends, rad/s.
     """
 
@@ -38,10 +40,9 @@ class Link:
     dR: FloatArray
     dv: FloatArray
     dp: FloatArray
-    by_bias: FloatArray
+    by_imu: FloatArray
     root_information: FloatArray
-    gyro_bias: FloatArray
-    accel_bias: FloatArray
+    imu: FloatArray
     rate_begin: FloatArray
     rate_end: FloatArray
 
@@ -50,26 +51,43 @@ def make_link(
     buffer: ImuBuffer,
     from_s: float,
     to_s: float,
-    gyro_bias: FloatArray,
-    accel_bias: FloatArray,
+    imu: FloatArray,
     noise: ImuNoise,
 ) -> Link | None:
-    """Integrate between two instants of the imu's clock; None where readings are missing."""
+    """Integrate between two instants of the imu's clock.
+
+    Args:
+        buffer: Readings.
+        from_s: Begin, s.
+        to_s: End, s.
+        imu: [gyro, accel] bias, rad/s and m/s^2; with the entries of the matrices where they are estimated.
+        noise: Densities.
+
+    Returns:
+        The link; None where readings are missing.
+    """
     segment = buffer.segment(from_s, to_s)
     if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
-    motion = strapdown(segment, gyro_bias[None], accel_bias[None])
-    errors = influence(_EYE, motion)
+    bias, entries = imu[:6], imu[6:]
+    if len(entries):
+        gyro_matrix, accel_matrix = matrices(entries)
+        motion = strapdown(segment, bias[None, :3], bias[None, 3:], gyro_matrix[None], accel_matrix[None])
+        errors = influence(_EYE, motion)
+        by_imu = by_entries(errors, segment, bias, gyro_matrix, accel_matrix)
+    else:
+        motion = strapdown(segment, bias[None, :3], bias[None, 3:])
+        errors = influence(_EYE, motion)
+        by_imu = errors.by_bias()
     root = np.linalg.inv(np.linalg.cholesky(errors.noise(noise)[_ORDER[:, None], _ORDER]))
     return Link(
         float(motion.t_s[-1]),
         motion.dR[0, -1],
         motion.dv[0, -1],
         motion.dp[0, -1],
-        errors.by_bias()[_ORDER],
+        by_imu[_ORDER],
         root,
-        gyro_bias.copy(),
-        accel_bias.copy(),
+        imu.copy(),
         segment.gyro[0],
         segment.gyro[-1],
     )
@@ -82,9 +100,9 @@ class Links(NamedTuple):
     dR: FloatArray
     dv: FloatArray
     dp: FloatArray
-    by_bias: FloatArray
+    by_imu: FloatArray
     root: FloatArray
-    bias: FloatArray  # (m, 6)
+    imu: FloatArray  # (m, 6) or (m, 21)
 
     @classmethod
     def stack(cls, links: list[Link]) -> Links:
@@ -94,13 +112,13 @@ class Links(NamedTuple):
             np.array([x.dR for x in links]),
             np.array([x.dv for x in links]),
             np.array([x.dp for x in links]),
-            np.array([x.by_bias for x in links]),
+            np.array([x.by_imu for x in links]),
             np.array([x.root_information for x in links]),
-            np.array([np.concatenate([x.gyro_bias, x.accel_bias]) for x in links]),
+            np.array([x.imu for x in links]),
         )
 
     def errors(
-        self, R: FloatArray, p: FloatArray, v: FloatArray, bias: FloatArray, gravity: FloatArray
+        self, R: FloatArray, p: FloatArray, v: FloatArray, imu: FloatArray, gravity: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Whitened errors and derivatives of all links.
 
@@ -108,14 +126,14 @@ class Links(NamedTuple):
             R: Attitudes at the m + 1 images, shape (m + 1, 3, 3).
             p: Positions in the world, m, shape (m + 1, 3).
             v: Velocities in the world, m/s, shape (m + 1, 3).
-            bias: [gyro, accel] bias in force on each link, shape (m, 6).
+            imu: [gyro, accel] bias on each link, and entries of the matrices, shape (m, q), q = 6 or 21.
             gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
 
         Returns:
-            Errors (m, 9), derivatives (m, 9, 24) by [turn p v of the first, turn p v of the second, bias].
+            Errors (m, 9), derivatives (m, 9, 18 + q) by [turn p v of the first, turn p v of the second, imu].
         """
         Rt = np.swapaxes(R[:-1], 1, 2)
-        off = np.einsum("mij,mj->mi", self.by_bias, bias - self.bias)
+        off = np.einsum("mij,mj->mi", self.by_imu, imu - self.imu)
         dR = self.dR @ so3.exp(off[:, :3])
         T = self.dt[:, None]
         v_local = np.matmul(Rt, (v[1:] - v[:-1] - T * gravity)[..., None])[..., 0]
@@ -123,14 +141,14 @@ class Links(NamedTuple):
         turn = Rt @ R[1:]
         e_R = so3.log(np.swapaxes(dR, 1, 2) @ turn)
         e = np.concatenate([e_R, v_local - self.dv - off[:, 3:6], p_local - self.dp - off[:, 6:]], axis=1)
-        J = np.zeros((len(e), 9, 24))
+        J = np.zeros((len(e), 9, 18 + imu.shape[1]))
         inverse = so3.right_jacobian_inverse(e_R)
         J[:, :3, 0:3] = -inverse @ np.swapaxes(turn, 1, 2)
         J[:, :3, 9:12] = inverse
-        J[:, :3, 18:] = -self.by_bias[:, :3]
+        J[:, :3, 18:] = -self.by_imu[:, :3]
         J[:, 3:6, 0:3], J[:, 6:, 0:3] = so3.hat(v_local), so3.hat(p_local)
         J[:, 3:6, 6:9], J[:, 3:6, 15:18] = -Rt, Rt
         J[:, 6:, 3:6], J[:, 6:, 12:15] = -Rt, Rt
         J[:, 6:, 6:9] = -Rt * T[..., None]
-        J[:, 3:, 18:] = -self.by_bias[:, 3:]
+        J[:, 3:, 18:] = -self.by_imu[:, 3:]
         return np.matmul(self.root, e[..., None])[..., 0], self.root @ J

@@ -16,7 +16,7 @@ import numpy as np
 
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free_bundle import Bundle, Fit
-from vical_daemon.estimation.free_carry import DRIFT, FULL, LENS, SHIFT, Carry
+from vical_daemon.estimation.free_carry import DRIFT, FULL, IMU, LENS, READOUT, SHIFT, Carry
 from vical_daemon.estimation.free_handover import afresh, aged, next_window
 from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.free_reports import window_reports
@@ -49,7 +49,7 @@ class TargetFreeCalibrator:
         cameras: What is known about the camera (one).
 
     Raises:
-        ValueError: More than one camera, or an option that needs a target.
+        ValueError: More than one camera, or the size of a target to be found.
     """
 
     def __init__(self, options: CalibrationOptions, cameras: dict[str, CameraPrior]) -> None:
@@ -57,16 +57,16 @@ class TargetFreeCalibrator:
             raise ValueError(
                 f"target-free calibration takes one camera at a time, not {len(cameras)}; choose one"
             )
-        if options.estimate:
-            raise ValueError(
-                f"target-free calibration cannot estimate {', '.join(sorted(options.estimate))} yet"
-            )
+        if "target_scale" in options.estimate:
+            raise ValueError("without a target there is no target_scale to estimate")
         self.options = options
         self.camera, self.prior = next(iter(cameras.items()))
         self.active = np.ones(FULL, dtype=bool)
         self.active[:6] = "extrinsics" not in options.fix
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         self.active[LENS] = "intrinsics" not in options.fix
+        self.active[READOUT] = "readout" in options.estimate
+        self.active[IMU] = "imu_intrinsics" in options.estimate
         self.judge = FreeJudge(options, self.camera, self.active)
         self.starter = Starter(options, self.prior)
         self.window: Window | None = None
@@ -277,6 +277,7 @@ class TargetFreeCalibrator:
             intrinsics=tuple(lens.intrinsics.tolist()),
             distortion=tuple(lens.distortion.tolist()),
             T_imu_cam=None if self.active[0] else self.prior.T_imu_cam,
+            readout_s=lens.readout_s,
         )
         self.starter = Starter(self.options, self.prior)
         self.latest = None

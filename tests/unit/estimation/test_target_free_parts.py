@@ -14,7 +14,8 @@ from vical_daemon.estimation.free_bundle import Bundle
 from vical_daemon.estimation.free_carry import (
     DRIFT,
     FULL,
-    calibration_difference,
+    IMU,
+    camera_difference,
     first_carry,
     later,
     moved,
@@ -63,11 +64,11 @@ class Scene:
         self.noise = ImuNoise(d.gyro, d.gyro_walk, d.accel, d.accel_walk)
         self.rig = rig
 
-    def window(self):
+    def window(self, entries=0):
         start = moved(self.camera, np.zeros(FULL))
         start.p_imu_cam = np.zeros(3)
-        bias = self.rig.gyro_bias.value(0.0)
-        linear = LinearStart(self.buffer, self.frames, start, bias, self.noise, 9.80665)
+        imu = np.concatenate([self.rig.gyro_bias.value(0.0), np.zeros(3 + entries)])
+        linear = LinearStart(self.buffer, self.frames, start, imu, self.noise, 9.80665)
         return linear.window(ArmPrior(np.zeros(3)))
 
 
@@ -76,21 +77,20 @@ def scene():
     return Scene()
 
 
-def test_links_derivatives_agree_with_differences(scene):
+@pytest.mark.parametrize("numbers", [6, 21])
+def test_links_derivatives_agree_with_differences(scene, numbers):
+    zero = np.zeros(numbers)
     links = Links.stack(
-        [
-            make_link(scene.buffer, 0.3 + 0.05 * k, 0.35 + 0.05 * k, np.zeros(3), np.zeros(3), scene.noise)
-            for k in range(3)
-        ]
+        [make_link(scene.buffer, 0.3 + 0.05 * k, 0.35 + 0.05 * k, zero, scene.noise) for k in range(3)]
     )
     rng = np.random.default_rng(1)
     R = Rotation.from_rotvec(0.4 * rng.standard_normal((4, 3))).as_matrix()
     p, v = rng.standard_normal((2, 4, 3))
-    bias = 0.01 * rng.standard_normal((3, 6))
+    bias = 0.01 * rng.standard_normal((3, numbers))
     gravity = np.array([0.0, 0.0, -9.8])
     e0, J = links.errors(R, p, v, bias, gravity)
     h = 1e-6
-    for k in range(24):
+    for k in range(18 + numbers):
         R2, p2, v2, b2 = R.copy(), p.copy(), v.copy(), bias.copy()
         image, axis = (1 if k < 9 else 2), k % 9
         if k >= 18:
@@ -106,9 +106,8 @@ def test_links_derivatives_agree_with_differences(scene):
 
 
 def test_link_carries_the_true_motion(scene):
-    link = make_link(
-        scene.buffer, 1.0, 1.5, scene.rig.gyro_bias.value(1.2), scene.rig.accel_bias.value(1.2), scene.noise
-    )
+    biases = np.concatenate([scene.rig.gyro_bias.value(1.2), scene.rig.accel_bias.value(1.2)])
+    link = make_link(scene.buffer, 1.0, 1.5, biases, scene.noise)
     offset = (scene.run.t_imu_ns[0] - scene.run.options.epoch_ns) * 1e-9
     move, g = scene.rig.trajectory, scene.rig.gravity_world_mps2
     a, b = 1.0 + offset, 1.5 + offset
@@ -122,9 +121,9 @@ def test_a_link_is_not_made_over_a_hole_in_the_readings():
     buffer = ImuBuffer(0)
     for t in (0.0, 0.01, 0.02, 0.2, 0.21):
         buffer.append(t, np.zeros(3), np.zeros(3))
-    assert make_link(buffer, 0.0, 0.02, np.zeros(3), np.zeros(3), ImuNoise()) is not None
-    assert make_link(buffer, 0.01, 0.205, np.zeros(3), np.zeros(3), ImuNoise()) is None
-    assert make_link(buffer, 0.0, 0.3, np.zeros(3), np.zeros(3), ImuNoise()) is None
+    assert make_link(buffer, 0.0, 0.02, np.zeros(6), ImuNoise()) is not None
+    assert make_link(buffer, 0.01, 0.205, np.zeros(6), ImuNoise()) is None
+    assert make_link(buffer, 0.0, 0.3, np.zeros(6), ImuNoise()) is None
 
 
 def test_epipolar_fit_finds_mounting_delay_and_bias_without_knowing_any(scene):
@@ -149,25 +148,40 @@ def test_start_finds_lever_arm_and_speed_linearly(scene):
     assert np.abs(np.linalg.norm(window.v, axis=1) - speed).max() < 0.1
 
 
+def test_links_follow_the_matrices_as_integrating_anew_does(scene):
+    """What a link says of other biases and matrices, against one integrated for them."""
+    rng = np.random.default_rng(3)
+    at = np.concatenate([[0.01, -0.02, 0.01], [0.1, 0.0, -0.1], 0.02 * rng.standard_normal(15)])
+    link = make_link(scene.buffer, 1.0, 1.25, at, scene.noise)
+    for k in range(21):
+        step = np.zeros(21)
+        step[k] = 1e-4
+        up, down = (make_link(scene.buffer, 1.0, 1.25, at + s * step, scene.noise) for s in (1.0, -1.0))
+        turn = Rotation.from_matrix(down.dR.T @ up.dR).as_rotvec()
+        change = np.concatenate([turn, up.dv - down.dv, up.dp - down.dp]) / 2e-4
+        scale = np.repeat(np.abs(link.by_imu).max(axis=1).reshape(3, 3).max(axis=1), 3)
+        np.testing.assert_allclose(link.by_imu[:, k] / scale, change / scale, atol=6e-3)
+
+
 @pytest.mark.parametrize("readout_s", [0.0, 0.02])
 def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s):
-    window = scene.window()
+    window = scene.window(entries=15)
     window.camera = replace(window.camera, readout_s=readout_s)
     active = np.ones(FULL, dtype=bool)
     problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 50.0).problem
     seen, links = window.observe(), window.stacked()
     normal, order = problem.normal(seen, links), problem.order()
     rng = np.random.default_rng(2)
-    scales = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-5] + [0.01] * 4 + [1e-5] * 4 + [1e-5])
+    scales = np.array([1e-4] * 6 + [1e-5] + [0.01] * 4 + [1e-5] * 4 + [1e-5] * 2 + [1e-6] * 15)
     for k in range(FULL):
         step = np.zeros(FULL)
         step[k] = scales[k] * rng.choice([-1.0, 1.0])
-        camera = window.camera
-        window.camera = moved(camera, step)
-        up = problem.normal(seen, links).cost
-        window.camera = moved(camera, -step)
-        down = problem.normal(seen, links).cost
-        window.camera = camera
+        camera, costs = window.camera, []
+        for d in (step, -step):
+            window.camera, window.imu = moved(camera, d), d[IMU]
+            costs.append(problem.normal(seen, links).cost)
+        window.camera, window.imu = camera, np.zeros(15)
+        up, down = costs
         slope, wanted = (up - down) / 2.0 / step[k] / 2.0, normal.g[order.calib[k]]
         assert slope == pytest.approx(
             wanted, rel=0.02, abs=0.02 * np.sqrt(normal.H[order.calib[k], order.calib[k]])
@@ -230,7 +244,7 @@ def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     active = np.arange(FULL) < 7
     bundle = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 1.0)
     fit = bundle.solve(scene.buffer, 25)
-    error = calibration_difference(fit.carry.camera, scene.camera)[:7]
+    error = camera_difference(fit.carry.camera, scene.camera)[:7]
     P = fit.carry.covariance()[11:, 11:]
     assert error @ np.linalg.solve(P, error) < 24.3  # chi-square, 7 degrees of freedom, 99.9 %
     assert np.sqrt(np.diag(P))[:3].max() < 2e-3
@@ -271,7 +285,7 @@ def test_where_north_and_origin_are_changes_nothing(scene):
         results.append(fit)
     a, b = (np.sqrt(np.diag(r.carry.covariance())) for r in results)
     np.testing.assert_allclose(a, b, rtol=0.02)
-    change = calibration_difference(results[0].carry.camera, results[1].carry.camera)[:7]
+    change = camera_difference(results[0].carry.camera, results[1].carry.camera)[:7]
     assert np.abs(change / a[11:]).max() < 0.05
 
 

@@ -1,0 +1,104 @@
+"""Optional blocks without a target: readout and matrices of the imu are found, with honest sigmas."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from vical_mocks.rig import reference_rig
+from vical_mocks.tracks import simulate_tracks
+
+from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
+from benchmarks.scores import nees
+from vical_daemon.estimation.free_carry import IMU
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.target_free import TargetFreeCalibrator
+
+pytestmark = pytest.mark.timeout(400)
+
+
+def followed(seed, estimate, *, seconds=9.0, dark=None, **changes):
+    """A recording of a rig with these changes, and the calibration that finds `estimate` beside the usual."""
+    shift_s = float(np.random.default_rng([seed, 92]).uniform(-0.05, 0.05))
+    rig = reference_rig(seed, timeshift_cam_imu_s=shift_s, **changes)
+    run = simulate_tracks(seed, seconds, rig=rig, camera_rate_hz=10.0)
+    if dark is not None:
+        run.frames[:] = [f for f in run.frames if not dark[0] < f.t_s < dark[1]]
+    prior = camera_prior(run, seed, StartErrors(0.05, 5.0), exact_lens=True)
+    options = CalibrationOptions(
+        fix=frozenset({"intrinsics"}),
+        estimate=frozenset(estimate),
+        target_free=True,
+        imu_noise=imu_noise(run),
+    )
+    subject = CalibratorSubject(options, prior, None)
+    return rig, subject.calibrator, feed(run, subject)
+
+
+def crooked(seed):
+    """Matrices of the rig's readings, one percent off; the accelerometer's inverse is a lower triangle."""
+    rng = np.random.default_rng([seed, 93])
+    lower = np.eye(3) + np.tril(0.01 * rng.standard_normal((3, 3)))
+    return {
+        "gyro_matrix": np.eye(3) + 0.01 * rng.standard_normal((3, 3)),
+        "accel_matrix": np.linalg.inv(lower),
+    }
+
+
+def matrix_errors(rig, imu):
+    """Of the 15 entries: M_g row by row, lower triangle of M_a."""
+    gyro = np.array(imu.gyro_matrix) - np.linalg.inv(rig.gyro_matrix)
+    accel = np.array(imu.accel_matrix) - np.linalg.inv(rig.accel_matrix)
+    return np.concatenate([gyro.ravel(), accel[np.tril_indices(3)]])
+
+
+@pytest.mark.parametrize("readout_s", [-0.015, 0.03])
+def test_a_readout_nobody_told_is_found(readout_s):
+    rig, calibrator, record = followed(3, {"readout"}, readout_s=readout_s)
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
+    camera = calibrator.estimate().cameras["cam0"]
+    assert 0.0 < camera.readout_sigma_s < 5e-4
+    assert abs(camera.readout_s - rig.readout_s) < 4.0 * camera.readout_sigma_s
+
+
+def test_scale_and_misalignment_of_the_imu_are_found():
+    rig, calibrator, record = followed(4, {"imu_intrinsics"}, **crooked(4))
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
+    error = matrix_errors(rig, calibrator.estimate().imu)
+    P = calibrator.latest.calibration()[IMU, IMU]
+    assert error @ np.linalg.solve(P, error) < chi2.isf(1e-4, 15)
+    assert np.sqrt(np.diag(P)).max() < 0.006  # from one percent, after nine seconds
+
+
+def test_untold_matrices_do_not_make_it_sure_of_a_wrong_answer():
+    _, _, record = followed(4, set(), seconds=12.0, **crooked(4))
+    for shot in record.snapshots:
+        if shot.status == "converged":
+            assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-6, 7), shot.t_s
+
+
+def test_what_was_found_outlasts_darkness():
+    rig, calibrator, record = followed(
+        5, {"readout", "imu_intrinsics"}, seconds=16.0, dark=(8.0, 11.0), readout_s=0.02, **crooked(5)
+    )
+    assert any("went on after" in text for _, text in record.events)
+    last = record.snapshots[-1]
+    assert nees(last.error, last.covariance, 7) < chi2.isf(1e-4, 7)
+    estimate = calibrator.estimate()
+    error, P = matrix_errors(rig, estimate.imu), calibrator.latest.calibration()[IMU, IMU]
+    assert error @ np.linalg.solve(P, error) < chi2.isf(1e-4, 15)
+    camera = estimate.cameras["cam0"]
+    assert abs(camera.readout_s - 0.02) < 4.0 * camera.readout_sigma_s
+
+
+def test_what_is_not_asked_for_is_held():
+    _, calibrator, _ = followed(6, set(), seconds=7.0)
+    estimate = calibrator.estimate()
+    assert estimate.imu.gyro_matrix == estimate.imu.accel_matrix == []
+    assert estimate.cameras["cam0"].readout_s == estimate.cameras["cam0"].readout_sigma_s == 0.0
+
+
+def test_the_size_of_a_target_that_is_not_there_is_refused():
+    options = CalibrationOptions(target_free=True, estimate=frozenset({"target_scale"}))
+    with pytest.raises(ValueError, match="without a target there is no target_scale"):
+        TargetFreeCalibrator(options, {"a": CameraPrior((640, 480))})

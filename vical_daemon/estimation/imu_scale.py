@@ -1,0 +1,56 @@
+"""Scale and misalignment of an IMU as fifteen numbers: what is estimated of its two matrices.
+
+omega = M_g (omega_m - b_g), f = M_a (f_m - b_a). Of M_a only the lower triangle: a full matrix could be
+traded against the mounting of the camera. Entries are those of M_g - I, row by row, and of M_a - I.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.imu_buffer import ImuSegment
+from vical_daemon.estimation.imu_model import Influence
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.state import LOWER
+
+ENTRIES = 15
+
+
+def matrices(entries: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """M_g and M_a of their entries, shapes (3, 3)."""
+    accel = np.eye(3)
+    accel[LOWER[:, 0], LOWER[:, 1]] += entries[9:]
+    return np.eye(3) + entries[:9].reshape(3, 3), accel
+
+
+def by_entries(
+    errors: Influence,
+    segment: ImuSegment,
+    bias: FloatArray,
+    gyro_matrix: FloatArray,
+    accel_matrix: FloatArray,
+) -> FloatArray:
+    """Derivatives of the end of a segment by biases and entries.
+
+    An error of M_g acts as an error of the rate, dM_g (omega_m - b_g), at each reading; one of the bias as
+    -M_g db_g; the accelerometer alike. (tested against differences)
+
+    Args:
+        errors: What errors of rate and force do to the end.
+        segment: Readings.
+        bias: [gyro, accel], shape (6,).
+        gyro_matrix: M_g in force.
+        accel_matrix: M_a in force.
+
+    Returns:
+        By [bias 6, entries 15], rows as in `Influence`, shape (9, 21).
+    """
+    at = errors.weights[:, None, None] * errors.at
+    turned, forced = at[:, :, :3], at[:, :, 3:]
+    rate, force = segment.gyro - bias[:3], segment.accel - bias[3:]
+    out = np.empty((9, 6 + ENTRIES))
+    out[:, :3] = -turned.sum(axis=0) @ gyro_matrix
+    out[:, 3:6] = -forced.sum(axis=0) @ accel_matrix
+    out[:, 6:15] = np.einsum("nai,nj->aij", turned, rate).reshape(9, 9)
+    out[:, 15:] = np.einsum("nai,nj->aij", forced, force)[:, LOWER[:, 0], LOWER[:, 1]]
+    return out

@@ -1,0 +1,122 @@
+"""Several cameras without a target: each calibrated by itself against the one IMU, and one answer of all.
+
+Cameras that see the same scene could share its points, but need not see any of it together; what ties them
+is the IMU. So the answers are those of one camera at a time, sigmas included, and a camera that is blind,
+dark or unplugged holds up no other. [docs/math/target_free.md]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, ImuEstimate, Status, TracePoint
+from vical_daemon.estimation.target_free import TargetFreeCalibrator
+
+# What the rig as a whole is: the first of these that any camera is.
+_ORDER = (
+    Status.INCONSISTENT,
+    Status.DEGENERATE,
+    Status.WAITING,
+    Status.INITIALISING,
+    Status.CONVERGING,
+    Status.CONVERGED,
+)
+
+
+class TargetFreeRig:
+    """Calibrates several cameras against one IMU, online, from feature tracks; see `TargetFreeCalibrator`.
+
+    Args:
+        options: Switches and noise.
+        cameras: What is known about each, at least one.
+
+    Raises:
+        ValueError: No camera, or the size of a target to be found.
+    """
+
+    def __init__(self, options: CalibrationOptions, cameras: dict[str, CameraPrior]) -> None:
+        if not cameras:
+            raise ValueError("no camera to calibrate")
+        self.parts = {name: TargetFreeCalibrator(options, {name: prior}) for name, prior in cameras.items()}
+        self.frames_ignored = 0  # of cameras that nobody asked for
+
+    def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
+        """Take one reading (imu clock, ns; rad/s; m/s^2)."""
+        for part in self.parts.values():
+            part.add_imu(t_imu_ns, gyro_rps, specific_force_mps2)
+
+    def add_points(self, frame: PointsFrame) -> None:
+        """Take the tracks of one image; those of unknown cameras are only counted."""
+        part = self.parts.get(frame.camera)
+        if part is None:
+            self.frames_ignored += 1
+        else:
+            part.add_points(frame)
+
+    def process(self) -> list[FrameReport]:
+        """Do what can be done with what has arrived; reports on the images of windows that are complete."""
+        return _in_order(part.process() for part in self.parts.values())
+
+    def finish(self) -> list[FrameReport]:
+        """End of the data: everything that inertial data cover."""
+        return _in_order(part.finish() for part in self.parts.values())
+
+    def estimate(self) -> CalibrationEstimate:
+        """Return what is known now; takes the events since the last call along."""
+        return together({name: part.estimate() for name, part in self.parts.items()})
+
+    def trace(self, camera: str) -> list[TracePoint]:
+        """Return how the calibration of one camera developed."""
+        return self.parts[camera].trace(camera) if camera in self.parts else []
+
+
+def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
+    """One answer of several cameras'.
+
+    Args:
+        estimates: By camera, at least one.
+
+    Returns:
+        All cameras; the status of the one that is behind, with its name before the reason; biases and
+        matrices from the camera that knows them best.
+    """
+    all_ = list(estimates.values())
+    status = min((e.status for e in all_), key=_ORDER.index)
+    behind = {name: e for name, e in estimates.items() if e.status == status}
+    frames = np.array([max(e.frames, 1) for e in all_], np.float64)
+    return CalibrationEstimate(
+        max(e.t_ns for e in all_),
+        status,
+        "; ".join(f"{name}: {e.reason}" for name, e in behind.items() if e.reason),
+        min(e.progress for e in all_),
+        next((e.guidance for e in behind.values() if e.guidance), ""),
+        max(e.duration_s for e in all_),
+        sum(e.frames for e in all_),
+        max(e.imu_samples for e in all_),
+        {name: camera for e in all_ for name, camera in e.cameras.items()},
+        _best_known([e.imu for e in all_ if e.imu is not None]),
+        next((e.gravity_world_mps2 for e in all_ if e.gravity_world_mps2), []),
+        float(np.average([e.nis_per_dof for e in all_], weights=frames)),
+        float(np.average([e.rejected_fraction for e in all_], weights=frames)),
+        [_named(name, text) for name, e in estimates.items() for text in e.events],
+    )
+
+
+def _best_known(imus: list[ImuEstimate]) -> ImuEstimate | None:
+    return min(imus, key=lambda imu: sum(imu.gyro_bias_sigma_rps), default=None)
+
+
+def _named(camera: str, text: str) -> str:
+    """An announcement with the camera's name, behind the word that says what kind it is ("bumped: ...")."""
+    if camera in text:
+        return text
+    kind, colon, rest = text.partition(": ")
+    return f"{kind}: {camera}: {rest}" if colon else f"{camera}: {text}"
+
+
+def _in_order(reports: Iterable[list[FrameReport]]) -> list[FrameReport]:
+    return sorted((r for part in reports for r in part), key=lambda r: r.t_ns)
