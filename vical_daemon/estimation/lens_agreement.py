@@ -1,4 +1,4 @@
-"""Do stretches of the data agree about the lens? How much larger its sigmas must be where they do not.
+"""Do stretches of the data agree about the lens, and is it of its model? How much larger its sigmas must be.
 
 A lens model never fits quite, and what it gets wrong depends on where in the image and at which slant the
 target is seen: for seconds at a time the same way. Residuals hardly show it (the parameters bend to fit), and
@@ -7,49 +7,70 @@ be; the answer with each run of neighbouring stretches left out in turn shows ho
 That block-jackknife variance, over the one that independent errors would give, is the factor by which the
 filter's variances are too small. It is known from few runs only: as for a Student variable, less is known.
 [Kunsch, "The jackknife and the bootstrap for general stationary observations", 1989; docs/math/filter.md]
+
+What all stretches get wrong alike no comparison shows. So the model's next power of the radius is estimated
+beside: where it is there beyond doubt, the parameters are known no better than they would move with it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.unscented import upper_root
 
+LENS = 8  # fx fy cx cy and the distortion
 _STRETCH_S = 5.0
-_SIGNIFICANT = 0.01
+_SIGNIFICANT = 0.01 / LENS  # one set of clean data in a hundred may lose by it, not one parameter
+_BEYOND_DOUBT = 4.0  # sigmas of the next power of the radius: by chance once in 16000
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3
 _LONGEST_RUN = 4
-_WEAK = np.array([0.1, 0.1, 0.1, 0.1])  # of the focal length: as good as nothing known
+_WEAK = 0.1  # of the focal length: as good as nothing known
 _WEAK_DISTORTION = 0.5
+_RIDGE = 1e-12  # corners in one line leave a turn about it open
+_RADIAL = {"radtan": (4, 5), "equidistant": (6, 7)}  # the two highest powers of the radius
 
 
-@dataclass(slots=True)
-class _Stretch:
-    """Information of some images about the lens, and that times the lens they would have."""
+class _Stretch(NamedTuple):
+    """Information of some images about the lens and its next power; that times the lens they would have."""
 
-    information: FloatArray = field(default_factory=lambda: np.zeros((8, 8)))
-    weighted: FloatArray = field(default_factory=lambda: np.zeros(8))
+    information: FloatArray
+    weighted: FloatArray
 
     def plus(self, other: _Stretch) -> _Stretch:
         return _Stretch(self.information + other.information, self.weighted + other.weighted)
+
+
+class _Told(NamedTuple):
+    """What all stretches say together: values, covariance if errors were independent, and factors on it."""
+
+    values: FloatArray
+    covariance: FloatArray
+    factors: FloatArray
 
 
 @dataclass(slots=True)
 class LensAgreement:
     """Running agreement of one camera's lens.
 
+    Args:
+        model: radtan or equidistant.
+
     Attributes:
         factors: Multiply the variances of fx fy cx cy and the four distortion coefficients, >= 1, shape (8,).
+        moved: How far those eight would move with one more power of the radius, where that is there beyond
+            doubt; else zeros; px and -, shape (8,).
     """
 
-    factors: FloatArray = field(default_factory=lambda: np.ones(8))
+    model: str
+    factors: FloatArray = field(default_factory=lambda: np.ones(LENS))
+    moved: FloatArray = field(default_factory=lambda: np.zeros(LENS))
     _done: list[_Stretch] = field(default_factory=list)
-    _now: _Stretch = field(default_factory=_Stretch)
+    _now: _Stretch | None = None
     _begin_s: float = np.inf
 
     def learn(
@@ -68,35 +89,66 @@ class LensAgreement:
             self._close(lens[0])
             self._begin_s = t_s
         # whatever the pose of the image may be: only what no pose explains says something about the lens
-        p, n = by_pose.shape[1], by_pose.shape[1] + by_lens.shape[1]
-        rows = np.concatenate([by_pose, by_lens, innovation[:, None]], axis=1)
-        R = upper_root(rows)[p:n]
-        J = R[:, p:n]
-        self._now.information += J.T @ J
-        self._now.weighted += J.T @ (R[:, n] + J @ lens)
+        rows = np.column_stack([by_pose, by_lens, self._next_power(by_lens), innovation])
+        N, p = rows.T @ rows, by_pose.shape[1]
+        posed = N[:p, :p] + _RIDGE * np.trace(N[:p, :p]) * np.eye(p)
+        N = N[p:, p:] - N[p:, :p] @ np.linalg.solve(posed, N[:p, p:])
+        A, b = N[:-1, :-1], N[:-1, -1]
+        said = _Stretch(A, b + A[:, :LENS] @ lens)
+        self._now = said if self._now is None else self._now.plus(said)
+
+    def _next_power(self, by_lens: FloatArray) -> FloatArray:
+        """Derivative by the coefficient that the model would have next, shape (2n,)."""
+        below, highest = (by_lens[:, k].reshape(-1, 2) for k in _RADIAL[self.model])
+        size = np.maximum((below**2).sum(axis=1), 1e-30)  # each power is the one below times radius squared
+        return np.asarray((highest * ((below * highest).sum(axis=1) / size)[:, None]).ravel())
 
     def _close(self, focal_px: float) -> None:
-        """Put the stretch to the others and leave out each in turn."""
-        if self._now.information.any():
+        """Put the stretch to the others and compare."""
+        if self._now is not None:
             self._done.append(self._now)
-            self._now = _Stretch()
+            self._now = None
         if len(self._done) > _MOST:
             self._done[:2] = [self._done[0].plus(self._done[1])]
-        n = len(self._done)
-        if n < _LEAST:
+        if len(self._done) < _LEAST:
             return
-        weak = np.diag(np.concatenate([1.0 / (_WEAK * focal_px) ** 2, np.full(4, _WEAK_DISTORTION**-2)]))
         A = np.array([s.information for s in self._done])
         b = np.array([s.weighted for s in self._done])
-        whole = A.sum(axis=0) + weak
-        lens = np.linalg.solve(whole, b.sum(axis=0))
-        d = min(max(1, n // 3), _LONGEST_RUN)
-        runs = np.stack([np.arange(k, k + d) for k in range(n - d + 1)])
-        left = whole - A[runs].sum(axis=1)
-        without = np.linalg.solve(left, (b.sum(axis=0) - b[runs].sum(axis=1))[..., None])[..., 0]
-        spread = (n - d) / (d * len(runs)) * ((without - lens) ** 2).sum(axis=0)
-        ratio = spread / np.diag(np.linalg.inv(whole))
-        apart = n / d  # how many runs there are to tell the spread from
-        limit = float(chi2.isf(_SIGNIFICANT, apart)) / apart
-        student = apart / max(apart - 2.0, 1.0)
-        self.factors = np.where(ratio > limit, student * ratio, 1.0)
+        weak = np.array([_WEAK * focal_px] * 4 + [_WEAK_DISTORTION] * 5) ** -2.0
+        self.factors = _compared(A[:, :LENS, :LENS], b[:, :LENS], weak[:LENS]).factors
+        free = _compared(A, b, weak)
+        power, variance = free.values[LENS], free.covariance[LENS, LENS]
+        doubt = _BEYOND_DOUBT**2 * free.factors[LENS] * variance
+        there = power if power**2 > doubt else 0.0
+        self.moved = free.covariance[:LENS, LENS] * (there / variance)
+
+
+def _compared(A: FloatArray, b: FloatArray, weak: FloatArray) -> _Told:
+    """Leave out each run of stretches in turn.
+
+    Args:
+        A: Information by stretch, shape (n, m, m).
+        b: That times the values of each stretch, shape (n, m).
+        weak: Information of a prior that hardly matters, shape (m,).
+    """
+    n = len(A)
+    d = min(max(1, n // 3), _LONGEST_RUN)
+    runs = np.stack([np.arange(k, k + d) for k in range(n - d + 1)])
+    whole = A.sum(axis=0) + np.diag(weak)
+    P = np.linalg.inv(whole)
+    values = P @ b.sum(axis=0)
+    # information of all but two runs, which may overlap
+    out = (runs[:, :, None] == np.arange(n)).any(axis=1)
+    both = out[:, None] | out[None]
+    left = whole - np.tensordot(both.astype(np.float64), A, axes=1)
+    Q = np.linalg.inv(left[np.arange(len(runs)), np.arange(len(runs))])
+    without = np.matmul(Q, (b.sum(axis=0) - out @ b)[..., None])[..., 0]
+    # covariance of the changes were errors independent: stretches do not tell equally much
+    C = np.einsum("rpi,rsij,sjp->rsp", Q, left, Q, optimize=True) - np.diag(P)
+    usual = np.einsum("rrp->rp", C)
+    ratio = ((without - values) ** 2 / usual).mean(axis=0)
+    # a mean of dependent squares: like a chi-square of as many degrees as have its variance [Satterthwaite]
+    dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
+    limit = chi2.isf(_SIGNIFICANT, dof) / dof
+    student = dof / np.maximum(dof - 2.0, 1.0)
+    return _Told(values, P, np.where(ratio > limit, student * ratio, 1.0))

@@ -185,7 +185,7 @@ def wide_filter(
         if unshown is not None and where.position is not None:
             held = unshown.projector
             root[where.position, where.position] = UNKNOWN_M * (np.eye(3) - held) + HELD_M * held
-    agreement = {name: LensAgreement() for name in layout.cameras}
+    agreement = {name: LensAgreement(state.cameras[name].distortion_model) for name in layout.cameras}
     shared = {name: SharedErrors() for name in layout.cameras}
     return CalibrationFilter(
         state,

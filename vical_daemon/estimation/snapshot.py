@@ -22,17 +22,22 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     spread = float(np.sqrt(f.consistency[name].factor))
     raw = f.sigmas()
     sigma = spread * raw
-    lens = np.maximum(np.sqrt(f.agreement[name].factors), spread)
+    agreement = f.agreement[name]
+    lens = np.maximum(np.sqrt(agreement.factors), spread)
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
         PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), (spread**2 * pose_covariance(f, where)).tolist()),
         float(camera.timeshift_s),
         float(sigma[where.timeshift]) if where.timeshift is not None else 0.0,
         camera.intrinsics.tolist(),
-        (lens[:4] * raw[where.intrinsics]).tolist() if where.intrinsics is not None else [0.0] * 4,
+        np.hypot(lens[:4] * raw[where.intrinsics], agreement.moved[:4]).tolist()
+        if where.intrinsics is not None
+        else [0.0] * 4,
         camera.distortion_model,
         camera.distortion.tolist(),
-        (lens[4:] * raw[where.distortion]).tolist() if where.distortion is not None else [0.0] * 4,
+        np.hypot(lens[4:] * raw[where.distortion], agreement.moved[4:]).tolist()
+        if where.distortion is not None
+        else [0.0] * 4,
         float(reprojection_rms_px),
         float(f.corner_noise[name].sigma_px),
         [],
