@@ -35,7 +35,8 @@ _DONE = 1.0  # a step that promises less than this of the sum of squares is the 
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
-_SMALL = 0.1  # of the sum of squares: from here on outliers stand out
+_SMALL = 0.1  # of the sum of squares: where a step promises no more, outliers stand out
+_STUCK = 0.02  # of the sum of squares: where a step brought no more, outliers may be why
 
 
 class Fit(NamedTuple):
@@ -126,7 +127,7 @@ class Bundle:
                     break
                 w.bad.clear()  # late images had looked like outliers
                 seen, cleaned, gain = w.observe(), False, np.inf
-            elif not cleaned and min(step.promise, gain) < _SMALL * normal.cost:
+            elif not cleaned and (step.promise < _SMALL * normal.cost or gain < _STUCK * normal.cost):
                 # close enough to tell what does not belong; or stuck, because of it
                 self._apply(step)
                 cleaned = True

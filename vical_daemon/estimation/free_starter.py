@@ -41,6 +41,7 @@ _SHIFT_SIGMA_S = 4e-3
 _READOUT_SIGMA_S = 0.015
 _IMU_SIGMA = 0.01  # scale and misalignment
 _MIN_TRACKS = 12
+_MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _FULL_FITS = 2
 _ROUGH_STEPS = 8
 _APART_RAD = float(np.deg2rad(2.0))
@@ -276,7 +277,7 @@ def _not_sure_yet(fit: EpipolarFit, *, mounting_known: bool) -> str:
 
 
 def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -> Frames:
-    """The last images without a hole between them."""
+    """The last images without a hole between them; of very many every second one, evenly."""
     out: Frames = []
     for t, frame in reversed(frames):
         if t > end_s or len(frame.ids) < _MIN_TRACKS:
@@ -284,7 +285,7 @@ def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -
         if t < begin_s or (out and (out[-1][0] - t > _MAX_HOLE_S or out[0][0] - t > span_s)):
             break
         out.append((t, frame))
-    return out[::-1]
+    return out[:: -(-len(out) // _MOST_IMAGES) or 1][::-1]
 
 
 def _still(frames: Frames) -> bool:
