@@ -23,6 +23,7 @@ from vical_daemon.estimation.image_update import (
     frame_limit,
     rows_of,
     solve,
+    whitened,
 )
 from vical_daemon.estimation.imu_buffer import ImuSegment
 from vical_daemon.estimation.lens_agreement import LensAgreement
@@ -198,20 +199,18 @@ class CalibrationFilter:
         """What an image says about shared errors and lens before it is used."""
         where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
         shared, agreement = self.shared.get(image.camera), self.agreement.get(image.camera)
-        rows, sigma = rows_of(fit.keep), image.sigma_px[fit.keep]
-        every = lin.ways[rows] / np.repeat(sigma, 2)[:, None]
-        each = ((image.uv - lin.z)[fit.keep] / sigma[:, None]).ravel()
         if shared is not None:
-            # the fit may be linearised elsewhere
-            ways, innovation = (every, each) if lin.curved.size else (fit.ways, fit.r)
+            # a fit far from straight is linearised elsewhere
+            ways, innovation = whitened(image, lin, fit.keep) if lin.curved.size else (fit.ways, fit.r)
             level = self.consistency[image.camera].level
             by_shared = ways @ (lin.by_error @ shared_ways(self.state, self.layout, image.camera))
             shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
         if agreement is not None and where.intrinsics is not None and where.distortion is not None:
             lens = slice(where.intrinsics.start, where.distortion.stop)
             values = np.concatenate([camera.intrinsics, camera.distortion])
-            by_pose, by_lens = every @ lin.by_error[:, :6], every @ lin.by_error[:, lens]
-            agreement.learn(self.state.t_s, each, by_pose, by_lens, values)
+            ways, innovation = whitened(image, lin, fit.keep)
+            by_pose, by_lens = ways @ lin.by_error[:, :6], ways @ lin.by_error[:, lens]
+            agreement.learn(self.state.t_s, innovation, by_pose, by_lens, values)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""

@@ -64,6 +64,13 @@ def rows_of(keep: BoolArray) -> BoolArray | slice:
     return slice(None) if keep.all() else np.repeat(keep, 2)
 
 
+def whitened(image: Image, lin: Linear, keep: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """The ways of the kept corners and their innovation over the corner noise, shapes (2n, k), (2n,)."""
+    sigma = image.sigma_px[keep]
+    ways = lin.ways[rows_of(keep)] / np.repeat(sigma, 2)[:, None]
+    return ways, ((image.uv - lin.z)[keep] / sigma[:, None]).ravel()
+
+
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
     moves = lin.moves

@@ -26,6 +26,7 @@ LENS = 8  # fx fy cx cy and the distortion
 _STRETCH_S = 5.0
 _SIGNIFICANT = 0.01 / LENS  # one set of clean data in a hundred may lose by it, not one parameter
 _BEYOND_DOUBT = 4.0  # sigmas of the next power of the radius: by chance once in 16000
+_LEAST_TOLD = 1e-9  # of the variance of all: a run that tells less tells nothing
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3
 _LONGEST_RUN = 4
@@ -145,7 +146,7 @@ def _compared(A: FloatArray, b: FloatArray, weak: FloatArray) -> _Told:
     without = np.matmul(Q, (b.sum(axis=0) - out @ b)[..., None])[..., 0]
     # covariance of the changes were errors independent: stretches do not tell equally much
     C = np.einsum("rpi,rsij,sjp->rsp", Q, left, Q, optimize=True) - np.diag(P)
-    usual = np.einsum("rrp->rp", C)
+    usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_TOLD * np.diag(P))
     ratio = ((without - values) ** 2 / usual).mean(axis=0)
     # a mean of dependent squares: like a chi-square of as many degrees as have its variance [Satterthwaite]
     dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))

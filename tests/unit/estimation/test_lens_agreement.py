@@ -126,3 +126,14 @@ def test_corners_in_one_line_say_what_they_can():
         by_pose[:, 0] = 0.0  # a turn about the line moves no corner
         agreement.learn(1.0 * k, rng.standard_normal(20), by_pose, by_lens, LENS)
     assert np.isfinite(agreement.factors).all() and np.isfinite(agreement.moved).all()
+
+
+def test_a_stretch_that_says_nothing_is_no_evidence():
+    rng = np.random.default_rng(9)
+    agreement = LensAgreement("radtan")
+    for stretch in range(8):
+        weight = 1e-9 if stretch in (2, 6) else 1.0  # seen from so far that only the pose fits
+        for k in range(6):
+            by_pose, by_lens = rng.standard_normal((40, 6)), weight * rng.standard_normal((40, 8)) / SIZE
+            agreement.learn(5.0 * stretch + 0.5 * k, rng.standard_normal(40), by_pose, by_lens, LENS)
+    np.testing.assert_array_equal(agreement.factors, 1.0)
