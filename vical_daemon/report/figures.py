@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import chi2
 
 from vical_daemon.estimation import so3
@@ -33,7 +34,7 @@ def _panels(
     matplotlib's own layout engine would double the time of every figure.
     """
     figure = Figure(figsize=(width, height))
-    left, right, top, bottom, gap = 0.58, 0.12, 0.30, 0.45, 0.60
+    left, right, top, bottom, gap = 0.68, 0.12, 0.30, 0.45, 0.65
     panel_width = (width - left - right - gap * (columns - 1)) / columns
     panel_height = (height - top - bottom - gap * (rows - 1)) / rows
     axes = figure.subplots(
@@ -129,6 +130,9 @@ def sigmas(trace: Sequence[dict[str, Any]]) -> Figure:
             panel.plot(t, shown, color=AXES[i] if values.shape[1] == 3 else INK, linewidth=1.3)
         if np.nanmax(np.where(values > 0, values, np.nan), initial=0) > 0:
             panel.set_yscale("log")
+            panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            panel.yaxis.set_major_formatter("{x:g}")
+            panel.yaxis.set_minor_formatter(NullFormatter())
         _style(panel, title, "time, s", unit)
     return figure
 
