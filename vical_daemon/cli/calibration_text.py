@@ -52,15 +52,21 @@ def _camera_lines(camera: dict[str, Any]) -> list[str]:
         _row("sigma about cam x y z", [math.degrees(s) for s in sigma[3:]], None, "deg", 4),
         _row("time shift", [shift_ms], [1e3 * camera["timeshift_sigma_s"]], "ms", 3)
         + "  (t_imu = t_cam + shift)",
+        *_readout_lines(camera),
         _row("fx fy cx cy", camera["intrinsics"], camera["intrinsics_sigma"], "px", 2),
         _row(camera["distortion_model"], camera["distortion"], camera["distortion_sigma"], "", 5),
         f"  {'reprojection rms':<22}{camera['reprojection_rms_px']:.3f} px",
     ]
-    if camera.get("readout_s") or camera.get("readout_sigma_s"):
-        readout = (1e3 * camera["readout_s"], 1e3 * camera["readout_sigma_s"])
-        lines.insert(5, _row("readout", [readout[0]], [readout[1]], "ms", 3) + "  (first row to last)")
     lines += [f"  withheld: {what}" for what in camera["unobservable"]]
     return lines
+
+
+def _readout_lines(camera: dict[str, Any]) -> list[str]:
+    """The readout of a rolling shutter, told or found."""
+    readout_s, sigma_s = camera.get("readout_s", 0.0), camera.get("readout_sigma_s", 0.0)
+    if not (readout_s or sigma_s):
+        return []
+    return [_row("readout", [1e3 * readout_s], [1e3 * sigma_s], "ms", 3) + "  (first row to last)"]
 
 
 def _row(name: str, values: list[float], sigmas: list[float] | None, unit: str, digits: int) -> str:

@@ -34,7 +34,7 @@ _HYSTERESIS = 2.0
 _ENOUGH_WINDOWS = 2
 _MOST_SIGMA_PX = 3.0
 _MOST_INERTIAL = 2.5
-_MOST_REFUSED, _MOST_REFUSED_FIRST = 0.4, 0.2
+_MOST_REFUSED = 0.4
 _DOUBT = 1e-5  # chance of a window that disagrees this much
 _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
@@ -136,7 +136,7 @@ class FreeJudge:
             self.misfit = f"features miss their places by {fit.sigma_px:.1f} px"
         elif fit.inertial > _MOST_INERTIAL:
             self.misfit = f"inertial data and images disagree ({fit.inertial:.1f} times their noise)"
-        elif share > (_MOST_REFUSED_FIRST if first else _MOST_REFUSED):
+        elif share > _MOST_REFUSED:
             self.misfit = f"{share:.0%} of the features do not move with the scene"
         return not self.misfit
 

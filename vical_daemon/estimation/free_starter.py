@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -277,7 +278,7 @@ def _not_sure_yet(fit: EpipolarFit, *, mounting_known: bool) -> str:
 
 
 def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -> Frames:
-    """The last images without a hole between them; of very many every second one, evenly."""
+    """The last images without a hole between them; of very many every second or third."""
     out: Frames = []
     for t, frame in reversed(frames):
         if t > end_s or len(frame.ids) < _MIN_TRACKS:
@@ -285,7 +286,8 @@ def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -
         if t < begin_s or (out and (out[-1][0] - t > _MAX_HOLE_S or out[0][0] - t > span_s)):
             break
         out.append((t, frame))
-    return out[:: -(-len(out) // _MOST_IMAGES) or 1][::-1]
+    every = max(1, math.ceil(len(out) / _MOST_IMAGES))
+    return out[::every][::-1]
 
 
 def _still(frames: Frames) -> bool:

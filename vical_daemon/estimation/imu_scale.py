@@ -48,9 +48,8 @@ def by_entries(
     at = errors.weights[:, None, None] * errors.at
     turned, forced = at[:, :, :3], at[:, :, 3:]
     rate, force = segment.gyro - bias[:3], segment.accel - bias[3:]
-    out = np.empty((9, 6 + ENTRIES))
-    out[:, :3] = -turned.sum(axis=0) @ gyro_matrix
-    out[:, 3:6] = -forced.sum(axis=0) @ accel_matrix
+    out, by_bias = np.empty((9, 6 + ENTRIES)), errors.by_bias()
+    out[:, :3], out[:, 3:6] = by_bias[:, :3] @ gyro_matrix, by_bias[:, 3:] @ accel_matrix
     out[:, 6:15] = np.einsum("nai,nj->aij", turned, rate).reshape(9, 9)
     out[:, 15:] = np.einsum("nai,nj->aij", forced, force)[:, LOWER[:, 0], LOWER[:, 1]]
     return out

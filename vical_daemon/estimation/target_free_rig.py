@@ -1,8 +1,8 @@
 """Several cameras without a target: each calibrated by itself against the one IMU, and one answer of all.
 
 Cameras that see the same scene could share its points, but need not see any of it together; what ties them
-is the IMU. So the answers are those of one camera at a time, sigmas included, and a camera that is blind,
-dark or unplugged holds up no other. [docs/math/target_free.md]
+is the IMU. So the answers are those of one camera at a time, sigmas included, and go on while another camera
+is blind, dark or unplugged; `converged` is the rig when all of them are. [docs/math/target_free.md]
 """
 
 from __future__ import annotations
@@ -89,20 +89,20 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
     behind = {name: e for name, e in estimates.items() if e.status == status}
     frames = np.array([max(e.frames, 1) for e in all_], np.float64)
     return CalibrationEstimate(
-        max(e.t_ns for e in all_),
-        status,
-        "; ".join(f"{name}: {e.reason}" for name, e in behind.items() if e.reason),
-        min(e.progress for e in all_),
-        next((e.guidance for e in behind.values() if e.guidance), ""),
-        max(e.duration_s for e in all_),
-        sum(e.frames for e in all_),
-        max(e.imu_samples for e in all_),
-        {name: camera for e in all_ for name, camera in e.cameras.items()},
-        _best_known([e.imu for e in all_ if e.imu is not None]),
-        next((e.gravity_world_mps2 for e in all_ if e.gravity_world_mps2), []),
-        float(np.average([e.nis_per_dof for e in all_], weights=frames)),
-        float(np.average([e.rejected_fraction for e in all_], weights=frames)),
-        [_named(name, text) for name, e in estimates.items() for text in e.events],
+        t_ns=max(e.t_ns for e in all_),
+        status=status,
+        reason="; ".join(f"{name}: {e.reason}" for name, e in behind.items() if e.reason),
+        progress=min(e.progress for e in all_),
+        guidance=next((e.guidance for e in behind.values() if e.guidance), ""),
+        duration_s=max(e.duration_s for e in all_),
+        frames=sum(e.frames for e in all_),
+        imu_samples=max(e.imu_samples for e in all_),
+        cameras={name: camera for e in all_ for name, camera in e.cameras.items()},
+        imu=_best_known([e.imu for e in all_ if e.imu is not None]),
+        gravity_world_mps2=next((e.gravity_world_mps2 for e in all_ if e.gravity_world_mps2), []),
+        nis_per_dof=float(np.average([e.nis_per_dof for e in all_], weights=frames)),
+        rejected_fraction=float(np.average([e.rejected_fraction for e in all_], weights=frames)),
+        events=[_named(name, text) for name, e in estimates.items() for text in e.events],
     )
 
 
@@ -112,7 +112,7 @@ def _best_known(imus: list[ImuEstimate]) -> ImuEstimate | None:
 
 def _named(camera: str, text: str) -> str:
     """An announcement with the camera's name, behind the word that says what kind it is ("bumped: ...")."""
-    if camera in text:
+    if text.startswith(f"{camera}: "):
         return text
     kind, colon, rest = text.partition(": ")
     return f"{kind}: {camera}: {rest}" if colon else f"{camera}: {text}"

@@ -90,7 +90,16 @@ def test_gross_outliers_and_broken_tracks_never_bend_an_answer(seed):
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
 
 
-def test_a_window_that_must_refuse_much_is_no_start():
+@pytest.mark.parametrize("seed", [1, 2])
+def test_starts_while_three_tenths_of_the_features_move(seed):
+    run = simulated(seed=seed, seconds=9.0, moving_fraction=0.3)
+    record = feed(run, subject_for(run))
+    assert record.started_s() <= 7.0
+    for shot in record.snapshots:
+        assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
+
+
+def test_a_window_far_from_settled_throws_no_good_observations_out():
     # a lens that nearly folds at the corners, told roughly: windows stop far from the truth with a quarter of
     # the good observations refused, and small sigmas (seed 2 of `benchmarks zoo --target-free`)
     run, _ = draw(2, 25.0, target_free=True)

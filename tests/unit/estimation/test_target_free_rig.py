@@ -130,5 +130,5 @@ def test_announcements_bear_the_name_of_their_camera():
             1, Status.CONVERGED, "", 1.0, "", 1.0, 5, 9, {}, None, [], 1.0, 0.0, list(events)
         )
 
-    both = together({"a1": said("bumped: the lever arm"), "b2": said("went on", "b2: stamps jitter")})
-    assert both.events == ["bumped: a1: the lever arm", "b2: went on", "b2: stamps jitter"]
+    both = together({"a": said("bumped: the lever arm"), "b2": said("went on", "b2: stamps jitter")})
+    assert both.events == ["bumped: a: the lever arm", "b2: went on", "b2: stamps jitter"]
