@@ -131,8 +131,6 @@ class Window:
     def imu_by_link(self) -> FloatArray:
         """Bias in force on each link, and entries of the matrices, shape (F - 1, 6) or (F - 1, 21)."""
         bias = self.bias[self.knots()]
-        if not len(self.imu):
-            return bias
         return np.concatenate([bias, np.broadcast_to(self.imu, (len(bias), len(self.imu)))], axis=1)
 
     def accelerations(self) -> tuple[FloatArray, FloatArray]:
