@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from vical_mocks.points import SimulatedRun, simulate
+from vical_mocks.points import SimulatedRun, board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
@@ -46,6 +46,7 @@ class Case:
         rig: Changes of the rig.
         bound: Changes of the bound's model.
         estimate: Optional blocks of the estimator.
+        crooked: The board is not as stated: see `vical_mocks.points.crooked_board`.
     """
 
     lens_known: bool = False
@@ -60,6 +61,7 @@ class Case:
     rig: dict[str, Any] = field(default_factory=dict)
     bound: dict[str, Any] = field(default_factory=dict)
     estimate: frozenset[str] = frozenset()
+    crooked: bool = False
 
     @property
     def dof(self) -> int:
@@ -87,6 +89,13 @@ CASES: dict[str, Case] = {
     "skew 100 ppm": Case(skew_ppm=100.0, trials=20),
     "stamp jitter 1 ms": Case(simulation={"stamp_jitter_s": 1e-3}, trials=20),
     "whole images off by 0.3 px": Case(simulation={"frame_sigma_px": 0.3}, trials=20),
+    "crooked board": Case(crooked=True, trials=20),
+    "crooked board, its shape found": Case(crooked=True, estimate=frozenset({"target_shape"}), trials=20),
+    "crooked board, lens known": Case(crooked=True, lens_known=True, trials=20),
+    "crooked board, lens known, its shape found": Case(
+        crooked=True, lens_known=True, estimate=frozenset({"target_shape"}), trials=20
+    ),
+    "straight board, its shape found": Case(estimate=frozenset({"target_shape"}), trials=20),
     "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
     "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),
     "target-free, stamp jitter 1 ms": Case(
@@ -131,8 +140,10 @@ def make_run(case: Case, seed: int, seconds: float) -> SimulatedRun:
         changes["R_imu_cam"] = Rotation.random(rng=rng).as_matrix()
         changes["p_imu_cam"] = 0.2 * rng.standard_normal(3) / np.sqrt(3)
     rig = reference_rig(seed, timeshift_cam_imu_s=shift, clock_skew_ppm=case.skew_ppm, **changes)
-    make = simulate_tracks if case.target_free else simulate
-    return make(seed, seconds, rig=rig, **case.simulation)
+    if case.target_free:
+        return simulate_tracks(seed, seconds, rig=rig, **case.simulation)
+    points_m = crooked_board(seed) if case.crooked else None
+    return simulate(seed, seconds, rig=rig, points_m=points_m, **case.simulation)
 
 
 def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject:
@@ -147,7 +158,8 @@ def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject
     )
     if kind == "ekf":
         return EkfSubject(options, prior, run.points_m)
-    return CalibratorSubject(options, prior, None if case.target_free else run.points_m)
+    stated_m = board_points() if case.crooked else run.points_m
+    return CalibratorSubject(options, prior, None if case.target_free else stated_m)
 
 
 def bound_options(case: Case, run: SimulatedRun) -> BoundOptions:

@@ -69,9 +69,9 @@ class ImuConfig:
 class LensConfig:
     """What is known about a lens, in Kalibr's words (`kalibr_io` reads Kalibr's own files)."""
 
-    distortion_model: Literal["radtan", "equidistant"] = "radtan"
+    distortion_model: Literal["radtan", "plumb_bob", "equidistant"] = "radtan"
     intrinsics: tuple[Focal, Focal, float, float] | None = None
-    distortion_coeffs: tuple[float, float, float, float] | None = None
+    distortion_coeffs: tuple[float, ...] | None = None
     T_cam_imu: Matrix4 | None = None
     timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
     readout_s: Annotated[float, Bound(low=0, high=0.2)] = 0.0
@@ -138,7 +138,7 @@ class CalibrationConfig:
     imu: Name | None = None
     cameras: tuple[Name, ...] = ()
     fix: tuple[Literal["intrinsics", "timeshift", "extrinsics"], ...] = ()
-    estimate: tuple[Literal["imu_intrinsics", "readout", "target_scale"], ...] = ()
+    estimate: tuple[Literal["imu_intrinsics", "readout", "target_scale", "target_shape"], ...] = ()
     corner_sigma_px: Annotated[float, Bound(above=0, high=20)] = CalibrationOptions().corner_sigma_px
     gravity_mps2: Annotated[float, Bound(low=9.7, high=9.9, hint="magnitude on Earth, m/s^2")] = 9.80665
     lag_s: Annotated[float, Bound(low=0, high=5)] = 0.2

@@ -7,8 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vical_daemon.estimation.camera_model import COEFFICIENTS, PLUMB_BOB
+
 if TYPE_CHECKING:
     from vical_daemon.config import CameraConfig, Config
+
+NEEDS_TARGET = "plumb_bob needs a target; without one use radtan"
 
 
 def contradictions(config: Config) -> Iterator[tuple[str, str]]:
@@ -16,7 +20,10 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
     for name, imu in config.imus.items():
         yield from _check_gx3_rate(f"imus.{name}.rate_hz", imu.rate_hz)
     for name, camera in config.cameras.items():
-        yield from _check_lens(f"cameras.{name}.lens", camera, config.calibration.fix)
+        path = f"cameras.{name}.lens"
+        yield from _check_lens(path, camera, config.calibration.fix)
+        if config.calibration.mode == "target_free" and camera.lens.distortion_model == PLUMB_BOB:
+            yield f"{path}.distortion_model", NEEDS_TARGET
     calibration = config.calibration
     if calibration.imu is not None and calibration.imu not in config.imus:
         yield (
@@ -55,6 +62,9 @@ def _check_lens(path: str, camera: CameraConfig, fix: tuple[str, ...]) -> Iterat
                 )
     if lens.T_cam_imu is not None and (text := rigid_error(lens.T_cam_imu)):
         yield f"{path}.T_cam_imu", text
+    model = lens.distortion_model
+    if lens.distortion_coeffs is not None and (text := coefficients_error(model, lens.distortion_coeffs)):
+        yield f"{path}.distortion_coeffs", text
     needed = {
         "intrinsics": ("intrinsics", lens.intrinsics),
         "extrinsics": ("T_cam_imu", lens.T_cam_imu),
@@ -64,6 +74,14 @@ def _check_lens(path: str, camera: CameraConfig, fix: tuple[str, ...]) -> Iterat
         key, value = needed[what]
         if value is None:
             yield path, f"calibration.fix holds {what}, so {key} must be given here"
+
+
+def coefficients_error(model: str, values: Sequence[float]) -> str:
+    """Say what is wrong with the number of a distortion model's coefficients; empty if nothing."""
+    names = COEFFICIENTS[model]
+    if len(values) == len(names):
+        return ""
+    return f"expected {len(names)} values ({' '.join(names)} of {model}), found {len(values)}"
 
 
 def rigid_error(matrix: Sequence[Sequence[float]]) -> str:

@@ -80,6 +80,5 @@ def _from_prior(prior: CameraPrior) -> FlowCamera | None:
 
 def _from_estimate(e: CameraEstimate) -> FlowCamera:
     fx, fy, cx, cy = e.intrinsics
-    a, b, c, d = e.distortion
     R = so3.matrix_from_quat(np.array(e.T_imu_cam.q_wxyz))
-    return FlowCamera((fx, fy, cx, cy), (a, b, c, d), e.distortion_model, R, e.timeshift_cam_imu_s)
+    return FlowCamera((fx, fy, cx, cy), tuple(e.distortion), e.distortion_model, R, e.timeshift_cam_imu_s)

@@ -15,7 +15,8 @@ import numpy as np
 
 from vical_daemon import schema
 from vical_daemon.config import Config, Focal, LensConfig, Matrix4
-from vical_daemon.config_rules import rigid_error
+from vical_daemon.config_rules import coefficients_error, rigid_error
+from vical_daemon.estimation.camera_model import RADTAN
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -34,7 +35,7 @@ class _KalibrCamera:
     """The keys of one camera in a Kalibr camchain; those below `resolution` are read and not used."""
 
     camera_model: Literal["pinhole"] = "pinhole"
-    distortion_model: Literal["radtan", "equidistant", "none"] = "radtan"
+    distortion_model: Literal["radtan", "plumb_bob", "equidistant", "none"] = "radtan"
     intrinsics: tuple[Focal, Focal, float, float] | None = None
     distortion_coeffs: tuple[float, ...] | None = None
     T_cam_imu: Matrix4 | None = None
@@ -145,12 +146,10 @@ def calibration_options(config: Config) -> CalibrationOptions:
 
 
 def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> CameraPrior:
-    coefficients = camera.distortion_coeffs
-    if camera.distortion_model == "none":
-        coefficients = None
-    elif coefficients is not None and len(coefficients) != 4:
-        path = f"{name}.distortion_coeffs"
-        raise ConfigError(schema.mistake(document, path, f"expected 4 values, found {len(coefficients)}"))
+    model = RADTAN if camera.distortion_model == "none" else camera.distortion_model
+    coefficients = None if camera.distortion_model == "none" else camera.distortion_coeffs
+    if coefficients is not None and (text := coefficients_error(model, coefficients)):
+        raise ConfigError(schema.mistake(document, f"{name}.distortion_coeffs", text))
     if camera.T_cam_imu is not None and (text := rigid_error(camera.T_cam_imu)):
         raise ConfigError(schema.mistake(document, f"{name}.T_cam_imu", text))
     resolution = camera.resolution or (0, 0)
@@ -158,8 +157,8 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
     return CameraPrior(
         resolution=resolution,
         intrinsics=camera.intrinsics,
-        distortion_model="radtan" if camera.distortion_model == "none" else camera.distortion_model,
-        distortion=None if coefficients is None else (*coefficients[:3], coefficients[3]),
+        distortion_model=model,
+        distortion=coefficients,
         T_imu_cam=_inverse(camera.T_cam_imu),
         timeshift_cam_imu_s=camera.timeshift_cam_imu,
         readout_s=readout_s,

@@ -23,6 +23,26 @@ def board_points(columns: int = 8, rows: int = 6, spacing_m: float = 0.05) -> Fl
     return np.stack([col.ravel() * spacing_m, row.ravel() * spacing_m, np.zeros(col.size)], axis=-1)
 
 
+def crooked_board(seed: int) -> FloatArray:
+    """The board of `board_points` as a printer and a table make it, m, (48, 3).
+
+    Narrower than tall by 0.2 % and skew (one-sigma), bent and twisted by 0.5 mm at its edges, bowed in its
+    plane by 0.2 mm, each corner 0.15 mm beside its place; not turned, shifted or grown as a whole, which no
+    image shows.
+    """
+    rng = np.random.default_rng([seed, 63])
+    points = board_points()
+    x, y = (points[:, :2] - points[:, :2].mean(axis=0)).T
+    narrow, skew = 1e-3 * rng.standard_normal(2)
+    half = np.array([x.max(), y.max()])
+    second = np.stack([(x / half[0]) ** 2, (y / half[1]) ** 2, x * y / half.prod()], axis=-1)
+    off = second @ (np.array([0.2e-3, 0.2e-3, 0.5e-3]) * rng.standard_normal((3, 3)))
+    off[:, 0] += narrow * x + skew * y
+    off[:, 1] += skew * x - narrow * y
+    out: FloatArray = points + off - off.mean(axis=0) + 0.15e-3 * rng.standard_normal(points.shape)
+    return out
+
+
 @dataclass(frozen=True)
 class SimulatedFrame:
     """What a detector gives for one image.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from vical_daemon.estimation.result import CalibrationEstimate
 
 FIX = ("intrinsics", "timeshift", "extrinsics")
-ESTIMATE = ("imu_intrinsics", "readout", "target_scale")
+ESTIMATE = ("imu_intrinsics", "readout", "target_scale", "target_shape")
 _EXAMPLES = """\
 examples:
   vical calibrate log.mcap --target target.yaml --initial lens.yaml --fix intrinsics

@@ -14,7 +14,9 @@ from vical_daemon import topics
 from vical_daemon.bus import LocalBus, Sample
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.config import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
+from vical_daemon.config_rules import NEEDS_TARGET
 from vical_daemon.estimate_role import EstimateRole
+from vical_daemon.estimation.camera_model import PLUMB_BOB
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.estimators import make_estimator
@@ -88,6 +90,8 @@ def make_job(
             f"{recording.path} holds no camera, neither images nor points; `vical info` shows what is in it"
         )
     priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
+    if target is None and any(p.distortion_model == PLUMB_BOB for p in priors.values()):
+        raise CliError(f"--initial: {NEEDS_TARGET}")
     config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
     config = replace(
         config,

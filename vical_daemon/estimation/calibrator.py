@@ -54,7 +54,8 @@ class Calibrator:
         self.options = options
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
-        self.layout = make_layout(list(cameras), fix=options.fix, estimate=options.estimate)
+        models = {name: prior.distortion_model for name, prior in cameras.items()}
+        self.layout = make_layout(models, fix=options.fix, estimate=options.estimate, target_m=self.target)
         self.judge = Judge(options, self.layout)
         self.filter: CalibrationFilter | None = None
         self._buffer: ImuBuffer | None = None

@@ -1,9 +1,10 @@
 """Pinhole cameras with radial-tangential or equidistant distortion: project, unproject, Jacobians.
 
 Kalibr's names and OpenCV's numbers: `radtan` is k1 k2 p1 p2 (Brown-Conrady, OpenCV's first four),
-`equidistant` is k1 k2 k3 k4 (Kannala-Brandt, OpenCV's fisheye). Intrinsics are fx fy cx cy in pixels; pixel
-centres lie at integers. Everything is batched: points (..., 3) against intrinsics (..., 4) and distortion
-(..., 4), whose leading axes broadcast, so that a filter projects all sigma points in one call.
+`equidistant` is k1 k2 k3 k4 (Kannala-Brandt, OpenCV's fisheye). `plumb_bob` is ROS' name for radtan with one
+more power of the radius, k1 k2 p1 p2 k3 (OpenCV's five). Intrinsics are fx fy cx cy in pixels; pixel centres
+lie at integers. Everything is batched: points (..., 3) against intrinsics (..., 4) and distortion (..., d),
+d = 4 or 5, whose leading axes broadcast, so that a filter projects all sigma points in one call.
 """
 
 from __future__ import annotations
@@ -15,8 +16,14 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 RADTAN = "radtan"
+PLUMB_BOB = "plumb_bob"
 EQUIDISTANT = "equidistant"
-MODELS = (RADTAN, EQUIDISTANT)
+COEFFICIENTS = {
+    RADTAN: ("k1", "k2", "p1", "p2"),
+    PLUMB_BOB: ("k1", "k2", "p1", "p2", "k3"),
+    EQUIDISTANT: ("k1", "k2", "k3", "k4"),
+}
+"""Names of each model's coefficients, in order."""
 
 _TINY_RADIUS = 1e-9  # below it a ray is the optical axis, and theta / r is 1 to the last digit
 _NEWTON_STEPS = 25
@@ -24,8 +31,8 @@ _NEWTON_DONE = 1e-14  # step in normalised units (focal lengths); a millionth of
 
 
 def _check_model(model: str) -> None:
-    if model not in MODELS:
-        raise ValueError(f"unknown distortion model {model!r}: use {' or '.join(MODELS)}")
+    if model not in COEFFICIENTS:
+        raise ValueError(f"unknown distortion model {model!r}: use {' or '.join(COEFFICIENTS)}")
 
 
 def _front(z: FloatArray) -> FloatArray:
@@ -39,7 +46,7 @@ def distort(xy: FloatArray, distortion: FloatArray) -> FloatArray:
 
     Args:
         xy: Ideal coordinates X/Z, Y/Z, shape (..., 2).
-        distortion: k1 k2 p1 p2, shape (..., 4).
+        distortion: k1 k2 p1 p2 [k3], shape (..., 4) or (..., 5).
 
     Returns:
         Distorted normalised coordinates, shape (..., 2).
@@ -48,7 +55,10 @@ def distort(xy: FloatArray, distortion: FloatArray) -> FloatArray:
     k1, k2, p1, p2 = (distortion[..., i] for i in range(4))
     x2, y2, xy2 = x * x, y * y, 2.0 * x * y
     r2 = x2 + y2
-    radial = 1.0 + r2 * (k1 + k2 * r2)
+    upper = k2 * r2
+    if distortion.shape[-1] == 5:
+        upper += distortion[..., 4] * (r2 * r2)
+    radial = 1.0 + r2 * (k1 + upper)
     out = np.empty((*radial.shape, 2))
     out[..., 0] = x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x2)
     out[..., 1] = y * radial + p1 * (r2 + 2.0 * y2) + p2 * xy2
@@ -63,8 +73,8 @@ def project(
     Args:
         points_cam: x right, y down, z forward, m, shape (..., 3).
         intrinsics: fx fy cx cy, px, shape (..., 4).
-        distortion: Four coefficients, shape (..., 4).
-        model: radtan or equidistant.
+        distortion: The model's coefficients, shape (..., d).
+        model: radtan, plumb_bob or equidistant.
 
     Returns:
         Pixels u v, shape (..., 2); not-a-number where radtan has z <= 0 (a fisheye may look behind).
@@ -76,8 +86,10 @@ def project(
     points = np.asarray(points_cam, dtype=np.float64)
     K = np.asarray(intrinsics, dtype=np.float64)
     D = np.asarray(distortion, dtype=np.float64)
-    front = points[..., :2] / _front(points[..., 2:]) if model == RADTAN else points
-    uv = (distort(front, D) if model == RADTAN else _equidistant(front, D)) * K[..., :2]
+    if model == EQUIDISTANT:
+        uv = _equidistant(points, D) * K[..., :2]
+    else:
+        uv = distort(points[..., :2] / _front(points[..., 2:]), D) * K[..., :2]
     uv += K[..., 2:]
     return uv
 
@@ -107,12 +119,12 @@ def project_jacobians(
     Args:
         points_cam: Points in the camera frame, m, shape (..., 3).
         intrinsics: fx fy cx cy, px, shape (..., 4).
-        distortion: Four coefficients, shape (..., 4).
-        model: radtan or equidistant.
+        distortion: The model's coefficients, shape (..., d).
+        model: radtan, plumb_bob or equidistant.
 
     Returns:
-        Pixels (..., 2); their derivatives by the point (..., 2, 3), px/m; by fx fy cx cy and the four
-        distortion coefficients (..., 2, 8).
+        Pixels (..., 2); their derivatives by the point (..., 2, 3), px/m; by fx fy cx cy and the
+        distortion coefficients (..., 2, 4 + d).
 
     Raises:
         ValueError: unknown model.
@@ -121,14 +133,12 @@ def project_jacobians(
     points = np.asarray(points_cam, dtype=np.float64)
     K = np.asarray(intrinsics, dtype=np.float64)
     D = np.asarray(distortion, dtype=np.float64)
-    if model == RADTAN:
-        d, d_point, d_distortion = _radtan_jacobians(points, D)
-    else:
-        d, d_point, d_distortion = _equidistant_jacobians(points, D)
+    jacobians = _equidistant_jacobians if model == EQUIDISTANT else _radtan_jacobians
+    d, d_point, d_distortion = jacobians(points, D)
     focal = K[..., :2]
     uv = d * focal + K[..., 2:]
     J_point = d_point * focal[..., None]
-    J_camera = np.zeros((*d.shape, 8))
+    J_camera = np.zeros((*d.shape, 4 + D.shape[-1]))
     J_camera[..., 0, 0] = d[..., 0]
     J_camera[..., 1, 1] = d[..., 1]
     J_camera[..., 0, 2] = J_camera[..., 1, 3] = 1.0
@@ -139,37 +149,36 @@ def project_jacobians(
 def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     iz = 1.0 / _front(points[..., 2])
     x, y = points[..., 0] * iz, points[..., 1] * iz
-    k1, k2, p1, p2 = (D[..., i] for i in range(4))
     r2 = x * x + y * y
     d = distort(np.stack((x, y), axis=-1), D)
-    a, b, c = _radtan_derivative(x, y, r2, k1, k2, p1, p2)
+    a, b, c = _radtan_derivative(x, y, r2, D)
     J = np.empty((*d.shape, 3))
     J[..., 0, 0] = a * iz
     J[..., 0, 1] = J[..., 1, 0] = b * iz
     J[..., 1, 1] = c * iz
     J[..., 0, 2] = -(a * x + b * y) * iz
     J[..., 1, 2] = -(b * x + c * y) * iz
-    J_d = np.empty((*d.shape, 4))
+    J_d = np.empty((*d.shape, D.shape[-1]))
     r4 = r2 * r2
     J_d[..., 0, 0], J_d[..., 1, 0] = x * r2, y * r2
     J_d[..., 0, 1], J_d[..., 1, 1] = x * r4, y * r4
     J_d[..., 0, 2] = J_d[..., 1, 3] = 2.0 * x * y
     J_d[..., 1, 2], J_d[..., 0, 3] = r2 + 2.0 * y * y, r2 + 2.0 * x * x
+    if D.shape[-1] == 5:
+        J_d[..., 0, 4], J_d[..., 1, 4] = x * r4 * r2, y * r4 * r2
     return d, J, J_d
 
 
 def _radtan_derivative(
-    x: FloatArray,
-    y: FloatArray,
-    r2: FloatArray,
-    k1: FloatArray,
-    k2: FloatArray,
-    p1: FloatArray,
-    p2: FloatArray,
+    x: FloatArray, y: FloatArray, r2: FloatArray, D: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the symmetric 2x2 derivative of `distort`: [[a, b], [b, c]]."""
+    k1, k2, p1, p2 = (D[..., i] for i in range(4))
     radial = 1.0 + r2 * (k1 + k2 * r2)
     slope = 2.0 * k1 + 4.0 * k2 * r2
+    if D.shape[-1] == 5:
+        r4 = D[..., 4] * (r2 * r2)
+        radial, slope = radial + r4 * r2, slope + 6.0 * r4
     a = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
     b = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
     c = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
@@ -214,8 +223,8 @@ def unproject(
     Args:
         uv_px: Raw distorted pixels, shape (..., 2).
         intrinsics: fx fy cx cy, px, shape (..., 4).
-        distortion: Four coefficients, shape (..., 4).
-        model: radtan or equidistant.
+        distortion: The model's coefficients, shape (..., d).
+        model: radtan, plumb_bob or equidistant.
 
     Returns:
         Unit rays in the camera frame (..., 3), not-a-number where not ok; ok (...): converged, and on the
@@ -228,7 +237,7 @@ def unproject(
     K = np.asarray(intrinsics, dtype=np.float64)
     D = np.asarray(distortion, dtype=np.float64)
     d = (np.asarray(uv_px, dtype=np.float64) - K[..., 2:]) / K[..., :2]
-    if model == RADTAN:
+    if model != EQUIDISTANT:
         xy, ok = _undistort_radtan(d, D)
         rays = np.concatenate((xy, np.ones_like(xy[..., :1])), axis=-1)
         rays /= np.sqrt(np.einsum("...i,...i->...", rays, rays))[..., None]
@@ -259,10 +268,13 @@ def undistort(
 def valid_radius(distortion: FloatArray) -> FloatArray:
     """Return the normalised radius up to which radtan's radial part grows (...,), inf where for ever.
 
-    First positive root of d/dr [r (1 + k1 r^2 + k2 r^4)] = 1 + 3 k1 s + 5 k2 s^2, s = r^2. Beyond it a
-    projected point folds back towards the image centre and means nothing.
+    First positive root of d/dr [r (1 + k1 r^2 + k2 r^4 + k3 r^6)] = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with
+    s = r^2.
+    Beyond it a projected point folds back towards the image centre and means nothing.
     """
     D = np.asarray(distortion, dtype=np.float64)
+    if D.shape[-1] == 5 and D[..., 4].any():
+        return _valid_radius_cubic(D)
     a, b = 5.0 * D[..., 1], 3.0 * D[..., 0]
     discriminant = b * b - 4.0 * a
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -273,10 +285,19 @@ def valid_radius(distortion: FloatArray) -> FloatArray:
     return out
 
 
+def _valid_radius_cubic(D: FloatArray) -> FloatArray:
+    out = np.empty(D.shape[:-1])
+    for at in np.ndindex(out.shape):
+        k1, k2, _, _, k3 = D[at]
+        roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
+        out[at] = np.sqrt(real.min()) if len(real) else np.inf
+    return out
+
+
 def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArray]:
     shape = np.broadcast_shapes(d.shape[:-1], D.shape[:-1])
     limit = valid_radius(D)
-    k1, k2, p1, p2 = (D[..., i] for i in range(4))
     target = np.broadcast_to(d, (*shape, 2))
     # a start inside the monotonic range: from the far side Newton would land on the wrong branch
     r_d = np.hypot(target[..., 0], target[..., 1])
@@ -287,7 +308,7 @@ def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArr
         for _ in range(_NEWTON_STEPS):
             x, y = xy[..., 0], xy[..., 1]
             e = distort(xy, D) - target
-            a, b, c = _radtan_derivative(x, y, x * x + y * y, k1, k2, p1, p2)
+            a, b, c = _radtan_derivative(x, y, x * x + y * y, D)
             det = a * c - b * b
             step = np.stack((c * e[..., 0] - b * e[..., 1], a * e[..., 1] - b * e[..., 0]), axis=-1)
             step /= det[..., None]

@@ -209,7 +209,7 @@ def starting_camera(prior: CameraPrior) -> CameraState:
         np.array(p, np.float64),
         prior.timeshift_cam_imu_s or 0.0,
         np.array(prior.intrinsics if prior.intrinsics is not None else guess, np.float64),
-        np.array(prior.distortion if prior.distortion is not None else (0.0,) * 4, np.float64),
+        prior.coefficients(),
         prior.distortion_model,
         prior.resolution,
         prior.readout_s,

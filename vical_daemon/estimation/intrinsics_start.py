@@ -22,7 +22,8 @@ MOST_VIEWS = 24
 _FEWEST, _LEAST_POINTS = 6, 12
 _STEPS = 15
 _Poses = list[tuple[FloatArray, FloatArray]]
-_PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05])  # relative to fx for the first four
+# relative to fx for the first four; four for the distortion, and radtan's fifth
+_PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])
 
 
 def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArray) -> float:
@@ -53,9 +54,10 @@ def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArra
 def _adjusted(
     views: list[PointsFrame], poses: _Poses, lens: Lens, target: FloatArray
 ) -> tuple[FloatArray, _Poses, float]:
-    """Lens (8,), poses and RMS residual in px after the adjustment, from a lens and poses."""
+    """Lens (4 + d,), poses and RMS residual in px after the adjustment, from a lens and poses."""
     theta = np.concatenate([lens.intrinsics, lens.distortion])
-    scale = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(4)]) * _PRIOR
+    n = len(theta)
+    scale = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(n - 4)]) * _PRIOR[:n]
     prior, cost, damping = theta.copy(), np.inf, 1e-3
     best = (theta, poses)
     for _ in range(_STEPS):
@@ -122,9 +124,9 @@ def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> _Poses:
 class _Normal:
     """Normal equations with the poses eliminated (Schur complement)."""
 
-    def __init__(self) -> None:
-        self.A = np.zeros((8, 8))
-        self.b = np.zeros(8)
+    def __init__(self, lens: int) -> None:
+        self.A = np.zeros((lens, lens))
+        self.b = np.zeros(lens)
         self.views: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self.cost = 0.0
 
@@ -154,7 +156,8 @@ def _normal(
     theta: FloatArray,
     model: str,
 ) -> _Normal | None:
-    out = _Normal()
+    n = len(theta)
+    out = _Normal(n)
     for view, (R, p) in zip(views, poses, strict=True):
         X = target[view.ids]
         x = X @ R.T + p
@@ -162,5 +165,5 @@ def _normal(
         if not np.isfinite(uv).all():
             return None
         J_pose = np.concatenate([J_point, J_point @ (-R @ so3.hat(X))], axis=-1)
-        out.add(J_lens.reshape(-1, 8), J_pose.reshape(-1, 6), (view.uv_px - uv).ravel())
+        out.add(J_lens.reshape(-1, n), J_pose.reshape(-1, 6), (view.uv_px - uv).ravel())
     return out

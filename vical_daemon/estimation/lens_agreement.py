@@ -20,11 +20,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from vical_daemon.estimation.camera_model import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.measurements import FloatArray
 
-LENS = 8  # fx fy cx cy and the distortion
 _STRETCH_S = 5.0
-_SIGNIFICANT = 0.01 / LENS  # one set of clean data in a hundred may lose by it, not one parameter
+_SIGNIFICANT = 0.01  # one set of clean data in a hundred may lose by it, not one parameter
 _BEYOND_DOUBT = 4.0  # sigmas of the next power of the radius: by chance once in 16000
 _LEAST_TOLD = 1e-9  # of the variance of all: a run that tells less tells nothing
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
@@ -33,7 +33,8 @@ _LONGEST_RUN = 4
 _WEAK = 0.1  # of the focal length: as good as nothing known
 _WEAK_DISTORTION = 0.5
 _RIDGE = 1e-12  # corners in one line leave a turn about it open
-_RADIAL = {"radtan": (4, 5), "equidistant": (6, 7)}  # the two highest powers of the radius
+# the two highest powers of the radius among fx fy cx cy and the distortion
+_RADIAL = {RADTAN: (4, 5), PLUMB_BOB: (5, 8), EQUIDISTANT: (6, 7)}
 
 
 class _Stretch(NamedTuple):
@@ -59,20 +60,24 @@ class LensAgreement:
     """Running agreement of one camera's lens.
 
     Args:
-        model: radtan or equidistant.
+        model: radtan, plumb_bob or equidistant.
 
     Attributes:
-        factors: Multiply the variances of fx fy cx cy and the four distortion coefficients, >= 1, shape (8,).
-        moved: How far those eight would move with one more power of the radius, where that is there beyond
-            doubt; else zeros; px and -, shape (8,).
+        factors: Multiply the variances of fx fy cx cy and the distortion coefficients, >= 1, shape (n,).
+        moved: How far those would move with one more power of the radius, where that is there beyond doubt;
+            else zeros; px and -, shape (n,).
     """
 
     model: str
-    factors: FloatArray = field(default_factory=lambda: np.ones(LENS))
-    moved: FloatArray = field(default_factory=lambda: np.zeros(LENS))
+    factors: FloatArray = field(init=False)
+    moved: FloatArray = field(init=False)
     _done: list[_Stretch] = field(default_factory=list)
     _now: _Stretch | None = None
     _begin_s: float = np.inf
+
+    def __post_init__(self) -> None:
+        n = 4 + len(COEFFICIENTS[self.model])
+        self.factors, self.moved = np.ones(n), np.zeros(n)
 
     def learn(
         self, t_s: float, innovation: FloatArray, by_pose: FloatArray, by_lens: FloatArray, lens: FloatArray
@@ -83,26 +88,20 @@ class LensAgreement:
             t_s: Its instant, s.
             innovation: Measured minus predicted, over the corner noise, shape (2n,).
             by_pose: Derivatives of the whitened pixels by attitude and position, shape (2n, 6).
-            by_lens: By fx fy cx cy and the distortion, shape (2n, 8).
-            lens: Present values, shape (8,).
+            by_lens: By fx fy cx cy and the distortion, shape (2n, m).
+            lens: Present values, shape (m,).
         """
         if not 0.0 <= t_s - self._begin_s < _STRETCH_S:
             self._close(lens[0])
             self._begin_s = t_s
         # whatever the pose of the image may be: only what no pose explains says something about the lens
-        rows = np.column_stack([by_pose, by_lens, self._next_power(by_lens), innovation])
+        rows = np.column_stack([by_pose, by_lens, next_power(by_lens, self.model), innovation])
         N, p = rows.T @ rows, by_pose.shape[1]
         posed = N[:p, :p] + _RIDGE * np.trace(N[:p, :p]) * np.eye(p)
         N = N[p:, p:] - N[p:, :p] @ np.linalg.solve(posed, N[:p, p:])
         A, b = N[:-1, :-1], N[:-1, -1]
-        said = _Stretch(A, b + A[:, :LENS] @ lens)
+        said = _Stretch(A, b + A[:, :-1] @ lens)
         self._now = said if self._now is None else self._now.plus(said)
-
-    def _next_power(self, by_lens: FloatArray) -> FloatArray:
-        """Derivative by the coefficient that the model would have next, shape (2n,)."""
-        below, highest = (by_lens[:, k].reshape(-1, 2) for k in _RADIAL[self.model])
-        size = np.maximum((below**2).sum(axis=1), 1e-30)  # each power is the one below times radius squared
-        return np.asarray((highest * ((below * highest).sum(axis=1) / size)[:, None]).ravel())
 
     def _close(self, focal_px: float) -> None:
         """Put the stretch to the others and compare."""
@@ -115,13 +114,26 @@ class LensAgreement:
             return
         A = np.array([s.information for s in self._done])
         b = np.array([s.weighted for s in self._done])
-        weak = np.array([_WEAK * focal_px] * 4 + [_WEAK_DISTORTION] * 5) ** -2.0
-        self.factors = _compared(A[:, :LENS, :LENS], b[:, :LENS], weak[:LENS]).factors
+        n = len(self.factors)
+        weak = np.array([_WEAK * focal_px] * 4 + [_WEAK_DISTORTION] * (n - 3)) ** -2.0
+        self.factors = _compared(A[:, :n, :n], b[:, :n], weak[:n]).factors
         free = _compared(A, b, weak)
-        power, variance = free.values[LENS], free.covariance[LENS, LENS]
-        doubt = _BEYOND_DOUBT**2 * free.factors[LENS] * variance
+        power, variance = free.values[n], free.covariance[n, n]
+        doubt = _BEYOND_DOUBT**2 * free.factors[n] * variance
         there = power if power**2 > doubt else 0.0
-        self.moved = free.covariance[:LENS, LENS] * (there / variance)
+        self.moved = free.covariance[:n, n] * (there / variance)
+
+
+def next_power(by_lens: FloatArray, model: str) -> FloatArray:
+    """Derivative by the coefficient that a distortion model would have next, shape (2n,).
+
+    Args:
+        by_lens: Derivatives by fx fy cx cy and the distortion, shape (2n, m).
+        model: radtan, plumb_bob or equidistant.
+    """
+    below, highest = (by_lens[:, k].reshape(-1, 2) for k in _RADIAL[model])
+    size = np.maximum((below**2).sum(axis=1), 1e-30)  # each power is the one below times radius squared
+    return np.asarray((highest * ((below * highest).sum(axis=1) / size)[:, None]).ravel())
 
 
 def _compared(A: FloatArray, b: FloatArray, weak: FloatArray) -> _Told:
@@ -150,6 +162,6 @@ def _compared(A: FloatArray, b: FloatArray, weak: FloatArray) -> _Told:
     ratio = ((without - values) ** 2 / usual).mean(axis=0)
     # a mean of dependent squares: like a chi-square of as many degrees as have its variance [Satterthwaite]
     dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
-    limit = chi2.isf(_SIGNIFICANT, dof) / dof
+    limit = chi2.isf(_SIGNIFICANT / len(values), dof) / dof
     student = dof / np.maximum(dof - 2.0, 1.0)
     return _Told(values, P, np.where(ratio > limit, student * ratio, 1.0))

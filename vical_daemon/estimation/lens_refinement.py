@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import project_jacobians, undistort, valid_radius
+from vical_daemon.estimation.camera_model import EQUIDISTANT, project_jacobians, undistort, valid_radius
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.planar_pose import planar_pose
 
@@ -25,8 +25,8 @@ _WIDTH = 4.0
 _DONE = 1e-7  # relative gain of a step below which nothing changes any more
 _MIN_VIEWS = 8
 _MIN_POINTS = 12
-# One-sigma of the start values: focal lengths and centre relative to the focal length, then k1 k2 p1 p2
-_PRIOR = np.array([0.2, 0.2, 0.1, 0.1, 0.5, 0.5, 0.02, 0.02])
+# One-sigma of the start values: focal lengths and centre relative to the focal length, then k1 k2 p1 p2 k3
+_PRIOR = np.array([0.2, 0.2, 0.1, 0.1, 0.5, 0.5, 0.02, 0.02, 0.2])
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class LensFit:
 
     Attributes:
         intrinsics: fx fy cx cy, px, shape (4,).
-        distortion: Four coefficients, shape (4,).
-        sigma: Standard deviations of the eight, from the residuals, shape (8,).
+        distortion: The model's d coefficients, shape (d,).
+        sigma: Standard deviations of all these, from the residuals, shape (4 + d,).
         corner_sigma_px: Robust noise of a corner per axis, px.
         views: Views that took part; 0: too few, and the start values are returned.
     """
@@ -90,8 +90,8 @@ def refine_lens(
         frames: Views; ids index `points_m`.
         points_m: Target points, m, shape (n, 3).
         intrinsics: Start, fx fy cx cy, px; within some 20 %.
-        distortion: Start, four coefficients.
-        model: radtan or equidistant.
+        distortion: Start, the model's coefficients.
+        model: radtan, plumb_bob or equidistant.
         max_views: How many views to use.
 
     Returns:
@@ -100,8 +100,8 @@ def refine_lens(
     lens = np.concatenate((intrinsics, distortion)).astype(np.float64)
     views = _collect(frames, points_m, lens, model, max_views)
     if views is None:
-        return LensFit(lens[:4], lens[4:], np.full(8, np.nan), float("nan"), 0)
-    scale = np.concatenate((np.full(4, lens[0]), np.ones(4))) * _PRIOR
+        return LensFit(lens[:4], lens[4:], np.full(len(lens), np.nan), float("nan"), 0)
+    scale = np.concatenate((np.full(4, lens[0]), np.ones(len(lens) - 4))) * _PRIOR[: len(lens)]
     start, damping = lens.copy(), 1e-8
     measured: float | None = None
     sigma = 1.0
@@ -160,7 +160,7 @@ def _collect(
 
 @dataclass
 class _System:
-    """Normal equations: lens (8, 8), poses (v, 6, 6), and between (v, 6, 8); gradients; robust cost."""
+    """Normal equations: lens (n, n), poses (v, 6, 6), and between (v, 6, n); gradients; robust cost."""
 
     A: FloatArray
     P: FloatArray
@@ -185,7 +185,7 @@ class _System:
         q = points_m @ np.swapaxes(views.R, 1, 2) + views.p[:, None]
         uv, J_point, J_lens = project_jacobians(q, lens[:4], lens[4:], model)
         inside = views.seen & np.isfinite(uv).all(axis=-1)
-        if model == "radtan":
+        if model != EQUIDISTANT:
             inside &= np.hypot(q[..., 0], q[..., 1]) < valid_radius(lens[4:]) * q[..., 2]
         r = np.where(inside[..., None], views.uv - np.nan_to_num(uv), 0.0)
         r2 = np.einsum("vni,vni->vn", r, r)
@@ -203,7 +203,7 @@ class _System:
         J_turn = -(J_point @ (views.R[:, None] @ so3.hat(points_m)))
         root = np.sqrt(weight)[..., None, None]
         Jp = np.nan_to_num(np.concatenate((J_point, J_turn), axis=-1) * root).reshape(v, -1, 6)
-        Jl = np.nan_to_num(J_lens * root).reshape(v, -1, 8)
+        Jl = np.nan_to_num(J_lens * root).reshape(v, -1, len(lens))
         e = (r * root[..., 0]).reshape(v, -1, 1)
         Jpt, Jlt = np.swapaxes(Jp, 1, 2), np.swapaxes(Jl, 1, 2)
         return cls(
@@ -217,7 +217,7 @@ class _System:
         )
 
     def reduced(self, prior: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Information of the lens with the poses eliminated (8, 8), and the poses' inverses (v, 6, 6)."""
+        """Information of the lens with the poses eliminated (n, n), and the poses' inverses (v, 6, 6)."""
         diagonal = np.einsum("vii->vi", self.P)
         P_inverse = np.linalg.inv(self.P + np.eye(6) * (damping * diagonal + 1e-9)[:, None, :])
         A = self.A + np.diag(prior) + damping * np.diag(np.diagonal(self.A))
@@ -225,7 +225,7 @@ class _System:
         return out, np.asarray(P_inverse, dtype=np.float64)
 
     def solve(self, pull: FloatArray, prior: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Steps of the lens (8,) and of the poses (v, 6)."""
+        """Steps of the lens (n,) and of the poses (v, 6)."""
         S, P_inverse = self.reduced(prior, damping)
         b = self.b + pull - np.einsum("vpl,vpq,vq->l", self.C, P_inverse, self.c)
         d_lens = np.linalg.solve(S, b)

@@ -22,6 +22,7 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
 from vical_daemon.estimation.rates import Rates
 from vical_daemon.estimation.retract import camera_points, pose_points
 from vical_daemon.estimation.state import ATTITUDE, POSITION, VELOCITY, Layout, State
+from vical_daemon.estimation.target_modes import MODES
 from vical_daemon.estimation.target_view import view
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
@@ -113,6 +114,9 @@ def project_errors(
     world: FloatArray = points * state.target_scale
     if layout.target_scale is not None:
         world = points * (state.target_scale + errors[:, layout.target_scale])[:, None, None]
+    if layout.target_modes is not None and layout.target_shape is not None:
+        shapes = state.target_shape + errors[:, layout.target_shape]
+        world = world + np.einsum("npm,sm->snp", layout.target_modes.fields(points), shapes)
     ahead = t_cam_s - state.t_s
     rows = None
     if where.readout is not None or known.readout_s != 0.0:
@@ -154,7 +158,7 @@ def view_derivatives(
     """How the pixels move with the camera and its lens, and those with the errors of the state.
 
     The ways are: the camera turns by phi and moves by tau (in its own frame), d x_cam = x_cam x phi - tau;
-    its lens; the size of the target. Global shutter.
+    its lens; the size of the target and its shape. Global shutter.
     [docs/math/filter.md, eq. (7); derivatives tested against differences]
 
     Returns:
@@ -166,7 +170,10 @@ def view_derivatives(
     turn = so3.exp_one(rates.omega * ahead_s)
     R = state.R_world_imu @ turn
     p = state.p_world_imu + ahead_s * (state.v_world_imu + (0.5 * ahead_s) * rates.accel)
-    arm = image.points * state.target_scale - p
+    place = image.points * state.target_scale
+    if layout.target_modes is not None:
+        place = place + layout.target_modes.fields(image.points) @ state.target_shape
+    arm = place - p
     x_cam = (arm @ R - cam.p_imu_cam) @ cam.R_imu_cam
     with np.errstate(all="ignore"):
         uv, J, J_lens = project_jacobians(x_cam, cam.intrinsics, cam.distortion, cam.distortion_model)
@@ -176,12 +183,18 @@ def view_derivatives(
     ways[:, :3] = cross(J, np.repeat(x_cam, 2, axis=0))  # j' (x x phi) = (j x x)' phi
     ways[:, 3:6] = -J
     if where.intrinsics is not None and where.distortion is not None:
-        ways[:, 6:14] = J_lens.reshape(-1, 8)
-        by_error[6:10, where.intrinsics] = by_error[10:14, where.distortion] = np.eye(4)
+        n = J_lens.shape[-1]
+        ways[:, 6 : 6 + n] = J_lens.reshape(-1, n)
+        by_error[6 : 6 + n, where.intrinsics.start : where.distortion.stop] = np.eye(n)
+    at = len(by_error) - MODES * (layout.target_shape is not None)
     if layout.target_scale is not None:
         grown = image.points @ (R @ cam.R_imu_cam)
-        ways[:, -1] = np.einsum("ij,ij->i", J, np.repeat(grown, 2, axis=0))
-        by_error[-1, layout.target_scale] = 1.0
+        ways[:, at - 1] = np.einsum("ij,ij->i", J, np.repeat(grown, 2, axis=0))
+        by_error[at - 1, layout.target_scale] = 1.0
+    if layout.target_modes is not None and layout.target_shape is not None:
+        moved = (R @ cam.R_imu_cam).T @ layout.target_modes.fields(image.points)
+        ways[:, at:] = (J.reshape(-1, 2, 3) @ moved).reshape(-1, MODES)
+        by_error[at:, layout.target_shape] = np.eye(MODES)
     return uv, ways, by_error
 
 
@@ -194,7 +207,8 @@ def _pose_by_error(
     tau = R_imu_cam' (a x p_imu_cam).
     """
     where, cam = layout.cameras[camera], state.cameras[camera]
-    rows = 6 + (8 if where.intrinsics is not None else 0) + (layout.target_scale is not None)
+    lens = 4 + len(cam.distortion) if where.intrinsics is not None else 0
+    rows = 6 + lens + (layout.target_scale is not None) + MODES * (layout.target_shape is not None)
     out = np.zeros((rows, layout.size))
     to_cam = cam.R_imu_cam.T
     arm = -to_cam @ so3.hat(cam.p_imu_cam)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.camera_model import COEFFICIENTS
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -33,8 +35,8 @@ class CameraPrior:
     Attributes:
         resolution: width, height, px.
         intrinsics: fx fy cx cy, px; None: guessed from the resolution.
-        distortion_model: radtan or equidistant.
-        distortion: 4 coefficients; None: zeros.
+        distortion_model: radtan, plumb_bob or equidistant.
+        distortion: The model's coefficients; None: zeros.
         T_imu_cam: (R_imu_cam (3,3), p_imu_cam (3,)) or None: nothing known, found from the data.
         timeshift_cam_imu_s: t_imu = t_cam + shift, s; None: nothing known, found from the data.
         readout_s: Rolling-shutter readout, first to last row, s; 0: global shutter.
@@ -43,10 +45,15 @@ class CameraPrior:
     resolution: tuple[int, int]
     intrinsics: tuple[float, float, float, float] | None = None
     distortion_model: str = "radtan"
-    distortion: tuple[float, float, float, float] | None = None
+    distortion: tuple[float, ...] | None = None
     T_imu_cam: tuple[FloatArray, FloatArray] | None = None
     timeshift_cam_imu_s: float | None = None
     readout_s: float = 0.0
+
+    def coefficients(self) -> FloatArray:
+        """The distortion as given, zeros where it is not, shape (d,)."""
+        given = self.distortion or (0.0,) * len(COEFFICIENTS[self.distortion_model])
+        return np.array(given, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +90,8 @@ class CalibrationOptions:
 
     Attributes:
         fix: Of {"intrinsics", "timeshift", "extrinsics"}: held at their priors.
-        estimate: Of {"imu_intrinsics", "readout", "target_scale"}: optional blocks switched on.
+        estimate: Of {"imu_intrinsics", "readout", "target_scale", "target_shape"}: optional blocks that are
+            switched on.
         target_free: Landmarks are estimated, no target is known.
         gravity_mps2: Magnitude of gravity, m/s^2.
         corner_sigma_px: First guess of the corner noise; measured from the data afterwards.

@@ -155,11 +155,14 @@ def _about(
         p_world_imu=state.p_world_imu,
         v_world_imu=state.v_world_imu,
         cameras={name: replace(camera, skew=0.0) for name, camera in trial.state.cameras.items()},
+        target_shape=state.target_shape,  # expected near zero, not near what was found last
     )
     fresh = make(begin)
     wide = np.diag(fresh.S)
     narrow = np.minimum(wide, REHEARSED * trial.sigmas())
     narrow[: MOTION.stop] = wide[: MOTION.stop]
+    if trial.layout.target_shape is not None:
+        narrow[trial.layout.target_shape] = wide[trial.layout.target_shape]
     fresh.S = fresh.S * (narrow / wide)[:, None]
     fresh.corner_noise = trial.corner_noise
     return fresh
@@ -223,6 +226,8 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool) -> FloatArray:
         s[layout.gyro_matrix], s[layout.accel_matrix] = 0.01, 0.01
     if layout.target_scale is not None:
         s[layout.target_scale] = 0.002
+    if layout.target_modes is not None and layout.target_shape is not None:
+        s[layout.target_shape] = layout.target_modes.sigma_m
     for name, where in layout.cameras.items():
         focal = float(state.cameras[name].intrinsics[0])
         if where.position is not None and where.rotation is not None:

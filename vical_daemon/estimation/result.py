@@ -43,8 +43,8 @@ class CameraEstimate:
         timeshift_sigma_s: Its standard deviation, s.
         intrinsics: fx fy cx cy, px.
         intrinsics_sigma: Standard deviations, px (0 where held fixed).
-        distortion_model: radtan or equidistant.
-        distortion: 4 coefficients.
+        distortion_model: radtan, plumb_bob or equidistant.
+        distortion: Its coefficients.
         distortion_sigma: Standard deviations.
         reprojection_rms_px: RMS of the residuals of accepted corners, px.
         corner_sigma_px: Measured corner noise per axis, px.

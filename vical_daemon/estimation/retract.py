@@ -108,6 +108,9 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     scale = state.target_scale
     if layout.target_scale is not None:
         scale += float(dx[layout.target_scale])
+    shape = state.target_shape
+    if layout.target_shape is not None:
+        shape = shape + dx[layout.target_shape]
     tilted = rotation_of_grp(state.tilt @ dx[GRAVITY])
     return State(
         state.t_s,
@@ -121,6 +124,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         gyro_matrix,
         accel_matrix,
         scale,
+        shape,
         tilted @ state.tilt,
     )
 

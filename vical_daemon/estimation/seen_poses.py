@@ -32,7 +32,7 @@ class Lens:
         guess = (0.87 * width, 0.87 * width, 0.5 * (width - 1), 0.5 * (height - 1))
         return cls(
             np.array(prior.intrinsics if prior.intrinsics is not None else guess, dtype=np.float64),
-            np.array(prior.distortion if prior.distortion is not None else (0.0,) * 4, dtype=np.float64),
+            prior.coefficients(),
             prior.distortion_model,
             prior.resolution,
             prior.readout_s,

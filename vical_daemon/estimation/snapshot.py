@@ -37,7 +37,7 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         camera.distortion.tolist(),
         np.hypot(lens[4:] * raw[where.distortion], agreement.moved[4:]).tolist()
         if where.distortion is not None
-        else [0.0] * 4,
+        else [0.0] * len(camera.distortion),
         float(reprojection_rms_px),
         float(f.corner_noise[name].sigma_px),
         [],

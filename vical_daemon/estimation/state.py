@@ -7,11 +7,14 @@ parameters; equal to the rotation vector for small angles), local (right): R = R
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from vical_daemon.estimation.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.target_modes import MODES, TargetModes
 
 MOTION = slice(0, 9)  # attitude rad, position m, velocity m/s: what moves
 ATTITUDE = slice(0, 3)  # rad, local (right) error of R_world_imu
@@ -34,13 +37,13 @@ class CameraSlices:
     timeshift: int | None  # s
     skew: int | None  # s/s, drift of the time shift
     intrinsics: slice | None  # px, fx fy cx cy
-    distortion: slice | None  # 4 coefficients
+    distortion: slice | None  # 4 coefficients, or 5
     readout: int | None  # s
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Order of the error state: [core 17 | imu matrices | cameras | target scale].
+    """Order of the error state: [core 17 | imu matrices | cameras | target scale | target shape].
 
     Attributes:
         size: Length of the error state.
@@ -50,6 +53,8 @@ class Layout:
             full matrix could be traded against R_imu_cam.
         cameras: By name.
         target_scale: Relative size of the board, index or None.
+        target_shape: How far the board is off in each of its modes, m; None: as stated.
+        target_modes: Those modes; None: as stated.
     """
 
     size: int
@@ -58,10 +63,25 @@ class Layout:
     accel_matrix: slice | None
     cameras: dict[str, CameraSlices]
     target_scale: int | None
+    target_shape: slice | None = None
+    target_modes: TargetModes | None = None
 
 
-def make_layout(cameras: list[str], *, fix: frozenset[str], estimate: frozenset[str]) -> Layout:
-    """Lay the error state out for a set of switches (names as in `CalibrationOptions`)."""
+def make_layout(
+    models: Mapping[str, str],
+    *,
+    fix: frozenset[str],
+    estimate: frozenset[str],
+    target_m: FloatArray | None = None,
+) -> Layout:
+    """Lay the error state out.
+
+    Args:
+        models: Distortion model by camera.
+        fix: Names as in `CalibrationOptions`.
+        estimate: Likewise.
+        target_m: Points of the target, m, shape (n, 3), for its shape to be estimated.
+    """
     at = _CORE
     gyro_matrix = accel_matrix = None
     if "imu_intrinsics" in estimate:
@@ -77,10 +97,11 @@ def make_layout(cameras: list[str], *, fix: frozenset[str], estimate: frozenset[
         at += n
         return slice(at - n, at)
 
-    for name in cameras:
+    for name, model in models.items():
         position, rotation = take("extrinsics" not in fix, 3), take("extrinsics" not in fix, 3)
         shift, skew = take("timeshift" not in fix, 1), take("timeshift" not in fix, 1)
-        intrinsics, distortion = take("intrinsics" not in fix, 4), take("intrinsics" not in fix, 4)
+        lens = "intrinsics" not in fix
+        intrinsics, distortion = take(lens, 4), take(lens, len(COEFFICIENTS[model]))
         readout = take("readout" in estimate, 1)
         blocks[name] = CameraSlices(
             position,
@@ -92,7 +113,11 @@ def make_layout(cameras: list[str], *, fix: frozenset[str], estimate: frozenset[
             readout.start if readout else None,
         )
     scale = take("target_scale" in estimate, 1)
-    return Layout(at, dynamic, gyro_matrix, accel_matrix, blocks, scale.start if scale else None)
+    modes = None if target_m is None or "target_shape" not in estimate else TargetModes.of(target_m)
+    shape = take(modes is not None, MODES)
+    return Layout(
+        at, dynamic, gyro_matrix, accel_matrix, blocks, scale.start if scale else None, shape, modes
+    )
 
 
 @dataclass(slots=True)
@@ -126,6 +151,7 @@ class State:
         accel_matrix: M_a in f = M_a (f_m - b_a), lower triangular.
         cameras: By name.
         target_scale: True size of the board over its stated size.
+        target_shape: How far the board is off in each of `Layout.target_modes`, m, shape (11,).
         tilt: Two unit vectors across gravity, shape (3, 2): the errors of its direction are turns about them.
             They turn with it: a basis worked out anew from each gravity must jump somewhere, and the
             covariance would not jump with it.
@@ -142,6 +168,7 @@ class State:
     gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     target_scale: float = 1.0
+    target_shape: FloatArray = field(default_factory=lambda: np.zeros(MODES))
     tilt: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:

@@ -57,8 +57,8 @@ class TargetFreeCalibrator:
             raise ValueError(
                 f"target-free calibration takes one camera at a time, not {len(cameras)}; choose one"
             )
-        if "target_scale" in options.estimate:
-            raise ValueError("without a target there is no target_scale to estimate")
+        for block in sorted({"target_scale", "target_shape"} & options.estimate):
+            raise ValueError(f"without a target there is no {block} to estimate")
         self.options = options
         self.camera, self.prior = next(iter(cameras.items()))
         self.active = np.ones(FULL, dtype=bool)

@@ -53,6 +53,9 @@ FORMATS: dict[str, Callable[[Rig], list[ExportFile]]] = {
 }
 
 
+_FOUR_COEFFICIENTS = ("kalibr", "openvins", "vins")  # have no fifth for radtan
+
+
 def export(rig: Rig, format_name: str) -> list[ExportFile]:
     """Turn a rig into the files of a format; the first one is the main file.
 
@@ -63,4 +66,10 @@ def export(rig: Rig, format_name: str) -> list[ExportFile]:
         raise ExportError(f"format {format_name!r} is none of {', '.join(FORMATS)}")
     if not rig.cameras:
         raise ExportError("there is no camera in the source: the calibration had no solution yet")
+    longer = [c.name for c in rig.cameras.values() if len(c.distortion) > 4]
+    if longer and format_name in _FOUR_COEFFICIENTS:
+        raise ExportError(
+            f"{', '.join(longer)}: {format_name} has no place for plumb_bob's k3; calibrate with "
+            "distortion_model: radtan, or export to ros, opencv, orbslam3 or basalt"
+        )
     return FORMATS[format_name](rig)

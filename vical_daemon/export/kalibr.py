@@ -98,7 +98,7 @@ def _read_camera(name: str, block: Any, T_before_imu: FloatArray | None, path: P
     else:
         raise ExportError(f"{path}: {name} has no T_cam_imu; run the camera-imu step of Kalibr first")
     fx, fy, cx, cy = _numbers(block, "intrinsics", 4, name, path)
-    k1, k2, k3, k4 = _numbers(block, "distortion_coeffs", 4, name, path)
+    distortion = tuple(_numbers(block, "distortion_coeffs", 4, name, path))
     width, height = _numbers(block, "resolution", 2, name, path)
     return RigCamera(
         name=name,
@@ -107,7 +107,7 @@ def _read_camera(name: str, block: Any, T_before_imu: FloatArray | None, path: P
         timeshift_cam_imu_s=float(block.get("timeshift_cam_imu", 0.0)),
         intrinsics=(fx, fy, cx, cy),
         distortion_model=model,
-        distortion=(k1, k2, k3, k4),
+        distortion=distortion,
         resolution=(int(width), int(height)),
         topic=str(block.get("rostopic", "")),
     )

@@ -23,8 +23,8 @@ class RigCamera:
         p_imu_cam: Camera origin in the imu frame, m, shape (3,).
         timeshift_cam_imu_s: t_imu = t_cam + timeshift_cam_imu_s, s.
         intrinsics: fx fy cx cy, px.
-        distortion_model: radtan or equidistant.
-        distortion: k1 k2 p1 p2 or k1 k2 k3 k4.
+        distortion_model: radtan, plumb_bob or equidistant.
+        distortion: k1 k2 p1 p2 [k3] or k1 k2 k3 k4.
         resolution: width, height, px; None: not known.
         covariance: Of [px py pz rx ry rz], m and rad, rotation error local, shape (6, 6); None: not known.
         timeshift_sigma_s: Its standard deviation, s; None: not known.
@@ -40,7 +40,7 @@ class RigCamera:
     timeshift_cam_imu_s: float
     intrinsics: tuple[float, float, float, float]
     distortion_model: str
-    distortion: tuple[float, float, float, float]
+    distortion: tuple[float, ...]
     resolution: tuple[int, int] | None = None
     covariance: FloatArray | None = None
     timeshift_sigma_s: float | None = None

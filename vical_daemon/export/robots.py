@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.camera_model import COEFFICIENTS
 from vical_daemon.export.rig import Rig, RigCamera
 from vical_daemon.export.text import comment, number, row
 
@@ -18,7 +19,7 @@ def write_camera_info(camera: RigCamera, rig: Rig) -> str:
     width, height = camera.size
     fx, fy, cx, cy = camera.intrinsics
     fisheye = camera.distortion_model == "equidistant"
-    coefficients = list(camera.distortion) + ([] if fisheye else [0.0])
+    coefficients = list(camera.distortion) + ([0.0] if camera.distortion_model == "radtan" else [])
     model = "equidistant" if fisheye else "plumb_bob"
     x, y, z = camera.p_imu_cam
     qw, qx, qy, qz = so3.quat_from_matrix(camera.R_imu_cam)
@@ -80,8 +81,8 @@ def write_basalt(rig: Rig) -> str:
 
     `T_imu_cam` is ours; `cam_time_offset_ns` is added to the image stamps (t_imu = t_cam + offset, our
     sign; one for all cameras, so the first one's). Noises are continuous-time densities. Its biases act as
-    a = (I + S) a_m - b, so S = M_a - I and b = M_a b_a. radtan becomes pinhole-radtan8 with k3..k6 = 0,
-    known to Basalt since its Monado fork; rpmax 0: no limit.
+    a = (I + S) a_m - b, so S = M_a - I and b = M_a b_a. radtan and plumb_bob become pinhole-radtan8 with
+    the other coefficients 0, known to Basalt since its Monado fork; rpmax 0: no limit.
     """
     cameras = list(rig.cameras.values())
     noise = rig.noise
@@ -119,8 +120,8 @@ def _basalt_camera(camera: RigCamera) -> dict[str, Any]:
         return {"camera_type": "kb4", "intrinsics": values}
     if not any(camera.distortion):
         return {"camera_type": "pinhole", "intrinsics": values}
-    values |= dict(zip(("k1", "k2", "p1", "p2"), camera.distortion, strict=True))
-    values |= dict.fromkeys(("k3", "k4", "k5", "k6", "rpmax"), 0.0)
+    values |= dict.fromkeys(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "rpmax"), 0.0)
+    values |= dict(zip(COEFFICIENTS[camera.distortion_model], camera.distortion, strict=True))
     return {"camera_type": "pinhole-radtan8", "intrinsics": values}
 
 

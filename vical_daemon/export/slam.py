@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vical_daemon.estimation.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.export.rig import Rig, RigCamera
 from vical_daemon.export.text import comment, matrix_rows, number, opencv_matrix, row
@@ -136,7 +137,7 @@ def write_orbslam3(rig: Rig) -> str:
     Noises are continuous-time densities (it multiplies by sqrt(rate) itself).
     """
     camera = rig.only_camera("orbslam3")
-    names = ("k1", "k2", "k3", "k4") if camera.distortion_model == "equidistant" else ("k1", "k2", "p1", "p2")
+    names = COEFFICIENTS[camera.distortion_model]
     kind = "KannalaBrandt8" if camera.distortion_model == "equidistant" else "PinHole"
     keys = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
     keys |= dict(zip(names, camera.distortion, strict=True))

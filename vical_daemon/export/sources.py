@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.camera_model import COEFFICIENTS, RADTAN
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.export.rig import ExportError, Rig, RigCamera
@@ -70,7 +71,10 @@ def _camera(name: str, entry: Any) -> RigCamera:
         p = np.array(pose["p_m"], dtype=np.float64)
         covariance = pose.get("covariance")
         fx, fy, cx, cy = (float(v) for v in entry["intrinsics"])
-        k1, k2, k3, k4 = (float(v) for v in entry["distortion"])
+        model = str(entry.get("distortion_model") or RADTAN)
+        distortion = tuple(float(v) for v in entry["distortion"])
+        if len(distortion) != len(COEFFICIENTS.get(model, ())):
+            raise ValueError(f"{len(distortion)} distortion coefficients for {model!r}")
         size = entry.get("resolution")
         sigma = entry.get("timeshift_sigma_s")
         camera = RigCamera(
@@ -79,8 +83,8 @@ def _camera(name: str, entry: Any) -> RigCamera:
             p_imu_cam=p,
             timeshift_cam_imu_s=float(entry["timeshift_cam_imu_s"]),
             intrinsics=(fx, fy, cx, cy),
-            distortion_model=str(entry.get("distortion_model") or "radtan"),
-            distortion=(k1, k2, k3, k4),
+            distortion_model=model,
+            distortion=distortion,
             resolution=None if not size else (int(size[0]), int(size[1])),
             covariance=None if not covariance else np.array(covariance, dtype=np.float64).reshape(6, 6),
             timeshift_sigma_s=None if sigma is None else float(sigma),

@@ -21,9 +21,9 @@ _ENCODINGS = {
     "bgr8": ("u1", 3), "rgb8": ("u1", 3), "8UC3": ("u1", 3), "bgra8": ("u1", 4), "rgba8": ("u1", 4),
     "bayer_rggb8": ("u1", 1), "bayer_bggr8": ("u1", 1), "bayer_gbrg8": ("u1", 1), "bayer_grbg8": ("u1", 1),
 }  # fmt: skip
-# our name of a lens model -> ROS name; ROS' plumb_bob has a fifth coefficient k3
-_MODEL_TO_ROS = {"radtan": "plumb_bob", "equidistant": "equidistant"}
-_MODEL_FROM_ROS = {"plumb_bob": "radtan", "equidistant": "equidistant", "fisheye": "equidistant"}
+# our name of a lens model -> ROS name; radtan is plumb_bob without its fifth coefficient k3
+_MODEL_TO_ROS = {"radtan": "plumb_bob"}
+_MODEL_FROM_ROS = {"fisheye": "equidistant"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +89,9 @@ class CameraInfoMessage:
         width: Columns of the image.
         height: Rows of the image.
         intrinsics: fx fy cx cy, px.
-        distortion_model: Our name: radtan or equidistant; ROS' name where we have none.
-        distortion: Coefficients as sent (radtan: k1 k2 p1 p2 [k3]).
+        distortion_model: Our name: radtan (plumb_bob whose k3 is 0), plumb_bob or equidistant; ROS' name
+            where we have none.
+        distortion: Coefficients as sent (radtan: k1 k2 p1 p2 [0]).
     """
 
     stamp_ns: int
@@ -183,8 +184,8 @@ def encode_camera_info(
         frame_id: Name of the camera.
         resolution: width, height, px.
         intrinsics: fx fy cx cy, px.
-        distortion_model: radtan (sent as plumb_bob with k3 = 0) or equidistant.
-        distortion: 4 coefficients, or none.
+        distortion_model: radtan (sent as plumb_bob with k3 = 0), plumb_bob or equidistant.
+        distortion: The model's coefficients, or none.
     """
     fx, fy, cx, cy = intrinsics
     coefficients = list(distortion)
@@ -220,6 +221,7 @@ def decode_camera_info(data: bytes) -> CameraInfoMessage:
     reader.skip(9 * 8 + 12 * 8, 8)  # rectification and projection
     reader.skip(6 * 4 + 1, 4)  # binning and region of interest
     intrinsics = (float(k[0]), float(k[4]), float(k[2]), float(k[5]))
-    return CameraInfoMessage(
-        stamp_ns, frame_id, width, height, intrinsics, _MODEL_FROM_ROS.get(model, model), distortion
-    )
+    model = _MODEL_FROM_ROS.get(model, model)
+    if model == "plumb_bob" and not any(distortion[4:]):
+        model = "radtan"
+    return CameraInfoMessage(stamp_ns, frame_id, width, height, intrinsics, model, distortion)

@@ -41,7 +41,7 @@ float64 timeshift_cam_imu_s      # t_imu = t_cam + timeshift_cam_imu_s
 float64 timeshift_sigma_s
 float64[] intrinsics             # fx fy cx cy, px
 float64[] intrinsics_sigma
-string distortion_model          # radtan (k1 k2 p1 p2) or equidistant
+string distortion_model          # radtan (k1 k2 p1 p2), plumb_bob (with k3) or equidistant
 float64[] distortion
 float64[] distortion_sigma
 float64 readout_s                # first to last row, 0 global shutter

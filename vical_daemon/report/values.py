@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vical_daemon.estimation.camera_model import COEFFICIENTS, RADTAN
 from vical_daemon.euler import euler_deg, euler_sigma_deg
 
 Row = tuple[str, str, str, str]
@@ -53,14 +54,14 @@ def camera_rows(camera: dict[str, Any]) -> list[Row]:
 
 def lens_rows(camera: dict[str, Any]) -> list[Row]:
     """Rows for intrinsics and distortion."""
-    model = camera.get("distortion_model", "radtan")
-    names = ("k1", "k2", "p1", "p2") if model == "radtan" else ("k1", "k2", "k3", "k4")
+    model = camera.get("distortion_model", RADTAN)
+    names = COEFFICIENTS[model]
     rows: list[Row] = []
     for key, units, labels in (
         ("intrinsics", "px", ("fx", "fy", "cx", "cy")),
         ("distortion", "", tuple(f"{n} ({model})" for n in names)),
     ):
-        sigmas: Sequence[float | None] = camera.get(f"{key}_sigma") or [None] * 4
+        sigmas: Sequence[float | None] = camera.get(f"{key}_sigma") or [None] * len(labels)
         for label, number, sigma in zip(labels, camera.get(key, []), sigmas, strict=False):
             rows.append((label, *value(number, sigma), units))
     rows.append(("reprojection RMS", f"{camera['reprojection_rms_px']:.3f}", "", "px"))

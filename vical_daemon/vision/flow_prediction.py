@@ -25,15 +25,15 @@ class FlowCamera:
 
     Attributes:
         intrinsics: fx fy cx cy, px.
-        distortion: Four coefficients.
-        distortion_model: radtan or equidistant.
+        distortion: The model's coefficients.
+        distortion_model: radtan, plumb_bob or equidistant.
         R_imu_cam: Rotation that maps camera vectors into the imu frame, shape (3, 3); None: unknown, the gyro
             is not used.
         timeshift_cam_imu_s: t_imu = t_cam + shift, s.
     """
 
     intrinsics: tuple[float, float, float, float]
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     distortion_model: str = "radtan"
     R_imu_cam: FloatArray | None = None
     timeshift_cam_imu_s: float = 0.0

@@ -151,6 +151,13 @@ def test_camera_info_is_what_rosbags_writes(model, ros_model, extra):
     )
 
 
+def test_camera_info_with_a_fifth_coefficient_stays_plumb_bob():
+    d = (-0.32, 0.15, 1e-4, 5e-5, -0.04)
+    sent = m.encode_camera_info(STAMP_NS, "cam0", (752, 480), (1, 2, 3, 4), "plumb_bob", d)
+    decoded = m.decode_camera_info(sent)
+    assert (decoded.distortion_model, decoded.distortion) == ("plumb_bob", d)
+
+
 @pytest.mark.parametrize("type_name", [m.POINTS_TYPE, m.TRACKS_TYPE])
 @pytest.mark.parametrize("n", [0, 1, 144])
 @pytest.mark.parametrize("stated", [True, False])

@@ -78,7 +78,9 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("[458.6, 457.3, 320.5, 240.0]", "[458.6, 457.3, 320.5]", "cameras.cam0.lens.intrinsics: expected 4 values, found 3 (config line 10)"),
         ("[458.6, 457.3, 320.5, 240.0]", "[458.6, -1, 320.5, 2]", "cameras.cam0.lens.intrinsics.1: -1 must be above 0 (config line 10)"),
         ("[458.6, 457.3, 320.5, 240.0]", "[458.6, 457.3, 240.0, 620]", "cameras.cam0.lens.intrinsics: the principal point y = 620 lies outside 0..480 (config line 10)"),
-        ("lens:\n", "lens:\n      distortion_model: fov\n", "cameras.cam0.lens.distortion_model: the text 'fov' is none of radtan, equidistant (config line 10)"),
+        ("lens:\n", "lens:\n      distortion_model: fov\n", "cameras.cam0.lens.distortion_model: the text 'fov' is none of radtan, plumb_bob, equidistant (config line 10)"),
+        ("lens:\n", "lens:\n      distortion_coeffs: [0, 0, 0]\n", "cameras.cam0.lens.distortion_coeffs: expected 4 values (k1 k2 p1 p2 of radtan), found 3 (config line 10)"),
+        ("lens:\n", "lens:\n      distortion_model: plumb_bob\n      distortion_coeffs: [0, 0, 0, 0]\n", "cameras.cam0.lens.distortion_coeffs: expected 5 values (k1 k2 p1 p2 k3 of plumb_bob), found 4 (config line 11)"),
         ("lens:\n", "lens:\n      T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]\n", "cameras.cam0.lens.T_cam_imu: the upper left 3x3 block is no rotation (config line 10)"),
         ("target: board.yaml", "calibration: {}", "calibration.mode: target needs `target: FILE` (`vical target` makes one), or mode: target_free (config line 11)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [extrinsics]}", "cameras.cam0.lens: calibration.fix holds extrinsics, so T_cam_imu must be given here (config line 9)"),
@@ -227,7 +229,10 @@ class TestInitial:
         ("text", "message"),
         [
             ("cam0: {distorsion_coeffs: [1]}", "did you mean distortion_coeffs"),
-            ("cam0: {distortion_coeffs: [1, 2, 3, 4, 5]}", "expected 4 values, found 5"),
+            (
+                "cam0: {distortion_coeffs: [1, 2, 3, 4, 5]}",
+                r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5",
+            ),
             ("cam0: {camera_model: omni}", "none of pinhole"),
             ("camera: {}\nlidar0: {}", "unknown section"),
             ("cam0: 5", "unknown key"),

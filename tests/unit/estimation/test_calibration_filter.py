@@ -49,7 +49,7 @@ def build(run, scale=1.0):
         np.array(rig.gravity_world_mps2, float),
         {"cam0": camera},
     )
-    layout = make_layout(["cam0"], fix=frozenset({"intrinsics"}), estimate=frozenset())
+    layout = make_layout({"cam0": "radtan"}, fix=frozenset({"intrinsics"}), estimate=frozenset())
     sigma = np.full(layout.size, 1e-3)
     sigma[6:9], sigma[12:15] = 1e-2, 1e-2
     sigma[layout.cameras["cam0"].skew] = 1e-9

@@ -8,7 +8,9 @@ from vical_daemon.estimation import camera_model as cm
 
 K = np.array([458.6, 457.3, 367.2, 248.4])
 D_RADTAN = np.array([-0.2834, 0.0739, 0.00019, 1.76e-05])
+D_PLUMB_BOB = np.array([-0.3244, 0.1537, 9e-5, 5e-5, -0.0415])
 D_FISHEYE = np.array([-0.013, 0.021, -0.015, 0.004])
+LENSES = [(cm.RADTAN, D_RADTAN), (cm.PLUMB_BOB, D_PLUMB_BOB), (cm.EQUIDISTANT, D_FISHEYE)]
 KM = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
 
 
@@ -22,20 +24,20 @@ def _points(n=300, spread=0.7):
 
 def _opencv(points, model, D):
     zero = np.zeros(3)
-    if model == cm.RADTAN:
+    if model != cm.EQUIDISTANT:
         return cv2.projectPoints(points, zero, zero, KM, D)[0][:, 0]
     return cv2.fisheye.projectPoints(points[:, None], zero, zero, KM, D)[0][:, 0]
 
 
-@pytest.mark.parametrize(("model", "D"), [(cm.RADTAN, D_RADTAN), (cm.EQUIDISTANT, D_FISHEYE)])
+@pytest.mark.parametrize(("model", "D"), LENSES)
 def test_projection_agrees_with_opencv(model, D):
     points = _points()
     np.testing.assert_allclose(cm.project(points, K, D, model), _opencv(points, model, D), atol=1e-9)
 
 
-@pytest.mark.parametrize(("model", "D"), [(cm.RADTAN, D_RADTAN), (cm.EQUIDISTANT, D_FISHEYE)])
+@pytest.mark.parametrize(("model", "D"), LENSES)
 def test_unproject_inverts_project_to_machine_precision(model, D):
-    points = _points(spread=0.95 if model == cm.RADTAN else 3.0)
+    points = _points(spread=3.0 if model == cm.EQUIDISTANT else 0.95)
     rays, ok = cm.unproject(cm.project(points, K, D, model), K, D, model)
     assert ok.all()
     np.testing.assert_allclose(rays, points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-12)
@@ -44,7 +46,7 @@ def test_unproject_inverts_project_to_machine_precision(model, D):
     np.testing.assert_allclose(xy, points[:, :2] / points[:, 2:], atol=1e-11)
 
 
-@pytest.mark.parametrize(("model", "D"), [(cm.RADTAN, D_RADTAN), (cm.EQUIDISTANT, D_FISHEYE)])
+@pytest.mark.parametrize(("model", "D"), LENSES)
 def test_jacobians_by_finite_differences(model, D):
     points = _points(40)
     uv, J_point, J_camera = cm.project_jacobians(points, K, D, model)
@@ -54,8 +56,10 @@ def test_jacobians_by_finite_differences(model, D):
         step = h * np.eye(3)[i]
         numeric = (cm.project(points + step, K, D, model) - cm.project(points - step, K, D, model)) / (2 * h)
         np.testing.assert_allclose(J_point[..., i], numeric, rtol=1e-6, atol=2e-5)
-    for i in range(8):
-        step = h * np.eye(8)[i]
+    n = 4 + len(D)
+    assert J_camera.shape[-1] == n
+    for i in range(n):
+        step = h * np.eye(n)[i]
         numeric = (
             cm.project(points, K + step[:4], D + step[4:], model)
             - cm.project(points, K - step[:4], D - step[4:], model)
@@ -63,16 +67,16 @@ def test_jacobians_by_finite_differences(model, D):
         np.testing.assert_allclose(J_camera[..., i], numeric, rtol=1e-6, atol=2e-5)
 
 
-@pytest.mark.parametrize("model", cm.MODELS)
-def test_sigma_points_broadcast_in_one_call(model):
+@pytest.mark.parametrize(("model", "D"), LENSES)
+def test_sigma_points_broadcast_in_one_call(model, D):
     rng = np.random.default_rng(8)
     points = _points(12)[None] + rng.normal(0, 0.01, (5, 12, 3))
     Ks = K + rng.normal(0, 2, (5, 1, 4))
-    Ds = D_FISHEYE + rng.normal(0, 0.001, (5, 1, 4))
+    Ds = D + rng.normal(0, 0.001, (5, 1, len(D)))
     uv = cm.project(points, Ks, Ds, model)
     assert uv.shape == (5, 12, 2)
     np.testing.assert_allclose(uv[3, 7], cm.project(points[3, 7], Ks[3, 0], Ds[3, 0], model))
-    assert cm.project_jacobians(points, Ks, Ds, model)[2].shape == (5, 12, 2, 8)
+    assert cm.project_jacobians(points, Ks, Ds, model)[2].shape == (5, 12, 2, 4 + len(D))
     rays, ok = cm.unproject(uv, Ks, Ds, model)
     assert ok.all() and rays.shape == (5, 12, 3)
 
@@ -103,6 +107,14 @@ def test_pixels_that_no_ray_reaches_are_refused():
     assert np.isinf(cm.valid_radius(np.zeros(4)))
 
 
+def test_the_fifth_coefficient_moves_the_fold():
+    r = cm.valid_radius(D_PLUMB_BOB)
+    across = np.linspace(0.0, r, 1000)[:, None] * [1.0, 0.0]
+    radius = cm.distort(across, D_PLUMB_BOB * [1, 1, 0, 0, 1])[:, 0]
+    assert (np.diff(radius) > 0).all() and radius[-1] - radius[-2] < 1e-5
+    assert np.isinf(cm.valid_radius(np.array([0.1, 0.0, 0, 0, 0.1])))
+
+
 def test_an_unknown_model_is_named():
-    with pytest.raises(ValueError, match="radtan or equidistant"):
+    with pytest.raises(ValueError, match="radtan or plumb_bob or equidistant"):
         cm.project(np.ones(3), K, D_RADTAN, "fov")

@@ -34,7 +34,7 @@ def some_filter(skew, factor=1.0):
         np.array([0.0, 0, -9.8]),
         {NAME: camera},
     )
-    layout = make_layout([NAME], fix=frozenset({"intrinsics"}), estimate=frozenset())
+    layout = make_layout({NAME: "radtan"}, fix=frozenset({"intrinsics"}), estimate=frozenset())
     S = 1e-4 * np.tril(np.random.default_rng(1).normal(size=(layout.size, layout.size)))
     where = layout.cameras[NAME].skew
     S[where] *= 1e-5 / np.linalg.norm(S[where])

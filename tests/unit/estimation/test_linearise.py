@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.camera_model import COEFFICIENTS
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.linearise import (
     Image,
@@ -16,18 +17,19 @@ from vical_daemon.estimation.linearise import (
 from vical_daemon.estimation.propagate import move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.rates import Rates
 from vical_daemon.estimation.state import CameraState, State, make_layout
+from vical_daemon.estimation.target_modes import MODES
 
 BOARD = np.stack([*np.meshgrid(np.arange(5) * 0.05, np.arange(4) * 0.05), np.zeros((4, 5))], axis=-1)
 
 
-def scene(model: str, estimate=frozenset({"target_scale"})):
+def scene(model: str, estimate=frozenset({"target_scale", "target_shape"})):
     """A camera half a metre in front of a board, in motion, with everything estimated."""
     camera = CameraState(
         so3.exp(np.array([0.3, -0.2, 0.9])),
         np.array([0.03, -0.05, 0.02]),
         0.004,
         np.array([460.0, 455.0, 325.0, 238.0]),
-        np.array([-0.28, 0.07, 2e-4, -3e-4]),
+        np.array([-0.28, 0.07, 2e-4, -3e-4, -0.03])[: len(COEFFICIENTS[model])],
         model,
         (640, 480),
     )
@@ -42,8 +44,9 @@ def scene(model: str, estimate=frozenset({"target_scale"})):
         np.array([1.0, 9.0, -3.7]),
         {"cam0": camera},
         target_scale=1.01,
+        target_shape=1e-3 * np.random.default_rng(6).standard_normal(MODES),
     )
-    layout = make_layout(["cam0"], fix=frozenset(), estimate=estimate)
+    layout = make_layout({"cam0": model}, fix=frozenset(), estimate=estimate, target_m=BOARD.reshape(-1, 3))
     rates = Rates(np.array([0.7, -1.1, 0.5]), np.array([1.0, 2.0, -1.5]))
     points = BOARD.reshape(-1, 3).copy()
     uv = np.zeros((len(points), 2))
@@ -60,12 +63,12 @@ def scene(model: str, estimate=frozenset({"target_scale"})):
     return state, layout, rates, image
 
 
-@pytest.mark.parametrize("model", ["radtan", "equidistant"])
+@pytest.mark.parametrize("model", ["radtan", "plumb_bob", "equidistant"])
 def test_derivatives_of_the_view_are_those_of_the_projection(model):
     state, layout, rates, image = scene(model)
     uv, ways, by_error = view_derivatives(state, layout, rates, image)
     H = ways @ by_error
-    assert ways.shape == (2 * len(image.points), 6 + 8 + 1)
+    assert ways.shape == (2 * len(image.points), 6 + 4 + len(COEFFICIENTS[model]) + 1 + MODES)
     steps = 1e-6 * np.eye(layout.size)
     arguments = (state, layout, rates, "cam0", image.t_cam_s, image.points, None)
     differences = (project_errors(*arguments, steps) - project_errors(*arguments, -steps)) / 2e-6

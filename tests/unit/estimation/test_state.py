@@ -40,7 +40,7 @@ def test_tilting_keeps_the_length_and_turns_by_the_angle():
 
 @pytest.mark.parametrize("direction", [(0.0, 1.0, 1e-4), (1.0, 0.0, 1e-4), (0.6, -0.8, 1e-4)])
 def test_the_directions_of_tilt_turn_with_gravity_and_never_jump(direction):
-    layout = st.make_layout([], fix=frozenset(), estimate=frozenset())
+    layout = st.make_layout({}, fix=frozenset(), estimate=frozenset())
     z, eye = np.zeros(3), np.eye(3)
     state = st.State(0.0, eye, z, z, z, z, 9.8 * np.array(direction), {})
     first = state.tilt
@@ -56,7 +56,9 @@ def test_the_directions_of_tilt_turn_with_gravity_and_never_jump(direction):
 
 def test_layout_has_no_overlap_and_covers_everything():
     layout = st.make_layout(
-        ["a", "b"], fix=frozenset(), estimate=frozenset({"imu_intrinsics", "readout", "target_scale"})
+        {"a": "radtan", "b": "plumb_bob"},
+        fix=frozenset(),
+        estimate=frozenset({"imu_intrinsics", "readout", "target_scale"}),
     )
     used = np.zeros(layout.size, dtype=int)
     used[:17] += 1
@@ -74,7 +76,7 @@ def test_layout_has_no_overlap_and_covers_everything():
 
 def test_fixed_blocks_are_not_in_the_layout():
     layout = st.make_layout(
-        ["a"], fix=frozenset({"intrinsics", "timeshift", "extrinsics"}), estimate=frozenset()
+        {"a": "radtan"}, fix=frozenset({"intrinsics", "timeshift", "extrinsics"}), estimate=frozenset()
     )
     c = layout.cameras["a"]
     assert layout.size == 17

@@ -195,6 +195,29 @@ def test_opencv_file_projects_like_the_camera(rig, tmp_path):
     )
 
 
+FIVE = (-0.32, 0.15, 1e-4, 5e-5, -0.04)
+
+
+def test_a_fifth_coefficient_goes_where_there_is_a_place_for_it(rig, tmp_path):
+    camera = replace(rig.cameras["cam0"], distortion_model="plumb_bob", distortion=FIVE)
+    rig = replace(rig, cameras={"cam0": camera})
+    info = yaml.safe_load(files(rig, "ros")["cam0.yaml"])
+    assert info["distortion_model"] == "plumb_bob"
+    assert info["distortion_coefficients"]["data"] == pytest.approx(FIVE)
+    opened = storage(tmp_path, files(rig, "opencv")["camera.yaml"])
+    assert opened.getNode("distortion_coefficients").mat().ravel() == pytest.approx(FIVE)
+    opened = storage(tmp_path, files(rig, "orbslam3")["settings.yaml"])
+    assert opened.getNode("Camera1.k3").real() == pytest.approx(-0.04)
+    basalt = json.loads(files(rig, "basalt")["calibration.json"])["value0"]["intrinsics"][0]
+    assert basalt["camera_type"] == "pinhole-radtan8"
+    assert [basalt["intrinsics"][k] for k in ("k1", "p2", "k3", "k4")] == pytest.approx([-0.32, 5e-5, -0.04, 0])
+    again = rig_from_json(json.loads(files(rig, "json")["calibration.json"]))
+    assert again.cameras["cam0"].distortion == pytest.approx(FIVE)
+    for name in ("kalibr", "openvins", "vins"):
+        with pytest.raises(ExportError, match=f"cam0: {name} has no place for plumb_bob's k3; calibrate with"):
+            files(rig, name)
+
+
 def test_ros_camera_info_has_what_the_parser_asks_for(rig):
     made = files(rig, "ros")
     info = yaml.safe_load(made["cam0.yaml"])

@@ -1,0 +1,89 @@
+"""target_modes.py: the displacement fields, and a crooked board found by the whole estimator."""
+
+import numpy as np
+import pytest
+from vical_mocks.points import board_points, crooked_board, simulate
+from vical_mocks.rig import reference_rig
+
+from tests.unit.estimation.test_calibrator import errors
+from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.target_modes import MODES, TargetModes
+
+BOARD = board_points()
+
+
+def test_each_mode_is_a_metre_large_at_the_edges_and_independent():
+    elsewhere = BOARD + np.array([3.0, -1.0, 0.0])
+    modes = TargetModes.of(elsewhere)
+    fields = modes.fields(elsewhere)
+    assert modes.half_m == pytest.approx(0.175)
+    np.testing.assert_allclose(modes.centre_m, [3.175, -0.875])
+    assert np.abs(fields).max(axis=(0, 1))[:3] == pytest.approx([1.0, 1.0, 1.0])
+    stacked = fields.reshape(-1, MODES)
+    assert np.linalg.matrix_rank(stacked) == MODES
+
+
+def test_no_mode_is_a_turn_or_a_change_of_size_of_the_print():
+    fields = TargetModes.of(BOARD).fields(BOARD)
+    arms = BOARD - BOARD.mean(axis=0)
+    turn = np.cross([0.0, 0.0, 1.0], arms)
+    square = np.abs(arms[:, 0]) <= 0.126  # a part as wide as tall: x and y weigh the same
+    for mode in range(MODES):
+        assert np.sum(fields[square, :, mode] * arms[square]) == pytest.approx(0.0, abs=1e-9)
+        assert np.sum(fields[square, :, mode] * turn[square]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_second_order_differences_are_those_of_the_field():
+    modes = TargetModes.of(BOARD)
+    rng = np.random.default_rng(2)
+    shape = rng.standard_normal(MODES)
+    h = 0.01 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    at = np.array([[0.1, 0.05, 0.0]])
+    for axis in range(2):
+        twice = sum(w * (modes.fields(at + k * h[axis]) @ shape) for k, w in ((-1, 1), (0, -2), (1, 1)))
+        np.testing.assert_allclose(
+            twice[0] / (0.01 / modes.half_m) ** 2, 2 * shape[np.array([5, 8, 2]) + axis]
+        )
+
+
+@pytest.fixture(scope="module", params=[3, 4])
+def crooked(request):
+    seed = request.param
+    rig = reference_rig(seed, timeshift_cam_imu_s=0.02)
+    return seed, simulate(seed, 25.0, rig=rig, points_m=crooked_board(seed))
+
+
+def calibrate(run, estimate=frozenset()):
+    lens = run.rig.lens
+    start = CameraPrior((640, 480), (530.0, 530.0, 322.0, 236.0), lens.model)
+    c = Calibrator(CalibrationOptions(estimate=estimate), {"cam0": start}, BOARD)
+    frames = iter(run.frames)
+    frame = next(frames, None)
+    for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True):
+        c.add_imu(int(t), w, f)
+        while frame is not None and frame.t_cam_ns <= t:
+            c.add_points(PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px))
+            c.process()
+            frame = next(frames, None)
+    c.finish()
+    return c
+
+
+def test_a_crooked_board_is_found_and_the_lens_with_it(crooked):
+    seed, run = crooked
+    c = calibrate(run, frozenset({"target_shape"}))
+    estimate = c.estimate()
+    x, sigma = errors(estimate, run)
+    assert np.abs(x / sigma).max() < 3.5
+    camera = estimate.cameras["cam0"]
+    off = np.array(camera.intrinsics) - run.rig.lens.intrinsics
+    assert np.abs(off / camera.intrinsics_sigma).max() < 3.5
+    # beside what each corner has for itself, and a plane of its own: the world frame is free
+    f = c.filter
+    found = c.layout.target_modes.fields(BOARD) @ f.state.target_shape
+    left = crooked_board(seed) - BOARD - found
+    plane = np.column_stack([BOARD[:, :2], np.ones(len(BOARD))])
+    left_z = left[:, 2] - plane @ np.linalg.lstsq(plane, left[:, 2], rcond=None)[0]
+    assert np.std(left_z) < 0.2e-3
+    assert np.std(found[:, 2]) > 0.1e-3
