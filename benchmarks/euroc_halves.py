@@ -40,9 +40,11 @@ class Half(NamedTuple):
     steady_s: list[float]
 
 
-def calibrate(items: Items, fix: frozenset[str], points: np.ndarray, prior: CameraPrior = PRIOR) -> Half:
+def calibrate(
+    items: Items, options: CalibrationOptions, points: np.ndarray, prior: CameraPrior = PRIOR
+) -> Half:
     """Calibrate a stretch of (stamp, message) in order; its CPU counts from the start on."""
-    c = Calibrator(CalibrationOptions(fix=fix, imu_noise=NOISE), {"cam0": prior}, points)
+    c = Calibrator(options, {"cam0": prior}, points)
     steady_s: list[float] = []
     residuals = []
     for _, item in items:
@@ -60,17 +62,27 @@ def calibrate(items: Items, fix: frozenset[str], points: np.ndarray, prior: Came
     return Half(c.estimate().cameras["cam0"], rms_px, steady_s)
 
 
-def held_back_px(camera: CameraEstimate, other: Items, points: np.ndarray) -> float:
-    """RMS of corners that had no part in a calibration, with it held fixed, px an axis."""
+def held_back_px(camera: CameraEstimate, other: Items, points: np.ndarray, target_off: bool) -> float:
+    """RMS of corners that had no part in a calibration, with it held fixed, px an axis.
+
+    Where the calibration was made with a target that is not as stated (`target_off`), so it is here: its
+    shape is the target's, not the camera's.
+    """
     q = np.roll(camera.T_imu_cam.q_wxyz, -1)
     prior = replace(
         PRIOR,
+        distortion_model=camera.distortion_model,
         intrinsics=tuple(camera.intrinsics),
         distortion=tuple(camera.distortion),
         T_imu_cam=(Rotation.from_quat(q).as_matrix(), np.array(camera.T_imu_cam.p_m)),
         timeshift_cam_imu_s=camera.timeshift_cam_imu_s,
     )
-    return calibrate(other, frozenset({"intrinsics", "timeshift", "extrinsics"}), points, prior).rms_px
+    options = CalibrationOptions(
+        fix=frozenset({"intrinsics", "timeshift", "extrinsics"}),
+        estimate=frozenset({"target_shape"} if target_off else ()),
+        imu_noise=NOISE,
+    )
+    return calibrate(other, options, points, prior).rms_px
 
 
 def read(folder: Path) -> Items:
@@ -124,10 +136,24 @@ def main(argv: list[str]) -> int:
         "| CPU an image once started, ms: mean (median) |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for name, fix in (("fixed", frozenset({"intrinsics"})), ("free", frozenset())):
-        halves = [[i for i in items if (i[0] < split) == first] for first in (True, False)]
-        a, b = (calibrate(h, fix, points) for h in halves)
-        held = (held_back_px(b.camera, halves[0], points), held_back_px(a.camera, halves[1], points))
+    halves = [[i for i in items if (i[0] < split) == first] for first in (True, False)]
+    held_lens, free = (
+        CalibrationOptions(fix=f, imu_noise=NOISE) for f in (frozenset({"intrinsics"}), frozenset())
+    )
+    shape = replace(free, estimate=frozenset({"target_shape"}))
+    five = replace(PRIOR, distortion_model="plumb_bob", distortion=(*DISTORTION, 0.0))
+    for name, options, prior in (
+        ("fixed", held_lens, PRIOR),
+        ("free", free, PRIOR),
+        ("free, target_shape", shape, PRIOR),
+        ("free, plumb_bob, target_shape", shape, five),
+    ):
+        a, b = (calibrate(h, options, points, prior) for h in halves)
+        off = name != "fixed"
+        held = (
+            held_back_px(b.camera, halves[0], points, off),
+            held_back_px(a.camera, halves[1], points, off),
+        )
         own = ", ".join(f"{px / half.rms_px:.3f}" for px, half in zip(held, (a, b), strict=True))
         noise = ", ".join(
             f"{px / half.camera.corner_sigma_px:.2f}" for px, half in zip(held, (a, b), strict=True)

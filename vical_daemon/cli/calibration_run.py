@@ -128,7 +128,13 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     bus = LocalBus()
     estimator = make_estimator(job.config, job.priors)
     keep = frames.extend if keep_frames else None
-    role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, keep=keep)
+    events: list[str] = []
+
+    def listen(estimate: CalibrationEstimate) -> CalibrationEstimate:
+        events.extend(estimate.events)
+        return estimate
+
+    role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, inspect=listen, keep=keep)
     for key in (job.imu.key, *(_points_key(job, name) for name in job.cameras)):
         bus.subscribe(key, role.take)
     _attach_detectors(bus, job)
@@ -144,7 +150,7 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     publish(bus, role.finish())
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
-    return Outcome(role.latest, traces, frames)
+    return Outcome(replace(role.latest, events=events), traces, frames)
 
 
 def document(job: Job, outcome: Outcome) -> dict[str, Any]:

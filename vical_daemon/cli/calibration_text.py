@@ -24,6 +24,8 @@ def describe(result: dict[str, Any]) -> str:
             for axis, row in zip("xyz", imu.get(key) or [], strict=False):
                 lines.append(_row(f"{label} {axis}", row, None, "", 5))
         lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
+    if result.get("events"):
+        lines += ["", *(f"  {event}" for event in result["events"])]
     lines += [
         "",
         f"  NIS per degree of freedom {result['nis_per_dof']:.2f} (1 when consistent, less when cautious), "

@@ -41,6 +41,7 @@ from vical_daemon.estimation.rates import Rates, rates_after
 from vical_daemon.estimation.retract import orthonormal, retract
 from vical_daemon.estimation.shared_errors import SharedErrors, shared_ways
 from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, State
+from vical_daemon.estimation.target_doubt import TargetDoubt
 from vical_daemon.estimation.unshown_axes import UnshownAxes
 
 _EYE = np.eye(3)
@@ -63,6 +64,7 @@ class CalibrationFilter:
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
         shared: Measured errors that the corners of an image share, by camera.
+        doubt: Whether the target is as stated, by camera; empty where its shape is estimated.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         rates: Rates at the state's instant.
@@ -78,6 +80,7 @@ class CalibrationFilter:
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     shared: dict[str, SharedErrors] = field(default_factory=dict)
+    doubt: dict[str, TargetDoubt] = field(default_factory=dict)
     unshown: UnshownAxes | None = None
     drifting: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
@@ -196,7 +199,7 @@ class CalibrationFilter:
             self.loosen(column)
 
     def _measure(self, image: Image, lin: Linear, fit: ImageFit) -> None:
-        """What an image says about shared errors and lens before it is used."""
+        """What an image says about shared errors, lens and target before it is used."""
         where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
         shared, agreement = self.shared.get(image.camera), self.agreement.get(image.camera)
         if shared is not None:
@@ -205,12 +208,23 @@ class CalibrationFilter:
             level = self.consistency[image.camera].level
             by_shared = ways @ (lin.by_error @ shared_ways(self.state, self.layout, image.camera))
             shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
-        if agreement is not None and where.intrinsics is not None and where.distortion is not None:
-            lens = slice(where.intrinsics.start, where.distortion.stop)
+        free, doubt, t_s = where.intrinsics is not None, self.doubt.get(image.camera), self.state.t_s
+        asked = doubt is not None and doubt.due(t_s)
+        if not (free or asked):
+            return
+        ways, innovation = whitened(image, lin, fit.keep)
+        by_pose = ways @ lin.by_error[:, :6]
+        by_lens, values = np.zeros((len(ways), 0)), np.zeros(0)
+        if where.intrinsics is not None and where.distortion is not None:
             values = np.concatenate([camera.intrinsics, camera.distortion])
-            ways, innovation = whitened(image, lin, fit.keep)
-            by_pose, by_lens = ways @ lin.by_error[:, :6], ways @ lin.by_error[:, lens]
-            agreement.learn(self.state.t_s, innovation, by_pose, by_lens, values)
+            by_lens = ways @ lin.by_error[:, where.intrinsics.start : where.distortion.stop]
+        if agreement is not None and free:
+            agreement.learn(t_s, innovation, by_pose, by_lens, values)
+        if doubt is not None and asked:
+            # a point that moves in the world looks as if the camera moved the other way
+            by_place = -by_pose[:, 3:].reshape(-1, 2, 3)
+            by_shape = (by_place @ doubt.modes.fields(image.points[fit.keep])).reshape(len(ways), -1)
+            doubt.learn(t_s, innovation, by_pose, by_lens, values, by_shape)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""

@@ -28,8 +28,9 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.seen_poses import Lens, pose_of
+from vical_daemon.estimation.shape_start import ShapeStart
 from vical_daemon.estimation.starting import LATE_S, Starting
-from vical_daemon.estimation.state import make_layout
+from vical_daemon.estimation.state import Layout, make_layout
 
 _KEEP_S = 5.0
 
@@ -54,8 +55,7 @@ class Calibrator:
         self.options = options
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
-        models = {name: prior.distortion_model for name, prior in cameras.items()}
-        self.layout = make_layout(models, fix=options.fix, estimate=options.estimate, target_m=self.target)
+        self.layout = self._lay_out(options.estimate)
         self.judge = Judge(options, self.layout)
         self.filter: CalibrationFilter | None = None
         self._buffer: ImuBuffer | None = None
@@ -65,6 +65,11 @@ class Calibrator:
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
+        self._shape_start = ShapeStart(self._step)
+
+    def _lay_out(self, estimate: frozenset[str]) -> Layout:
+        models = {name: prior.distortion_model for name, prior in self.priors.items()}
+        return make_layout(models, fix=self.options.fix, estimate=estimate, target_m=self.target)
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -130,6 +135,7 @@ class Calibrator:
         later = self._pending.take_all()
         self.filter, self._stale = found.filter, None
         self._held_back = HeldBack()
+        self._shape_start.forget()
         self.judge.started(self.filter.state.t_s, found.reason)
         self.watch.started(self.filter.state.t_s)
         self._starting.anew()
@@ -175,7 +181,10 @@ class Calibrator:
         if f.unshown is not None:
             self._starting.take([(t_cam_s, frame)])
             f.unshown.follow(f)
-        self._buffer.trim(min(f.state.t_s, self._starting.oldest_s) - _KEEP_S)
+        elif f.doubt and "intrinsics" not in self.options.fix:
+            self._shape_start.take(t_cam_s, frame)
+        needed_s = min(f.state.t_s, self._starting.oldest_s, self._shape_start.oldest_s)
+        self._buffer.trim(needed_s - _KEEP_S)
         ratio = self._held_back_ratio(frame, t_cam_s)
         if ratio is not None:
             self.judge.held_back(ratio, f.consistency[frame.camera].scale)
@@ -185,7 +194,34 @@ class Calibrator:
             return report
         self.judge.saw_frame(report, f)
         self._act(self.watch.look(report, f), frame, t_cam_s)
+        if self.filter is f and any(doubt.off_m is not None for doubt in f.doubt.values()):
+            self._target_is_off(f)
         return report
+
+    def _target_is_off(self, f: CalibrationFilter) -> None:
+        """The target is not as stated: estimate its shape, too, from all that is kept."""
+        assert self._buffer is not None
+        off_mm = 1e3 * max(float(np.abs(d.off_m).max()) for d in f.doubt.values() if d.off_m is not None)
+        seen = f"corners lie up to {off_mm:.1f} mm beside their stated places"
+        if "intrinsics" in self.options.fix:  # it may as well be the lens
+            self.judge.announce(f"{seen}, or the lens that is held is not this camera's", once="target")
+            f.doubt.clear()
+            return
+        layout = self._lay_out(self.options.estimate | {"target_shape"})
+        starting = Starting(self.options, layout, self.target, self._step)
+        found = self._shape_start.attempt(starting, self._buffer, self.priors)
+        if found is None:  # asked again after the next stretch
+            for doubt in f.doubt.values():
+                doubt.off_m = None
+            return
+        starting.anew()
+        self._shape_start.forget()
+        self.layout = self.judge.layout = layout
+        self.filter, self._starting, self._held_back = found, starting, HeldBack()
+        self.judge.announce(
+            f"the target is not as stated: {seen}; its shape is estimated, too", once="target"
+        )
+        self.watch.started(found.state.t_s)
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
         """How well an image was predicted that the held-back copy of the filter has not used."""
@@ -243,12 +279,19 @@ class Calibrator:
         self.judge.changed(self.watch.why)
         self._stale, self.filter = (f if f.plausible() else None), None
         self._starting.anew()
+        self._shape_start.forget()
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
         drifting = self.filter is not None and any(in_doubt(self.filter, name) for name in self.priors)
         self.judge.clocks_in_doubt = drifting or self.watch.doubtful
+        held = "intrinsics" in self.options.fix
+        self.judge.target_in_doubt = (
+            not held
+            and self.filter is not None
+            and any(doubt.undecided for doubt in self.filter.doubt.values())
+        )
         return self.judge.estimate(self.filter, self._stale)
 
     def trace(self, camera: str) -> list[TracePoint]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.camera_model import RADTAN
 from vical_daemon.estimation.clock_drift import CLOCKS_IN_DOUBT, averaged
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import imu_noise_doubt
@@ -28,6 +29,9 @@ _HELD_BACK_BAD = 9.0
 _HYSTERESIS = 2.0
 _RECENT = 60
 _MOVE = "turn the rig about all three axes while moving it"
+
+
+_TERM_MISSING = "the lens of {} needs one term more than radtan has: give it distortion_model: plumb_bob"
 
 
 class Judge:
@@ -51,7 +55,7 @@ class Judge:
         self.events: list[str] = []
         self.status = Status.WAITING
         self.bumped = ""
-        self.clocks_in_doubt = False
+        self.clocks_in_doubt = self.target_in_doubt = False
         self._ever_converged = False
         self._start_reason = ""
         self._motion_missing = False
@@ -142,6 +146,9 @@ class Judge:
         told = jitter_told(report.camera, f.shared[report.camera].jitter_s)
         if told:
             self.announce(told, once=f"jitter {report.camera}")
+        lens = f.agreement[report.camera]
+        if lens.model == RADTAN and lens.moved.any():
+            self.announce(_TERM_MISSING.format(report.camera), once=f"lens {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())
@@ -230,6 +237,12 @@ class Judge:
                 return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
             if self.clocks_in_doubt:
                 return Status.CONVERGING, CLOCKS_IN_DOUBT, ""
+            if self.target_in_doubt:
+                return (
+                    Status.CONVERGING,
+                    "sigmas are small; whether the target is as stated is not sure yet",
+                    "",
+                )
             if not self._held_back_fine():
                 return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
             return Status.CONVERGED, "", ""

@@ -171,7 +171,7 @@ def view_derivatives(
     R = state.R_world_imu @ turn
     p = state.p_world_imu + ahead_s * (state.v_world_imu + (0.5 * ahead_s) * rates.accel)
     place = image.points * state.target_scale
-    if layout.target_modes is not None:
+    if layout.target_modes is not None and layout.target_shape is not None:
         place = place + layout.target_modes.fields(image.points) @ state.target_shape
     arm = place - p
     x_cam = (arm @ R - cam.p_imu_cam) @ cam.R_imu_cam

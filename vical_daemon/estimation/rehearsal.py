@@ -29,6 +29,7 @@ from vical_daemon.estimation.state import (
     Layout,
     State,
 )
+from vical_daemon.estimation.target_doubt import TargetDoubt
 from vical_daemon.estimation.unshown_axes import UNKNOWN_M, UnshownAxes
 
 _MOST_RUNS = 6
@@ -200,8 +201,17 @@ def wide_filter(
         consistency,
         agreement,
         shared,
+        _doubts(state, layout),
         unshown,
     )
+
+
+def _doubts(state: State, layout: Layout) -> dict[str, TargetDoubt]:
+    """Whether the target is as stated is asked where its shape is not estimated anyway."""
+    modes = layout.target_modes
+    if modes is None or layout.target_shape is not None:
+        return {}
+    return {name: TargetDoubt(state.cameras[name].distortion_model, modes) for name in layout.cameras}
 
 
 def _before_board_m(state: State, camera: str) -> float:

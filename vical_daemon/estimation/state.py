@@ -54,7 +54,7 @@ class Layout:
         cameras: By name.
         target_scale: Relative size of the board, index or None.
         target_shape: How far the board is off in each of its modes, m; None: as stated.
-        target_modes: Those modes; None: as stated.
+        target_modes: The ways in which it may be off; None: no target.
     """
 
     size: int
@@ -80,7 +80,7 @@ def make_layout(
         models: Distortion model by camera.
         fix: Names as in `CalibrationOptions`.
         estimate: Likewise.
-        target_m: Points of the target, m, shape (n, 3), for its shape to be estimated.
+        target_m: Points of the target, m, shape (n, 3); None: no target.
     """
     at = _CORE
     gyro_matrix = accel_matrix = None
@@ -113,8 +113,8 @@ def make_layout(
             readout.start if readout else None,
         )
     scale = take("target_scale" in estimate, 1)
-    modes = None if target_m is None or "target_shape" not in estimate else TargetModes.of(target_m)
-    shape = take(modes is not None, MODES)
+    modes = None if target_m is None else TargetModes.of(target_m)
+    shape = take(modes is not None and "target_shape" in estimate, MODES)
     return Layout(
         at, dynamic, gyro_matrix, accel_matrix, blocks, scale.start if scale else None, shape, modes
     )

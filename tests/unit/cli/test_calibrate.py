@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,35 @@ def test_json_has_the_promised_keys_and_the_same_bits_through_an_mcap(
     )
     assert 1 <= len(first["trace"]) <= 6
     assert "cam0 in the imu frame" in calibration_text.describe(first | {"cpu_s": 1.0})
+
+
+def test_all_that_was_announced_on_the_way_is_told_at_the_end(
+    shortest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Announcer:
+        def __init__(self, inner: Estimator) -> None:
+            self._inner, self.calls = inner, 0
+
+        def estimate(self):
+            self.calls += 1
+            return replace(self._inner.estimate(), events=[f"event {self.calls}"])
+
+        def __getattr__(self, name: str):
+            return getattr(self._inner, name)
+
+    make = calibration_run.make_estimator
+    monkeypatch.setattr(calibration_run, "make_estimator", lambda *a: Announcer(make(*a)))
+    job = calibration_run.make_job(
+        open_recording(shortest),
+        read_initial(shortest / "initial.yaml"),
+        target=str(shortest / "target.yaml"),
+    )
+    outcome = calibration_run.run_job(job, lambda share, estimate: None)
+    told = outcome.estimate.events
+    assert len(told) > 2
+    assert told == [f"event {k + 1}" for k in range(len(told))]
+    text = calibration_text.describe(calibration_run.document(job, outcome))
+    assert all(event in text for event in told)
 
 
 def test_the_roles_add_nothing_to_what_the_estimator_is_fed(

@@ -7,6 +7,7 @@ from vical_mocks.points import simulate
 from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import Status
 
@@ -73,6 +74,22 @@ def test_nothing_is_known_about_mounting_and_delay_and_all_is_found(run, done):
     assert sigma[6] < 1e-4
     assert estimate.nis_per_dof == pytest.approx(1.0, abs=0.2)
     assert len(done.trace("cam0")) >= 8
+
+
+def test_a_lens_that_needs_one_term_more_is_told_once():
+    run = simulate(5, 8.0)
+    c = calibrate(run, CalibrationOptions())
+    f, frame = c.filter, run.frames[-1]
+    zeros, good = np.zeros_like(frame.uv_px), np.ones(len(frame.ids), bool)
+    report = FrameReport(0, "cam0", frame.ids, frame.uv_px, zeros, good, True, 1.0, 1, 0.5)
+    c.estimate()
+    c.judge.saw_frame(report, f)
+    assert c.estimate().events == []
+    f.agreement["cam0"].moved[4] = 0.01
+    for _ in range(2):
+        c.judge.saw_frame(report, f)
+    (event,) = c.estimate().events
+    assert "the lens of cam0" in event and "plumb_bob" in event
 
 
 def test_runs_are_bit_identical(run, done):

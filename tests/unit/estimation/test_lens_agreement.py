@@ -68,7 +68,7 @@ def test_memory_is_bounded():
     for k in range(300):
         J, P = rng.standard_normal((20, 8)), rng.standard_normal((20, 6))
         agreement.learn(5.0 * k, rng.standard_normal(20), P, J, LENS)
-    assert len(agreement._done) <= 40
+    assert len(agreement._stretches._done) <= 40
     assert np.isfinite(agreement.factors).all()
 
 

@@ -8,6 +8,8 @@ from vical_mocks.rig import reference_rig
 from tests.unit.estimation.test_calibrator import errors
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.shape_start import ShapeStart
 from vical_daemon.estimation.target_modes import MODES, TargetModes
 
 BOARD = board_points()
@@ -54,10 +56,13 @@ def crooked(request):
     return seed, simulate(seed, 25.0, rig=rig, points_m=crooked_board(seed))
 
 
-def calibrate(run, estimate=frozenset()):
+def calibrate(run, estimate=frozenset(), *, lens_held=False, each=None):
     lens = run.rig.lens
     start = CameraPrior((640, 480), (530.0, 530.0, 322.0, 236.0), lens.model)
-    c = Calibrator(CalibrationOptions(estimate=estimate), {"cam0": start}, BOARD)
+    if lens_held:
+        start = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
+    fix = frozenset({"intrinsics"} if lens_held else ())
+    c = Calibrator(CalibrationOptions(fix=fix, estimate=estimate), {"cam0": start}, BOARD)
     frames = iter(run.frames)
     frame = next(frames, None)
     for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True):
@@ -65,6 +70,8 @@ def calibrate(run, estimate=frozenset()):
         while frame is not None and frame.t_cam_ns <= t:
             c.add_points(PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px))
             c.process()
+            if each is not None:
+                each(c)
             frame = next(frames, None)
     c.finish()
     return c
@@ -87,3 +94,57 @@ def test_a_crooked_board_is_found_and_the_lens_with_it(crooked):
     left_z = left[:, 2] - plane @ np.linalg.lstsq(plane, left[:, 2], rcond=None)[0]
     assert np.std(left_z) < 0.2e-3
     assert np.std(found[:, 2]) > 0.1e-3
+
+
+def test_a_crooked_board_is_noticed_announced_and_from_then_on_allowed_for(crooked):
+    _, run = crooked
+    events, before = [], []
+
+    def each(c):
+        estimate = c.estimate()
+        events.extend((estimate.duration_s, e) for e in estimate.events)
+        if c.layout.target_shape is None:
+            before.append(estimate.status)
+
+    c = calibrate(run, each=each)
+    told = [(t, e) for t, e in events if "the target is not as stated" in e]
+    assert len(told) == 1
+    assert 9.0 < told[0][0] < 15.0
+    assert "its shape is estimated, too" in told[0][1]
+    assert Status.CONVERGED not in before  # small sigmas, but the target was not sure yet
+    estimate = c.estimate()
+    assert estimate.status == Status.CONVERGED
+    x, sigma = errors(estimate, run)
+    assert np.abs(x / sigma).max() < 3.5
+    assert c._shape_start.oldest_s == np.inf  # nothing is kept any longer
+
+
+def test_with_the_lens_held_it_is_said_and_nothing_else(crooked):
+    _, run = crooked
+    c = calibrate(run, lens_held=True)
+    events = c.estimate().events
+    assert any("or the lens that is held is not this camera's" in e for e in events)
+    assert c.layout.target_shape is None and not c.filter.doubt
+    x, sigma = errors(c.estimate(), run)
+    assert np.abs(x / sigma).max() < 3.5
+
+
+def test_a_second_start_that_fails_leaves_everything_as_it_was(crooked, monkeypatch):
+    _, run = crooked
+    monkeypatch.setattr(ShapeStart, "attempt", lambda *_: None)
+    statuses = set()
+    c = calibrate(run, each=lambda c: statuses.add(c.estimate().status))
+    assert c.layout.target_shape is None
+    assert not any("target" in e for e in c.estimate().events)
+    assert Status.CONVERGED not in statuses
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_a_straight_board_stays_as_it_is_stated(seed):
+    c = calibrate(simulate(seed, 20.0))
+    assert c.layout.target_shape is None
+    assert not any("stated" in e for e in c.estimate().events)
+    assert c.estimate().status == Status.CONVERGED
+    c.filter.doubt["cam0"].undecided = True
+    assert c.estimate().status == Status.CONVERGING
+    assert c.estimate().reason == "sigmas are small; whether the target is as stated is not sure yet"

@@ -210,11 +210,15 @@ def test_a_fifth_coefficient_goes_where_there_is_a_place_for_it(rig, tmp_path):
     assert opened.getNode("Camera1.k3").real() == pytest.approx(-0.04)
     basalt = json.loads(files(rig, "basalt")["calibration.json"])["value0"]["intrinsics"][0]
     assert basalt["camera_type"] == "pinhole-radtan8"
-    assert [basalt["intrinsics"][k] for k in ("k1", "p2", "k3", "k4")] == pytest.approx([-0.32, 5e-5, -0.04, 0])
+    assert [basalt["intrinsics"][k] for k in ("k1", "p2", "k3", "k4")] == pytest.approx(
+        [-0.32, 5e-5, -0.04, 0]
+    )
     again = rig_from_json(json.loads(files(rig, "json")["calibration.json"]))
     assert again.cameras["cam0"].distortion == pytest.approx(FIVE)
     for name in ("kalibr", "openvins", "vins"):
-        with pytest.raises(ExportError, match=f"cam0: {name} has no place for plumb_bob's k3; calibrate with"):
+        with pytest.raises(
+            ExportError, match=f"cam0: {name} has no place for plumb_bob's k3; calibrate with"
+        ):
             files(rig, name)
 
 

@@ -1,0 +1,133 @@
+"""What stretches of the data say about some unknowns, and how far they agree.
+
+What a model gets wrong is wrong in the same way for seconds at a time: images next to each other are no
+independent witnesses, and residuals hardly show it (the unknowns bend to fit). So images are gathered to
+stretches of some seconds; the answer with each run of neighbouring stretches left out in turn shows how far
+it rests on any of them. That block-jackknife variance, over the one that independent errors would give, is
+the factor by which variances are too small. It is known from few runs only: as for a Student variable, less
+is known. [Kunsch, "The jackknife and the bootstrap for general stationary observations", 1989;
+docs/math/filter.md]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from vical_daemon.estimation.measurements import FloatArray
+
+_SIGNIFICANT = 0.01  # one set of clean data in a hundred may lose by it, not one unknown
+_LEAST_TOLD = 1e-9  # of the variance of all: a run that tells less tells nothing
+_MOST = 40  # stretches kept apart; beyond, the oldest two become one
+_LEAST = 3
+_LONGEST_RUN = 4
+_RIDGE = 1e-12  # corners in one line leave a turn about it open
+
+
+class _Stretch(NamedTuple):
+    """Information of some images about the unknowns; that times the values they would have."""
+
+    information: FloatArray
+    weighted: FloatArray
+
+    def plus(self, other: _Stretch) -> _Stretch:
+        return _Stretch(self.information + other.information, self.weighted + other.weighted)
+
+
+class Told(NamedTuple):
+    """What all stretches say together.
+
+    Attributes:
+        values: Of the unknowns, shape (m,).
+        covariance: If errors were independent, shape (m, m).
+        factors: By which its diagonal is too small, >= 1, shape (m,).
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    factors: FloatArray
+
+
+@dataclass(slots=True)
+class Stretches:
+    """Gathers images.
+
+    Args:
+        length_s: Of a stretch.
+    """
+
+    length_s: float
+    _done: list[_Stretch] = field(default_factory=list)
+    _now: _Stretch | None = None
+    _begin_s: float = np.inf
+
+    def learn(
+        self, t_s: float, innovation: FloatArray, by_pose: FloatArray, by: FloatArray, values: FloatArray
+    ) -> bool:
+        """Take in one image before it is used.
+
+        Args:
+            t_s: Its instant, s.
+            innovation: Measured minus predicted, over the corner noise, shape (2n,).
+            by_pose: Derivatives of the whitened pixels by attitude and position, shape (2n, 6).
+            by: By the unknowns, shape (2n, m).
+            values: Present values of these, shape (m,).
+
+        Returns:
+            Whether a stretch was closed and there are enough of them to be compared.
+        """
+        closed = not 0.0 <= t_s - self._begin_s < self.length_s
+        if closed:
+            self._close()
+            self._begin_s = t_s
+        # whatever the pose of the image may be: only what no pose explains says something about the rest
+        rows = np.column_stack([by_pose, by, innovation])
+        N, p = rows.T @ rows, by_pose.shape[1]
+        posed = N[:p, :p] + _RIDGE * np.trace(N[:p, :p]) * np.eye(p)
+        N = N[p:, p:] - N[p:, :p] @ np.linalg.solve(posed, N[:p, p:])
+        A, b = N[:-1, :-1], N[:-1, -1]
+        said = _Stretch(A, b + A @ values)
+        self._now = said if self._now is None else self._now.plus(said)
+        return closed and len(self._done) >= _LEAST
+
+    def _close(self) -> None:
+        if self._now is not None:
+            self._done.append(self._now)
+            self._now = None
+        if len(self._done) > _MOST:
+            self._done[:2] = [self._done[0].plus(self._done[1])]
+
+    def compared(self, sigmas: FloatArray) -> Told:
+        """Leave out each run of stretches in turn.
+
+        Args:
+            sigmas: Of a prior about zero that hardly matters; of the first so many unknowns, shape (k,), the
+                others are held at zero.
+        """
+        k = len(sigmas)
+        A = np.array([s.information[:k, :k] for s in self._done])
+        b = np.array([s.weighted[:k] for s in self._done])
+        n = len(A)
+        d = min(max(1, n // 3), _LONGEST_RUN)
+        runs = np.stack([np.arange(i, i + d) for i in range(n - d + 1)])
+        whole = A.sum(axis=0) + np.diag(sigmas**-2.0)
+        P = np.linalg.inv(whole)
+        values = P @ b.sum(axis=0)
+        # information of all but two runs, which may overlap
+        out = (runs[:, :, None] == np.arange(n)).any(axis=1)
+        both = out[:, None] | out[None]
+        left = whole - np.tensordot(both.astype(np.float64), A, axes=1)
+        Q = np.linalg.inv(left[np.arange(len(runs)), np.arange(len(runs))])
+        without = np.matmul(Q, (b.sum(axis=0) - out @ b)[..., None])[..., 0]
+        # covariance of the changes were errors independent: stretches do not tell equally much
+        C = np.einsum("rpi,rsij,sjp->rsp", Q, left, Q, optimize=True) - np.diag(P)
+        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_TOLD * np.diag(P))
+        ratio = ((without - values) ** 2 / usual).mean(axis=0)
+        # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
+        dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
+        limit = chi2.isf(_SIGNIFICANT / k, dof) / dof
+        student = dof / np.maximum(dof - 2.0, 1.0)
+        return Told(values, P, np.where(ratio > limit, student * ratio, 1.0))
