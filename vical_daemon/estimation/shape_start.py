@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
@@ -55,12 +53,13 @@ class ShapeStart:
         Returns:
             A filter at the last image, or None where there is no start.
         """
-        begin_s = self.oldest_s
-        starting.take([item for item in self._kept if item[0] < begin_s + _BEGIN_S])
+        end_s = self.oldest_s + _BEGIN_S
+        # in order of the imu's time: stamps of several cameras need not be
+        n = next((i for i, (t_cam_s, _) in enumerate(self._kept) if t_cam_s >= end_s), len(self._kept))
+        starting.take(self._kept[:n])
         found = starting.attempt(buffer, priors, may_be_partial=False)
         if found.filter is None:
             return None
-        last = bisect_right(self._kept, found.frames[-1][0], key=lambda item: item[0])
-        for t_cam_s, frame in [*found.frames, *self._kept[last:]]:
+        for t_cam_s, frame in [*found.frames, *self._kept[n:]]:
             self._step(found.filter, frame, t_cam_s)
         return found.filter
