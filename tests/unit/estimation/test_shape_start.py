@@ -1,4 +1,4 @@
-"""shape_start.py: every image kept is used once, whatever the order of the cameras' stamps; memory is bounded."""
+"""shape_start.py: each image kept is used once, whatever the order of stamps; memory is bounded."""
 
 import numpy as np
 
@@ -42,10 +42,9 @@ def test_each_image_is_filtered_once_and_in_order():
     starting = FakeStarting()
     assert start.attempt(starting, None, {}) is FILTER
     assert 220 < len(starting.frames) < 250  # six seconds of them make the start
+    both = (("cam0", 0.08), ("cam1", 0.02))
     assert [(camera, round(t_s, 3)) for _, camera, t_s in used] == [
-        (camera, round(0.05 * k + late, 3))
-        for k in range(200)
-        for camera, late in (("cam0", 0.08), ("cam1", 0.02))
+        (camera, round(0.05 * k + late, 3)) for k in range(200) for camera, late in both
     ]
     assert all(f is FILTER for f, _, _ in used)
 
