@@ -1,4 +1,4 @@
-"""Pinhole cameras with radial-tangential or equidistant distortion: project, unproject, Jacobians.
+"""Pinhole cameras with radial-tangential or equidistant distortion: project, Jacobians (back: `camera_rays`).
 
 Kalibr's names and OpenCV's numbers: `radtan` is k1 k2 p1 p2 (Brown-Conrady, OpenCV's first four),
 `equidistant` is k1 k2 k3 k4 (Kannala-Brandt, OpenCV's fisheye). `plumb_bob` is ROS' name for radtan with one
@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 RADTAN = "radtan"
 PLUMB_BOB = "plumb_bob"
@@ -26,11 +25,10 @@ COEFFICIENTS = {
 """Names of each model's coefficients, in order."""
 
 _TINY_RADIUS = 1e-9  # below it a ray is the optical axis, and theta / r is 1 to the last digit
-_NEWTON_STEPS = 25
-_NEWTON_DONE = 1e-14  # step in normalised units (focal lengths); a millionth of a pixel is 1e-9
 
 
-def _check_model(model: str) -> None:
+def check_model(model: str) -> None:
+    """Raise ValueError where there is no such distortion model."""
     if model not in COEFFICIENTS:
         raise ValueError(f"unknown distortion model {model!r}: use {' or '.join(COEFFICIENTS)}")
 
@@ -82,7 +80,7 @@ def project(
     Raises:
         ValueError: unknown model.
     """
-    _check_model(model)
+    check_model(model)
     points = np.asarray(points_cam, dtype=np.float64)
     K = np.asarray(intrinsics, dtype=np.float64)
     D = np.asarray(distortion, dtype=np.float64)
@@ -129,7 +127,7 @@ def project_jacobians(
     Raises:
         ValueError: unknown model.
     """
-    _check_model(model)
+    check_model(model)
     points = np.asarray(points_cam, dtype=np.float64)
     K = np.asarray(intrinsics, dtype=np.float64)
     D = np.asarray(distortion, dtype=np.float64)
@@ -151,7 +149,7 @@ def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, Fl
     x, y = points[..., 0] * iz, points[..., 1] * iz
     r2 = x * x + y * y
     d = distort(np.stack((x, y), axis=-1), D)
-    a, b, c = _radtan_derivative(x, y, r2, D)
+    a, b, c = radtan_derivative(x, y, r2, D)
     J = np.empty((*d.shape, 3))
     J[..., 0, 0] = a * iz
     J[..., 0, 1] = J[..., 1, 0] = b * iz
@@ -169,7 +167,7 @@ def _radtan_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArray, Fl
     return d, J, J_d
 
 
-def _radtan_derivative(
+def radtan_derivative(
     x: FloatArray, y: FloatArray, r2: FloatArray, D: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the symmetric 2x2 derivative of `distort`: [[a, b], [b, c]]."""
@@ -213,129 +211,3 @@ def _equidistant_jacobians(points: FloatArray, D: FloatArray) -> tuple[FloatArra
     direction = np.stack((ux, uy), axis=-1)
     J_d = direction[..., :, None] * (theta[..., None] * powers)[..., None, :]
     return d, J, J_d
-
-
-def unproject(
-    uv_px: FloatArray, intrinsics: FloatArray, distortion: FloatArray, model: str = RADTAN
-) -> tuple[FloatArray, BoolArray]:
-    """Return the unit rays of pixels, found by Newton's method, with a mask of where that succeeded.
-
-    Args:
-        uv_px: Raw distorted pixels, shape (..., 2).
-        intrinsics: fx fy cx cy, px, shape (..., 4).
-        distortion: The model's coefficients, shape (..., d).
-        model: radtan, plumb_bob or equidistant.
-
-    Returns:
-        Unit rays in the camera frame (..., 3), not-a-number where not ok; ok (...): converged, and on the
-        branch where the distortion is still monotonic (beyond it two rays share a pixel).
-
-    Raises:
-        ValueError: unknown model.
-    """
-    _check_model(model)
-    K = np.asarray(intrinsics, dtype=np.float64)
-    D = np.asarray(distortion, dtype=np.float64)
-    d = (np.asarray(uv_px, dtype=np.float64) - K[..., 2:]) / K[..., :2]
-    if model != EQUIDISTANT:
-        xy, ok = _undistort_radtan(d, D)
-        rays = np.concatenate((xy, np.ones_like(xy[..., :1])), axis=-1)
-        rays /= np.sqrt(np.einsum("...i,...i->...", rays, rays))[..., None]
-        return rays, ok
-    theta_d = np.hypot(d[..., 0], d[..., 1])
-    theta, ok = _undistort_theta(theta_d, D)
-    sine_ratio = np.where(theta_d > 0.0, np.sin(theta) / np.where(theta_d > 0.0, theta_d, 1.0), 1.0)
-    rays = np.concatenate((d * sine_ratio[..., None], np.cos(theta)[..., None]), axis=-1)
-    return rays, ok
-
-
-def undistort(
-    uv_px: FloatArray, intrinsics: FloatArray, distortion: FloatArray, model: str = RADTAN
-) -> tuple[FloatArray, BoolArray]:
-    """Return ideal normalised coordinates X/Z, Y/Z (..., 2) of pixels and where they are defined.
-
-    As `unproject`; rays at or behind the image plane (fisheye beyond 90 degrees) are not ok.
-    """
-    rays, ok = unproject(uv_px, intrinsics, distortion, model)
-    front = rays[..., 2] > 1e-6
-    ok = ok & front
-    xy: FloatArray = np.where(
-        ok[..., None], rays[..., :2] / np.where(front, rays[..., 2], 1.0)[..., None], np.nan
-    )
-    return xy, ok
-
-
-def valid_radius(distortion: FloatArray) -> FloatArray:
-    """Return the normalised radius up to which radtan's radial part grows (...,), inf where for ever.
-
-    First positive root of d/dr [r (1 + k1 r^2 + k2 r^4 + k3 r^6)] = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with
-    s = r^2.
-    Beyond it a projected point folds back towards the image centre and means nothing.
-    """
-    D = np.asarray(distortion, dtype=np.float64)
-    if D.shape[-1] == 5 and D[..., 4].any():
-        return _valid_radius_cubic(D)
-    a, b = 5.0 * D[..., 1], 3.0 * D[..., 0]
-    discriminant = b * b - 4.0 * a
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the smallest positive root, written without cancellation and good for a = 0
-        s = 2.0 / (-b + np.sqrt(discriminant))
-    other: FloatArray = np.where((discriminant >= 0.0) & (s > 0.0), s, np.inf)
-    out: FloatArray = np.sqrt(other)
-    return out
-
-
-def _valid_radius_cubic(D: FloatArray) -> FloatArray:
-    out = np.empty(D.shape[:-1])
-    for at in np.ndindex(out.shape):
-        k1, k2, _, _, k3 = D[at]
-        roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
-        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
-        out[at] = np.sqrt(real.min()) if len(real) else np.inf
-    return out
-
-
-def _undistort_radtan(d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArray]:
-    shape = np.broadcast_shapes(d.shape[:-1], D.shape[:-1])
-    limit = valid_radius(D)
-    target = np.broadcast_to(d, (*shape, 2))
-    # a start inside the monotonic range: from the far side Newton would land on the wrong branch
-    r_d = np.hypot(target[..., 0], target[..., 1])
-    start = np.minimum(1.0, 0.9 * limit / np.maximum(r_d, 1e-300))
-    xy = target * start[..., None]
-    error = np.full(shape, np.inf)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for _ in range(_NEWTON_STEPS):
-            x, y = xy[..., 0], xy[..., 1]
-            e = distort(xy, D) - target
-            a, b, c = _radtan_derivative(x, y, x * x + y * y, D)
-            det = a * c - b * b
-            step = np.stack((c * e[..., 0] - b * e[..., 1], a * e[..., 1] - b * e[..., 0]), axis=-1)
-            step /= det[..., None]
-            xy = xy - step
-            error = np.abs(step).max(axis=-1)
-            if not np.any(error > _NEWTON_DONE):
-                break
-        ok = (error < 1e-9) & (np.hypot(xy[..., 0], xy[..., 1]) < limit) & (det > 0.0)
-    return np.where(ok[..., None], xy, np.nan), ok
-
-
-def _undistort_theta(theta_d: FloatArray, D: FloatArray) -> tuple[FloatArray, BoolArray]:
-    shape = np.broadcast_shapes(theta_d.shape, D.shape[:-1])
-    target = np.broadcast_to(theta_d, shape)
-    theta = np.minimum(target, np.pi / 2)
-    k1, k2, k3, k4 = (D[..., i] for i in range(4))
-    error = np.full(shape, np.inf)
-    slope = np.ones(shape)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for _ in range(_NEWTON_STEPS):
-            t2 = theta * theta
-            value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-            slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
-            step = np.clip((value - target) / slope, -0.5, 0.5)
-            theta = theta - step
-            error = np.abs(step)
-            if not np.any(error > _NEWTON_DONE):
-                break
-        ok = (error < 1e-9) & (slope > 0.0) & (theta >= 0.0) & (theta < np.pi)
-    return np.where(ok, theta, np.nan), ok

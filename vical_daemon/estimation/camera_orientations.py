@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import undistort
+from vical_daemon.estimation.camera_rays import undistort
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.planar_pose import PlanarPose, PlanarPoses, planar_pose
 

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import project_jacobians, unproject
+from vical_daemon.estimation.camera_model import project_jacobians
+from vical_daemon.estimation.camera_rays import unproject
 from vical_daemon.estimation.imu_model import cross, rotation_steps
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import unproject
+from vical_daemon.estimation.camera_rays import unproject
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.inertial_links import Link, Links, make_link

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import project_jacobians, unproject
+from vical_daemon.estimation.camera_model import project_jacobians
+from vical_daemon.estimation.camera_rays import unproject
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.planar_pose import belonging, planar_pose
 

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import EQUIDISTANT, project_jacobians, undistort, valid_radius
+from vical_daemon.estimation.camera_model import EQUIDISTANT, project_jacobians
+from vical_daemon.estimation.camera_rays import undistort, valid_radius
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.planar_pose import planar_pose
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.camera_model import unproject
+from vical_daemon.estimation.camera_rays import unproject
 from vical_daemon.estimation.measurements import BoolArray, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.planar_pose import PlanarPose, belonging, planar_pose
 

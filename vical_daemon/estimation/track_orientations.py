@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import unproject
 from vical_daemon.estimation.camera_orientations import Orientations
+from vical_daemon.estimation.camera_rays import unproject
 from vical_daemon.estimation.measurements import PointsFrame
 
 FloatArray = npt.NDArray[np.float64]

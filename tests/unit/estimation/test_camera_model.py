@@ -1,10 +1,11 @@
-"""camera_model.py against OpenCV and finite differences."""
+"""camera_model.py and camera_rays.py against OpenCV and finite differences."""
 
 import cv2
 import numpy as np
 import pytest
 
 from vical_daemon.estimation import camera_model as cm
+from vical_daemon.estimation import camera_rays as cr
 
 K = np.array([458.6, 457.3, 367.2, 248.4])
 D_RADTAN = np.array([-0.2834, 0.0739, 0.00019, 1.76e-05])
@@ -38,10 +39,10 @@ def test_projection_agrees_with_opencv(model, D):
 @pytest.mark.parametrize(("model", "D"), LENSES)
 def test_unproject_inverts_project_to_machine_precision(model, D):
     points = _points(spread=3.0 if model == cm.EQUIDISTANT else 0.95)
-    rays, ok = cm.unproject(cm.project(points, K, D, model), K, D, model)
+    rays, ok = cr.unproject(cm.project(points, K, D, model), K, D, model)
     assert ok.all()
     np.testing.assert_allclose(rays, points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-12)
-    xy, ok = cm.undistort(cm.project(points, K, D, model), K, D, model)
+    xy, ok = cr.undistort(cm.project(points, K, D, model), K, D, model)
     assert ok.all()
     np.testing.assert_allclose(xy, points[:, :2] / points[:, 2:], atol=1e-11)
 
@@ -77,7 +78,7 @@ def test_sigma_points_broadcast_in_one_call(model, D):
     assert uv.shape == (5, 12, 2)
     np.testing.assert_allclose(uv[3, 7], cm.project(points[3, 7], Ks[3, 0], Ds[3, 0], model))
     assert cm.project_jacobians(points, Ks, Ds, model)[2].shape == (5, 12, 2, 4 + len(D))
-    rays, ok = cm.unproject(uv, Ks, Ds, model)
+    rays, ok = cr.unproject(uv, Ks, Ds, model)
     assert ok.all() and rays.shape == (5, 12, 3)
 
 
@@ -88,31 +89,31 @@ def test_what_a_pinhole_cannot_see_is_not_a_number():
 
 def test_a_fisheye_sees_behind_its_image_plane():
     point = np.array([[1.0, 0.2, -0.3]])
-    rays, ok = cm.unproject(cm.project(point, K, D_FISHEYE, cm.EQUIDISTANT), K, D_FISHEYE, cm.EQUIDISTANT)
+    rays, ok = cr.unproject(cm.project(point, K, D_FISHEYE, cm.EQUIDISTANT), K, D_FISHEYE, cm.EQUIDISTANT)
     assert ok.all()
     np.testing.assert_allclose(rays, point / np.linalg.norm(point), atol=1e-12)
-    xy, ok = cm.undistort(cm.project(point, K, D_FISHEYE, cm.EQUIDISTANT), K, D_FISHEYE, cm.EQUIDISTANT)
+    xy, ok = cr.undistort(cm.project(point, K, D_FISHEYE, cm.EQUIDISTANT), K, D_FISHEYE, cm.EQUIDISTANT)
     assert not ok.any() and np.isnan(xy).all()
 
 
 def test_pixels_that_no_ray_reaches_are_refused():
     D = np.array([-0.3, 0.0, 0.0, 0.0])
-    limit = cm.valid_radius(D)
+    limit = cr.valid_radius(D)
     assert limit == pytest.approx(np.sqrt(1 / 0.9))
     edge = limit * (1 - 0.3 * limit**2)
     uv = np.array([[K[2] + K[0] * edge * 1.05, K[3]], [K[2] + K[0] * edge * 0.97, K[3]]])
-    rays, ok = cm.unproject(uv, K, D)
+    rays, ok = cr.unproject(uv, K, D)
     assert ok.tolist() == [False, True] and np.isnan(rays[0]).all()
-    assert np.isinf(cm.valid_radius(np.array([0.1, 0.0, 0, 0])))
-    assert np.isinf(cm.valid_radius(np.zeros(4)))
+    assert np.isinf(cr.valid_radius(np.array([0.1, 0.0, 0, 0])))
+    assert np.isinf(cr.valid_radius(np.zeros(4)))
 
 
 def test_the_fifth_coefficient_moves_the_fold():
-    r = cm.valid_radius(D_PLUMB_BOB)
+    r = cr.valid_radius(D_PLUMB_BOB)
     across = np.linspace(0.0, r, 1000)[:, None] * [1.0, 0.0]
     radius = cm.distort(across, D_PLUMB_BOB * [1, 1, 0, 0, 1])[:, 0]
     assert (np.diff(radius) > 0).all() and radius[-1] - radius[-2] < 1e-5
-    assert np.isinf(cm.valid_radius(np.array([0.1, 0.0, 0, 0, 0.1])))
+    assert np.isinf(cr.valid_radius(np.array([0.1, 0.0, 0, 0, 0.1])))
 
 
 def test_an_unknown_model_is_named():
