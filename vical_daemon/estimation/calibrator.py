@@ -29,6 +29,7 @@ from vical_daemon.estimation.measurements import (
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.seen_poses import Lens, pose_of
 from vical_daemon.estimation.shape_start import ShapeStart
+from vical_daemon.estimation.stamp_steps import StampSteps
 from vical_daemon.estimation.starting import LATE_S, Starting
 from vical_daemon.estimation.state import Layout, make_layout
 
@@ -60,6 +61,7 @@ class Calibrator:
         self.filter: CalibrationFilter | None = None
         self._buffer: ImuBuffer | None = None
         self._base_ns = 0
+        self._stamps = StampSteps()
         self._pending = FrameQueue(list(cameras))
         self._starting = Starting(options, self.layout, self.target, self._step)
         self.watch = ChangeWatch()
@@ -78,10 +80,11 @@ class Calibrator:
             self._base_ns = t_imu_ns
             self._buffer = ImuBuffer(t_imu_ns)
         gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
-        if self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
+        if self._buffer.append(self._stamps.even((t_imu_ns - self._base_ns) * 1e-9), gyro, accel):
             self.judge.saw_imu(t_imu_ns, gyro, accel)
         else:
             self.judge.imu_refused += 1
+        self.judge.events += self._stamps.news()
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image; those of unknown cameras or off the board are only counted."""
@@ -292,8 +295,8 @@ class Calibrator:
             and self.filter is not None
             and any(doubt.undecided for doubt in self.filter.doubt.values())
         )
-        return self.judge.estimate(self.filter, self._stale)
+        return self._stamps.told(self.judge.estimate(self.filter, self._stale))
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
-        return self.judge.trace(camera)
+        return self._stamps.told_trace(self.judge.trace(camera))

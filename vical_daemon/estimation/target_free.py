@@ -25,6 +25,7 @@ from vical_daemon.estimation.free_window import Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.stamp_steps import StampSteps
 from vical_daemon.estimation.thinning import Thinning
 from vical_daemon.estimation.unshown_axes import has_turned
 
@@ -76,6 +77,7 @@ class TargetFreeCalibrator:
         self._noise = (options.corner_sigma_px, 1.0, 0.0)  # px, how long errors last, jitter of stamps in s
         self._buffer: ImuBuffer | None = None
         self._base_ns = 0
+        self._stamps = StampSteps()
         self._pending: list[tuple[float, PointsFrame]] = []
         self._newest_s = -np.inf  # stamp of the last image, used or not
         self._thinning = Thinning(MAX_RATE_HZ)
@@ -90,10 +92,11 @@ class TargetFreeCalibrator:
             self._base_ns = t_imu_ns
             self._buffer = ImuBuffer(t_imu_ns)
         gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
-        if self._buffer.append((t_imu_ns - self._base_ns) * 1e-9, gyro, accel):
+        if self._buffer.append(self._stamps.even((t_imu_ns - self._base_ns) * 1e-9), gyro, accel):
             self.judge.saw_imu(t_imu_ns, gyro)
         else:
             self.judge.imu_refused += 1
+        self.judge.events += self._stamps.news()
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
@@ -315,11 +318,12 @@ class TargetFreeCalibrator:
         known = self._doubted or self.latest
         if known is not None and self._buffer is not None:
             known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
-        return self.judge.estimate(known, running=self.window is not None, gravity=gravity)
+        estimate = self.judge.estimate(known, running=self.window is not None, gravity=gravity)
+        return self._stamps.told(estimate)
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration developed."""
-        return self.judge.trace() if camera == self.camera else []
+        return self._stamps.told_trace(self.judge.trace()) if camera == self.camera else []
 
 
 def _full(window: Window) -> bool:

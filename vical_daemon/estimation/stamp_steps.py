@@ -1,0 +1,102 @@
+"""Steps in the stamps of an IMU: its device's clock was found to be elsewhere on the host's.
+
+A driver that maps a device's clock learns it from arrivals, and where the first ones were late it finds out
+some seconds later, by milliseconds: from one reading to the next all stamps move. To a filter that is a rig
+whose time shift jumps, and motion that is missing. The device's clock itself is even; so readings are put on
+an even axis, and the step belongs to the time shift told: t_imu = t_cam + shift by the stamps of *now*.
+Only stamps that are even but for such steps are touched; others (taken on arrival) are as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+
+_LEARN = 20  # intervals by which the usual one is known
+_LEAST_S = 1e-4  # smaller steps are like jitter
+_EVEN_S = 5e-5  # stamps that deviate by more from an even grid were not made by a device's clock
+_FADES = 1.0 - 1.0 / 500.0  # of the largest deviation, an interval
+_MOST = 0.55  # of an interval
+_SETTLED = 4  # readings after which a step is one: a single late stamp is followed by a short interval
+
+
+@dataclass(slots=True)
+class StampSteps:
+    """Follows the stamps of one IMU.
+
+    Attributes:
+        total_s: All steps so far: stamps say so much more than an even clock would, s.
+    """
+
+    total_s: float = 0.0
+    _last_s: float = np.nan
+    _first: list[float] = field(default_factory=list)
+    _period_s: float = 0.0
+    _largest_s: float = 0.0
+    _before_s: float = 0.0  # the total before a step that is not certain yet
+    _since: int = 0
+    _news: list[str] = field(default_factory=list)
+
+    def even(self, t_s: float) -> float:
+        """Put the stamp of the next reading, s, on the even axis."""
+        interval_s, self._last_s = t_s - self._last_s, t_s
+        if self._period_s:
+            self._follow(interval_s - self._period_s)
+        elif interval_s > 0.0:
+            self._learn(interval_s)
+        return t_s - self.total_s
+
+    def _learn(self, interval_s: float) -> None:
+        self._first.append(interval_s)
+        if len(self._first) == _LEARN:
+            self._period_s = float(np.median(self._first))
+            self._largest_s = float(np.abs(np.array(self._first) - self._period_s).max())
+            self._first.clear()
+
+    def _follow(self, deviation_s: float) -> None:
+        size_s = abs(deviation_s)
+        if deviation_s > _MOST * self._period_s:  # readings are missing
+            return
+        if self._largest_s < _EVEN_S and _LEAST_S < size_s < _MOST * self._period_s:
+            if not self._since:
+                self._before_s, self._since = self.total_s, _SETTLED
+            self.total_s += deviation_s
+            return
+        if size_s < _LEAST_S:
+            self._period_s += 0.01 * deviation_s
+        self._largest_s = max(size_s, self._largest_s * _FADES)
+        if self._since:
+            self._since -= 1
+            if not self._since:
+                self._settle()
+
+    def _settle(self) -> None:
+        """A step has been followed by even stamps: it was one, or a single late stamp."""
+        step_s = self.total_s - self._before_s
+        if abs(step_s) < _LEAST_S:
+            self.total_s = self._before_s
+            return
+        self._news.append(
+            f"stamps of the imu moved by {1e3 * step_s:+.1f} ms (its clock was mapped anew): followed"
+        )
+
+    def news(self) -> list[str]:
+        """Steps that have become certain since the last call, in words."""
+        news, self._news = self._news, []
+        return news
+
+    def told(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
+        """An estimate by the even axis, told by the stamps of now."""
+        cameras = {
+            name: replace(e, timeshift_cam_imu_s=e.timeshift_cam_imu_s + self.total_s)
+            for name, e in estimate.cameras.items()
+        }
+        return replace(estimate, cameras=cameras)
+
+    def told_trace(self, points: Iterable[TracePoint]) -> list[TracePoint]:
+        """A trace by the even axis, told by the stamps of now."""
+        return [replace(p, timeshift_s=p.timeshift_s + self.total_s) for p in points]
