@@ -47,6 +47,8 @@ class Case:
         bound: Changes of the bound's model.
         estimate: Optional blocks of the estimator.
         crooked: The board is not as stated: see `vical_mocks.points.crooked_board`.
+        imu_off: One sigma of each entry of the imu's matrices, of which the gyro's is symmetric (what is not
+            is a turn of the imu's frame).
     """
 
     lens_known: bool = False
@@ -62,6 +64,7 @@ class Case:
     bound: dict[str, Any] = field(default_factory=dict)
     estimate: frozenset[str] = frozenset()
     crooked: bool = False
+    imu_off: float = 0.0
 
     @property
     def dof(self) -> int:
@@ -95,6 +98,9 @@ CASES: dict[str, Case] = {
     "crooked board, lens known, its shape found": Case(
         crooked=True, lens_known=True, estimate=frozenset({"target_shape"}), trials=20
     ),
+    "imu 0.1 % off": Case(imu_off=1e-3, bound={"imu_matrix_prior": 1e-3}, trials=20),
+    "imu 0.3 % off": Case(imu_off=3e-3, bound={"imu_matrix_prior": 3e-3}, trials=20),
+    "imu 1 % off": Case(imu_off=1e-2, bound={"imu_matrix_prior": 1e-2}, trials=20),
     "straight board, its shape found": Case(estimate=frozenset({"target_shape"}), trials=20),
     "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
     "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),
@@ -139,6 +145,11 @@ def make_run(case: Case, seed: int, seconds: float) -> SimulatedRun:
         rng = np.random.default_rng([seed, 62])
         changes["R_imu_cam"] = Rotation.random(rng=rng).as_matrix()
         changes["p_imu_cam"] = 0.2 * rng.standard_normal(3) / np.sqrt(3)
+    if case.imu_off:
+        rng = np.random.default_rng([seed, 63])
+        G, A = case.imu_off * rng.standard_normal((2, 3, 3))
+        changes["gyro_matrix"] = np.eye(3) + 0.5 * (G + G.T)
+        changes["accel_matrix"] = np.eye(3) + A
     rig = reference_rig(seed, timeshift_cam_imu_s=shift, clock_skew_ppm=case.skew_ppm, **changes)
     if case.target_free:
         return simulate_tracks(seed, seconds, rig=rig, **case.simulation)

@@ -67,6 +67,8 @@ class CalibrationFilter:
         doubt: Whether the target is as stated, by camera; empty where its shape is estimated.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
+        imu_off: The imu's matrices, where they are estimated, are known not to be the identity (see
+            `imu_doubt`).
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
@@ -83,6 +85,7 @@ class CalibrationFilter:
     doubt: dict[str, TargetDoubt] = field(default_factory=dict)
     unshown: UnshownAxes | None = None
     drifting: set[str] = field(default_factory=set)
+    imu_off: bool = True
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
     _motion_straight: Straightness = field(default_factory=Straightness)
@@ -106,9 +109,9 @@ class CalibrationFilter:
         d = self.layout.dynamic
         S = self.S[:d, :d]
         sigmas = np.sqrt((S**2).sum(axis=1))
-        straight = self.layout.gyro_matrix is None and self._motion_straight.holds(sigmas)
+        straight = self._motion_straight.holds(sigmas)
         if straight:
-            moved = move_by_derivatives(self.state, S, segment)
+            moved = move_by_derivatives(self.state, self.layout, S, segment)
         else:
             moved = move_by_sigma_points(self.state, self.layout, S, segment)
         Q = moved.influence.noise(self.imu_noise) + _TINY
@@ -308,9 +311,10 @@ class CalibrationFilter:
         column[index] = sigma
         self.loosen(column)
 
-    def loosen(self, column: FloatArray) -> None:
-        """Add the covariance `column column'`: one direction of the errors, shape (n,), is in doubt."""
-        self.S = unscented.lower_root(np.concatenate([self.S, column[:, None]], axis=1))
+    def loosen(self, columns: FloatArray) -> None:
+        """Add the covariance `columns columns'`: directions of the errors, shape (n,) or (n, k), in doubt."""
+        added = columns.reshape(self.layout.size, -1)
+        self.S = unscented.lower_root(np.concatenate([self.S, added], axis=1))
 
     def reset_motion(self, R_world_imu: FloatArray, p_world_imu: FloatArray) -> None:
         """Forget where the rig is and keep the calibration: motion anew, with no tie to the rest."""

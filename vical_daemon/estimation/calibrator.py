@@ -18,6 +18,8 @@ from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_doubt import ImuDoubt
+from vical_daemon.estimation.imu_doubt import in_doubt as imu_in_doubt
 from vical_daemon.estimation.judge import Judge
 from vical_daemon.estimation.measurements import (
     BoolArray,
@@ -68,10 +70,12 @@ class Calibrator:
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
         self._shape_start = ShapeStart(self._step)
+        self._imu_doubt = ImuDoubt()
 
     def _lay_out(self, estimate: frozenset[str]) -> Layout:
         models = {name: prior.distortion_model for name, prior in self.priors.items()}
-        return make_layout(models, fix=self.options.fix, estimate=estimate, target_m=self.target)
+        entries = estimate | {"imu_intrinsics"}  # always states, see `imu_doubt`
+        return make_layout(models, fix=self.options.fix, estimate=entries, target_m=self.target)
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -196,6 +200,9 @@ class Calibrator:
             self._restart(f)
             return report
         self.judge.saw_frame(report, f)
+        told = self._imu_doubt.look(f)
+        if told:
+            self.judge.announce(told, once="imu")
         self._act(self.watch.look(report, f), frame, t_cam_s)
         if self.filter is f and any(doubt.off_m is not None for doubt in f.doubt.values()):
             self._target_is_off(f)
@@ -289,6 +296,7 @@ class Calibrator:
         """Return what is known now."""
         drifting = self.filter is not None and any(in_doubt(self.filter, name) for name in self.priors)
         self.judge.clocks_in_doubt = drifting or self.watch.doubtful
+        self.judge.imu_in_doubt = self.filter is not None and imu_in_doubt(self.filter)
         held = "intrinsics" in self.options.fix
         self.judge.target_in_doubt = (
             not held

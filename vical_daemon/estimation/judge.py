@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation import clock_drift, imu_doubt
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.camera_model import RADTAN
-from vical_daemon.estimation.clock_drift import CLOCKS_IN_DOUBT, averaged
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import imu_noise_doubt
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
@@ -55,7 +55,7 @@ class Judge:
         self.events: list[str] = []
         self.status = Status.WAITING
         self.bumped = ""
-        self.clocks_in_doubt = self.target_in_doubt = False
+        self.clocks_in_doubt = self.target_in_doubt = self.imu_in_doubt = False
         self._ever_converged = False
         self._start_reason = ""
         self._motion_missing = False
@@ -153,7 +153,7 @@ class Judge:
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())
         if trace.due(f.state.t_s):
-            trace.add(f.state.t_s, self._camera(camera, averaged(f)), self.nis_per_dof(), self.status)
+            trace.add(f.state.t_s, self._camera(camera, self._weighed(f)), self.nis_per_dof(), self.status)
 
     # ------------------------------------------------------------------ what is said
     def nis_per_dof(self) -> float:
@@ -169,7 +169,7 @@ class Judge:
         self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
     ) -> CalibrationEstimate:
         """Put everything together; `stale`: what was known before a change, shown while starting anew."""
-        f, stale = (None if x is None else averaged(x) for x in (f, stale))
+        f, stale = (None if x is None else self._weighed(x) for x in (f, stale))
         shown = f or stale
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
@@ -197,6 +197,11 @@ class Judge:
             self._points[0] / max(self._points[1], 1),
             events,
         )
+
+    def _weighed(self, f: CalibrationFilter) -> CalibrationFilter:
+        """The filter over all hypotheses about imu and clocks."""
+        asked = "imu_intrinsics" in self.options.estimate
+        return clock_drift.averaged(imu_doubt.averaged(f, gyro_frame=not asked))
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
         square = self._square.get(name, ())
@@ -236,7 +241,9 @@ class Judge:
             if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
                 return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
             if self.clocks_in_doubt:
-                return Status.CONVERGING, CLOCKS_IN_DOUBT, ""
+                return Status.CONVERGING, clock_drift.CLOCKS_IN_DOUBT, ""
+            if self.imu_in_doubt:
+                return Status.CONVERGING, imu_doubt.IMU_IN_DOUBT, ""
             if self.target_in_doubt:
                 return (
                     Status.CONVERGING,

@@ -9,6 +9,7 @@ import numpy as np
 from vical_daemon.estimation import so3, unscented
 from vical_daemon.estimation.imu_buffer import ImuSegment
 from vical_daemon.estimation.imu_model import Influence, Motion, compose, influence, strapdown
+from vical_daemon.estimation.imu_scale import by_entries
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.retract import motion_points
 from vical_daemon.estimation.state import (
@@ -70,9 +71,11 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
     )
 
 
-def move_by_derivatives(state: State, S: FloatArray, segment: ImuSegment) -> Moved:
-    """The same to first order about the nominal state; without the imu's matrices."""
-    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None])
+def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
+    """The same to first order about the nominal state."""
+    entries = layout.gyro_matrix is not None and layout.accel_matrix is not None
+    matrices = (state.gyro_matrix[None], state.accel_matrix[None]) if entries else (None, None)
+    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None], *matrices)
     T = float(relative.t_s[-1])
     dR, dv, dp = relative.dR[0, -1], relative.dv[0, -1], relative.dp[0, -1]
     R, g = state.R_world_imu, state.gravity
@@ -84,7 +87,12 @@ def move_by_derivatives(state: State, S: FloatArray, segment: ImuSegment) -> Mov
     F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = _EYE
     F[POSITION, VELOCITY] = T * _EYE
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
-    F[:, _BIASES] = errors.by_bias()
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        bias = np.concatenate([state.gyro_bias, state.accel_bias])
+        by = by_entries(errors, segment, bias, state.gyro_matrix, state.accel_matrix)
+        F[:, _BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
+    else:
+        F[:, _BIASES] = errors.by_bias()
     return Moved(
         R @ dR,
         state.p_world_imu + T * state.v_world_imu + (0.5 * T * T) * g + R @ dp,

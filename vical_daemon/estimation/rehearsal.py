@@ -14,6 +14,7 @@ from vical_daemon.estimation.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.consistency import MODES, Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.imu_doubt import ENTRY_SIGMA, KNOWN_OFF_SIGMA
 from vical_daemon.estimation.initialise import HELD_M
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
@@ -156,14 +157,18 @@ def _about(
         p_world_imu=state.p_world_imu,
         v_world_imu=state.v_world_imu,
         cameras={name: replace(camera, skew=0.0) for name, camera in trial.state.cameras.items()},
-        target_shape=state.target_shape,  # expected near zero, not near what was found last
+        # expected as stated, not near what was found last
+        target_shape=state.target_shape,
+        gyro_matrix=state.gyro_matrix,
+        accel_matrix=state.accel_matrix,
     )
     fresh = make(begin)
     wide = np.diag(fresh.S)
     narrow = np.minimum(wide, REHEARSED * trial.sigmas())
     narrow[: MOTION.stop] = wide[: MOTION.stop]
-    if trial.layout.target_shape is not None:
-        narrow[trial.layout.target_shape] = wide[trial.layout.target_shape]
+    for where in (trial.layout.target_shape, trial.layout.gyro_matrix, trial.layout.accel_matrix):
+        if where is not None:
+            narrow[where] = wide[where]
     fresh.S = fresh.S * (narrow / wide)[:, None]
     fresh.corner_noise = trial.corner_noise
     return fresh
@@ -183,7 +188,8 @@ def wide_filter(
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
-    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None))
+    asked = "imu_intrinsics" in options.estimate
+    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, imu_asked=asked))
     unshown = None if still_axes is None else UnshownAxes(still_axes)
     for where in layout.cameras.values():
         if unshown is not None and where.position is not None:
@@ -203,6 +209,7 @@ def wide_filter(
         shared,
         _doubts(state, layout),
         unshown,
+        imu_off=asked,
     )
 
 
@@ -219,7 +226,7 @@ def _before_board_m(state: State, camera: str) -> float:
     return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
 
 
-def start_sigmas(state: State, layout: Layout, *, partial: bool) -> FloatArray:
+def start_sigmas(state: State, layout: Layout, *, partial: bool, imu_asked: bool) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
     The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
@@ -233,7 +240,7 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool) -> FloatArray:
     s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        s[layout.gyro_matrix], s[layout.accel_matrix] = 0.01, 0.01
+        s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if imu_asked else ENTRY_SIGMA
     if layout.target_scale is not None:
         s[layout.target_scale] = 0.002
     if layout.target_modes is not None and layout.target_shape is not None:

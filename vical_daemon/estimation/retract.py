@@ -101,10 +101,9 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     """Return the state moved by one error vector, shape (n,). The argument is not changed."""
     gyro_matrix, accel_matrix = state.gyro_matrix, state.accel_matrix
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        points = motion_points(state, layout, dx[None])
-        assert points.gyro_matrix is not None
-        assert points.accel_matrix is not None
-        gyro_matrix, accel_matrix = points.gyro_matrix[0], points.accel_matrix[0]
+        gyro_matrix = gyro_matrix + dx[layout.gyro_matrix].reshape(3, 3)
+        accel_matrix = accel_matrix.copy()
+        accel_matrix[LOWER[:, 0], LOWER[:, 1]] += dx[layout.accel_matrix]
     scale = state.target_scale
     if layout.target_scale is not None:
         scale += float(dx[layout.target_scale])
