@@ -24,7 +24,9 @@ _SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
 _GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2 = 4e-4, 5e-3  # by which biases may have walked while nothing was seen
 
 
-def afresh(window: Window, known: Carry | None, active: BoolArray, held: FloatArray | None) -> Carry:
+def afresh(
+    window: Window, known: Carry | None, active: BoolArray, held: FloatArray | None, imu_sigma: float
+) -> Carry:
     """Prior of a window that starts from nothing: wide, or with the calibration and biases known before.
 
     Args:
@@ -32,8 +34,9 @@ def afresh(window: Window, known: Carry | None, active: BoolArray, held: FloatAr
         known: What was known, or None.
         active: Which calibration errors are estimated, shape (FULL,).
         held: Axis along which the lever arm is held, see `Starter`.
+        imu_sigma: Of the entries of the imu's matrices, where nothing is known.
     """
-    wide = first_carry(window, active, start_sigmas(window.camera))
+    wide = first_carry(window, active, start_sigmas(window.camera, imu_sigma))
     if known is None:
         return wide if held is None else held_along(wide, held)
     known = known.at(wide.t_cam_s)

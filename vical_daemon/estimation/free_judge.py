@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 from scipy.stats import chi2
 
+from vical_daemon.estimation import imu_doubt
 from vical_daemon.estimation.clock_drift import (
     CLOCKS_APART,
     CLOCKS_IN_DOUBT,
@@ -16,7 +17,15 @@ from vical_daemon.estimation.clock_drift import (
 )
 from vical_daemon.estimation.free_bundle import Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry
-from vical_daemon.estimation.free_snapshot import camera_estimate, drift_evidence, imu_estimate
+from vical_daemon.estimation.free_snapshot import (
+    IMU_SIGMA,
+    Doubts,
+    camera_estimate,
+    drift_evidence,
+    imu_estimate,
+    imu_evidence,
+)
+from vical_daemon.estimation.imu_doubt import KNOWN_OFF_SIGMA
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import (
@@ -76,6 +85,8 @@ class FreeJudge:
         self._quiet = ""
         self._jitter_told = False
         self.drifting = False  # the clock of the camera is known to run apart from the imu's
+        self._imu_asked = self._imu_off = "imu_intrinsics" in options.estimate
+        self.imu_sigma = KNOWN_OFF_SIGMA if self._imu_asked else IMU_SIGMA
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -146,6 +157,7 @@ class FreeJudge:
         self._squares.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
         self._watch_clocks(fit.carry)
+        self._watch_imu(fit.carry)
         if self._trace.due(t_s):
             self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
 
@@ -156,6 +168,12 @@ class FreeJudge:
         self.drifting = True
         sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
         self.events.append(drift_told(self.camera, CLOCKS_APART, carry.camera.skew, sigma))
+
+    def _watch_imu(self, carry: Carry) -> None:
+        """Announce an imu whose matrices are beyond doubt not the identity."""
+        if not self._imu_off and imu_doubt.surely_off(imu_evidence(carry, self.factor())):
+            self._imu_off = True
+            self.events.append(imu_doubt.told(carry.imu))
 
     def _evidence(self, carry: Carry) -> float:
         return drift_evidence(carry, self.factor())
@@ -220,7 +238,11 @@ class FreeJudge:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
         missing = [] if camera is None or carry is None else self._missing(camera, carry)
-        doubt = carry is not None and not self.drifting and self._evidence(carry) > 1.0
+        doubt = ""
+        if carry is not None and not self.drifting and self._evidence(carry) > 1.0:
+            doubt = CLOCKS_IN_DOUBT
+        if carry is not None and not self._imu_off and imu_evidence(carry, self.factor()) > 0.0:
+            doubt = imu_doubt.IMU_IN_DOUBT
         self.status, reason, advice = self._decide(camera is not None, running, missing, doubt)
         if advice and carry is not None:
             advice = shortcoming(self._motion, carry.camera.R_imu_cam, carry.bias[:3]) or advice
@@ -239,7 +261,7 @@ class FreeJudge:
             self.frames_seen,
             self.imu_samples,
             {} if camera is None else {self.camera: camera},
-            None if carry is None else imu_estimate(carry),
+            None if carry is None else imu_estimate(carry, matrices_told=self._imu_asked),
             gravity,
             self.nis_per_dof(),
             refused / max(seen, 1),
@@ -250,7 +272,9 @@ class FreeJudge:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
         factor = self.factor()
-        return camera_estimate(carry, factor, self.drifting, self._sigma_px, rms_px, self.held)
+        imu_off = 1.0 if self._imu_off else imu_doubt.probability(imu_evidence(carry, factor))
+        doubts = Doubts(factor, self.drifting, imu_off, gyro_frame=not self._imu_asked)
+        return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
@@ -259,9 +283,9 @@ class FreeJudge:
         )
 
     def _decide(
-        self, known: bool, running: bool, missing: list[Missing], doubt: bool
+        self, known: bool, running: bool, missing: list[Missing], doubt: str
     ) -> tuple[Status, str, str]:
-        """Status, reason and guidance; `doubt`: the clocks may run apart."""
+        """Status, reason and guidance; `doubt`: what may not be as it is taken to be, or nothing."""
         if not known:
             return self._before_start()
         if not running and self._windows == 0:
@@ -279,7 +303,7 @@ class FreeJudge:
             if self.factor() > _MOST_FACTOR:
                 return Status.INCONSISTENT, "stretches of the data disagree more than their sigmas say", ""
             if doubt:
-                return Status.CONVERGING, CLOCKS_IN_DOUBT + pause, ""
+                return Status.CONVERGING, doubt + pause, ""
             return Status.CONVERGED, pause.strip(" ()"), ""
         worst = missing[0]
         if self._now_s - (self._started_s or 0.0) > _PATIENCE_S and worst.excess > _LOST:

@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.clock_drift import evidence, probability
-from vical_daemon.estimation.free_carry import DRIFT, LENS, READOUT, SHIFT, Carry, moved
+from vical_daemon.estimation.free_carry import (
+    ARM,
+    DRIFT,
+    FULL,
+    IMU,
+    LENS,
+    READOUT,
+    SHIFT,
+    TURN,
+    Carry,
+    moved,
+)
+from vical_daemon.estimation.imu_doubt import log_bayes_factor, turn
 from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.unshown_axes import held_covariance
+
+IMU_SIGMA = 3e-3
+"""Scale or alignment of an IMU that is not as it says, one sigma of each entry."""
+_GYRO = slice(IMU.start, IMU.start + 9)
 
 
 def drift_evidence(carry: Carry, factor: float) -> float:
@@ -26,28 +45,43 @@ def drift_evidence(carry: Carry, factor: float) -> float:
     return evidence(carry.camera.skew, factor * float(carry.calibration()[DRIFT, DRIFT]))
 
 
+def imu_evidence(carry: Carry, factor: float) -> float:
+    """Return by how much an imu whose matrices are not the identity is likelier (log of Bayes' factor)."""
+    return log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], IMU_SIGMA, factor)
+
+
+class Doubts(NamedTuple):
+    """How what is carried is to be told.
+
+    Attributes:
+        factor: Measured variance over the stated one; multiplies what is told.
+        drifting: The camera's clock is known to run apart from the imu's.
+        imu_off: Probability that the imu's matrices are not the identity.
+        gyro_frame: The camera is told in the frame in which the gyro's matrix is symmetric.
+    """
+
+    factor: float = 1.0
+    drifting: bool = False
+    imu_off: float = 1.0
+    gyro_frame: bool = False
+
+
 def camera_estimate(
-    carry: Carry,
-    factor: float,
-    drifting: bool,
-    sigma_px: float,
-    rms_px: float,
-    held: FloatArray | None = None,
+    carry: Carry, doubts: Doubts, sigma_px: float, rms_px: float, held: FloatArray | None = None
 ) -> CameraEstimate:
     """The camera as it is known.
 
     Args:
         carry: What is known.
-        factor: Measured variance over the stated one; multiplies what is told.
-        drifting: Its clock is known to run apart from the imu's.
+        doubts: See there.
         sigma_px: Pixel noise.
         rms_px: RMS of the residuals.
         held: Axis of the imu along which the lever arm is not known, unit, shape (3,); None: there is none.
     """
-    camera, covariance = _told(carry, factor, drifting)
+    camera, covariance = _told(carry, doubts)
     if held is not None:
         covariance[:3, :3] += held_covariance(np.outer(held, held))
-    sigma = np.sqrt(np.diag(covariance))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
         PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), covariance[:6, :6].tolist()),
@@ -66,20 +100,44 @@ def camera_estimate(
     )
 
 
-def _told(carry: Carry, factor: float, drifting: bool) -> tuple[CameraState, FloatArray]:
-    """Camera and covariance (FULL, FULL) over both hypotheses about its clock; see `clock_drift`."""
-    camera, P = carry.camera, carry.calibration() * factor
-    if drifting or not carry.active[DRIFT]:
+def _told(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray]:
+    """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `imu_doubt`."""
+    camera, entries, P = _over_imu(carry, doubts)
+    if doubts.gyro_frame:
+        camera, P = _in_gyro_frame(camera, entries, P)
+    if doubts.drifting or not carry.active[DRIFT]:
         return camera, P
-    p = probability(drift_evidence(carry, factor))
+    p = probability(evidence(camera.skew, float(P[DRIFT, DRIFT])))
     sigma = float(np.sqrt(P[DRIFT, DRIFT]))
     k, z = P[:, DRIFT] / sigma, camera.skew / sigma
     return moved(camera, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(k, k)
 
 
-def imu_estimate(carry: Carry) -> ImuEstimate:
-    """Biases and their sigmas; where estimated, the matrices."""
+def _over_imu(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
+    """Camera, entries of the imu's matrices and covariance over both hypotheses about these."""
+    P, p = carry.calibration() * doubts.factor, doubts.imu_off
+    if p == 1.0:
+        return carry.camera, carry.imu, P
+    gain = np.linalg.solve(P[IMU, IMU], P[IMU]).T
+    d = gain @ carry.imu
+    P = P - (1.0 - p) * (gain @ P[IMU]) + p * (1.0 - p) * np.outer(d, d)
+    return moved(carry.camera, -(1.0 - p) * d), p * carry.imu, P
+
+
+def _in_gyro_frame(camera: CameraState, entries: FloatArray, P: FloatArray) -> tuple[CameraState, FloatArray]:
+    """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries."""
+    J = np.eye(FULL)
+    by_entries = turn(np.eye(9).reshape(3, 3, 9))
+    J[TURN, _GYRO] = -camera.R_imu_cam.T @ by_entries
+    J[ARM, _GYRO] = so3.hat(camera.p_imu_cam) @ by_entries
+    back = so3.exp(-turn(entries[:9].reshape(3, 3)))
+    camera = replace(camera, R_imu_cam=back @ camera.R_imu_cam, p_imu_cam=back @ camera.p_imu_cam)
+    return camera, J @ P @ J.T
+
+
+def imu_estimate(carry: Carry, *, matrices_told: bool) -> ImuEstimate:
+    """Biases and their sigmas; where asked for, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[5:11])
-    told = [m.tolist() for m in matrices(carry.imu)] if len(carry.imu) else [[], []]
+    told = [m.tolist() for m in matrices(carry.imu)] if matrices_told else [[], []]
     bias = carry.bias
     return ImuEstimate(bias[:3].tolist(), bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist(), *told)

@@ -28,7 +28,7 @@ class _Found(NamedTuple):
     """What rotations say, or what was known before."""
 
     camera: CameraState
-    imu: FloatArray  # biases, and entries of the matrices where they are estimated, see `Link`
+    imu: FloatArray  # biases, and entries of the matrices, see `Link`
     arm_sigma_m: float
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 
@@ -40,7 +40,6 @@ _EVERY_S, _EVERY_MOST_S = 1.0, 4.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
 _READOUT_SIGMA_S = 0.015
-_IMU_SIGMA = 0.01  # scale and misalignment
 _MIN_TRACKS = 12
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _FULL_FITS = 2
@@ -169,8 +168,7 @@ class Starter:
             sigma = 1e-4
         if self.prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
             camera.timeshift_s = self.prior.timeshift_cam_imu_s
-        entries = ENTRIES if "imu_intrinsics" in self.options.estimate else 0
-        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + entries)]), sigma, about)
+        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + ENTRIES)]), sigma, about)
 
     def _seeds(
         self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState, *, look_around: bool
@@ -216,12 +214,17 @@ def starting_camera(prior: CameraPrior) -> CameraState:
     )
 
 
-def start_sigmas(camera: CameraState) -> FloatArray:
-    """How far each calibration error may be off at a start: many times what it is worth; shape (FULL,)."""
+def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
+    """How far each calibration error may be off at a start: many times what it is worth; shape (FULL,).
+
+    Args:
+        camera: Its focal length counts.
+        imu_sigma: Of the entries of the imu's matrices.
+    """
     f = float(camera.intrinsics[0])
     lens = [0.05 * f, 0.05 * f, 0.03 * f, 0.03 * f]
     distortion = [0.1, 0.1, 0.01, 0.01] if camera.distortion_model == "radtan" else [0.05] * 4
-    imu = [_IMU_SIGMA] * ENTRIES
+    imu = [imu_sigma] * ENTRIES
     return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA, _READOUT_SIGMA_S] + imu)
 
 

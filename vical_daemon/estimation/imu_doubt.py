@@ -49,26 +49,50 @@ def _factor(f: CalibrationFilter) -> float:
     return max((c.factor for c in f.consistency.values()), default=1.0)
 
 
+def log_bayes_factor(entries: FloatArray, covariance: FloatArray, sigma: float, factor: float) -> float:
+    """Logarithm of how much more likely the data are if the entries are not zero.
+
+    Args:
+        entries: As estimated, shape (15,).
+        covariance: Of them, shape (15, 15).
+        sigma: Of their prior.
+        factor: What was learnt beyond the prior is worth so many times less than the covariance says.
+    """
+    values, unit = entries / sigma, np.eye(len(entries))
+    information = np.linalg.inv(covariance / sigma**2)
+    tempered = unit + (information - unit) / factor
+    weighted = information @ values / factor
+    fits = float(weighted @ np.linalg.solve(tempered, weighted))
+    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(tempered)[1])
+
+
+def probability(log_evidence: float) -> float:
+    """Probability that the entries are not zero."""
+    return float(1.0 / (1.0 + (1.0 - _OFF) / _OFF * np.exp(-log_evidence)))
+
+
+def surely_off(log_evidence: float) -> bool:
+    """Whether that is beyond doubt."""
+    return probability(log_evidence) > _SURE
+
+
+def told(entries: FloatArray) -> str:
+    """The announcement."""
+    percent = 100.0 * float(np.abs(entries).max())
+    return f"scale and alignment of the imu are off by up to {percent:.1f} %: allowed for from now on"
+
+
 def log_evidence(f: CalibrationFilter) -> float:
-    """Logarithm of how much more likely the data are if the entries are not zero (Bayes factor)."""
+    """`log_bayes_factor` of a filter's entries."""
     where = _entries(f.layout)
     if where is None or any(c.scale > _FITS for c in f.consistency.values()):
         return -_MOST
-    # in units of the prior; errors that last count `factor` times less than the filter thinks
-    values = _values(f) / ENTRY_SIGMA
-    entries, unit = f.S[where] / ENTRY_SIGMA, np.eye(len(values))
-    information = np.linalg.inv(entries @ entries.T)
-    told = unit + (information - unit) / _factor(f)
-    weighted = information @ values / _factor(f)
-    fits = float(weighted @ np.linalg.solve(told, weighted))
-    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(told)[1])
+    return log_bayes_factor(_values(f), f.S[where] @ f.S[where].T, ENTRY_SIGMA, _factor(f))
 
 
 def off(f: CalibrationFilter) -> float:
     """Probability that the entries are not zero; 1 where that was announced, or they were asked for."""
-    if f.imu_off:
-        return 1.0
-    return float(1.0 / (1.0 + (1.0 - _OFF) / _OFF * np.exp(-log_evidence(f))))
+    return 1.0 if f.imu_off else probability(log_evidence(f))
 
 
 def averaged(f: CalibrationFilter, *, gyro_frame: bool) -> CalibrationFilter:
@@ -106,8 +130,8 @@ def _mixed(f: CalibrationFilter, where: slice, p: float) -> CalibrationFilter:
 def _in_gyro_frame(f: CalibrationFilter) -> CalibrationFilter:
     """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries."""
     assert f.layout.gyro_matrix is not None
-    turned = _turn(f.S[f.layout.gyro_matrix].reshape(3, 3, -1))
-    back = exp_one(-_turn(f.state.gyro_matrix))
+    turned = turn(f.S[f.layout.gyro_matrix].reshape(3, 3, -1))
+    back = exp_one(-turn(f.state.gyro_matrix))
     S, cameras = f.S.copy(), dict(f.state.cameras)
     for name, slices in f.layout.cameras.items():
         if slices.position is None or slices.rotation is None:
@@ -121,7 +145,7 @@ def _in_gyro_frame(f: CalibrationFilter) -> CalibrationFilter:
     return replace(f, state=state, S=S)
 
 
-def _turn(M: FloatArray) -> FloatArray:
+def turn(M: FloatArray) -> FloatArray:
     """The rotation vector whose matrix the antisymmetric part of M is, shape (3, ...)."""
     return np.asarray(0.5 * (M[[2, 0, 1], [1, 2, 0]] - M[[1, 2, 0], [2, 0, 1]]))
 
@@ -159,9 +183,8 @@ class ImuDoubt:
         if f.imu_off or f.state.t_s < self._next_s:
             return ""
         self._next_s = f.state.t_s + _EVERY_S
-        if off(f) < _SURE:
+        if not surely_off(log_evidence(f)):
             return ""
         _widen(f)
         f.imu_off = True
-        percent = 100.0 * float(np.abs(_values(f)).max())
-        return f"scale and alignment of the imu are off by up to {percent:.2f} %: now estimated, too"
+        return told(_values(f))

@@ -45,6 +45,7 @@ class Judge:
     def __init__(self, options: CalibrationOptions, layout: Layout) -> None:
         self.options = options
         self.layout = layout
+        self._imu_asked = "imu_intrinsics" in options.estimate
         self._motion = RunningMotion()
         self.imu_samples = 0
         self.imu_refused = 0
@@ -191,7 +192,7 @@ class Judge:
             self.frames,
             self.imu_samples,
             cameras,
-            None if shown is None else imu_estimate(shown),
+            None if shown is None else imu_estimate(shown, matrices=self._imu_asked),
             [] if shown is None else shown.state.gravity.tolist(),
             self.nis_per_dof(),
             self._points[0] / max(self._points[1], 1),
@@ -200,8 +201,7 @@ class Judge:
 
     def _weighed(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter over all hypotheses about imu and clocks."""
-        asked = "imu_intrinsics" in self.options.estimate
-        return clock_drift.averaged(imu_doubt.averaged(f, gyro_frame=not asked))
+        return clock_drift.averaged(imu_doubt.averaged(f, gyro_frame=not self._imu_asked))
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
         square = self._square.get(name, ())

@@ -47,10 +47,9 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     )
 
 
-def imu_estimate(f: CalibrationFilter) -> ImuEstimate:
-    """Biases and, where estimated, the matrices."""
+def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
+    """Biases and, where asked for, the matrices."""
     sigma = f.sigmas()
-    matrices = f.layout.gyro_matrix is not None and f.imu_off
     return ImuEstimate(
         f.state.gyro_bias.tolist(),
         f.state.accel_bias.tolist(),

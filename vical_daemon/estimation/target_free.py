@@ -16,7 +16,7 @@ import numpy as np
 
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free_bundle import Bundle, Fit
-from vical_daemon.estimation.free_carry import DRIFT, FULL, IMU, LENS, READOUT, SHIFT, Carry
+from vical_daemon.estimation.free_carry import DRIFT, FULL, LENS, READOUT, SHIFT, Carry
 from vical_daemon.estimation.free_handover import afresh, aged, next_window
 from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.free_reports import window_reports
@@ -67,7 +67,6 @@ class TargetFreeCalibrator:
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         self.active[LENS] = "intrinsics" not in options.fix
         self.active[READOUT] = "readout" in options.estimate
-        self.active[IMU] = "imu_intrinsics" in options.estimate
         self.judge = FreeJudge(options, self.camera, self.active)
         self.starter = Starter(options, self.prior)
         self.window: Window | None = None
@@ -191,7 +190,7 @@ class TargetFreeCalibrator:
             self.judge.waiting(attempt, self.starter.motion_missing)
             return False
         window = attempt
-        carry = afresh(window, known, self.active, self.starter.held)
+        carry = afresh(window, known, self.active, self.starter.held, self.judge.imu_sigma)
         bundle = Bundle(window, carry, *self._noise)
         fit = bundle.solve(self._buffer, _STEPS_START)
         if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
