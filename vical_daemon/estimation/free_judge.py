@@ -18,14 +18,13 @@ from vical_daemon.estimation.clock_drift import (
 from vical_daemon.estimation.free_bundle import Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry
 from vical_daemon.estimation.free_snapshot import (
-    IMU_SIGMA,
     Doubts,
     camera_estimate,
     drift_evidence,
     imu_estimate,
     imu_evidence,
 )
-from vical_daemon.estimation.imu_doubt import KNOWN_OFF_SIGMA
+from vical_daemon.estimation.imu_doubt import ENTRY_SIGMA, KNOWN_OFF_SIGMA
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import (
@@ -86,7 +85,7 @@ class FreeJudge:
         self._jitter_told = False
         self.drifting = False  # the clock of the camera is known to run apart from the imu's
         self._imu_asked = self._imu_off = "imu_intrinsics" in options.estimate
-        self.imu_sigma = KNOWN_OFF_SIGMA if self._imu_asked else IMU_SIGMA
+        self.imu_sigma = KNOWN_OFF_SIGMA if self._imu_asked else ENTRY_SIGMA
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens

@@ -21,15 +21,13 @@ from vical_daemon.estimation.free_carry import (
     Carry,
     moved,
 )
-from vical_daemon.estimation.imu_doubt import log_bayes_factor, turn
+from vical_daemon.estimation.imu_doubt import ENTRY_SIGMA, log_bayes_factor, turn
 from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.unshown_axes import held_covariance
 
-IMU_SIGMA = 3e-3
-"""Scale or alignment of an IMU that is not as it says, one sigma of each entry."""
 _GYRO = slice(IMU.start, IMU.start + 9)
 
 
@@ -47,7 +45,7 @@ def drift_evidence(carry: Carry, factor: float) -> float:
 
 def imu_evidence(carry: Carry, factor: float) -> float:
     """Return by how much an imu whose matrices are not the identity is likelier (log of Bayes' factor)."""
-    return log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], IMU_SIGMA, factor)
+    return log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], ENTRY_SIGMA, factor)
 
 
 class Doubts(NamedTuple):

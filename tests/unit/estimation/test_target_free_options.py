@@ -70,11 +70,28 @@ def test_scale_and_misalignment_of_the_imu_are_found():
     assert np.sqrt(np.diag(P)).max() < 0.006  # from one percent, after nine seconds
 
 
-def test_untold_matrices_do_not_make_it_sure_of_a_wrong_answer():
-    _, _, record = followed(4, set(), seconds=12.0, **crooked(4))
+@pytest.mark.parametrize("size", [1e-3, 3e-3, 1e-2])
+def test_untold_matrices_are_noticed_and_no_answer_is_sure_and_wrong(size):
+    # what is told is the mounting in the frame in which the gyro's matrix is symmetric
+    rng = np.random.default_rng(4)
+    G, A = rng.standard_normal((2, 3, 3))
+    off = {"gyro_matrix": np.eye(3) + 0.5 * size * (G + G.T), "accel_matrix": np.eye(3) + size * A}
+    _, calibrator, record = followed(4, set(), seconds=12.0, **off)
+    assert any("scale and alignment" in text for _, text in record.events)
+    assert record.statuses[-1][1] == "converged"
     for shot in record.snapshots:
         if shot.status == "converged":
             assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-6, 7), shot.t_s
+    assert calibrator.estimate().imu.gyro_matrix == []  # only where asked for: another frame is meant
+
+
+def test_an_imu_that_is_true_pays_nothing():
+    _, _, record = followed(4, set(), seconds=12.0)
+    _, _, beside = followed(4, {"imu_intrinsics"}, seconds=12.0)
+    assert not any("scale and alignment" in text for _, text in record.events)
+    assert nees(record.snapshots[-1].error, record.snapshots[-1].covariance, 7) < chi2.isf(1e-3, 7)
+    sigma, asked = (np.sqrt(np.diag(r.snapshots[-1].covariance))[3:6] for r in (record, beside))
+    assert sigma.max() < 0.6 * asked.max()
 
 
 def test_what_was_found_outlasts_darkness():

@@ -168,7 +168,7 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s):
     window = scene.window(entries=15)
     window.camera = replace(window.camera, readout_s=readout_s)
     active = np.ones(FULL, dtype=bool)
-    problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 50.0).problem
+    problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 50.0).problem
     seen, links = window.observe(), window.stacked()
     normal, order = problem.normal(seen, links), problem.order()
     rng = np.random.default_rng(2)
@@ -242,7 +242,7 @@ def test_late_images_move_the_errors_of_links_as_told(scene):
 def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     window = scene.window()
     active = np.arange(FULL) < 7
-    bundle = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 1.0)
+    bundle = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 1.0)
     fit = bundle.solve(scene.buffer, 25)
     error = camera_difference(fit.carry.camera, scene.camera)[:7]
     P = fit.carry.covariance()[11:, 11:]
@@ -255,7 +255,7 @@ def test_adjusted_window_is_right_within_its_own_sigmas(scene):
 def test_a_drift_carries_into_the_time_shift_of_the_next_window(scene):
     window = scene.window()
     active = (np.arange(FULL) < 7) | (np.arange(FULL) == DRIFT)
-    fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 1.0).solve(
+    fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 1.0).solve(
         scene.buffer, 25
     )
     first, carry = window.camera, fit.carry
@@ -279,7 +279,7 @@ def test_where_north_and_origin_are_changes_nothing(scene):
         world = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
         window.R, window.v = world @ window.R, window.v @ world.T
         window.p = window.p @ world.T + turn * np.array([3.0, -1.0, 0.5])
-        fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera)), 0.5).solve(
+        fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 0.5).solve(
             scene.buffer, 25
         )
         results.append(fit)
