@@ -170,9 +170,21 @@ class FreeJudge:
 
     def _watch_imu(self, carry: Carry) -> None:
         """Announce an imu whose matrices are beyond doubt not the identity."""
-        if not self._imu_off and imu_doubt.surely_off(imu_evidence(carry, self.factor())):
+        if not self._imu_off and self._agreement and imu_doubt.surely_off(self._imu_evidence(carry)):
             self._imu_off = True
             self.events.append(imu_doubt.told(carry.imu))
+
+    def _imu_evidence(self, carry: Carry) -> float:
+        """Where windows disagree it is the images that do not fit, whatever the imu may be."""
+        factor = self.factor()
+        return -np.inf if factor > _MODEL_FITS else imu_evidence(carry, factor)
+
+    def _imu_is_off(self, carry: Carry) -> float:
+        """Probability that it is; before two windows could be compared, it may as well be the images."""
+        if self._imu_off:
+            return 1.0
+        off = imu_doubt.probability(self._imu_evidence(carry))
+        return off if self._agreement else min(off, 0.5)
 
     def _evidence(self, carry: Carry) -> float:
         return drift_evidence(carry, self.factor())
@@ -240,7 +252,7 @@ class FreeJudge:
         doubt = ""
         if carry is not None and not self.drifting and self._evidence(carry) > 1.0:
             doubt = CLOCKS_IN_DOUBT
-        if carry is not None and not self._imu_off and imu_evidence(carry, self.factor()) > 0.0:
+        if carry is not None and not self._imu_off and self._imu_evidence(carry) > 0.0:
             doubt = imu_doubt.IMU_IN_DOUBT
         self.status, reason, advice = self._decide(camera is not None, running, missing, doubt)
         if advice and carry is not None:
@@ -270,9 +282,8 @@ class FreeJudge:
     def _camera(self, carry: Carry) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
-        factor = self.factor()
-        imu_off = 1.0 if self._imu_off else imu_doubt.probability(imu_evidence(carry, factor))
-        doubts = Doubts(factor, self.drifting, imu_off, gyro_frame=not self._imu_asked)
+        off = self._imu_is_off(carry)
+        doubts = Doubts(self.factor(), self.drifting, off, gyro_frame=not self._imu_asked)
         return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:
