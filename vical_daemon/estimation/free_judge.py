@@ -47,6 +47,7 @@ _DOUBT = 1e-5  # chance of a window that disagrees this much
 _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
+_IMAGES_FIT = 4.0  # an imu that is 1 % off makes it 2 to 3
 _BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
 _TURN_AND_MOVE = "turn the rig about all three axes while moving it to and fro"
 _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
@@ -177,7 +178,7 @@ class FreeJudge:
     def _imu_evidence(self, carry: Carry) -> float:
         """Where windows disagree it is the images that do not fit, whatever the imu may be."""
         factor = self.factor()
-        return -np.inf if factor > _MODEL_FITS else imu_evidence(carry, factor)
+        return -np.inf if factor > _IMAGES_FIT else imu_evidence(carry, factor)
 
     def _imu_is_off(self, carry: Carry) -> float:
         """Probability that it is; before two windows could be compared, it may as well be the images."""
