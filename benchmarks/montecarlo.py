@@ -131,6 +131,9 @@ CASES: dict[str, Case] = {
         estimate=frozenset({"imu_intrinsics"}),
         trials=20,
     ),
+    "target-free, imu 0.3 % off": Case(
+        lens_known=True, target_free=True, imu_off=3e-3, bound={"imu_matrix_prior": 3e-3}, trials=20
+    ),
     "target-free, skew 100 ppm": Case(lens_known=True, target_free=True, skew_ppm=100.0, trials=20),
 }
 
