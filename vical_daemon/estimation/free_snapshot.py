@@ -21,7 +21,7 @@ from vical_daemon.estimation.free_carry import (
     Carry,
     moved,
 )
-from vical_daemon.estimation.imu_doubt import ENTRY_SIGMA, log_bayes_factor, turn
+from vical_daemon.estimation.imu_doubt import log_bayes_factor, turn
 from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
@@ -45,7 +45,7 @@ def drift_evidence(carry: Carry, factor: float) -> float:
 
 def imu_evidence(carry: Carry, factor: float) -> float:
     """Return by how much an imu whose matrices are not the identity is likelier (log of Bayes' factor)."""
-    return log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], ENTRY_SIGMA, factor)
+    return log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], factor)
 
 
 class Doubts(NamedTuple):

@@ -49,17 +49,16 @@ def _factor(f: CalibrationFilter) -> float:
     return max((c.factor for c in f.consistency.values()), default=1.0)
 
 
-def log_bayes_factor(entries: FloatArray, covariance: FloatArray, sigma: float, factor: float) -> float:
+def log_bayes_factor(entries: FloatArray, covariance: FloatArray, factor: float) -> float:
     """Logarithm of how much more likely the data are if the entries are not zero.
 
     Args:
-        entries: As estimated, shape (15,).
+        entries: As estimated with a prior of `ENTRY_SIGMA`, shape (15,).
         covariance: Of them, shape (15, 15).
-        sigma: Of their prior.
         factor: What was learnt beyond the prior is worth so many times less than the covariance says.
     """
-    values, unit = entries / sigma, np.eye(len(entries))
-    information = np.linalg.inv(covariance / sigma**2)
+    values, unit = entries / ENTRY_SIGMA, np.eye(len(entries))
+    information = np.linalg.inv(covariance / ENTRY_SIGMA**2)
     tempered = unit + (information - unit) / factor
     weighted = information @ values / factor
     fits = float(weighted @ np.linalg.solve(tempered, weighted))
@@ -87,7 +86,7 @@ def log_evidence(f: CalibrationFilter) -> float:
     where = _entries(f.layout)
     if where is None or any(c.scale > _FITS for c in f.consistency.values()):
         return -_MOST
-    return log_bayes_factor(_values(f), f.S[where] @ f.S[where].T, ENTRY_SIGMA, _factor(f))
+    return log_bayes_factor(_values(f), f.S[where] @ f.S[where].T, _factor(f))
 
 
 def off(f: CalibrationFilter) -> float:
