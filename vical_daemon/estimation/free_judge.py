@@ -7,24 +7,10 @@ from collections import deque
 import numpy as np
 from scipy.stats import chi2
 
-from vical_daemon.estimation import imu_doubt
-from vical_daemon.estimation.clock_drift import (
-    CLOCKS_APART,
-    CLOCKS_IN_DOUBT,
-    SURE,
-    drift_told,
-    probability,
-)
 from vical_daemon.estimation.free_bundle import Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry
-from vical_daemon.estimation.free_snapshot import (
-    Doubts,
-    camera_estimate,
-    drift_evidence,
-    imu_estimate,
-    imu_evidence,
-)
-from vical_daemon.estimation.imu_doubt import ENTRY_SIGMA, KNOWN_OFF_SIGMA
+from vical_daemon.estimation.free_doubts import FreeDoubts
+from vical_daemon.estimation.free_snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
 from vical_daemon.estimation.result import (
@@ -47,7 +33,6 @@ _DOUBT = 1e-5  # chance of a window that disagrees this much
 _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
-_IMAGES_FIT = 4.0  # an imu that is 1 % off makes it 2 to 3
 _BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
 _TURN_AND_MOVE = "turn the rig about all three axes while moving it to and fro"
 _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
@@ -84,9 +69,7 @@ class FreeJudge:
         self._bumped = ""
         self._quiet = ""
         self._jitter_told = False
-        self.drifting = False  # the clock of the camera is known to run apart from the imu's
-        self._imu_asked = self._imu_off = "imu_intrinsics" in options.estimate
-        self.imu_sigma = KNOWN_OFF_SIGMA if self._imu_asked else ENTRY_SIGMA
+        self.doubts = FreeDoubts(camera, imu_asked="imu_intrinsics" in options.estimate)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -133,7 +116,7 @@ class FreeJudge:
     def changed(self, why: str) -> None:
         """The rig is not what it was."""
         self.events.append(f"bumped: {why}" if self._ever_converged else f"started over: {why}")
-        self._bumped, self._quiet, self.drifting = why, "", False
+        self._bumped, self._quiet, self.doubts.drifting = why, "", False
         self._started_s, self._windows = None, 0
         self._agreement.clear()
 
@@ -156,39 +139,9 @@ class FreeJudge:
         self._now_s, self._sigma_px, self.jitter_s = t_s, fit.sigma_px, fit.jitter_s
         self._squares.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
-        self._watch_clocks(fit.carry)
-        self._watch_imu(fit.carry)
+        self.events += self.doubts.watch(fit.carry, self.factor(), bool(self._agreement))
         if self._trace.due(t_s):
             self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
-
-    def _watch_clocks(self, carry: Carry) -> None:
-        """Announce a drift that is beyond doubt."""
-        if self.drifting or probability(self._evidence(carry)) < SURE:
-            return
-        self.drifting = True
-        sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
-        self.events.append(drift_told(self.camera, CLOCKS_APART, carry.camera.skew, sigma))
-
-    def _watch_imu(self, carry: Carry) -> None:
-        """Announce an imu whose matrices are beyond doubt not the identity."""
-        if not self._imu_off and self._agreement and imu_doubt.surely_off(self._imu_evidence(carry)):
-            self._imu_off = True
-            self.events.append(imu_doubt.told(carry.imu))
-
-    def _imu_evidence(self, carry: Carry) -> float:
-        """Where windows disagree it is the images that do not fit, whatever the imu may be."""
-        factor = self.factor()
-        return -np.inf if factor > _IMAGES_FIT else imu_evidence(carry, factor)
-
-    def _imu_is_off(self, carry: Carry) -> float:
-        """Probability that it is; before two windows could be compared, it may as well be the images."""
-        if self._imu_off:
-            return 1.0
-        off = imu_doubt.probability(self._imu_evidence(carry))
-        return off if self._agreement else min(off, 0.5)
-
-    def _evidence(self, carry: Carry) -> float:
-        return drift_evidence(carry, self.factor())
 
     def closed(self) -> None:
         """A window is complete and agreed."""
@@ -250,11 +203,7 @@ class FreeJudge:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
         missing = [] if camera is None or carry is None else self._missing(camera, carry)
-        doubt = ""
-        if carry is not None and not self.drifting and self._evidence(carry) > 1.0:
-            doubt = CLOCKS_IN_DOUBT
-        if carry is not None and not self._imu_off and self._imu_evidence(carry) > 0.0:
-            doubt = imu_doubt.IMU_IN_DOUBT
+        doubt = "" if carry is None else self.doubts.reason(carry, self.factor())
         self.status, reason, advice = self._decide(camera is not None, running, missing, doubt)
         if advice and carry is not None:
             advice = shortcoming(self._motion, carry.camera.R_imu_cam, carry.bias[:3]) or advice
@@ -273,7 +222,7 @@ class FreeJudge:
             self.frames_seen,
             self.imu_samples,
             {} if camera is None else {self.camera: camera},
-            None if carry is None else imu_estimate(carry, matrices_told=self._imu_asked),
+            None if carry is None else imu_estimate(carry, matrices_told=self.doubts.imu_asked),
             gravity,
             self.nis_per_dof(),
             refused / max(seen, 1),
@@ -283,8 +232,7 @@ class FreeJudge:
     def _camera(self, carry: Carry) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
-        off = self._imu_is_off(carry)
-        doubts = Doubts(self.factor(), self.drifting, off, gyro_frame=not self._imu_asked)
+        doubts = self.doubts.weighed(carry, self.factor(), bool(self._agreement))
         return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[Missing]:

@@ -21,7 +21,7 @@ from vical_daemon.estimation.free_carry import (
     Carry,
     moved,
 )
-from vical_daemon.estimation.imu_doubt import log_bayes_factor, turn
+from vical_daemon.estimation.imu_doubt import turn
 from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
@@ -29,23 +29,6 @@ from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.unshown_axes import held_covariance
 
 _GYRO = slice(IMU.start, IMU.start + 9)
-
-
-def drift_evidence(carry: Carry, factor: float) -> float:
-    """Return how much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated.
-
-    Args:
-        carry: What is known.
-        factor: Measured variance over the stated one.
-    """
-    if not carry.active[DRIFT]:
-        return 0.0
-    return evidence(carry.camera.skew, factor * float(carry.calibration()[DRIFT, DRIFT]))
-
-
-def imu_evidence(carry: Carry, factor: float) -> float:
-    """Return by how much an imu whose matrices are not the identity is likelier (log of Bayes' factor)."""
-    return log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], factor)
 
 
 class Doubts(NamedTuple):

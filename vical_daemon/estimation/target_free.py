@@ -190,7 +190,7 @@ class TargetFreeCalibrator:
             self.judge.waiting(attempt, self.starter.motion_missing)
             return False
         window = attempt
-        carry = afresh(window, known, self.active, self.starter.held, self.judge.imu_sigma)
+        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma)
         bundle = Bundle(window, carry, *self._noise)
         fit = bundle.solve(self._buffer, _STEPS_START)
         if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
@@ -260,7 +260,7 @@ class TargetFreeCalibrator:
         self.judge.closed()
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
-        drifting, noise = self.judge.drifting, self.options.imu_noise
+        drifting, noise = self.judge.doubts.drifting, self.options.imu_noise
         self.carry = aged(fit.carry, noise, self.active, window.span_s, drifting=drifting)
         self.window = next_window(window, self.carry)
 

@@ -167,9 +167,9 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
     judge = FreeJudge(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
-    judge.drifting = True
+    judge.doubts.drifting = True
     judge.changed("the camera moved")
-    assert not judge.drifting
+    assert not judge.doubts.drifting
 
 
 def test_a_drifting_clock_is_followed_also_over_darkness():

@@ -1,0 +1,89 @@
+"""Hypotheses that a target-free calibration keeps beside each other: do clocks drift, is the imu off?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation import imu_doubt
+from vical_daemon.estimation.clock_drift import (
+    CLOCKS_APART,
+    CLOCKS_IN_DOUBT,
+    SURE,
+    drift_told,
+    evidence,
+    probability,
+)
+from vical_daemon.estimation.free_carry import DRIFT, IMU, Carry
+from vical_daemon.estimation.free_snapshot import Doubts
+
+_IMAGES_FIT = 4.0  # measured variance over the stated one; an imu that is 1 % off makes it 2 to 3
+
+
+class FreeDoubts:
+    """Follows what the windows say about clocks and imu.
+
+    Args:
+        camera: Name of the camera.
+        imu_asked: The imu's matrices are asked for: they are estimated whatever the evidence.
+
+    Attributes:
+        drifting: The camera's clock is known to run apart from the imu's.
+        imu_sigma: Prior of the entries of the imu's matrices.
+    """
+
+    def __init__(self, camera: str, *, imu_asked: bool) -> None:
+        self._camera = camera
+        self.imu_asked = self._imu_off = imu_asked
+        self.imu_sigma = imu_doubt.KNOWN_OFF_SIGMA if imu_asked else imu_doubt.ENTRY_SIGMA
+        self.drifting = False
+
+    def watch(self, carry: Carry, factor: float, compared: bool) -> list[str]:
+        """Announce what has got beyond doubt.
+
+        Args:
+            carry: What is known.
+            factor: Measured variance over the stated one.
+            compared: Windows could be compared; before, what looks like the imu may as well be the images.
+        """
+        events = []
+        if not self.drifting and probability(self._drift(carry, factor)) >= SURE:
+            self.drifting = True
+            sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
+            events.append(drift_told(self._camera, CLOCKS_APART, carry.camera.skew, sigma))
+        if not self._imu_off and compared and imu_doubt.surely_off(self._imu(carry, factor)):
+            self._imu_off = True
+            events.append(imu_doubt.told(carry.imu))
+        return events
+
+    def reason(self, carry: Carry, factor: float) -> str:
+        """What may not be as it is taken to be, in words; empty where nothing speaks for it."""
+        if not self._imu_off and self._imu(carry, factor) > 0.0:
+            return imu_doubt.IMU_IN_DOUBT
+        if not self.drifting and self._drift(carry, factor) > 1.0:
+            return CLOCKS_IN_DOUBT
+        return ""
+
+    def weighed(self, carry: Carry, factor: float, compared: bool) -> Doubts:
+        """How likely each is, for what is told; arguments as for `watch`."""
+        off = 1.0
+        if not self._imu_off:
+            off = imu_doubt.probability(self._imu(carry, factor))
+            off = off if compared else min(off, 0.5)
+        return Doubts(factor, self.drifting, off, gyro_frame=not self.imu_asked)
+
+    @staticmethod
+    def _drift(carry: Carry, factor: float) -> float:
+        """How much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated."""
+        if not carry.active[DRIFT]:
+            return 0.0
+        return evidence(carry.camera.skew, factor * float(carry.calibration()[DRIFT, DRIFT]))
+
+    @staticmethod
+    def _imu(carry: Carry, factor: float) -> float:
+        """By how much an imu that is off is likelier (logarithm of Bayes' factor).
+
+        Where windows disagree it is the images that do not fit, whatever the imu may be.
+        """
+        if factor > _IMAGES_FIT:
+            return -np.inf
+        return imu_doubt.log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], factor)
