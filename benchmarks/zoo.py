@@ -71,7 +71,15 @@ def draw_sampling(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def draw(seed: int, seconds: float, *, target_free: bool) -> tuple[SimulatedRun, bool]:
+def draw_matrices(seed: int) -> dict[str, Any]:
+    """Scale and alignment from 0.03 to 1 % off; what of the gyro's is no turn of the frame."""
+    rng = np.random.default_rng([seed, 72])
+    size = float(np.exp(rng.uniform(np.log(3e-4), np.log(1e-2))))
+    G, A = size * rng.standard_normal((2, 3, 3))
+    return {"gyro_matrix": np.eye(3) + 0.5 * (G + G.T), "accel_matrix": np.eye(3) + A}
+
+
+def draw(seed: int, seconds: float, *, target_free: bool, imu_off: bool = False) -> tuple[SimulatedRun, bool]:
     """A recording of the rig of this seed, and whether its lens is told."""
     rng = np.random.default_rng([seed, 71])
     lens, densities, sampling = draw_lens(rng), draw_densities(rng), draw_sampling(rng)
@@ -100,6 +108,7 @@ def draw(seed: int, seconds: float, *, target_free: bool) -> tuple[SimulatedRun,
         R_imu_cam=R,
         p_imu_cam=p,
         lens=lens,
+        **(draw_matrices(seed) if imu_off else {}),
     )
     lens_told = bool(rng.random() < 0.3)
     if not target_free:
@@ -112,9 +121,9 @@ def draw(seed: int, seconds: float, *, target_free: bool) -> tuple[SimulatedRun,
     return run, lens_told
 
 
-def trial(target_free: bool, seconds: float, seed: int) -> runner.Result:
+def trial(target_free: bool, imu_off: bool, seconds: float, seed: int) -> runner.Result:
     """One rig, nothing given but its noise densities and a lens 3 % off."""
-    run, told = draw(seed, seconds, target_free=target_free)
+    run, told = draw(seed, seconds, target_free=target_free, imu_off=imu_off)
     prior = camera_prior(run, seed, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=told)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"}) if told else frozenset(),
@@ -168,14 +177,15 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks zoo", description=__doc__)
     runner.add_arguments(parser, trials=40, seconds=25.0)
     parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
+    parser.add_argument("--imu-off", action="store_true", help="imus whose scale and alignment are not true")
     args = parser.parse_args(argv)
-    name = "free" if args.target_free else "board"
+    name = ("free" if args.target_free else "board") + ("_imu_off" if args.imu_off else "")
     code = runner.fingerprint(
         "vical_daemon/estimation", "benchmarks/feed.py", "benchmarks/zoo.py", "mocks/vical_mocks"
     )
     results = runner.run_trials(
         f"zoo_{name}_{args.seconds:g}s",
-        partial(trial, args.target_free, args.seconds),
+        partial(trial, args.target_free, args.imu_off, args.seconds),
         runner.seeds_of(args),
         args,
         code,
