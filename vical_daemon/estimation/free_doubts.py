@@ -16,8 +16,6 @@ from vical_daemon.estimation.clock_drift import (
 from vical_daemon.estimation.free_carry import DRIFT, IMU, Carry
 from vical_daemon.estimation.free_snapshot import Doubts
 
-_IMAGES_FIT = 4.0  # measured variance over the stated one; an imu that is 1 % off makes it 2 to 3
-
 
 class FreeDoubts:
     """Follows what the windows say about clocks and imu.
@@ -82,8 +80,7 @@ class FreeDoubts:
     def _imu(carry: Carry, factor: float) -> float:
         """By how much an imu that is off is likelier (logarithm of Bayes' factor).
 
-        Where windows disagree it is the images that do not fit, whatever the imu may be.
+        Where windows disagree although the entries are free, it is the images, and what they say about the
+        imu is worth less by as much again.
         """
-        if factor > _IMAGES_FIT:
-            return -np.inf
-        return imu_doubt.log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], factor)
+        return imu_doubt.log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], factor**2)

@@ -31,7 +31,6 @@ _OFF = 0.05  # share of rigs where they are not, to begin with
 _SURE = 0.99
 _EVERY_S = 1.0
 _MOST = 300.0  # of a logarithm
-_FITS = 4.0  # corner scale above which it is the images that do not fit, whatever the imu may be
 
 
 def _entries(layout: Layout) -> slice | None:
@@ -82,11 +81,16 @@ def told(entries: FloatArray) -> str:
 
 
 def log_evidence(f: CalibrationFilter) -> float:
-    """`log_bayes_factor` of a filter's entries."""
+    """`log_bayes_factor` of a filter's entries.
+
+    Where images miss by more than their noise although the entries are free, it is the images (a lens that is
+    held and wrong, a crooked board), and what they say about the imu is worth less by as much again.
+    """
     where = _entries(f.layout)
-    if where is None or any(c.scale > _FITS for c in f.consistency.values()):
+    if where is None:
         return -_MOST
-    return log_bayes_factor(_values(f), f.S[where] @ f.S[where].T, _factor(f))
+    misfit = max((c.scale for c in f.consistency.values()), default=1.0)
+    return log_bayes_factor(_values(f), f.S[where] @ f.S[where].T, _factor(f) * misfit)
 
 
 def off(f: CalibrationFilter) -> float:
