@@ -36,3 +36,13 @@ def test_reaches_kalibrs_result_from_rough_intrinsics_alone(capsys):
     sigma = np.sqrt(np.diag(camera["T_imu_cam"]["covariance"]))
     assert np.all(sigma[:3] > 2e-4)  # honest: a plain filter claims 0.08 mm here
     assert np.all(sigma[:3] < 2e-3)
+
+
+def test_a_lens_that_radtan_does_not_quite_fit_is_no_knock(capsys):
+    """After the hole at 59 s half a board at the image's edge had been told as `bumped`."""
+    arguments = ["--target", str(FOLDER / "target.yaml"), "--initial", str(FOLDER / "initial.yaml")]
+    code = main(["calibrate", str(FOLDER), *arguments, "--json", "--quiet"])
+    result = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert result["status"] == "converged"
+    assert not any("bumped" in event for event in result["events"])

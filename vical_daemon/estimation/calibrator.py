@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation import imu_doubt
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, drift_told, in_doubt
@@ -18,8 +19,6 @@ from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.imu_doubt import ImuDoubt
-from vical_daemon.estimation.imu_doubt import in_doubt as imu_in_doubt
 from vical_daemon.estimation.judge import Judge
 from vical_daemon.estimation.measurements import (
     BoolArray,
@@ -70,7 +69,7 @@ class Calibrator:
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
         self._shape_start = ShapeStart(self._step)
-        self._imu_doubt = ImuDoubt()
+        self._imu_doubt = imu_doubt.ImuDoubt()
 
     def _lay_out(self, estimate: frozenset[str]) -> Layout:
         models = {name: prior.distortion_model for name, prior in self.priors.items()}
@@ -296,7 +295,7 @@ class Calibrator:
         """Return what is known now."""
         drifting = self.filter is not None and any(in_doubt(self.filter, name) for name in self.priors)
         self.judge.clocks_in_doubt = drifting or self.watch.doubtful
-        self.judge.imu_in_doubt = self.filter is not None and imu_in_doubt(self.filter)
+        self.judge.imu_in_doubt = self.filter is not None and imu_doubt.in_doubt(self.filter)
         held = "intrinsics" in self.options.fix
         self.judge.target_in_doubt = (
             not held

@@ -114,8 +114,11 @@ class Consistency:
 
     @property
     def alarmed(self) -> bool:
-        """The innovations have jumped: allowed for by how long this rig's errors usually last."""
-        return self.images > _LAGS and self.alarm > _CUSUM_LIMIT * self.factor
+        """The innovations have jumped: allowed for by how long this rig's errors usually last, and how large.
+
+        Where lens or board do not fit, the view decides: half a board at the image's edge is no knock.
+        """
+        return self.images > _LAGS and self.alarm > _CUSUM_LIMIT * self.factor * np.sqrt(self.scale)
 
     @property
     def level(self) -> float:

@@ -50,7 +50,8 @@ class FreeDoubts:
             events.append(drift_told(self._camera, CLOCKS_APART, carry.camera.skew, sigma))
         if not self._imu_off and compared and imu_doubt.surely_off(self._imu(carry, factor)):
             self._imu_off = True
-            events.append(imu_doubt.told(carry.imu))
+            sigmas = np.sqrt(factor * np.diag(carry.calibration())[IMU])
+            events.append(imu_doubt.told(carry.imu, sigmas))
         return events
 
     def reason(self, carry: Carry, factor: float) -> str:

@@ -1,10 +1,10 @@
 """Are the IMU's scale and alignment as its readings say? Both answers are kept, as for clocks that drift.
 
 To ask every IMU for its two matrices would make lever arm and mounting two to three times less certain; one
-whose axes are off by 0.2 %, as most are, taken as true, puts them ten stated sigmas off within a minute. So
-the filter always has the fifteen entries among its states. That they are zero is a hypothesis beside it: its
-Gaussian is the filter's own, conditioned on that, and its odds come from how far the entries lie from zero
-(Savage-Dickey density ratio). What is told are mean and covariance of the mixture.
+whose axes are off by 0.2 %, taken as true, puts them ten stated sigmas off within a minute. So the filter
+always has the fifteen entries among its states. That they are zero is a hypothesis beside it: its Gaussian is
+the filter's own, conditioned on that, and its odds come from how far the entries lie from zero (Savage-Dickey
+density ratio). What is told are mean and covariance of the mixture.
 [docs/math/filter.md, eq. (18)]
 """
 
@@ -74,10 +74,11 @@ def surely_off(log_evidence: float) -> bool:
     return probability(log_evidence) > _SURE
 
 
-def told(entries: FloatArray) -> str:
-    """The announcement."""
-    percent = 100.0 * float(np.abs(entries).max())
-    return f"scale and alignment of the imu are off by up to {percent:.1f} %: allowed for from now on"
+def told(entries: FloatArray, sigmas: FloatArray) -> str:
+    """The announcement, with the entry that is off beyond all others."""
+    surest = int(np.argmax(np.abs(entries) / sigmas))
+    percent, sigma = 100.0 * abs(float(entries[surest])), 100.0 * float(sigmas[surest])
+    return f"scale or alignment of the imu is off, by {percent:.2f} +- {sigma:.2f} %: allowed for from now on"
 
 
 def log_evidence(f: CalibrationFilter) -> float:
@@ -89,8 +90,11 @@ def log_evidence(f: CalibrationFilter) -> float:
     where = _entries(f.layout)
     if where is None:
         return -_MOST
-    misfit = max((c.scale for c in f.consistency.values()), default=1.0)
-    return log_bayes_factor(_values(f), f.S[where] @ f.S[where].T, _factor(f) * misfit)
+    return log_bayes_factor(_values(f), f.S[where] @ f.S[where].T, _factor(f) * _misfit(f))
+
+
+def _misfit(f: CalibrationFilter) -> float:
+    return max((c.scale for c in f.consistency.values()), default=1.0)
 
 
 def off(f: CalibrationFilter) -> float:
@@ -154,8 +158,11 @@ def turn(M: FloatArray) -> FloatArray:
 
 
 def in_doubt(f: CalibrationFilter) -> bool:
-    """Whether the data speak for entries that are not zero, though not yet surely."""
-    return not f.imu_off and log_evidence(f) > 0.0
+    """Whether the data speak for entries that are not zero, though not yet surely: they soon will.
+
+    Images that do not fit may never decide it; what is told covers both then.
+    """
+    return not f.imu_off and _misfit(f) == 1.0 and log_evidence(f) > 0.0
 
 
 def _widen(f: CalibrationFilter) -> None:
@@ -190,4 +197,5 @@ class ImuDoubt:
             return ""
         _widen(f)
         f.imu_off = True
-        return told(_values(f))
+        where = _entries(f.layout)
+        return told(_values(f), np.sqrt(_factor(f)) * f.sigmas()[where])

@@ -17,11 +17,11 @@ def prior(run):
     return {"cam0": CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))}
 
 
-def calibrate(run, options=None, cameras=None, force_scale=1.0, each=None):
+def calibrate(run, options=None, cameras=None, force_scale=1.0, each=None, target_m=None):
     c = Calibrator(
         options or CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise()),
         cameras or prior(run),
-        run.points_m,
+        run.points_m if target_m is None else target_m,
     )
     frames = iter(run.frames)
     frame = next(frames, None)

@@ -58,6 +58,20 @@ def test_a_jump_is_an_alarm_within_half_a_second():
     pytest.fail("no alarm")
 
 
+def test_the_larger_the_misfit_the_more_it_takes_to_alarm():
+    """Half a board at the edge of a badly fitting lens is no knock; a jump of two sigmas still is one."""
+    c, rng = Consistency(), np.random.default_rng(0)
+    feed(c, rng, 1500, size=2.0)
+    c.alarm = 1.9 * consistency._CUSUM_LIMIT
+    assert c.scale == pytest.approx(4.0, rel=0.15)
+    assert not c.alarmed
+    alarms = []
+    for _ in range(10):
+        feed(c, rng, 1, size=2.0, common=np.full((1, 8), 1.0))
+        alarms.append(c.alarmed)
+    assert any(alarms)
+
+
 def test_most_small_changes_are_an_alarm_within_two_seconds():
     """Innovations of twice their variance; what is not noticed soon is taken for noise, by the scale."""
     delays = []

@@ -96,6 +96,8 @@ def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_le
     lasting, *_ = some_filter(3.0, factor=8.0)
     assert log_evidence(misfit) == pytest.approx(log_evidence(lasting), rel=1e-12)
     assert log_evidence(misfit) < 0.2 * log_evidence(some_filter(3.0)[0])
+    assert log_evidence(misfit) > 0.0
+    assert not in_doubt(misfit)  # such images may never decide it: what is told covers both
 
 
 @pytest.mark.parametrize(("factor", "size"), [(1.0, 0.75), (3.0, 1.2)])
@@ -121,7 +123,7 @@ def test_once_announced_the_answer_is_that_of_a_wide_prior():
     f, _, _, entries, (H, z, noise, sigma) = some_filter(3.0)
     doubt = ImuDoubt()
     told = doubt.look(f)
-    assert "scale and alignment of the imu" in told
+    assert "scale or alignment of the imu" in told
     assert off(f) == 1.0
     assert doubt.look(f) == ""
     wide = sigma.copy()
@@ -129,8 +131,9 @@ def test_once_announced_the_answer_is_that_of_a_wide_prior():
     P = np.linalg.inv(np.diag(wide**-2) + H.T @ H / noise**2)
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(values(f.state), (P @ H.T @ z / noise**2)[entries], atol=1e-8)
-    largest = 100.0 * np.abs(values(f.state)).max()
-    assert f"{largest:.1f} %" in told
+    m, sigmas = 100.0 * (P @ H.T @ z / noise**2)[entries], 100.0 * np.sqrt(np.diag(P))[entries]
+    surest = np.argmax(np.abs(m) / sigmas)
+    assert f"{abs(m[surest]):.2f} +- {sigmas[surest]:.2f} %" in told
 
 
 def test_the_gyros_frame_is_that_in_which_its_matrix_is_symmetric():
@@ -184,7 +187,7 @@ def largest_z(snapshot):
 @pytest.mark.parametrize("size", [3e-3, 1e-2])
 def test_an_imu_that_is_off_is_noticed_and_nothing_told_is_far_out(size):
     record = calibrated(2, size)  # taken as true: 12 sigma at ten seconds, `converged`
-    assert any("scale and alignment" in text for _, text in record.events)
+    assert any("scale or alignment" in text for _, text in record.events)
     assert all(largest_z(s) < 4.0 for s in record.snapshots if s.status == "converged")
     assert largest_z(record.snapshots[-1]) < 3.5
     assert record.snapshots[-1].status == "converged"
@@ -192,7 +195,7 @@ def test_an_imu_that_is_off_is_noticed_and_nothing_told_is_far_out(size):
 
 def test_a_true_imu_pays_nothing():
     record = calibrated(1, 0.0)
-    assert not any("scale and alignment" in text for _, text in record.events)
+    assert not any("scale or alignment" in text for _, text in record.events)
     sigma = np.sqrt(np.diag(record.snapshots[-1].covariance))
     assert sigma[0] < 5e-4  # half of what it is with the matrices estimated
     assert record.snapshots[-1].status == "converged"

@@ -5,9 +5,9 @@ import pytest
 from vical_mocks.points import board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
 
+from tests.unit.estimation import test_calibrator
 from tests.unit.estimation.test_calibrator import errors
-from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.shape_start import ShapeStart
 from vical_daemon.estimation.target_modes import MODES, TargetModes
@@ -62,19 +62,8 @@ def calibrate(run, estimate=frozenset(), *, lens_held=False, each=None):
     if lens_held:
         start = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
     fix = frozenset({"intrinsics"} if lens_held else ())
-    c = Calibrator(CalibrationOptions(fix=fix, estimate=estimate), {"cam0": start}, BOARD)
-    frames = iter(run.frames)
-    frame = next(frames, None)
-    for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True):
-        c.add_imu(int(t), w, f)
-        while frame is not None and frame.t_cam_ns <= t:
-            c.add_points(PointsFrame("cam0", frame.t_cam_ns, frame.ids, frame.uv_px))
-            c.process()
-            if each is not None:
-                each(c)
-            frame = next(frames, None)
-    c.finish()
-    return c
+    options = CalibrationOptions(fix=fix, estimate=estimate)
+    return test_calibrator.calibrate(run, options, {"cam0": start}, each=each, target_m=BOARD)
 
 
 def test_a_crooked_board_is_found_and_the_lens_with_it(crooked):
