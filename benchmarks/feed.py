@@ -214,10 +214,10 @@ class CalibratorSubject:
         sigmas = [camera.timeshift_sigma_s, *camera.intrinsics_sigma, *camera.distortion_sigma]
         claimed[range(6, 15), range(6, 15)] = np.square(sigmas)
         inner = getattr(self.calibrator, "filter", None)
-        if inner is None or not hasattr(inner, "covariance"):
+        if inner is None:
             return claimed
         rows, places = self._rows(inner.layout.cameras[CAMERA])
-        joint = inner.covariance(rows)
+        joint = self.calibrator.judge.weighed(inner).covariance(rows)
         correlation = joint / np.sqrt(np.outer(np.diag(joint), np.diag(joint)))
         sigma = np.sqrt(np.diag(claimed))[places]
         full = np.zeros((15, 15))

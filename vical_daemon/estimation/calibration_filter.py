@@ -67,8 +67,7 @@ class CalibrationFilter:
         doubt: Whether the target is as stated, by camera; empty where its shape is estimated.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
-        imu_off: The imu's matrices, where they are estimated, are known not to be the identity (see
-            `imu_doubt`).
+        off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
     """
@@ -85,7 +84,7 @@ class CalibrationFilter:
     doubt: dict[str, TargetDoubt] = field(default_factory=dict)
     unshown: UnshownAxes | None = None
     drifting: set[str] = field(default_factory=set)
-    imu_off: bool = True
+    off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
     _motion_straight: Straightness = field(default_factory=Straightness)
@@ -222,7 +221,12 @@ class CalibrationFilter:
             values = np.concatenate([camera.intrinsics, camera.distortion])
             by_lens = ways @ lin.by_error[:, where.intrinsics.start : where.distortion.stop]
         if agreement is not None and free:
-            agreement.learn(t_s, innovation, by_pose, by_lens, values)
+            as_stated = innovation
+            if self.layout.target_shape is not None and "target_shape" not in self.off:
+                as_stated = innovation + ways @ (
+                    lin.by_error[:, self.layout.target_shape] @ self.state.target_shape
+                )
+            agreement.learn(t_s, as_stated, by_pose, by_lens, values)
         if doubt is not None and asked:
             # a point that moves in the world looks as if the camera moved the other way
             by_place = -by_pose[:, 3:].reshape(-1, 2, 3)

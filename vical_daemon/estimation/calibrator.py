@@ -6,15 +6,16 @@ short lag (so that inertial data always bracket each image) -> `judge` says how 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation import imu_doubt
+from vical_daemon.estimation import clock_drift, hypotheses
+from vical_daemon.estimation.beyond_doubt import BeyondDoubt
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
-from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, drift_told, in_doubt
+from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, drift_told
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
@@ -29,7 +30,6 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.seen_poses import Lens, pose_of
-from vical_daemon.estimation.shape_start import ShapeStart
 from vical_daemon.estimation.stamp_steps import StampSteps
 from vical_daemon.estimation.starting import LATE_S, Starting
 from vical_daemon.estimation.state import Layout, make_layout
@@ -64,17 +64,23 @@ class Calibrator:
         self._base_ns = 0
         self._stamps = StampSteps()
         self._pending = FrameQueue(list(cameras))
-        self._starting = Starting(options, self.layout, self.target, self._step)
+        self._starting = self._new_starting()
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
-        self._shape_start = ShapeStart(self._step)
-        self._imu_doubt = imu_doubt.ImuDoubt()
+        self._beyond_doubt = BeyondDoubt()
 
     def _lay_out(self, estimate: frozenset[str]) -> Layout:
         models = {name: prior.distortion_model for name, prior in self.priors.items()}
-        entries = estimate | {"imu_intrinsics"}  # always states, see `imu_doubt`
-        return make_layout(models, fix=self.options.fix, estimate=entries, target_m=self.target)
+        states = estimate | {hypotheses.IMU}  # always states, see `hypotheses`
+        if "intrinsics" not in self.options.fix:  # else what is missed may as well be the lens
+            states |= {hypotheses.TARGET}
+        return make_layout(models, fix=self.options.fix, estimate=states, target_m=self.target)
+
+    def _new_starting(self, off: Collection[str] = ()) -> Starting:
+        """For a rig of which it is known what is not as stated."""
+        options = replace(self.options, estimate=self.options.estimate | set(off))
+        return Starting(options, self.layout, self.target, self._step)
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -141,7 +147,6 @@ class Calibrator:
         later = self._pending.take_all()
         self.filter, self._stale = found.filter, None
         self._held_back = HeldBack()
-        self._shape_start.forget()
         self.judge.started(self.filter.state.t_s, found.reason)
         self.watch.started(self.filter.state.t_s)
         self._starting.anew()
@@ -187,9 +192,7 @@ class Calibrator:
         if f.unshown is not None:
             self._starting.take([(t_cam_s, frame)])
             f.unshown.follow(f)
-        elif f.doubt and "intrinsics" not in self.options.fix:
-            self._shape_start.take(t_cam_s, frame)
-        needed_s = min(f.state.t_s, self._starting.oldest_s, self._shape_start.oldest_s)
+        needed_s = min(f.state.t_s, self._starting.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
         ratio = self._held_back_ratio(frame, t_cam_s)
         if ratio is not None:
@@ -199,38 +202,21 @@ class Calibrator:
             self._restart(f)
             return report
         self.judge.saw_frame(report, f)
-        told = self._imu_doubt.look(f)
-        if told:
-            self.judge.announce(told, once="imu")
+        for block, told in self._beyond_doubt.look(f).items():
+            self.judge.announce(told, once=block)
         self._act(self.watch.look(report, f), frame, t_cam_s)
-        if self.filter is f and any(doubt.off_m is not None for doubt in f.doubt.values()):
-            self._target_is_off(f)
+        self._maybe_off(f)
         return report
 
-    def _target_is_off(self, f: CalibrationFilter) -> None:
-        """The target is not as stated: estimate its shape, too, from all that is kept."""
-        assert self._buffer is not None
-        off_mm = 1e3 * max(float(np.abs(d.off_m).max()) for d in f.doubt.values() if d.off_m is not None)
-        seen = f"corners lie up to {off_mm:.1f} mm beside their stated places"
-        if "intrinsics" in self.options.fix:  # it may as well be the lens
-            self.judge.announce(f"{seen}, or the lens that is held is not this camera's", once="target")
+    def _maybe_off(self, f: CalibrationFilter) -> None:
+        """With the lens held, tell that target or lens are not as stated; neither is estimated."""
+        off_mm = [1e3 * float(np.abs(d.off_m).max()) for d in f.doubt.values() if d.off_m is not None]
+        if off_mm:
+            seen = f"corners lie up to {max(off_mm):.1f} mm beside their stated places"
+            self.judge.announce(
+                f"{seen}, or the lens that is held is not this camera's", once=hypotheses.TARGET
+            )
             f.doubt.clear()
-            return
-        layout = self._lay_out(self.options.estimate | {"target_shape"})
-        starting = Starting(self.options, layout, self.target, self._step)
-        found = self._shape_start.attempt(starting, self._buffer, self.priors)
-        if found is None:  # asked again after the next stretch
-            for doubt in f.doubt.values():
-                doubt.off_m = None
-            return
-        starting.anew()
-        self._shape_start.forget()
-        self.layout = self.judge.layout = layout
-        self.filter, self._starting, self._held_back = found, starting, HeldBack()
-        self.judge.announce(
-            f"the target is not as stated: {seen}; its shape is estimated, too", once="target"
-        )
-        self.watch.started(found.state.t_s)
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
         """How well an image was predicted that the held-back copy of the filter has not used."""
@@ -274,7 +260,10 @@ class Calibrator:
         self.judge.announce("pose lost and taken anew from the image")
 
     def _restart(self, f: CalibrationFilter) -> None:
-        """The rig has changed: forget mounting and delay, keep the lens, and start from the data to come."""
+        """The rig has changed: forget mounting and delay, and start from the data to come.
+
+        Kept are the lens, and what is known not to be as stated.
+        """
         if f.unshown is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
             self._starting.anew()
@@ -287,22 +276,19 @@ class Calibrator:
             )
         self.judge.changed(self.watch.why)
         self._stale, self.filter = (f if f.plausible() else None), None
-        self._starting.anew()
-        self._shape_start.forget()
+        self._starting = self._new_starting(f.off if f.plausible() else frozenset())
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
-        drifting = self.filter is not None and any(in_doubt(self.filter, name) for name in self.priors)
-        self.judge.clocks_in_doubt = drifting or self.watch.doubtful
-        self.judge.imu_in_doubt = self.filter is not None and imu_doubt.in_doubt(self.filter)
-        held = "intrinsics" in self.options.fix
-        self.judge.target_in_doubt = (
-            not held
-            and self.filter is not None
-            and any(doubt.undecided for doubt in self.filter.doubt.values())
-        )
+        self.judge.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
         return self._stamps.told(self.judge.estimate(self.filter, self._stale))
+
+    def _in_doubt(self, f: CalibrationFilter) -> str:
+        """What keeps small sigmas from being believed, in words; empty: nothing."""
+        if self.watch.doubtful or any(clock_drift.in_doubt(f, name) for name in self.priors):
+            return clock_drift.CLOCKS_IN_DOUBT
+        return next((why for name, why in hypotheses.IN_DOUBT.items() if hypotheses.in_doubt(f, name)), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation import imu_doubt
+from vical_daemon.estimation import hypotheses
+from vical_daemon.estimation.beyond_doubt import KNOWN_OFF_SIGMA, imu_told
 from vical_daemon.estimation.clock_drift import (
     CLOCKS_APART,
     CLOCKS_IN_DOUBT,
@@ -32,7 +33,7 @@ class FreeDoubts:
     def __init__(self, camera: str, *, imu_asked: bool) -> None:
         self._camera = camera
         self.imu_asked = self._imu_off = imu_asked
-        self.imu_sigma = imu_doubt.KNOWN_OFF_SIGMA if imu_asked else imu_doubt.ENTRY_SIGMA
+        self.imu_sigma = KNOWN_OFF_SIGMA if imu_asked else hypotheses.ENTRY_SIGMA
         self.drifting = False
 
     def watch(self, carry: Carry, factor: float, compared: bool) -> list[str]:
@@ -48,16 +49,16 @@ class FreeDoubts:
             self.drifting = True
             sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
             events.append(drift_told(self._camera, CLOCKS_APART, carry.camera.skew, sigma))
-        if not self._imu_off and compared and imu_doubt.surely_off(self._imu(carry, factor)):
+        if not self._imu_off and compared and hypotheses.is_sure(self._imu(carry, factor)):
             self._imu_off = True
             sigmas = np.sqrt(factor * np.diag(carry.calibration())[IMU])
-            events.append(imu_doubt.told(carry.imu, sigmas))
+            events.append(imu_told(carry.imu, sigmas))
         return events
 
     def reason(self, carry: Carry, factor: float) -> str:
         """What may not be as it is taken to be, in words; empty where nothing speaks for it."""
         if not self._imu_off and self._imu(carry, factor) > 0.0:
-            return imu_doubt.IMU_IN_DOUBT
+            return hypotheses.IN_DOUBT[hypotheses.IMU]
         if not self.drifting and self._drift(carry, factor) > 1.0:
             return CLOCKS_IN_DOUBT
         return ""
@@ -66,7 +67,7 @@ class FreeDoubts:
         """How likely each is, for what is told; arguments as for `watch`."""
         off = 1.0
         if not self._imu_off:
-            off = imu_doubt.probability(self._imu(carry, factor))
+            off = hypotheses.probability(self._imu(carry, factor))
             off = off if compared else min(off, 0.5)
         return Doubts(factor, self.drifting, off, gyro_frame=not self.imu_asked)
 
@@ -84,4 +85,7 @@ class FreeDoubts:
         Where windows disagree although the entries are free, it is the images, and what they say about the
         imu is worth less by as much again.
         """
-        return imu_doubt.log_bayes_factor(carry.imu, carry.calibration()[IMU, IMU], factor**2)
+        sigma = hypotheses.ENTRY_SIGMA
+        return hypotheses.log_bayes_factor(
+            carry.imu / sigma, carry.calibration()[IMU, IMU] / sigma**2, factor**2
+        )

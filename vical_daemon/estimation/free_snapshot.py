@@ -21,7 +21,7 @@ from vical_daemon.estimation.free_carry import (
     Carry,
     moved,
 )
-from vical_daemon.estimation.imu_doubt import turn
+from vical_daemon.estimation.gyro_frame import turn
 from vical_daemon.estimation.imu_scale import matrices
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
@@ -82,7 +82,7 @@ def camera_estimate(
 
 
 def _told(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray]:
-    """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `imu_doubt`."""
+    """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `hypotheses`."""
     camera, entries, P = _over_imu(carry, doubts)
     if doubts.gyro_frame:
         camera, P = _in_gyro_frame(camera, entries, P)

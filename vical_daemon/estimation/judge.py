@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation import clock_drift, imu_doubt
+from vical_daemon.estimation import clock_drift, hypotheses
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.camera_model import RADTAN
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.held_back import imu_noise_doubt
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
@@ -56,7 +57,7 @@ class Judge:
         self.events: list[str] = []
         self.status = Status.WAITING
         self.bumped = ""
-        self.clocks_in_doubt = self.target_in_doubt = self.imu_in_doubt = False
+        self.in_doubt = ""
         self._ever_converged = False
         self._start_reason = ""
         self._motion_missing = False
@@ -154,7 +155,7 @@ class Judge:
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())
         if trace.due(f.state.t_s):
-            trace.add(f.state.t_s, self._camera(camera, self._weighed(f)), self.nis_per_dof(), self.status)
+            trace.add(f.state.t_s, self._camera(camera, self.weighed(f)), self.nis_per_dof(), self.status)
 
     # ------------------------------------------------------------------ what is said
     def nis_per_dof(self) -> float:
@@ -170,7 +171,7 @@ class Judge:
         self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
     ) -> CalibrationEstimate:
         """Put everything together; `stale`: what was known before a change, shown while starting anew."""
-        f, stale = (None if x is None else self._weighed(x) for x in (f, stale))
+        f, stale = (None if x is None else self.weighed(x) for x in (f, stale))
         shown = f or stale
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
@@ -199,9 +200,10 @@ class Judge:
             events,
         )
 
-    def _weighed(self, f: CalibrationFilter) -> CalibrationFilter:
-        """The filter over all hypotheses about imu and clocks."""
-        return clock_drift.averaged(imu_doubt.averaged(f, gyro_frame=not self._imu_asked))
+    def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
+        """The filter as it is told: over all hypotheses about imu, target and clocks."""
+        f = hypotheses.averaged(f)
+        return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
         square = self._square.get(name, ())
@@ -240,16 +242,8 @@ class Judge:
                 return Status.DEGENERATE, self._partial, _MOVE
             if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
                 return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
-            if self.clocks_in_doubt:
-                return Status.CONVERGING, clock_drift.CLOCKS_IN_DOUBT, ""
-            if self.imu_in_doubt:
-                return Status.CONVERGING, imu_doubt.IMU_IN_DOUBT, ""
-            if self.target_in_doubt:
-                return (
-                    Status.CONVERGING,
-                    "sigmas are small; whether the target is as stated is not sure yet",
-                    "",
-                )
+            if self.in_doubt:
+                return Status.CONVERGING, self.in_doubt, ""
             if not self._held_back_fine():
                 return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
             return Status.CONVERGED, "", ""

@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation import so3, unscented
+from vical_daemon.estimation.beyond_doubt import KNOWN_OFF_SIGMA
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.consistency import MODES, Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.imu_doubt import ENTRY_SIGMA, KNOWN_OFF_SIGMA
+from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, TARGET
 from vical_daemon.estimation.initialise import HELD_M
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
@@ -188,8 +189,8 @@ def wide_filter(
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
-    asked = "imu_intrinsics" in options.estimate
-    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, imu_asked=asked))
+    off = {IMU, TARGET} & options.estimate
+    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, imu_off=IMU in off))
     unshown = None if still_axes is None else UnshownAxes(still_axes)
     for where in layout.cameras.values():
         if unshown is not None and where.position is not None:
@@ -209,7 +210,7 @@ def wide_filter(
         shared,
         _doubts(state, layout),
         unshown,
-        imu_off=asked,
+        off=off,
     )
 
 
@@ -226,7 +227,7 @@ def _before_board_m(state: State, camera: str) -> float:
     return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
 
 
-def start_sigmas(state: State, layout: Layout, *, partial: bool, imu_asked: bool) -> FloatArray:
+def start_sigmas(state: State, layout: Layout, *, partial: bool, imu_off: bool) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
     The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
@@ -240,7 +241,7 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, imu_asked: bool
     s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if imu_asked else ENTRY_SIGMA
+        s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if imu_off else ENTRY_SIGMA
     if layout.target_scale is not None:
         s[layout.target_scale] = 0.002
     if layout.target_modes is not None and layout.target_shape is not None:

@@ -7,9 +7,9 @@ from vical_mocks.rig import reference_rig
 
 from tests.unit.estimation import test_calibrator
 from tests.unit.estimation.test_calibrator import errors
+from vical_daemon.estimation.hypotheses import TARGET, off
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.shape_start import ShapeStart
 from vical_daemon.estimation.target_modes import MODES, TargetModes
 
 BOARD = board_points()
@@ -87,25 +87,24 @@ def test_a_crooked_board_is_found_and_the_lens_with_it(crooked):
 
 def test_a_crooked_board_is_noticed_announced_and_from_then_on_allowed_for(crooked):
     _, run = crooked
-    events, before = [], []
+    events, far = [], []
 
     def each(c):
         estimate = c.estimate()
         events.extend((estimate.duration_s, e) for e in estimate.events)
-        if c.layout.target_shape is None:
-            before.append(estimate.status)
+        if estimate.status == Status.CONVERGED:
+            x, sigma = errors(estimate, run)
+            far.append(np.abs(x / sigma).max())
 
     c = calibrate(run, each=each)
     told = [(t, e) for t, e in events if "the target is not as stated" in e]
     assert len(told) == 1
-    assert 9.0 < told[0][0] < 15.0
-    assert "its shape is estimated, too" in told[0][1]
-    assert Status.CONVERGED not in before  # small sigmas, but the target was not sure yet
-    estimate = c.estimate()
-    assert estimate.status == Status.CONVERGED
-    x, sigma = errors(estimate, run)
-    assert np.abs(x / sigma).max() < 3.5
-    assert c._shape_start.oldest_s == np.inf  # nothing is kept any longer
+    assert told[0][0] < 10.0
+    assert "its shape is estimated from now on" in told[0][1]
+    assert not any("imu" in e for _, e in events)  # which had been suspected in its place
+    assert c.estimate().status == Status.CONVERGED
+    assert max(far) < 4.0
+    assert far[-1] < 3.5
 
 
 def test_with_the_lens_held_it_is_said_and_nothing_else(crooked):
@@ -118,22 +117,22 @@ def test_with_the_lens_held_it_is_said_and_nothing_else(crooked):
     assert np.abs(x / sigma).max() < 3.5
 
 
-def test_a_second_start_that_fails_leaves_everything_as_it_was(crooked, monkeypatch):
-    _, run = crooked
-    monkeypatch.setattr(ShapeStart, "attempt", lambda *_: None)
-    statuses = set()
-    c = calibrate(run, each=lambda c: statuses.add(c.estimate().status))
-    assert c.layout.target_shape is None
-    assert not any("target" in e for e in c.estimate().events)
-    assert Status.CONVERGED not in statuses
-
-
 @pytest.mark.parametrize("seed", [11, 12, 13])
-def test_a_straight_board_stays_as_it_is_stated(seed):
-    c = calibrate(simulate(seed, 20.0))
-    assert c.layout.target_shape is None
-    assert not any("stated" in e for e in c.estimate().events)
-    assert c.estimate().status == Status.CONVERGED
-    c.filter.doubt["cam0"].undecided = True
+def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed):
+    run = simulate(seed, 20.0)
+    c, asked = calibrate(run), calibrate(run, frozenset({"target_shape"}))
+    estimate = c.estimate()
+    assert not any("stated" in e for e in estimate.events)
+    assert estimate.status == Status.CONVERGED
+    assert off(c.filter, TARGET) < 0.01
+    sigma, beside = (np.array(e.cameras["cam0"].intrinsics_sigma) for e in (estimate, asked.estimate()))
+    assert sigma[2:].max() < 0.75 * beside[2:].max()  # image centre
+
+
+def test_while_it_is_not_sure_nothing_is_converged(crooked, monkeypatch):
+    _, run = crooked
+    monkeypatch.setattr("vical_daemon.estimation.hypotheses._SURE", 1.1)
+    monkeypatch.setattr("vical_daemon.estimation.hypotheses.weights", lambda f: {(): 0.5, (TARGET,): 0.5})
+    c = calibrate(run)
     assert c.estimate().status == Status.CONVERGING
     assert c.estimate().reason == "sigmas are small; whether the target is as stated is not sure yet"

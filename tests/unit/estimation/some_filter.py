@@ -1,0 +1,79 @@
+"""A filter after linear measurements of all its states, and the same in dense matrices."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from vical_mocks.points import board_points
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.consistency import Consistency
+from vical_daemon.estimation.corner_noise import CornerNoise
+from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, TARGET
+from vical_daemon.estimation.lens_agreement import LensAgreement
+from vical_daemon.estimation.measurements import ImuNoise
+from vical_daemon.estimation.retract import retract
+from vical_daemon.estimation.state import LOWER, CameraState, State, make_layout
+
+NAME = "cam0"
+
+
+@dataclass
+class Dense:
+    """Measurements z = H x + noise of states of `prior` sigmas, what they tell, and where the blocks are."""
+
+    H: np.ndarray
+    z: np.ndarray
+    noise: float
+    prior: np.ndarray
+    where: dict[str, np.ndarray]
+
+    def posterior(self, prior=None):
+        P = np.linalg.inv(np.diag((self.prior if prior is None else prior) ** -2.0) + self.information())
+        return P @ self.H.T @ self.z / self.noise**2, P
+
+    def information(self):
+        return self.H.T @ self.H / self.noise**2
+
+
+def some_filter(imu=1.0, target=0.0, factor=1.0, scale=1.0):
+    """A filter whose imu and target lie `imu` and `target` times half their prior's sigma off."""
+    rng = np.random.default_rng(5)
+    layout = make_layout(
+        {NAME: "radtan"},
+        fix=frozenset(),
+        estimate=frozenset({IMU, TARGET}),
+        target_m=board_points(8, 6, 0.05),
+    )
+    n = layout.size
+    where = {
+        IMU: np.arange(layout.gyro_matrix.start, layout.accel_matrix.stop),
+        TARGET: np.arange(layout.target_shape.start, layout.target_shape.stop),
+    }
+    sigma = np.full(n, 1e-2)
+    sigma[where[IMU]], sigma[where[TARGET]] = ENTRY_SIGMA, layout.target_modes.sigma_m
+    H, truth, noise = rng.normal(size=(2 * n, n)), np.zeros(n), 8e-3
+    truth[where[IMU]] = imu * 0.5 * ENTRY_SIGMA * rng.normal(size=15)
+    truth[where[TARGET]] = target * 0.5 * layout.target_modes.sigma_m * rng.normal(size=11)
+    H[:, where[TARGET]] *= ENTRY_SIGMA / layout.target_modes.sigma_m
+    dense = Dense(H, H @ truth + noise * rng.normal(size=len(H)), noise, sigma, where)
+    x, P = dense.posterior()
+    camera = CameraState(
+        so3.exp(np.array([0.3, -0.2, 0.9])), np.array([0.03, -0.05, 0.02]), 0.004,
+        np.array([460.0, 455.0, 325.0, 238.0]), np.zeros(4), "radtan", (640, 480),
+    )  # fmt: skip
+    zero = np.zeros(3)
+    start = State(1.0, np.eye(3), zero, zero, zero, zero, np.array([0.0, 0, -9.8]), {NAME: camera})
+    consistency = Consistency()
+    consistency.factor, consistency.scale = factor, scale
+    f = CalibrationFilter(
+        retract(start, layout, x), layout, np.linalg.cholesky(P), ImuNoise(), {NAME: CornerNoise(0.5)},
+        np.zeros(n), {NAME: consistency}, {NAME: LensAgreement("radtan")},
+    )  # fmt: skip
+    return f, x, P, dense
+
+
+def imu_entries(state):
+    return np.concatenate(
+        [(state.gyro_matrix - np.eye(3)).ravel(), (state.accel_matrix - np.eye(3))[*LOWER.T]]
+    )

@@ -1,0 +1,165 @@
+"""Which of the things taken for true are not? All answers are kept, each as likely as the data make it.
+
+To ask every rig for the shape of its board and the matrices of its IMU would make mounting and lever arm two
+to three times less certain; to take those that are a little off for true puts them ten stated sigmas off. So
+the filter always has them among its states. That the ones or the others, or all, are zero are hypotheses
+beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how far the
+states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the mixture.
+[docs/math/filter.md, eq. (18)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.retract import retract
+from vical_daemon.estimation.state import LOWER
+from vical_daemon.estimation.unscented import root, solve_lower
+
+IMU, TARGET = "imu_intrinsics", "target_shape"
+ENTRY_SIGMA = 2e-3
+"""Scale or alignment of an IMU that is not as it says, one sigma of each entry."""
+IN_DOUBT = {
+    IMU: "sigmas are small; whether the imu's scale and alignment are true is not sure yet",
+    TARGET: "sigmas are small; whether the target is as stated is not sure yet",
+}
+_OFF = 0.05  # share of imus, and of targets, that are not as stated, to begin with
+_SURE = 0.99
+_MOST = 300.0  # of a logarithm
+_NEGLIGIBLE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """States that are zero where what they describe is as stated.
+
+    Attributes:
+        where: Among the errors.
+        values: As estimated, shape (n,).
+        sigma: Of their prior, each.
+    """
+
+    where: slice
+    values: FloatArray
+    sigma: float
+
+
+def blocks(f: CalibrationFilter) -> dict[str, Block]:
+    """What a filter estimates beside the calibration, by its name in `CalibrationOptions.estimate`."""
+    layout, state, found = f.layout, f.state, {}
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        off = state.accel_matrix - np.eye(3)
+        entries = np.concatenate([(state.gyro_matrix - np.eye(3)).ravel(), off[LOWER[:, 0], LOWER[:, 1]]])
+        found[IMU] = Block(slice(layout.gyro_matrix.start, layout.accel_matrix.stop), entries, ENTRY_SIGMA)
+    if layout.target_shape is not None and layout.target_modes is not None:
+        found[TARGET] = Block(layout.target_shape, state.target_shape, layout.target_modes.sigma_m)
+    return found
+
+
+def log_bayes_factor(values: FloatArray, covariance: FloatArray, factor: float) -> float:
+    """Logarithm of how much more likely the data are if the values are not zero.
+
+    Args:
+        values: As estimated, over the sigmas of their prior, shape (n,).
+        covariance: Of them, shape (n, n).
+        factor: What was learnt beyond the prior is worth so many times less than the covariance says.
+    """
+    unit = np.eye(len(values))
+    information = np.linalg.inv(covariance)
+    tempered = unit + (information - unit) / factor
+    weighted = information @ values / factor
+    fits = float(weighted @ np.linalg.solve(tempered, weighted))
+    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(tempered)[1])
+
+
+def probability(log_evidence: float) -> float:
+    """Probability that a block is not zero."""
+    return float(1.0 / (1.0 + (1.0 - _OFF) / _OFF * np.exp(-log_evidence)))
+
+
+def factor(f: CalibrationFilter) -> float:
+    """By how much the variances of all that is told exceed the filter's own (see `consistency`)."""
+    return max((c.factor for c in f.consistency.values()), default=1.0)
+
+
+def misfit(f: CalibrationFilter) -> float:
+    """By how much images miss by more than their noise although all blocks are free.
+
+    Then it is the images (a lens that is held and wrong), and what they say of imu and target is worth less
+    by as much again.
+    """
+    return max((c.scale for c in f.consistency.values()), default=1.0)
+
+
+def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
+    """Probability of each hypothesis; a hypothesis is named by the blocks that are as stated."""
+    doubtful = {name: block for name, block in blocks(f).items() if name not in f.off}
+    less = factor(f) * misfit(f)
+    logs = {}
+    for true in (c for n in range(len(doubtful) + 1) for c in combinations(doubtful, n)):
+        logs[true] = len(true) * np.log(1.0 - _OFF) + (len(doubtful) - len(true)) * np.log(_OFF)
+        if true:
+            values = np.concatenate([doubtful[name].values / doubtful[name].sigma for name in true])
+            rows = np.concatenate([f.S[doubtful[name].where] / doubtful[name].sigma for name in true])
+            logs[true] -= log_bayes_factor(values, rows @ rows.T, less)
+    most = max(logs.values())
+    total = sum(np.exp(x - most) for x in logs.values())
+    return {true: float(np.exp(x - most) / total) for true, x in logs.items()}
+
+
+def off(f: CalibrationFilter, name: str) -> float:
+    """Probability that a block is not zero; 1 where that was announced, or it was asked for."""
+    return sum(p for true, p in weights(f).items() if name not in true)
+
+
+def is_sure(log_evidence: float) -> bool:
+    """Whether that is beyond doubt."""
+    return probability(log_evidence) > _SURE
+
+
+def surely_off(f: CalibrationFilter, name: str) -> bool:
+    """Whether that is beyond doubt."""
+    return off(f, name) > _SURE
+
+
+def in_doubt(f: CalibrationFilter, name: str) -> bool:
+    """Whether the data speak for a block that is not zero, though not yet surely: they soon will.
+
+    Images that do not fit may never decide it; what is told covers both then.
+    """
+    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > _OFF
+
+
+def averaged(f: CalibrationFilter) -> CalibrationFilter:
+    """Return the filter as it is to be told: mean and covariance over all hypotheses.
+
+    With U the orthonormal rows of S that move the blocks which are zero, and d = S U' U S^-1 x, conditioning
+    takes S U' U S' off P and moves the mean by -d.
+    """
+    every = blocks(f)
+    n = f.layout.size
+    columns, shifts, shares = [], [], []
+    for true, p in weights(f).items():
+        if p < _NEGLIGIBLE:
+            continue
+        S, d = f.S, np.zeros(n)
+        if true:
+            rows = np.concatenate([f.S[every[name].where] for name in true])
+            L = root(rows @ rows.T)
+            U = solve_lower(L, rows)
+            d = f.S @ (U.T @ solve_lower(L, np.concatenate([every[name].values for name in true])))
+            S = f.S - (f.S @ U.T) @ U
+        columns.append(np.sqrt(p) * S)
+        shifts.append(d)
+        shares.append(p)
+    if len(shares) == 1 and not shifts[0].any():
+        return f
+    share, d = np.array(shares) / sum(shares), np.array(shifts)
+    mean = share @ d
+    apart = (np.sqrt(share / factor(f))[:, None] * (d - mean)).T  # of what is told, which is `factor` times P
+    return replace(f, state=retract(f.state, f.layout, -mean), S=np.concatenate([*columns, apart], axis=1))
