@@ -16,6 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.consistency import MODES, modes
+from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import CameraEstimate
 from vical_daemon.messages import decode_imu, decode_points
@@ -33,10 +35,11 @@ Items = list[tuple[int, object]]
 
 
 class Half(NamedTuple):
-    """A stretch calibrated: the answer, RMS of its accepted corners (px an axis), CPU of each image, s."""
+    """A stretch calibrated: the answer, its corners' RMS and noise (px an axis), CPU of each image (s)."""
 
     camera: CameraEstimate
     rms_px: float
+    noise_px: float
     steady_s: list[float]
 
 
@@ -46,7 +49,7 @@ def calibrate(
     """Calibrate a stretch of (stamp, message) in order; its CPU counts from the start on."""
     c = Calibrator(options, {"cam0": prior}, points)
     steady_s: list[float] = []
-    residuals = []
+    used: list[FrameReport] = []
     for _, item in items:
         if isinstance(item, PointsFrame):
             started, before_s = c.filter is not None, time.process_time()
@@ -54,12 +57,23 @@ def calibrate(
             reports = c.process()
             if started:
                 steady_s.append(time.process_time() - before_s)
-            residuals += [r.residual_px[r.accepted] for r in reports if r.used]
+            used += [r for r in reports if r.used]
         else:
             c.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
     c.finish()
-    rms_px = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
-    return Half(c.estimate().cameras["cam0"], rms_px, steady_s)
+    rms_px = float(np.sqrt(np.mean(np.concatenate([r.residual_px[r.accepted] for r in used]) ** 2)))
+    return Half(c.estimate().cameras["cam0"], rms_px, noise_px(used), steady_s)
+
+
+def noise_px(reports: list[FrameReport]) -> float:
+    """Corner noise of a stretch, px an axis: residuals without what a pose could explain in each image."""
+    squares = freedom = 0.0
+    for r in reports:
+        residual, by_pose = r.residual_px[r.accepted].ravel(), modes(r.uv_px[r.accepted])
+        left = residual - by_pose @ np.linalg.lstsq(by_pose, residual, rcond=None)[0]
+        squares += float(left @ left)
+        freedom += len(residual) - MODES
+    return float(np.sqrt(squares / freedom))
 
 
 def held_back_px(camera: CameraEstimate, other: Items, points: np.ndarray, target_off: bool) -> float:
@@ -140,13 +154,11 @@ def main(argv: list[str]) -> int:
     held_lens, free = (
         CalibrationOptions(fix=f, imu_noise=NOISE) for f in (frozenset({"intrinsics"}), frozenset())
     )
-    shape = replace(free, estimate=frozenset({"target_shape"}))
     five = replace(PRIOR, distortion_model="plumb_bob", distortion=(*DISTORTION, 0.0))
     for name, options, prior in (
         ("fixed", held_lens, PRIOR),
         ("free", free, PRIOR),
-        ("free, target_shape", shape, PRIOR),
-        ("free, plumb_bob, target_shape", shape, five),
+        ("free, plumb_bob", free, five),
     ):
         a, b = (calibrate(h, options, points, prior) for h in halves)
         off = name != "fixed"
@@ -155,9 +167,7 @@ def main(argv: list[str]) -> int:
             held_back_px(a.camera, halves[1], points, off),
         )
         own = ", ".join(f"{px / half.rms_px:.3f}" for px, half in zip(held, (a, b), strict=True))
-        noise = ", ".join(
-            f"{px / half.camera.corner_sigma_px:.2f}" for px, half in zip(held, (a, b), strict=True)
-        )
+        noise = ", ".join(f"{px / half.noise_px:.3f}" for px, half in zip(held, (a, b), strict=True))
         ms = 1e3 * np.array(a.steady_s + b.steady_s)
         cells = row(name, a.camera, b.camera)
         print(f"{cells} {own}; {noise} | {np.mean(ms):.1f} ({np.median(ms):.1f}) |", flush=True)

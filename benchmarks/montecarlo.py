@@ -46,6 +46,7 @@ class Case:
         rig: Changes of the rig.
         bound: Changes of the bound's model.
         estimate: Optional blocks of the estimator.
+        readout_told: The readout of a rolling shutter is told.
         crooked: The board is not as stated: see `vical_mocks.points.crooked_board`.
         imu_off: One sigma of each entry of the imu's matrices, of which the gyro's is symmetric (what is not
             is a turn of the imu's frame).
@@ -63,6 +64,7 @@ class Case:
     rig: dict[str, Any] = field(default_factory=dict)
     bound: dict[str, Any] = field(default_factory=dict)
     estimate: frozenset[str] = frozenset()
+    readout_told: bool = True
     crooked: bool = False
     imu_off: float = 0.0
 
@@ -92,6 +94,9 @@ CASES: dict[str, Case] = {
     "skew 100 ppm": Case(skew_ppm=100.0, trials=20),
     "stamp jitter 1 ms": Case(simulation={"stamp_jitter_s": 1e-3}, trials=20),
     "whole images off by 0.3 px": Case(simulation={"frame_sigma_px": 0.3}, trials=20),
+    "rolling shutter of 20 ms, nothing said": Case(
+        rig={"readout_s": 0.02}, bound={"readout": True}, readout_told=False, trials=20
+    ),
     "crooked board": Case(crooked=True, trials=20),
     "crooked board, its shape found": Case(crooked=True, estimate=frozenset({"target_shape"}), trials=20),
     "crooked board, lens known": Case(crooked=True, lens_known=True, trials=20),
@@ -116,6 +121,7 @@ CASES: dict[str, Case] = {
         rig={"readout_s": 0.02},
         bound={"readout": True},
         estimate=frozenset({"readout"}),
+        readout_told=False,
         trials=20,
     ),
     "target-free, imu matrices 1 % off": Case(
@@ -163,6 +169,8 @@ def make_run(case: Case, seed: int, seconds: float) -> SimulatedRun:
 def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject:
     """The estimator of one trial: "vical" or "ekf"."""
     prior = camera_prior(run, seed, case.start, exact_lens=case.lens_known)
+    if not case.readout_told:
+        prior = replace(prior, readout_s=0.0)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"}) if case.lens_known else frozenset(),
         estimate=case.estimate,

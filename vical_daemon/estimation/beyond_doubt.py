@@ -1,4 +1,4 @@
-"""What turned out not to be as stated is announced, and estimated from then on, with no hypothesis beside it."""
+"""What turned out not to be as stated is announced; no hypothesis that it is stands beside it any longer."""
 
 from __future__ import annotations
 

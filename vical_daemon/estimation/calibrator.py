@@ -57,7 +57,10 @@ class Calibrator:
         self.options = options
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
-        self.layout = self._lay_out(options.estimate)
+        self._states = options.estimate | {hypotheses.IMU}  # always states, see `hypotheses`
+        if "intrinsics" not in options.fix:  # else what is missed may as well be the lens
+            self._states |= {hypotheses.TARGET}
+        self.layout = self._lay_out()
         self.judge = Judge(options, self.layout)
         self.filter: CalibrationFilter | None = None
         self._buffer: ImuBuffer | None = None
@@ -70,12 +73,9 @@ class Calibrator:
         self._held_back = HeldBack()
         self._beyond_doubt = BeyondDoubt()
 
-    def _lay_out(self, estimate: frozenset[str]) -> Layout:
+    def _lay_out(self) -> Layout:
         models = {name: prior.distortion_model for name, prior in self.priors.items()}
-        states = estimate | {hypotheses.IMU}  # always states, see `hypotheses`
-        if "intrinsics" not in self.options.fix:  # else what is missed may as well be the lens
-            states |= {hypotheses.TARGET}
-        return make_layout(models, fix=self.options.fix, estimate=states, target_m=self.target)
+        return make_layout(models, fix=self.options.fix, estimate=self._states, target_m=self.target)
 
     def _new_starting(self, off: Collection[str] = ()) -> Starting:
         """For a rig of which it is known what is not as stated."""
@@ -140,6 +140,9 @@ class Calibrator:
         if not (at_end or self._starting.due(self._buffer.newest_s)):
             return
         found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
+        if found.rolling:
+            self._estimate_readout(found.rolling)
+            found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
         if found.filter is None:
             if self.filter is None:
                 self.judge.waiting(found.reason, found.motion_missing)
@@ -152,6 +155,15 @@ class Calibrator:
         self._starting.anew()
         for t, frame in [*found.frames, *later]:
             self._pending.push(t, frame)
+
+    def _estimate_readout(self, camera: str) -> None:
+        """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
+        self._states |= {"readout"}
+        self.layout = self.judge.layout = self._lay_out()
+        self._starting.estimate_readout(self.layout)
+        self.judge.announce(
+            f"{camera}: a rolling shutter, by how the target is bent in motion: its readout is estimated, too"
+        )
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""

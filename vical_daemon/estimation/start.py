@@ -12,9 +12,10 @@ import numpy as np
 
 from vical_daemon.estimation.accel_alignment import align
 from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.intrinsics_start import MOST_VIEWS, estimate_intrinsics
+from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.motion_start import StartResult, motion_start
+from vical_daemon.estimation.readout_start import readout
 from vical_daemon.estimation.row_times import at_middle_row
 from vical_daemon.estimation.seen_poses import Lens, PoseCache, SeenPose
 from vical_daemon.estimation.state import CameraState, Layout
@@ -23,8 +24,6 @@ from vical_daemon.estimation.td_icp import TdIcpResult, td_icp
 _SHIFT_SIGMA_S = 1.0e-3
 _PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
 _ROTATION_SIGMA_RAD = np.deg2rad(1.0)
-_READOUTS_S = (0.0, 0.008, 0.016, 0.024, 0.032, 0.04)
-_SIGNIFICANT = 25.0
 _PARTIAL_STRETCH_S = 8.0
 _PARTIAL_MIN_S = 6.0
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)
@@ -132,42 +131,16 @@ def _with_motion(data: StartData, rough: dict[str, _Rough], *, partial: bool = F
 
 def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, list[SeenPose]]:
     """Lens of a camera, as known or estimated, and its poses since a stamp."""
-    lens = Lens.from_prior(data.priors[name])
-    readout_s, rows = _readout(data, name, lens), lens.resolution[1]
+    lens, readout_s = Lens.from_prior(data.priors[name]), data.priors[name].readout_s
+    rows = lens.resolution[1]
+    if data.layout.cameras[name].readout is not None:
+        readout_s = readout(data.frames[name], lens, data.target, readout_s)
     frames = at_middle_row(data.frames[name], readout_s, rows)
     if data.layout.cameras[name].intrinsics is not None:
         estimate_intrinsics(lens, [f for _, f in frames], data.target)
     cache = data.caches.setdefault(name, PoseCache())
     lens.readout_s = readout_s
     return lens, cache.poses(frames, lens, data.target, since_s)
-
-
-def _readout(data: StartData, name: str, lens: Lens) -> float:
-    """Readout of a camera, s: as given; where it is to be found, that with which its images are flattest.
-
-    A board in motion is bent by a rolling shutter as no pose and no lens bends it.
-    """
-    given = data.priors[name].readout_s
-    if data.layout.cameras[name].readout is None:
-        return given
-    tried = np.unique([given, *_READOUTS_S])
-    squares = np.array([_bent(data, name, lens, float(r)) for r in tried]) ** 2
-    least, sizes = int(np.argmin(squares)), [len(f.ids) for _, f in data.frames[name]]
-    numbers = 2.0 * sum(sizes) * min(1.0, MOST_VIEWS / max(len(sizes), 1))
-    was = squares[int(np.searchsorted(tried, given))]
-    if not was - squares[least] > _SIGNIFICANT * squares[least] / numbers:
-        return given
-    if not 0 < least < len(tried) - 1:
-        return float(tried[least])
-    around = slice(least - 1, least + 2)
-    a, b, _ = np.polyfit(tried[around] - tried[least], squares[around], 2)
-    return float(tried[least] - 0.5 * b / a)
-
-
-def _bent(data: StartData, name: str, lens: Lens, readout_s: float) -> float:
-    """RMS by which the images miss a flat board, px, if their rows are read like that."""
-    frames = at_middle_row(data.frames[name], readout_s, lens.resolution[1])
-    return estimate_intrinsics(replace(lens), [f for _, f in frames], data.target)
 
 
 def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift_s: float) -> CameraState:

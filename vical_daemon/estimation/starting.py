@@ -12,13 +12,15 @@ from vical_daemon.estimation import start
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.readout_start import looks_rolling
 from vical_daemon.estimation.rehearsal import Frames, Step, rehearsed, wide_filter
-from vical_daemon.estimation.seen_poses import PoseCache
+from vical_daemon.estimation.seen_poses import Lens, PoseCache
 from vical_daemon.estimation.state import Layout
 
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
 _ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must cost little
+_LOOK_S = 2.0  # it takes a fifth of a second of CPU
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
 
@@ -32,12 +34,14 @@ class Attempt:
         frames: Those it begins with, in order of the imu's time.
         reason: Why there is none, or what the motion does not show.
         motion_missing: It is motion that is missing, not time.
+        rolling: Name of a camera that has a rolling shutter of which nothing was said.
     """
 
     filter: CalibrationFilter | None
     frames: Frames
     reason: str
     motion_missing: bool = False
+    rolling: str = ""
 
 
 class Starting:
@@ -59,6 +63,7 @@ class Starting:
     def anew(self) -> None:
         """Forget what was seen and try often again."""
         self._next_s, self._every_s = -np.inf, _ATTEMPT_FIRST_S
+        self._next_look_s = -np.inf
         self._caches.clear()
         for frames in self._frames.values():
             frames.clear()
@@ -98,6 +103,9 @@ class Starting:
         data = start.StartData(
             buffer, self._frames, priors, self._options, self._layout, self._target, self._caches
         )
+        rolling = self._rolling(buffer.newest_s, priors)
+        if rolling:
+            return Attempt(None, [], "", rolling=rolling)
         result = start.attempt(data)
         if result.state is None and result.motion_missing and may_be_partial:
             result = start.partial_attempt(data, result.reason)
@@ -118,6 +126,23 @@ class Starting:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)
         return Attempt(found, frames, result.reason)
+
+    def estimate_readout(self, layout: Layout) -> None:
+        """Go on with a layout that has readouts among the unknowns."""
+        self._layout = layout
+        self._caches.clear()
+
+    def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> str:
+        """Name of a camera whose images a rolling shutter has bent, though nobody said so; or empty."""
+        if newest_s < self._next_look_s:
+            return ""
+        self._next_look_s = newest_s + _LOOK_S
+        for name, where in self._layout.cameras.items():
+            if where.readout is None and priors[name].readout_s == 0.0:
+                lens = Lens.from_prior(priors[name])
+                if looks_rolling(self._frames[name], lens, self._target):
+                    return name
+        return ""
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:
