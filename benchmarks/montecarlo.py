@@ -106,6 +106,10 @@ CASES: dict[str, Case] = {
     "imu 0.1 % off": Case(imu_off=1e-3, bound={"imu_matrix_prior": 1e-3}, trials=20),
     "imu 0.3 % off": Case(imu_off=3e-3, bound={"imu_matrix_prior": 3e-3}, trials=20),
     "imu 1 % off": Case(imu_off=1e-2, bound={"imu_matrix_prior": 1e-2}, trials=20),
+    "imu averages over 15 ms": Case(lens_known=True, simulation={"imu_average_s": 0.015}, trials=20),
+    "imu averages over 2 ms": Case(
+        lens_known=True, simulation={"imu_average_s": 0.002, "imu_rate_hz": 500.0}, trials=20
+    ),
     "straight board, its shape found": Case(estimate=frozenset({"target_shape"}), trials=20),
     "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
     "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),

@@ -50,6 +50,7 @@ class ImuConfig:
         protocol: auto asks the device which one it speaks.
         rate_hz: Samples a second; the GX3 divides 1000 Hz.
         filter_samples: Width M of the moving average in the device, ms; its delay is taken off the stamps.
+            None: as long as a sample lasts; longer ones flatten fast motion.
         baud: Bits a second on the line while streaming; None: as found, or more where the rate needs it.
         link: What lies in between; on a real UART (ftdi, uart) the bytes' own time is taken off the stamps.
         noise: Densities for the estimator.
@@ -59,7 +60,7 @@ class ImuConfig:
     driver: Literal["gx3"] = "gx3"
     protocol: Literal["auto", "single-byte", "mip"] = "auto"
     rate_hz: Annotated[float, Bound(low=1, high=1000)] = 500.0
-    filter_samples: Annotated[int, Bound(low=1, high=32)] = 15
+    filter_samples: Annotated[int, Bound(low=1, high=32)] | None = None
     baud: Literal[115200, 230400, 460800, 921600] | None = None
     link: Literal["auto", "usb", "ftdi", "uart"] = "auto"
     noise: NoiseConfig = field(default_factory=NoiseConfig)

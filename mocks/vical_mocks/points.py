@@ -68,8 +68,8 @@ class SimulationOptions:
 
     Attributes:
         imu_rate_hz: Samples a second.
-        imu_average: Each sample is the mean over the interval centred at its stamp instead of the
-            instantaneous value (the white noise is the same).
+        imu_average_s: Each sample is the mean over so long, centred at its stamp; 0: the instantaneous value
+            (the white noise is the same).
         camera_rate_hz: Frames a second.
         corner_sigma_px: White noise per axis.
         frame_sigma_px: Noise common to all corners of a frame, per axis.
@@ -85,7 +85,7 @@ class SimulationOptions:
     """
 
     imu_rate_hz: float = 100.0
-    imu_average: bool = False
+    imu_average_s: float = 0.0
     camera_rate_hz: float = 20.0
     corner_sigma_px: float = 0.5
     frame_sigma_px: float = 0.0
@@ -171,9 +171,9 @@ def simulate_imu(
     """
     step_s = 1.0 / options.imu_rate_hz
     t_s = np.arange(0.0, duration_s + step_s / 2, step_s)
-    if options.imu_average:
+    if options.imu_average_s:
         nodes, weights = np.polynomial.legendre.leggauss(4)
-        readings = [rig.imu_reading(t_s + x * step_s / 2) for x in nodes]
+        readings = [rig.imu_reading(t_s + x * options.imu_average_s / 2) for x in nodes]
         gyro = np.sum([w / 2 * r[0] for w, r in zip(weights, readings, strict=True)], axis=0)
         force = np.sum([w / 2 * r[1] for w, r in zip(weights, readings, strict=True)], axis=0)
     else:

@@ -34,6 +34,7 @@ imus:
   {imu}:
     port: {port}
     rate_hz: 100
+    filter_samples: 10         # as long as a sample lasts, the default
     noise: {{gyro_density: 3.8e-4, accel_density: 1.2e-3}}
 cameras:
   {camera}:

@@ -71,7 +71,10 @@ def _add_stream(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--samples", type=int, default=None, metavar="N", help="end after N samples")
     parser.add_argument("--seconds", type=float, default=None, metavar="S", help="end after S seconds")
     parser.add_argument(
-        "--filter-width", type=int, default=15, metavar="M", help="moving average of a GX3, 1 .. 32 ms"
+        "--filter-width",
+        type=int,
+        metavar="M",
+        help="moving average of a GX3, 1 .. 32 ms (default: as long as a sample lasts)",
     )
     parser.add_argument("--baud", type=int, default=None, help="for streaming; default: as the rate needs it")
     parser.add_argument(

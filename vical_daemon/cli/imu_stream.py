@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> None:
     if not 1.0 <= args.rate <= 1000.0:
         raise CliError(f"--rate {args.rate:g} is outside 1 .. 1000 Hz", 2)
-    if not 1 <= args.filter_width <= 32:
+    if args.filter_width is not None and not 1 <= args.filter_width <= 32:
         raise CliError(f"--filter-width {args.filter_width} is outside 1 .. 32", 2)
     for name in ("samples", "seconds"):
         value = getattr(args, name)

@@ -40,7 +40,7 @@ def open_imu(
     *,
     protocol: str = "auto",
     rate_hz: float = 100.0,
-    filter_width: int = 15,
+    filter_width: int | None = None,
     baud: int | None = None,
     link: str = "auto",
     reconnect: bool = True,
@@ -53,7 +53,8 @@ def open_imu(
         port: Path of the serial port; ``/dev/serial/by-id/...`` survives a replug.
         protocol: "single-byte", "mip", or "auto": whichever is answered.
         rate_hz: Samples per second; the nearest rate the device can divide to is taken.
-        filter_width: M of the GX3's moving average, 1 .. 32 ms; its delay is taken off the stamps.
+        filter_width: M of the GX3's moving average, 1 .. 32 ms; its delay is taken off the stamps. None: as
+            long as a sample lasts, so that averages neither overlap nor leave gaps.
         baud: Bits a second for streaming; None: as found, or more where the rate needs it. Temporary.
         link: What lies in between: "auto", "usb", "ftdi" or "uart"; decides whether bytes take wire time.
         reconnect: Come back by itself after an unplug.

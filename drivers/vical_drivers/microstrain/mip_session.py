@@ -96,7 +96,7 @@ class MipSession:
         """See `Session.configure`."""
         base_hz = self._base_rate_hz()
         decimation = max(1, round(base_hz / settings.rate_hz))
-        delay_s, taps = self._set_filter(settings.filter_width)
+        delay_s, taps = self._set_filter(settings.taps)
         self._time = self._set_format(decimation)
         record_bytes = 6 + 14 + 14 + (2 + _size_of(self._time) if self._time else 0)
         self._choose_baud(settings, record_bytes * base_hz / decimation)

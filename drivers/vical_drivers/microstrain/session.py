@@ -37,13 +37,23 @@ class ImuSettings:
 
     Attributes:
         rate_hz: Samples per second; the device divides its own base rate by whole numbers.
-        filter_width: M of the moving average on gyro and accelerometer (GX3), 1 .. 32 ms.
+        filter_width: M of the moving average on gyro and accelerometer (GX3), 1 .. 32 ms; None: as long as
+            a sample lasts.
         baud: Bits a second wanted on the line; None: as found, or more where the rate needs it.
     """
 
     rate_hz: float = 100.0
-    filter_width: int = 15
+    filter_width: int | None = None
     baud: int | None = None
+
+    @property
+    def taps(self) -> int:
+        """M as it is asked of the device.
+
+        An average as long as a sample lasts is all that happened since the last one, no more and no less: a
+        longer one flattens fast motion and counts noise twice, a shorter one leaves motion out.
+        """
+        return self.filter_width or min(max(round(1000.0 / self.rate_hz), 1), 32)
 
 
 @dataclass(frozen=True, slots=True)

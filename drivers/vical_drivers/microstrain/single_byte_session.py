@@ -102,7 +102,7 @@ class SingleByteSession:
         """See `Session.configure`. Volatile only (but see the comment on old firmware)."""
         decimation = max(1, round(cmd.BASE_RATE_HZ / settings.rate_hz))
         self._choose_baud(settings, cmd.BASE_RATE_HZ / decimation)
-        wanted = cmd.Sampling(decimation, cmd.FLAGS_INERTIAL_ONLY, settings.filter_width)
+        wanted = cmd.Sampling(decimation, cmd.FLAGS_INERTIAL_ONLY, settings.taps)
         in_force = cmd.Sampling.from_record(self._transact(cmd.sampling(), 0xDB))
         if in_force.difference(wanted):
             # Firmware before 1.1.27 writes its EEPROM on "apply". It happens once: the next start finds the
