@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 CAMERA, IMU = "cam0", "imu0"
 RATE_HZ = 12.5
+FILTER_SAMPLES = 10
 MOST, AFTER_CONVERGENCE = 80.0, 10.0  # seconds of data
 BOARD = {"kind": "checkerboard", "cols": 9, "rows": 6, "row_spacing_m": 0.045, "col_spacing_m": 0.045}
 _CONFIG = """\
@@ -34,7 +35,7 @@ imus:
   {imu}:
     port: {port}
     rate_hz: 100
-    filter_samples: 10         # as long as a sample lasts, the default
+    filter_samples: {taps}         # as long as a sample lasts, the default
     noise: {{gyro_density: 3.8e-4, accel_density: 1.2e-3}}
 cameras:
   {camera}:
@@ -88,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         config = _write_config(out, rig.port)
         if args.web is not None:
             config = replace(config, web=replace(config.web, enabled=True, port=args.web))
-        stamps = demo_truth.StampWitness(rig.imu_instant_ns, config.imus[IMU].filter_samples)
+        stamps = demo_truth.StampWitness(rig.imu_instant_ns, FILTER_SAMPLES)
         estimate, trace = _run_roles(config, rig, stamps, args)
     truth = demo_truth.truth_of_stamps(rig.rig.truth(0.0, CAMERA), stamps.error_s, stamps.wander_s, CAMERA)
     result = estimate.to_json() | {"status": str(estimate.status), "trace": trace}
@@ -186,6 +187,7 @@ def _write_config(out: Path, port: str) -> Config:
         camera=CAMERA,
         port=port,
         rate=RATE_HZ,
+        taps=FILTER_SAMPLES,
         log=json.dumps(str(out)),
         store=json.dumps(str(out / "store")),
     )

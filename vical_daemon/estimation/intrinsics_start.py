@@ -38,9 +38,15 @@ def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArra
     Returns:
         RMS residual, px; not-a-number when there were too few views (the lens is then left alone).
     """
-    views = _spread(frames, lens)
+    return lens_from_views([frames[k] for k in spread(frames, lens)], lens, target)[0]
+
+
+def lens_from_views(
+    views: list[PointsFrame], lens: Lens, target: FloatArray
+) -> tuple[float, list[PointsFrame]]:
+    """Improve a lens in place by chosen views; return as `estimate_intrinsics`, and corners that belong."""
     if len(views) < _FEWEST:
-        return float("nan")
+        return float("nan"), views
     theta, poses, rms = _adjusted(views, _poses(views, lens, target), lens, target)
     cleaned = [
         _without_outliers(v, *pose, target, theta, lens.model) for v, pose in zip(views, poses, strict=True)
@@ -49,7 +55,7 @@ def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArra
         theta, _, rms = _adjusted(cleaned, poses, lens, target)
     if np.isfinite(rms) and 0.3 * lens.intrinsics[0] < theta[0] < 3.0 * lens.intrinsics[0]:
         lens.intrinsics, lens.distortion = theta[:4], theta[4:]
-    return rms
+    return rms, cleaned
 
 
 def _adjusted(
@@ -93,11 +99,12 @@ def _without_outliers(
     return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])
 
 
-def _spread(frames: list[PointsFrame], lens: Lens) -> list[PointsFrame]:
-    """Choose views with many points that differ most in where the board lies in the image."""
-    good = [f for f in frames if len(f.ids) >= _LEAST_POINTS]
-    if len(good) <= MOST_VIEWS:
-        return good
+def spread(frames: list[PointsFrame], lens: Lens) -> list[int]:
+    """Choose views with many points that differ most in where the board lies in the image, 24 at most."""
+    usable = [k for k, f in enumerate(frames) if len(f.ids) >= _LEAST_POINTS]
+    if len(usable) <= MOST_VIEWS:
+        return usable
+    good = [frames[k] for k in usable]
     width, height = lens.resolution
     features = np.array(
         [np.concatenate([f.uv_px.mean(0), f.uv_px.std(0) * 2, f.uv_px[-1] - f.uv_px[0]]) for f in good]
@@ -107,7 +114,7 @@ def _spread(frames: list[PointsFrame], lens: Lens) -> list[PointsFrame]:
     while len(chosen) < MOST_VIEWS:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
-    return [good[i] for i in sorted(chosen)]
+    return sorted(usable[i] for i in chosen)
 
 
 def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> _Poses:

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.intrinsics_start import MOST_VIEWS, estimate_intrinsics
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.intrinsics_start import MOST_VIEWS, estimate_intrinsics, lens_from_views, spread
+from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.row_times import Frames, at_middle_row
 from vical_daemon.estimation.seen_poses import Lens
 
@@ -48,10 +48,21 @@ def looks_rolling(frames: Frames, lens: Lens, target: FloatArray) -> bool:
     """Whether the board is flatter beyond doubt if rows are read over 4 ms than if all are taken at once.
 
     It is where the readout is longer than 2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as
-    for `readout`.
+    for `readout`. The same corners are compared, each time from the lens that a first adjustment found.
     """
-    at_once, *short = (_bent(frames, lens, target, r) ** 2 for r in (0.0, _SHORT_S, -_SHORT_S))
-    return bool(at_once - min(short) > _BEYOND_DOUBT * min(short) / _numbers(frames))
+    ways = [_upright(frames, r, lens) for r in (0.0, _SHORT_S, -_SHORT_S)]
+    chosen = spread(ways[0], lens)
+    found = replace(lens)
+    belonging = lens_from_views([ways[0][k] for k in chosen], found, target)[1]
+    views = [[_only(way[k], b.ids) for k, b in zip(chosen, belonging, strict=True)] for way in ways]
+    at_once, *short = (lens_from_views(v, replace(found), target)[0] ** 2 for v in views)
+    numbers = 2.0 * sum(len(b.ids) for b in belonging)
+    return bool(at_once - min(short) > _BEYOND_DOUBT * min(short) / numbers)
+
+
+def _only(frame: PointsFrame, ids: IntArray) -> PointsFrame:
+    kept = np.isin(frame.ids, ids)
+    return PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[kept], frame.uv_px[kept])
 
 
 def _numbers(frames: Frames) -> float:
@@ -62,5 +73,13 @@ def _numbers(frames: Frames) -> float:
 
 def _bent(frames: Frames, lens: Lens, target: FloatArray, readout_s: float) -> float:
     """RMS by which the images miss a flat board, px, if their rows are read like that."""
-    upright = at_middle_row(frames, readout_s, lens.resolution[1])
-    return estimate_intrinsics(replace(lens), [frame for _, frame in upright], target)
+    return estimate_intrinsics(replace(lens), _upright(frames, readout_s, lens), target)
+
+
+def _upright(frames: Frames, readout_s: float, lens: Lens) -> list[PointsFrame]:
+    """Images as if their rows had been taken at once; always without the first and the last.
+
+    `at_middle_row` does not know how corners move there.
+    """
+    found = at_middle_row(frames, readout_s, lens.resolution[1]) if readout_s else frames[1:-1]
+    return [frame for _, frame in found]

@@ -37,6 +37,7 @@ def test_a_rolling_shutter_is_seen_either_way_up(seed, readout_s):
         {"corner_sigma_px": 0.1, "stamp_jitter_s": 1e-3},
         {"frame_sigma_px": 0.3},
         {"outlier_fraction": 0.05},
+        {"outlier_fraction": 0.02, "camera_rate_hz": 5.0, "corner_sigma_px": 0.15},
     ],
 )
 @pytest.mark.parametrize("seed", [1, 3])
