@@ -106,6 +106,7 @@ CASES: dict[str, Case] = {
     "imu 0.1 % off": Case(imu_off=1e-3, bound={"imu_matrix_prior": 1e-3}, trials=20),
     "imu 0.3 % off": Case(imu_off=3e-3, bound={"imu_matrix_prior": 3e-3}, trials=20),
     "imu 1 % off": Case(imu_off=1e-2, bound={"imu_matrix_prior": 1e-2}, trials=20),
+    "accelerometer 0.3 ms late": Case(lens_known=True, simulation={"accel_lag_s": 3e-4}, trials=20),
     "imu averages over 15 ms": Case(lens_known=True, simulation={"imu_average_s": 0.015}, trials=20),
     "imu averages over 2 ms": Case(
         lens_known=True, simulation={"imu_average_s": 0.002, "imu_rate_hz": 500.0}, trials=20

@@ -70,6 +70,7 @@ class SimulationOptions:
         imu_rate_hz: Samples a second.
         imu_average_s: Each sample is the mean over so long, centred at its stamp; 0: the instantaneous value
             (the white noise is the same).
+        accel_lag_s: How late the accelerometer's readings are against the gyro's.
         camera_rate_hz: Frames a second.
         corner_sigma_px: White noise per axis.
         frame_sigma_px: Noise common to all corners of a frame, per axis.
@@ -86,6 +87,7 @@ class SimulationOptions:
 
     imu_rate_hz: float = 100.0
     imu_average_s: float = 0.0
+    accel_lag_s: float = 0.0
     camera_rate_hz: float = 20.0
     corner_sigma_px: float = 0.5
     frame_sigma_px: float = 0.0
@@ -171,18 +173,23 @@ def simulate_imu(
     """
     step_s = 1.0 / options.imu_rate_hz
     t_s = np.arange(0.0, duration_s + step_s / 2, step_s)
-    if options.imu_average_s:
-        nodes, weights = np.polynomial.legendre.leggauss(4)
-        readings = [rig.imu_reading(t_s + x * options.imu_average_s / 2) for x in nodes]
-        gyro = np.sum([w / 2 * r[0] for w, r in zip(weights, readings, strict=True)], axis=0)
-        force = np.sum([w / 2 * r[1] for w, r in zip(weights, readings, strict=True)], axis=0)
-    else:
-        gyro, force = rig.imu_reading(t_s)
+    gyro = _averaged(rig, t_s, options.imu_average_s)[0]
+    force = _averaged(rig, t_s - options.accel_lag_s, options.imu_average_s)[1]
     root_rate = np.sqrt(options.imu_rate_hz)
     gyro = gyro + rig.densities.gyro * root_rate * rng.standard_normal(gyro.shape)
     force = force + rig.densities.accel * root_rate * rng.standard_normal(force.shape)
     stamped_s = t_s + options.imu_stamp_jitter_s * rng.standard_normal(t_s.shape)
     return _to_ns(stamped_s, options.epoch_ns), gyro, force
+
+
+def _averaged(rig: Rig, t_s: FloatArray, width_s: float) -> tuple[FloatArray, FloatArray]:
+    """Means of rate and specific force over `width_s` about instants (Gauss-Legendre)."""
+    if not width_s:
+        return rig.imu_reading(t_s)
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    readings = [rig.imu_reading(t_s + x * width_s / 2) for x in nodes]
+    gyro, force = (sum(w / 2 * r[k] for w, r in zip(weights, readings, strict=True)) for k in (0, 1))
+    return np.asarray(gyro), np.asarray(force)
 
 
 def exposure_times(

@@ -44,7 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fix", metavar="WHAT", default="", help=f"comma-separated, held at --initial: {', '.join(FIX)}"
     )
     parser.add_argument(
-        "--estimate", metavar="WHAT", default="", help=f"comma-separated, switched on: {', '.join(ESTIMATE)}"
+        "--estimate",
+        metavar="WHAT",
+        default="",
+        help=f"comma-separated, estimated without being suspected first: {', '.join(ESTIMATE)}",
     )
     parser.add_argument("--report", metavar="F.html", help="write a report with figures")
     parser.add_argument(

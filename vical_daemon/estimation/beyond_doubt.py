@@ -7,7 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, Block, blocks, factor, surely_off
+from vical_daemon.estimation.hypotheses import (
+    ENTRY_SIGMA,
+    IMU,
+    LAG,
+    TARGET,
+    Block,
+    blocks,
+    factor,
+    surely_off,
+)
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.retract import retract
@@ -16,6 +25,7 @@ from vical_daemon.estimation.unscented import root, solve_lower
 KNOWN_OFF_SIGMA = 1e-2
 """Prior of the entries of an IMU that is known to be off, or where its matrices are asked for."""
 _EVERY_S = 1.0
+_MEASURED = 400  # images
 
 
 def imu_told(entries: FloatArray, sigmas: FloatArray) -> str:
@@ -34,6 +44,13 @@ def target_told(shape_m: FloatArray, sigmas_m: FloatArray) -> str:
         f"the target is not as stated, by {1e3 * off:.2f} +- {1e3 * sigma:.2f} mm at its edges: "
         "its shape is estimated from now on"
     )
+
+
+def lag_told(lag_s: FloatArray, sigma_s: FloatArray) -> str:
+    """The announcement for an accelerometer whose delay is not that of the gyro."""
+    late = "behind" if lag_s[0] > 0 else "ahead of"
+    size_ms, sigma_ms = 1e3 * abs(float(lag_s[0])), 1e3 * float(sigma_s[0])
+    return f"the accelerometer is {size_ms:.2f} +- {sigma_ms:.2f} ms {late} the gyro: allowed for from now on"
 
 
 def _surest(values: FloatArray, sigmas: FloatArray) -> tuple[float, float]:
@@ -56,6 +73,9 @@ def _widen(f: CalibrationFilter, block: Block) -> None:
     f.state = retract(f.state, f.layout, dx)
 
 
+_TOLD = {IMU: imu_told, LAG: lag_told, TARGET: target_told}
+
+
 @dataclass(slots=True)
 class BeyondDoubt:
     """Asks once a second what is known not to be as stated."""
@@ -67,7 +87,14 @@ class BeyondDoubt:
         if f.state.t_s < self._next_s:
             return {}
         self._next_s = f.state.t_s + _EVERY_S
-        return {name: _off(f, name) for name in blocks(f) if name not in f.off and surely_off(f, name)}
+        return {name: _off(f, name) for name in blocks(f) if self._known(f, name)}
+
+    @staticmethod
+    def _known(f: CalibrationFilter, name: str) -> bool:
+        """A lag is small beside what images that do not fit do: only once that is measured is it known."""
+        if name in f.off or (name == LAG and max(c.images for c in f.consistency.values()) < _MEASURED):
+            return False
+        return surely_off(f, name)
 
 
 def _off(f: CalibrationFilter, name: str) -> str:
@@ -75,8 +102,7 @@ def _off(f: CalibrationFilter, name: str) -> str:
     f.off.add(name)
     if name == IMU:
         _widen(f, blocks(f)[name])
-    else:  # what stretches said of the lens, they said with the target as stated
+    if name == TARGET:  # what stretches said of the lens, they said with the target as stated
         f.agreement = {camera: LensAgreement(agreement.model) for camera, agreement in f.agreement.items()}
     block = blocks(f)[name]
-    told = imu_told if name == IMU else target_told
-    return told(block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])
+    return _TOLD[name](block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])

@@ -57,7 +57,7 @@ class Calibrator:
         self.options = options
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
-        self._states = options.estimate | {hypotheses.IMU}  # always states, see `hypotheses`
+        self._states = options.estimate | {hypotheses.IMU, hypotheses.LAG}  # always states, see `hypotheses`
         if "intrinsics" not in options.fix:  # else what is missed may as well be the lens
             self._states |= {hypotheses.TARGET}
         self.layout = self._lay_out()

@@ -21,14 +21,16 @@ from vical_daemon.estimation.retract import retract
 from vical_daemon.estimation.state import LOWER
 from vical_daemon.estimation.unscented import root, solve_lower
 
-IMU, TARGET = "imu_intrinsics", "target_shape"
+IMU, LAG, TARGET = "imu_intrinsics", "accel_lag", "target_shape"
 ENTRY_SIGMA = 2e-3
 """Scale or alignment of an IMU that is not as it says, one sigma of each entry."""
 IN_DOUBT = {
     IMU: "sigmas are small; whether the imu's scale and alignment are true is not sure yet",
     TARGET: "sigmas are small; whether the target is as stated is not sure yet",
 }
-_OFF = 0.05  # share of imus, and of targets, that are not as stated, to begin with
+LAG_SIGMA_S = 3e-4
+"""By how much the delays of accelerometer and gyro differ in an IMU where they do, one sigma, s."""
+_OFF = {IMU: 0.05, TARGET: 0.05, LAG: 0.05}  # share of rigs of which that is not as stated, to begin with
 _SURE = 0.99
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
@@ -51,11 +53,15 @@ class Block:
 
 def blocks(f: CalibrationFilter) -> dict[str, Block]:
     """What a filter estimates beside the calibration, by its name in `CalibrationOptions.estimate`."""
-    layout, state, found = f.layout, f.state, {}
+    layout, state = f.layout, f.state
+    found: dict[str, Block] = {}
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         off = state.accel_matrix - np.eye(3)
         entries = np.concatenate([(state.gyro_matrix - np.eye(3)).ravel(), off[LOWER[:, 0], LOWER[:, 1]]])
         found[IMU] = Block(slice(layout.gyro_matrix.start, layout.accel_matrix.stop), entries, ENTRY_SIGMA)
+    if layout.accel_lag is not None:
+        where = slice(layout.accel_lag, layout.accel_lag + 1)
+        found[LAG] = Block(where, np.array([state.accel_lag_s]), LAG_SIGMA_S)
     if layout.target_shape is not None and layout.target_modes is not None:
         found[TARGET] = Block(layout.target_shape, state.target_shape, layout.target_modes.sigma_m)
     return found
@@ -78,8 +84,8 @@ def log_bayes_factor(values: FloatArray, covariance: FloatArray, factor: float) 
 
 
 def probability(log_evidence: float) -> float:
-    """Probability that a block is not zero."""
-    return float(1.0 / (1.0 + (1.0 - _OFF) / _OFF * np.exp(-log_evidence)))
+    """Probability that an imu is not as stated, by the evidence for that alone."""
+    return float(1.0 / (1.0 + (1.0 - _OFF[IMU]) / _OFF[IMU] * np.exp(-log_evidence)))
 
 
 def factor(f: CalibrationFilter) -> float:
@@ -102,7 +108,7 @@ def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
     less = factor(f) * misfit(f)
     logs = {}
     for true in (c for n in range(len(doubtful) + 1) for c in combinations(doubtful, n)):
-        logs[true] = len(true) * np.log(1.0 - _OFF) + (len(doubtful) - len(true)) * np.log(_OFF)
+        logs[true] = sum(np.log(1.0 - _OFF[name] if name in true else _OFF[name]) for name in doubtful)
         if true:
             values = np.concatenate([doubtful[name].values / doubtful[name].sigma for name in true])
             rows = np.concatenate([f.S[doubtful[name].where] / doubtful[name].sigma for name in true])
@@ -132,7 +138,7 @@ def in_doubt(f: CalibrationFilter, name: str) -> bool:
 
     Images that do not fit may never decide it; what is told covers both then.
     """
-    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > _OFF
+    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > _OFF[name]
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:

@@ -54,10 +54,11 @@ def strapdown(
     accel_bias: FloatArray,
     gyro_matrix: FloatArray | None = None,
     accel_matrix: FloatArray | None = None,
+    accel_lag_s: FloatArray | None = None,
 ) -> Strapdown:
     """Integrate a segment for a batch of biases (strapdown mechanisation in the start frame).
 
-    omega = M_g (omega_m - b_g), f = M_a (f_m - b_a);  R' = R hat(omega), v' = R f, p' = v.
+    omega = M_g (omega_m - b_g), f = M_a (f_m + lag f_m' - b_a);  R' = R hat(omega), v' = R f, p' = v.
 
     Args:
         segment: Readings.
@@ -65,6 +66,7 @@ def strapdown(
         accel_bias: m/s^2, shape (S, 3).
         gyro_matrix: Scale and misalignment M_g, shape (S, 3, 3); None: identity.
         accel_matrix: The same for the accelerometer.
+        accel_lag_s: How late its readings are, s, shape (S,); None: not.
 
     Returns:
         The relative motion at every node.
@@ -72,6 +74,8 @@ def strapdown(
     dt = segment.t_s[1:] - segment.t_s[:-1]
     omega = segment.gyro - gyro_bias[:, None, :]
     force = segment.accel - accel_bias[:, None, :]
+    if accel_lag_s is not None and segment.accel_slope is not None:
+        force = force + accel_lag_s[:, None, None] * segment.accel_slope
     if gyro_matrix is not None:
         omega = omega @ gyro_matrix.swapaxes(-1, -2)
     if accel_matrix is not None:
@@ -170,6 +174,10 @@ class Influence(NamedTuple):
     def by_bias(self) -> FloatArray:
         """Return the end by constant biases [gyro 3, accel 3], shape (9, 6); Forster et al. 2017, (69)."""
         return -(self.weights @ self.at.reshape(-1, 54)).reshape(9, 6)
+
+    def by_force(self, force: FloatArray) -> FloatArray:
+        """Return the end by a force error, m/s^2 at each node, shape (n + 1, 3), in shape (9,)."""
+        return np.asarray(np.einsum("k,kij,kj->i", self.weights, self.at[:, :, 3:6], force))
 
     def noise(self, noise: ImuNoise) -> FloatArray:
         """Covariance of the end that white noise of the readings brings, shape (9, 9)."""

@@ -53,7 +53,12 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
     """Statistical linearisation of the strapdown equations over one segment; S of the dynamic errors."""
     points = motion_points(state, layout, unscented.offsets(S))
     relative = strapdown(
-        segment, points.gyro_bias, points.accel_bias, points.gyro_matrix, points.accel_matrix
+        segment,
+        points.gyro_bias,
+        points.accel_bias,
+        points.gyro_matrix,
+        points.accel_matrix,
+        points.accel_lag_s,
     )
     end = compose(Motion(points.R, points.p, points.v), relative, points.gravity)
     values = np.concatenate(
@@ -74,8 +79,9 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
 def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
     """The same to first order about the nominal state."""
     entries = layout.gyro_matrix is not None and layout.accel_matrix is not None
-    matrices = (state.gyro_matrix[None], state.accel_matrix[None]) if entries else (None, None)
-    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None], *matrices)
+    M_g, M_a = (state.gyro_matrix[None], state.accel_matrix[None]) if entries else (None, None)
+    lag_s = None if layout.accel_lag is None else np.array([state.accel_lag_s])
+    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None], M_g, M_a, lag_s)
     T = float(relative.t_s[-1])
     dR, dv, dp = relative.dR[0, -1], relative.dv[0, -1], relative.dp[0, -1]
     R, g = state.R_world_imu, state.gravity
@@ -93,6 +99,8 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
         F[:, _BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
     else:
         F[:, _BIASES] = errors.by_bias()
+    if layout.accel_lag is not None and segment.accel_slope is not None:
+        F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)
     return Moved(
         R @ dR,
         state.p_world_imu + T * state.v_world_imu + (0.5 * T * T) * g + R @ dp,

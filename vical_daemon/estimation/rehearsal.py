@@ -15,7 +15,7 @@ from vical_daemon.estimation.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.consistency import MODES, Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, TARGET
+from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, LAG, LAG_SIGMA_S, TARGET
 from vical_daemon.estimation.initialise import HELD_M
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
@@ -162,6 +162,7 @@ def _about(
         target_shape=state.target_shape,
         gyro_matrix=state.gyro_matrix,
         accel_matrix=state.accel_matrix,
+        accel_lag_s=state.accel_lag_s,
     )
     fresh = make(begin)
     wide = np.diag(fresh.S)
@@ -170,6 +171,8 @@ def _about(
     for where in (trial.layout.target_shape, trial.layout.gyro_matrix, trial.layout.accel_matrix):
         if where is not None:
             narrow[where] = wide[where]
+    if trial.layout.accel_lag is not None:
+        narrow[trial.layout.accel_lag] = wide[trial.layout.accel_lag]
     fresh.S = fresh.S * (narrow / wide)[:, None]
     fresh.corner_noise = trial.corner_noise
     return fresh
@@ -189,7 +192,7 @@ def wide_filter(
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
-    off = {IMU, TARGET} & options.estimate
+    off = {IMU, LAG, TARGET} & options.estimate
     root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, imu_off=IMU in off))
     unshown = None if still_axes is None else UnshownAxes(still_axes)
     for where in layout.cameras.values():
@@ -242,6 +245,8 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, imu_off: bool) 
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if imu_off else ENTRY_SIGMA
+    if layout.accel_lag is not None:
+        s[layout.accel_lag] = LAG_SIGMA_S
     if layout.target_scale is not None:
         s[layout.target_scale] = 0.002
     if layout.target_modes is not None and layout.target_shape is not None:

@@ -37,6 +37,7 @@ class MotionPoints(NamedTuple):
     gravity: FloatArray
     gyro_matrix: FloatArray | None
     accel_matrix: FloatArray | None
+    accel_lag_s: FloatArray | None = None
 
 
 class CameraPoints(NamedTuple):
@@ -66,6 +67,7 @@ def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoi
         tilted_gravity(state.gravity, state.tilt, errors[:, GRAVITY]),
         gyro_matrix,
         accel_matrix,
+        None if layout.accel_lag is None else state.accel_lag_s + errors[:, layout.accel_lag],
     )
 
 
@@ -104,6 +106,9 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         gyro_matrix = gyro_matrix + dx[layout.gyro_matrix].reshape(3, 3)
         accel_matrix = accel_matrix.copy()
         accel_matrix[LOWER[:, 0], LOWER[:, 1]] += dx[layout.accel_matrix]
+    lag_s = state.accel_lag_s
+    if layout.accel_lag is not None:
+        lag_s += float(dx[layout.accel_lag])
     scale = state.target_scale
     if layout.target_scale is not None:
         scale += float(dx[layout.target_scale])
@@ -122,6 +127,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         {name: _moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
         gyro_matrix,
         accel_matrix,
+        lag_s,
         scale,
         shape,
         tilted @ state.tilt,

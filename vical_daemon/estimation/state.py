@@ -43,14 +43,15 @@ class CameraSlices:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Order of the error state: [core 17 | imu matrices | cameras | target scale | target shape].
+    """Order of the error state: [core 17 | imu matrices | accel lag | cameras | target scale | target shape].
 
     Attributes:
         size: Length of the error state.
-        dynamic: Number of leading errors that enter the propagation (core and imu matrices).
+        dynamic: Number of leading errors that enter the propagation (core, imu matrices and lag).
         gyro_matrix: 9 entries, row-major, of M_g - I; None: not estimated.
         accel_matrix: 6 entries (lower triangle) of M_a - I; the lower triangle fixes the gauge, since a
             full matrix could be traded against R_imu_cam.
+        accel_lag: How late the accelerometer's readings are against the gyro's, s, index or None.
         cameras: By name.
         target_scale: Relative size of the board, index or None.
         target_shape: How far the board is off in each of its modes, m; None: as stated.
@@ -61,6 +62,7 @@ class Layout:
     dynamic: int
     gyro_matrix: slice | None
     accel_matrix: slice | None
+    accel_lag: int | None
     cameras: dict[str, CameraSlices]
     target_scale: int | None
     target_shape: slice | None = None
@@ -87,6 +89,8 @@ def make_layout(
     if "imu_intrinsics" in estimate:
         gyro_matrix, accel_matrix = slice(at, at + 9), slice(at + 9, at + 15)
         at += 15
+    accel_lag = at if "accel_lag" in estimate else None
+    at += accel_lag is not None
     dynamic = at
     blocks: dict[str, CameraSlices] = {}
 
@@ -116,7 +120,15 @@ def make_layout(
     modes = None if target_m is None else TargetModes.of(target_m)
     shape = take(modes is not None and "target_shape" in estimate, MODES)
     return Layout(
-        at, dynamic, gyro_matrix, accel_matrix, blocks, scale.start if scale else None, shape, modes
+        at,
+        dynamic,
+        gyro_matrix,
+        accel_matrix,
+        accel_lag,
+        blocks,
+        scale.start if scale else None,
+        shape,
+        modes,
     )
 
 
@@ -150,6 +162,7 @@ class State:
         gyro_matrix: M_g in omega = M_g (omega_m - b_g).
         accel_matrix: M_a in f = M_a (f_m - b_a), lower triangular.
         cameras: By name.
+        accel_lag_s: The specific force stamped t is that of t - accel_lag_s; the gyro's stamps are right.
         target_scale: True size of the board over its stated size.
         target_shape: How far the board is off in each of `Layout.target_modes`, m, shape (11,).
         tilt: Two unit vectors across gravity, shape (3, 2): the errors of its direction are turns about them.
@@ -167,6 +180,7 @@ class State:
     cameras: dict[str, CameraState]
     gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    accel_lag_s: float = 0.0
     target_scale: float = 1.0
     target_shape: FloatArray = field(default_factory=lambda: np.zeros(MODES))
     tilt: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))

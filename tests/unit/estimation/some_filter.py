@@ -9,7 +9,7 @@ from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
-from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, TARGET
+from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, LAG, LAG_SIGMA_S, TARGET
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.retract import retract
@@ -36,26 +36,30 @@ class Dense:
         return self.H.T @ self.H / self.noise**2
 
 
-def some_filter(imu=1.0, target=0.0, factor=1.0, scale=1.0):
-    """A filter whose imu and target lie `imu` and `target` times half their prior's sigma off."""
+def some_filter(imu=1.0, target=0.0, lag=0.0, factor=1.0, scale=1.0):
+    """A filter whose imu, target and lag lie so many times half their prior's sigma off."""
     rng = np.random.default_rng(5)
     layout = make_layout(
         {NAME: "radtan"},
         fix=frozenset(),
-        estimate=frozenset({IMU, TARGET}),
+        estimate=frozenset({IMU, LAG, TARGET}),
         target_m=board_points(8, 6, 0.05),
     )
     n = layout.size
     where = {
         IMU: np.arange(layout.gyro_matrix.start, layout.accel_matrix.stop),
+        LAG: np.array([layout.accel_lag]),
         TARGET: np.arange(layout.target_shape.start, layout.target_shape.stop),
     }
     sigma = np.full(n, 1e-2)
-    sigma[where[IMU]], sigma[where[TARGET]] = ENTRY_SIGMA, layout.target_modes.sigma_m
+    for name, size in ((IMU, ENTRY_SIGMA), (LAG, LAG_SIGMA_S), (TARGET, layout.target_modes.sigma_m)):
+        sigma[where[name]] = size
     H, truth, noise = rng.normal(size=(2 * n, n)), np.zeros(n), 8e-3
     truth[where[IMU]] = imu * 0.5 * ENTRY_SIGMA * rng.normal(size=15)
     truth[where[TARGET]] = target * 0.5 * layout.target_modes.sigma_m * rng.normal(size=11)
-    H[:, where[TARGET]] *= ENTRY_SIGMA / layout.target_modes.sigma_m
+    truth[where[LAG]] = lag * 0.5 * LAG_SIGMA_S
+    for name in (TARGET, LAG):
+        H[:, where[name]] *= ENTRY_SIGMA / sigma[where[name][0]]
     dense = Dense(H, H @ truth + noise * rng.normal(size=len(H)), noise, sigma, where)
     x, P = dense.posterior()
     camera = CameraState(

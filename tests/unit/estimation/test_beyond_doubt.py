@@ -5,7 +5,7 @@ import pytest
 
 from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
 from vical_daemon.estimation.beyond_doubt import KNOWN_OFF_SIGMA, BeyondDoubt
-from vical_daemon.estimation.hypotheses import IMU, TARGET, off
+from vical_daemon.estimation.hypotheses import IMU, LAG, TARGET, off
 
 
 def surest(values, P, where):
@@ -55,3 +55,16 @@ def test_it_is_asked_once_a_second():
     assert beyond.look(f) == {}
     f.state.t_s += 0.6
     assert list(beyond.look(f)) == [IMU]
+
+
+@pytest.mark.parametrize(("lag", "told"), [(6.0, "behind"), (-6.0, "ahead of")])
+def test_a_lag_is_announced_once_it_is_measured_how_well_images_fit(lag, told):
+    f, x, P, dense = some_filter(0.0, lag=lag)
+    assert BeyondDoubt().look(f) == {}
+    f.consistency[NAME].images = 400
+    events = BeyondDoubt().look(f)
+    assert list(events) == [LAG]
+    value, sigma = surest(x, P, dense.where[LAG])
+    assert f"is {1e3 * value:.2f} +- {1e3 * sigma:.2f} ms {told} the gyro" in events[LAG]
+    np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-9, atol=1e-15)
+    assert off(f, LAG) == pytest.approx(1.0, abs=1e-12)

@@ -127,9 +127,9 @@ def test_a_knock_is_announced_and_followed():
     assert np.abs(x / sigma).max() < 4.5
 
 
-def test_a_knock_does_not_make_an_imu_true():
+def test_a_knock_does_not_make_an_imu_true_nor_its_accelerometer_in_step():
     matrix = np.eye(3) + 5e-3 * np.array([[1.0, 0.4, -0.6], [0.4, -1.1, 0.8], [-0.6, 0.8, 0.3]])
-    rig = reference_rig(2, bumps=(Bump(12.0, timeshift_s=0.02),), gyro_matrix=matrix, accel_matrix=matrix)
+    rig = reference_rig(2, bumps=(Bump(22.0, timeshift_s=0.02),), gyro_matrix=matrix, accel_matrix=matrix)
     filters, shots = [], []
 
     def each(c):
@@ -137,12 +137,13 @@ def test_a_knock_does_not_make_an_imu_true():
         if c.filter is not None and c.filter not in filters:
             filters.append(c.filter)
 
-    calibrate(simulate(2, 24.0, rig=rig), each=each)
+    calibrate(simulate(2, 34.0, rig=rig, accel_lag_s=1e-3), each=each)
     events = [e for shot in shots for e in shot.events]
     assert sum(e.startswith("bumped") for e in events) == 1
     assert sum("scale or alignment of the imu is off" in e for e in events) == 1
+    assert sum("behind the gyro" in e for e in events) == 1
     assert len(filters) == 2
-    assert filters[1].off == {"imu_intrinsics"}  # and not found out again
+    assert filters[1].off == {"imu_intrinsics", "accel_lag"}  # and not found out again
     assert shots[-1].status == Status.CONVERGED
 
 

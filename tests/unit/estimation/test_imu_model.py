@@ -65,6 +65,37 @@ def test_a_bias_is_taken_off_and_a_matrix_applied():
     np.testing.assert_allclose(relative.dp, plain.dp, atol=1e-12)
 
 
+def late_segment(T, rate, lag_s):
+    """Forces of `lag_s` before their stamps, with their slopes; rates as they should be."""
+    t, step = np.linspace(0.0, T, int(T * rate) + 1), 1e-6
+    slopes = [
+        (f(t - late + step) - f(t - late - step)) / (2 * step) for f, late in ((rates, 0), (forces, lag_s))
+    ]
+    return ImuSegment(t, rates(t), forces(t - lag_s), 1 / rate, *slopes)
+
+
+def test_an_accelerometer_that_is_late_is_put_right():
+    zero, lag_s = np.zeros((1, 3)), 1e-3
+    late, right = late_segment(0.1, 200, lag_s), late_segment(0.1, 200, 0.0)
+    plain, wrong = im.strapdown(right, zero, zero), im.strapdown(late, zero, zero)
+    put_right = im.strapdown(late, zero, zero, accel_lag_s=np.array([lag_s]))
+    assert np.abs(wrong.dv - plain.dv).max() > 1e-4
+    np.testing.assert_allclose(put_right.dv, plain.dv, atol=2e-6)
+    np.testing.assert_allclose(put_right.dp, plain.dp, atol=2e-7)
+    np.testing.assert_array_equal(put_right.dR, plain.dR)
+
+
+def test_influence_of_a_force_agrees_with_differences_of_the_integration():
+    seg, lags = late_segment(0.1, 200, 0.0), np.array([0.0, 1e-4])
+    R0, zero = Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix(), np.zeros((2, 3))
+    relative = im.strapdown(seg, zero, zero, accel_lag_s=lags)
+    end = im.compose(im.Motion(np.repeat(R0[None], 2, 0), zero, zero), relative, np.repeat(G[None], 2, 0))
+    moved = np.concatenate([np.zeros(3), end.p[1] - end.p[0], end.v[1] - end.v[0]]) / lags[1]
+    nominal = im.Strapdown(*(x[:1] for x in relative[:3]), relative.t_s)
+    by_lag = im.influence(R0, nominal).by_force(seg.accel_slope)
+    np.testing.assert_allclose(by_lag, moved, atol=2e-3 * np.abs(moved).max())
+
+
 def test_batch_equals_loop():
     seg, rng = segment(0.1, 100), np.random.default_rng(0)
     bg, ba = 0.01 * rng.normal(size=(4, 3)), 0.1 * rng.normal(size=(4, 3))
