@@ -64,7 +64,7 @@ class CalibrationFilter:
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
         shared: Measured errors that the corners of an image share, by camera.
-        doubt: Whether the target is as stated, by camera; empty where its shape is estimated.
+        doubt: Whether the target is as stated, by camera, where the lens is held; else empty.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
@@ -202,7 +202,7 @@ class CalibrationFilter:
 
     def _measure(self, image: Image, lin: Linear, fit: ImageFit) -> None:
         """What an image says about shared errors, lens and target before it is used."""
-        where, camera = self.layout.cameras[image.camera], self.state.cameras[image.camera]
+        where = self.layout.cameras[image.camera]
         shared, agreement = self.shared.get(image.camera), self.agreement.get(image.camera)
         if shared is not None:
             # a fit far from straight is linearised elsewhere
@@ -210,28 +210,29 @@ class CalibrationFilter:
             level = self.consistency[image.camera].level
             by_shared = ways @ (lin.by_error @ shared_ways(self.state, self.layout, image.camera))
             shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
-        free, doubt, t_s = where.intrinsics is not None, self.doubt.get(image.camera), self.state.t_s
-        asked = doubt is not None and doubt.due(t_s)
-        if not (free or asked):
-            return
-        ways, innovation = whitened(image, lin, fit.keep)
-        by_pose = ways @ lin.by_error[:, :6]
-        by_lens, values = np.zeros((len(ways), 0)), np.zeros(0)
-        if where.intrinsics is not None and where.distortion is not None:
-            values = np.concatenate([camera.intrinsics, camera.distortion])
-            by_lens = ways @ lin.by_error[:, where.intrinsics.start : where.distortion.stop]
-        if agreement is not None and free:
-            as_stated = innovation
-            if self.layout.target_shape is not None and "target_shape" not in self.off:
-                as_stated = innovation + ways @ (
-                    lin.by_error[:, self.layout.target_shape] @ self.state.target_shape
-                )
-            agreement.learn(t_s, as_stated, by_pose, by_lens, values)
-        if doubt is not None and asked:
+        doubt = self.doubt.get(image.camera)
+        if where.intrinsics is not None and where.distortion is not None and agreement is not None:
+            by_lens = lin.by_error[:, where.intrinsics.start : where.distortion.stop]
+            self._ask_lens(agreement, image, lin, fit, by_lens)
+        elif doubt is not None and doubt.due(self.state.t_s):
+            ways, innovation = whitened(image, lin, fit.keep)
+            by_pose = ways @ lin.by_error[:, :6]
             # a point that moves in the world looks as if the camera moved the other way
             by_place = -by_pose[:, 3:].reshape(-1, 2, 3)
             by_shape = (by_place @ doubt.modes.fields(image.points[fit.keep])).reshape(len(ways), -1)
-            doubt.learn(t_s, innovation, by_pose, by_lens, values, by_shape)
+            doubt.learn(self.state.t_s, innovation, by_pose, by_shape)
+
+    def _ask_lens(
+        self, agreement: LensAgreement, image: Image, lin: Linear, fit: ImageFit, by_lens: FloatArray
+    ) -> None:
+        """What an image would have the lens be: with the target as stated until it is known not to be."""
+        ways, innovation = whitened(image, lin, fit.keep)
+        shape = self.layout.target_shape
+        if shape is not None and "target_shape" not in self.off:
+            innovation = innovation + ways @ (lin.by_error[:, shape] @ self.state.target_shape)
+        camera = self.state.cameras[image.camera]
+        values = np.concatenate([camera.intrinsics, camera.distortion])
+        agreement.learn(self.state.t_s, innovation, ways @ lin.by_error[:, :6], ways @ by_lens, values)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""

@@ -211,18 +211,18 @@ def wide_filter(
         consistency,
         agreement,
         shared,
-        _doubts(state, layout),
+        _doubts(layout),
         unshown,
         off=off,
     )
 
 
-def _doubts(state: State, layout: Layout) -> dict[str, TargetDoubt]:
-    """Whether the target is as stated is asked where its shape is not estimated anyway."""
+def _doubts(layout: Layout) -> dict[str, TargetDoubt]:
+    """Whether the target is as stated is asked where its shape is no state."""
     modes = layout.target_modes
     if modes is None or layout.target_shape is not None:
         return {}
-    return {name: TargetDoubt(state.cameras[name].distortion_model, modes) for name in layout.cameras}
+    return {name: TargetDoubt(modes) for name in layout.cameras}
 
 
 def _before_board_m(state: State, camera: str) -> float:
