@@ -1,10 +1,11 @@
 """Which of the things taken for true are not? All answers are kept, each as likely as the data make it.
 
-To ask every rig for the shape of its board and the matrices of its IMU would make mounting and lever arm two
-to three times less certain; to take those that are a little off for true puts them ten stated sigmas off. So
-the filter always has them among its states. That the ones or the others, or all, are zero are hypotheses
-beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how far the
-states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the mixture.
+To ask every rig for the shape of its board, the matrices of its IMU and the lag of its accelerometer would
+make the answer two to three times less certain; to take those that are a little off for true puts it ten
+stated sigmas off. So the filter always has them among its states. That some of them, or all, are zero are
+hypotheses beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how
+far the states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the
+mixture.
 [docs/math/filter.md, eq. (18)]
 """
 
@@ -30,7 +31,7 @@ IN_DOUBT = {
 }
 LAG_SIGMA_S = 3e-4
 """By how much the delays of accelerometer and gyro differ in an IMU where they do, one sigma, s."""
-_OFF = {IMU: 0.05, TARGET: 0.05, LAG: 0.05}  # share of rigs of which that is not as stated, to begin with
+_OFF = 0.05  # share of rigs of which any one of these is not as stated, to begin with
 _SURE = 0.99
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
@@ -85,7 +86,7 @@ def log_bayes_factor(values: FloatArray, covariance: FloatArray, factor: float) 
 
 def probability(log_evidence: float) -> float:
     """Probability that an imu is not as stated, by the evidence for that alone."""
-    return float(1.0 / (1.0 + (1.0 - _OFF[IMU]) / _OFF[IMU] * np.exp(-log_evidence)))
+    return float(1.0 / (1.0 + (1.0 - _OFF) / _OFF * np.exp(-log_evidence)))
 
 
 def factor(f: CalibrationFilter) -> float:
@@ -108,7 +109,7 @@ def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
     less = factor(f) * misfit(f)
     logs = {}
     for true in (c for n in range(len(doubtful) + 1) for c in combinations(doubtful, n)):
-        logs[true] = sum(np.log(1.0 - _OFF[name] if name in true else _OFF[name]) for name in doubtful)
+        logs[true] = len(true) * np.log(1.0 - _OFF) + (len(doubtful) - len(true)) * np.log(_OFF)
         if true:
             values = np.concatenate([doubtful[name].values / doubtful[name].sigma for name in true])
             rows = np.concatenate([f.S[doubtful[name].where] / doubtful[name].sigma for name in true])
@@ -138,7 +139,7 @@ def in_doubt(f: CalibrationFilter, name: str) -> bool:
 
     Images that do not fit may never decide it; what is told covers both then.
     """
-    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > _OFF[name]
+    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > _OFF
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
