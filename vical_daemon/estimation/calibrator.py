@@ -280,15 +280,16 @@ class Calibrator:
             self.filter = None
             self._starting.anew()
             return
-        for name, camera in f.state.cameras.items() if f.plausible() else ():
+        sound = f if f.plausible() else None
+        for name, camera in sound.state.cameras.items() if sound else ():
             self.priors[name] = replace(
                 self.priors[name],
                 intrinsics=tuple(camera.intrinsics.tolist()),
                 distortion=tuple(camera.distortion.tolist()),
             )
         self.judge.changed(self.watch.why)
-        self._stale, self.filter = (f if f.plausible() else None), None
-        self._starting = self._new_starting(f.off if f.plausible() else frozenset())
+        self._stale, self.filter = sound, None
+        self._starting = self._new_starting(sound.off if sound else ())
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

@@ -1,7 +1,7 @@
 """Which of the things taken for true are not? All answers are kept, each as likely as the data make it.
 
 To ask every rig for the shape of its board, the matrices of its IMU and the lag of its accelerometer would
-make the answer two to three times less certain; to take those that are a little off for true puts it ten
+make the answer up to three times less certain; to take those that are a little off for true puts it ten
 stated sigmas off. So the filter always has them among its states. That some of them, or all, are zero are
 hypotheses beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how
 far the states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the

@@ -6,7 +6,7 @@ Only a start: the filter estimates the same eight numbers with everything else.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -36,29 +36,50 @@ def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArra
         target: Its points, m, shape (n, 3).
 
     Returns:
-        RMS residual, px; not-a-number when there were too few views (the lens is then left alone).
+        RMS residual, px; not-a-number when too few views show a pose (the lens is then left alone).
     """
-    return lens_from_views([frames[k] for k in spread(frames, lens)], lens, target)[0]
+    fit = fit_lens([frames[k] for k in spread(frames, lens)], lens, target)
+    if fit is None:
+        return float("nan")
+    if np.isfinite(fit.rms_px) and 0.3 * lens.intrinsics[0] < fit.theta[0] < 3.0 * lens.intrinsics[0]:
+        lens.intrinsics, lens.distortion = fit.theta[:4], fit.theta[4:]
+    return fit.rms_px
 
 
-def lens_from_views(
-    views: list[PointsFrame], lens: Lens, target: FloatArray
-) -> tuple[float, list[PointsFrame]]:
-    """Improve a lens in place by chosen views; return as `estimate_intrinsics`, and corners that belong."""
-    if len(views) < _FEWEST:
-        return float("nan"), views
-    theta, poses, rms = _adjusted(views, _poses(views, lens, target), lens, target)
+class LensFit(NamedTuple):
+    """A lens and poses adjusted to views.
+
+    Attributes:
+        theta: fx fy cx cy and the distortion, shape (4 + d,).
+        poses: R_cam_target and p_cam_target, m, of each view that shows one.
+        rms_px: RMS residual, px.
+        views: These views, with the corners that belong.
+        which: Their places among the views given.
+    """
+
+    theta: FloatArray
+    poses: _Poses
+    rms_px: float
+    views: list[PointsFrame]
+    which: list[int]
+
+
+def fit_lens(views: list[PointsFrame], lens: Lens, target: FloatArray) -> LensFit | None:
+    """Adjust lens and poses to chosen views, then to their corners that belong; None: too few show a pose."""
+    which, poses = _poses(views, lens, target)
+    if len(which) < _FEWEST:
+        return None
+    views = [views[k] for k in which]
+    theta, poses, rms_px = adjusted(views, poses, lens, target)
     cleaned = [
         _without_outliers(v, *pose, target, theta, lens.model) for v, pose in zip(views, poses, strict=True)
     ]
     if any(len(new.ids) < len(old.ids) for new, old in zip(cleaned, views, strict=True)):
-        theta, _, rms = _adjusted(cleaned, poses, lens, target)
-    if np.isfinite(rms) and 0.3 * lens.intrinsics[0] < theta[0] < 3.0 * lens.intrinsics[0]:
-        lens.intrinsics, lens.distortion = theta[:4], theta[4:]
-    return rms, cleaned
+        theta, poses, rms_px = adjusted(cleaned, poses, lens, target)
+    return LensFit(theta, poses, rms_px, cleaned, which)
 
 
-def _adjusted(
+def adjusted(
     views: list[PointsFrame], poses: _Poses, lens: Lens, target: FloatArray
 ) -> tuple[FloatArray, _Poses, float]:
     """Lens (4 + d,), poses and RMS residual in px after the adjustment, from a lens and poses."""
@@ -117,16 +138,16 @@ def spread(frames: list[PointsFrame], lens: Lens) -> list[int]:
     return sorted(usable[i] for i in chosen)
 
 
-def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> _Poses:
-    poses, kept = [], []
-    for v in views:
+def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> tuple[list[int], _Poses]:
+    """Which views show a pose, and these."""
+    poses, which = [], []
+    for k, v in enumerate(views):
         rays, ok = unproject(v.uv_px, lens.intrinsics, lens.distortion, lens.model)
         found = planar_pose(target[v.ids[ok]], rays[ok, :2] / rays[ok, 2:])
         if found.candidates:
             poses.append((found.candidates[0].R_cam_target, found.candidates[0].p_cam_target))
-            kept.append(v)
-    views[:] = kept
-    return poses
+            which.append(k)
+    return which, poses
 
 
 class _Normal:

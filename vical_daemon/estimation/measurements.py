@@ -90,8 +90,8 @@ class CalibrationOptions:
 
     Attributes:
         fix: Of {"intrinsics", "timeshift", "extrinsics"}: held at their priors.
-        estimate: Of {"imu_intrinsics", "readout", "target_scale", "target_shape"}: optional blocks that are
-            switched on.
+        estimate: Of {"imu_intrinsics", "readout", "target_scale", "target_shape", "accel_lag"}: optional
+            blocks that are switched on.
         target_free: Landmarks are estimated, no target is known.
         gravity_mps2: Magnitude of gravity, m/s^2.
         corner_sigma_px: First guess of the corner noise; measured from the data afterwards.

@@ -10,7 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.intrinsics_start import MOST_VIEWS, estimate_intrinsics, lens_from_views, spread
+from vical_daemon.estimation.intrinsics_start import (
+    MOST_VIEWS,
+    adjusted,
+    estimate_intrinsics,
+    fit_lens,
+    spread,
+)
 from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.row_times import Frames, at_middle_row
 from vical_daemon.estimation.seen_poses import Lens
@@ -18,7 +24,7 @@ from vical_daemon.estimation.seen_poses import Lens
 _TRIED_S = 0.008 * np.arange(6)
 _SIGNIFICANT = 25.0
 _SHORT_S = 0.004
-_BEYOND_DOUBT = 100.0  # global shutters on real lenses reach 40
+_BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 34
 
 
 def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> float:
@@ -48,16 +54,20 @@ def looks_rolling(frames: Frames, lens: Lens, target: FloatArray) -> bool:
     """Whether the board is flatter beyond doubt if rows are read over 4 ms than if all are taken at once.
 
     It is where the readout is longer than 2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as
-    for `readout`. The same corners are compared, each time from the lens that a first adjustment found.
+    for `readout`. The same corners are compared, each time from lens and poses that a first adjustment found.
     """
     ways = [_upright(frames, r, lens) for r in (0.0, _SHORT_S, -_SHORT_S)]
     chosen = spread(ways[0], lens)
-    found = replace(lens)
-    belonging = lens_from_views([ways[0][k] for k in chosen], found, target)[1]
-    views = [[_only(way[k], b.ids) for k, b in zip(chosen, belonging, strict=True)] for way in ways]
-    at_once, *short = (lens_from_views(v, replace(found), target)[0] ** 2 for v in views)
-    numbers = 2.0 * sum(len(b.ids) for b in belonging)
-    return bool(at_once - min(short) > _BEYOND_DOUBT * min(short) / numbers)
+    fit = fit_lens([ways[0][k] for k in chosen], lens, target)
+    if fit is None:
+        return False
+    found = replace(lens, intrinsics=fit.theta[:4], distortion=fit.theta[4:])
+    squares = []
+    for way in ways:
+        views = [_only(way[chosen[k]], v.ids) for k, v in zip(fit.which, fit.views, strict=True)]
+        squares.append(adjusted(views, fit.poses, found, target)[2] ** 2)
+    flattest, numbers = min(squares[1:]), 2.0 * sum(len(v.ids) for v in fit.views)
+    return bool(squares[0] - flattest > _BEYOND_DOUBT * flattest / numbers)
 
 
 def _only(frame: PointsFrame, ids: IntArray) -> PointsFrame:

@@ -53,3 +53,18 @@ def test_a_rig_that_stands_still_shows_nothing():
     lens = Lens(np.array([530.0, 530.0, 322.0, 236.0]), np.zeros(4), "radtan", (640, 480))
     assert not looks_rolling(frames, lens, BOARD)
     assert readout(frames, lens, BOARD, 0.011) == 0.011
+
+
+def test_views_that_show_no_pose_are_left_out():
+    frames, lens = seen(1, 0.02)
+    nowhere = np.full_like(frames[20][1].uv_px, 7.0)
+    for k in (20, 30, 40):  # chosen for sure: nothing else lies there
+        f = frames[k][1]
+        frames[k] = (frames[k][0], PointsFrame(f.camera, f.t_cam_ns, f.ids, nowhere[: len(f.ids)]))
+    assert looks_rolling(frames, lens, BOARD)
+
+
+def test_too_few_images_show_nothing():
+    frames, lens = seen(1, 0.02)
+    assert not looks_rolling(frames[:6], lens, BOARD)
+    assert not looks_rolling([], lens, BOARD)
