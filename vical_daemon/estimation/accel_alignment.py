@@ -19,16 +19,9 @@ from itertools import permutations, product
 import numpy as np
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.accel_evidence import PRIORS, CameraPath, Evidence, gather
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.rotation_start import camera_turns
 
-_HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
-_STEP_S = 0.01
-_LEVER_ARM_PRIOR_M = 0.3
-_BIAS_PRIOR = 0.3  # m/s^2
-_GYRO_BIAS_PRIOR_RPS = 0.1
-_PRIORS = 9  # rows for these three vectors
-_MIN_WINDOWS = 12
 _COARSE_S, _FINE_S = 0.02, 0.004
 _APART_S = 0.25  # another delay this far away must fit worse by the contrast
 _MIN_CONTRAST = 4.0
@@ -67,55 +60,18 @@ class Alignment:
         )
 
 
-@dataclass(frozen=True)
-class _Evidence:
-    """What vision says: windows of accelerations and turns, with the maps that do not depend on the delay."""
-
-    grid_s: FloatArray  # camera clock, shape (g,)
-    R_target_cam: FloatArray  # on the grid, shape (g, 3, 3)
-    kernels: FloatArray  # of each window on the grid, shape (w, g)
-    accel_sigma: FloatArray  # m/s^2, shape (w,)
-    turn_span_s: FloatArray  # begin and end of each turn, shape (2, k)
-    turn_sigma: FloatArray  # rad, shape (k,)
-    seen: FloatArray  # accelerations, turns and priors over their sigmas, shape (n,)
-    others: FloatArray  # maps of gravity, lever arm, bias (camera frame) and gyro bias, shape (n, 12)
-    basis: FloatArray  # orthonormal, of the columns of `others`
-
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of the residuals."""
-        return max(len(self.seen) - _PRIORS - 16, 1)
-
-    def project(self, x: FloatArray) -> FloatArray:
-        """Take out what the eliminated unknowns explain."""
-        out: FloatArray = x - self.basis @ (self.basis.T @ x)
-        return out
-
-
-def align(
-    imu_rows: FloatArray,
-    t_cam_s: FloatArray,
-    R_target_cam: FloatArray,
-    p_target_cam: FloatArray,
-    sigma_m: FloatArray,
-    sigma_rad: FloatArray,
-    shifts_s: tuple[float, float],
-) -> Alignment | None:
+def align(path: CameraPath, imu_rows: FloatArray, shifts_s: tuple[float, float]) -> Alignment | None:
     """Find mounting and delay from a path of the camera and inertial readings.
 
     Args:
+        path: Of the camera.
         imu_rows: Columns t_s, gyro xyz (rad/s), specific force xyz (m/s^2), shape (m, 7).
-        t_cam_s: Stamps of the poses in the camera's clock, s, increasing, shape (n,).
-        R_target_cam: Attitudes of the camera, shape (n, 3, 3).
-        p_target_cam: Its positions, m, shape (n, 3).
-        sigma_m: Standard deviation of each position, m, shape (n,).
-        sigma_rad: Of each attitude, rad, shape (n,).
         shifts_s: Lowest and highest time shift to look at, s.
 
     Returns:
         The alignment, or None where there are too few poses in a row.
     """
-    evidence = _gather(t_cam_s, R_target_cam, p_target_cam, sigma_m, sigma_rad)
+    evidence = gather(path)
     if evidence is None:
         return None
     imu_rows = _with_angles(imu_rows)
@@ -131,19 +87,41 @@ def align(
     bend = max(float(low - 2.0 * middle + high) / _FINE_S**2, 1e-9)
     shift = float(fine[at] + np.clip((low - high) / (2.0 * bend * _FINE_S), -_FINE_S, _FINE_S))
     scale = max(float(middle) / evidence.dof, 1.0)
-    problem = _Reduced.at(evidence, imu_rows, shift)
-    J = _tangent(Rs[at])
-    information = J.T @ problem.A @ J / scale
-    worst = float(np.linalg.eigvalsh(information)[0])
-    R_imu_cam = Rs[at].T
-    return Alignment(
-        R_imu_cam,
-        shift,
-        R_imu_cam @ problem.turn_bias(Rs[at].ravel()),
-        1.0 / np.sqrt(max(worst, 1e-3)),
-        float(np.sqrt(2.0 * scale / bend)),
-        contrast,
-    )
+    shift_sigma = float(np.sqrt(2.0 * scale / bend))
+    return _alignment(evidence, imu_rows, Rs[at], scale, np.eye(3), (shift, shift_sigma, contrast))
+
+
+def align_at(
+    path: CameraPath, imu_rows: FloatArray, shift_s: float, axis_cam: FloatArray
+) -> Alignment | None:
+    """Find a mounting, but for a turn about an axis of the camera (3,), with a delay taken for known.
+
+    For a rig that turns about this axis at one rate all the time, see `align`.
+    """
+    evidence = gather(path)
+    if evidence is None:
+        return None
+    imu_rows = _with_angles(imu_rows)
+    costs, Rs = _costs(evidence, imu_rows, np.array([shift_s]))
+    scale = max(float(costs[0]) / evidence.dof, 1.0)
+    across = np.linalg.svd(axis_cam[None])[2][1:].T
+    return _alignment(evidence, imu_rows, Rs[0], scale, across, (shift_s, 0.0, np.inf))
+
+
+def _alignment(
+    evidence: Evidence,
+    rows: FloatArray,
+    R: FloatArray,
+    scale: float,
+    asked: FloatArray,
+    shift: tuple[float, float, float],
+) -> Alignment:
+    """The mounting R (cam from imu), known about the axes `asked`, (3, k); delay, its sigma and contrast."""
+    problem = _Reduced.at(evidence, rows, shift[0])
+    J = _tangent(R) @ asked
+    worst = float(np.linalg.eigvalsh(J.T @ problem.A @ J / scale)[0])
+    bias = R.T @ problem.turn_bias(R.ravel())
+    return Alignment(R.T, shift[0], bias, 1.0 / np.sqrt(max(worst, 1e-3)), shift[1], shift[2])
 
 
 def _with_angles(rows: FloatArray) -> FloatArray:
@@ -151,82 +129,6 @@ def _with_angles(rows: FloatArray) -> FloatArray:
     steps = np.diff(rows[:, 0])[:, None]
     angle = np.cumsum(0.5 * (rows[1:, 1:4] + rows[:-1, 1:4]) * steps, axis=0)
     return np.hstack([rows, np.vstack([np.zeros(3), angle])])
-
-
-def _gather(
-    t: FloatArray, R: FloatArray, p: FloatArray, sigma_m: FloatArray, sigma_rad: FloatArray
-) -> _Evidence | None:
-    half_s = max(_HALF_S, 2.2 * float(np.median(np.diff(t))))
-    grid = np.arange(t[0], t[-1], _STEP_S)
-    right = np.clip(np.searchsorted(t, grid, side="right"), 1, len(t) - 1)
-    share = ((grid - t[right - 1]) / (t[right] - t[right - 1]))[:, None, None]
-    # Straight between matrices: of two poses 3 deg apart that misses the rotation by 0.03 %.
-    R_grid = (1.0 - share) * R[right - 1] + share * R[right]
-    windows = [
-        window
-        for centre in np.arange(t[0] + half_s, t[-1] - half_s, half_s)
-        if (window := _window(float(centre), half_s, t, grid)) is not None
-    ]
-    if len(windows) < _MIN_WINDOWS:
-        return None
-    kernels = np.array([kernel for _, kernel in windows])
-    weights = np.array([weight for weight, _ in windows])
-    sigma = np.linalg.norm(weights * sigma_m, axis=1)
-    turns = camera_turns(t, so3.quat_from_matrix(R), most=len(t) // 2)
-    first, second, turn = turns.first, turns.second, turns.rotvec_cam
-    turn_sigma = np.hypot(sigma_rad[first], sigma_rad[second])
-    others = _other_unknowns(weights, kernels, R, R_grid, sigma, (t[second] - t[first]) / turn_sigma)
-    seen = np.concatenate([(weights @ p / sigma[:, None]).ravel(), (turn / turn_sigma[:, None]).ravel()])
-    return _Evidence(
-        grid,
-        R_grid,
-        kernels,
-        sigma,
-        np.array([t[first], t[second]]),
-        turn_sigma,
-        np.concatenate([seen, np.zeros(_PRIORS)]),
-        others,
-        np.linalg.qr(others)[0],
-    )
-
-
-def _window(
-    centre_s: float, half_s: float, t: FloatArray, grid_s: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Weights of the poses that give the acceleration about an instant, and how they weigh its course."""
-    inside = np.flatnonzero(np.abs(t - centre_s) <= half_s)
-    if len(inside) < 4 or np.ptp(t[inside]) < 1.5 * half_s:
-        return None
-    tau = t[inside] - centre_s
-    quadratic = np.linalg.pinv(np.stack([np.ones_like(tau), tau, 0.5 * tau * tau], axis=1))[2]
-    weights = np.zeros(len(t))
-    weights[inside] = quadratic
-    # The weights take no mean and no slope: integrating twice by parts, they see accelerations through this.
-    kernel: FloatArray = quadratic @ np.clip(tau[:, None] - (grid_s - centre_s), 0.0, None)
-    kernel = np.where(grid_s >= t[inside[0]], kernel, 0.0)
-    scaled: FloatArray = kernel / kernel.sum()
-    return weights, scaled
-
-
-def _other_unknowns(
-    weights: FloatArray,
-    kernels: FloatArray,
-    R: FloatArray,
-    R_grid: FloatArray,
-    accel_sigma: FloatArray,
-    span_by_sigma: FloatArray,
-) -> FloatArray:
-    """Map gravity, lever arm, accelerometer bias (camera frame) and gyro bias to what is seen."""
-    nw, nk = len(kernels), len(span_by_sigma)
-    out = np.zeros((3 * (nw + nk) + _PRIORS, 12))
-    lever, bias = np.einsum("wk,kij->wij", weights, R), np.einsum("wg,gij->wij", kernels, R_grid)
-    gravity = np.broadcast_to(np.eye(3), lever.shape)
-    by_force = np.concatenate([gravity, lever, -bias], axis=2) / accel_sigma[:, None, None]
-    out[: 3 * nw, :9] = by_force.reshape(-1, 9)
-    out[3 * nw : -_PRIORS, 9:] = -(span_by_sigma[:, None, None] * np.eye(3)).reshape(-1, 3)
-    sigmas = np.repeat([_LEVER_ARM_PRIOR_M, _BIAS_PRIOR, _GYRO_BIAS_PRIOR_RPS], 3)
-    out[-_PRIORS:, 3:] = np.diag(1.0 / sigmas)
-    return out
 
 
 @dataclass(frozen=True)
@@ -241,7 +143,7 @@ class _Reduced:
     _others: FloatArray
 
     @classmethod
-    def at(cls, e: _Evidence, rows: FloatArray, shift_s: float) -> _Reduced:
+    def at(cls, e: Evidence, rows: FloatArray, shift_s: float) -> _Reduced:
         """Set it up.
 
         Args:
@@ -256,7 +158,7 @@ class _Reduced:
         turned = np.stack([np.interp(e.turn_span_s + shift_s, t, rows[:, 7 + m]) for m in range(3)], axis=-1)
         turn = (turned[1] - turned[0]) / e.turn_sigma[:, None]
         by_turn = (np.eye(3)[None, :, :, None] * turn[:, None, None, :]).reshape(-1, 9)
-        D = np.vstack([by_force.reshape(-1, 9), by_turn, np.zeros((_PRIORS, 9))])
+        D = np.vstack([by_force.reshape(-1, 9), by_turn, np.zeros((PRIORS, 9))])
         PD, Py = e.project(D), e.project(e.seen)
         return cls(PD.T @ PD, PD.T @ Py, float(Py @ Py), D, e.seen, e.others)
 
@@ -266,7 +168,7 @@ class _Reduced:
         return np.asarray(found[9:], dtype=np.float64)
 
 
-def _costs(e: _Evidence, rows: FloatArray, shifts_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _costs(e: Evidence, rows: FloatArray, shifts_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least cost over all mountings for each shift, shape (s,), and R_cam_imu there, shape (s, 3, 3)."""
     problems = [_Reduced.at(e, rows, float(d)) for d in shifts_s]
     A, b = np.array([p.A for p in problems]), np.array([p.b for p in problems])

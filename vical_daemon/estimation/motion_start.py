@@ -28,12 +28,15 @@ class StartResult:
         motion_missing: It is motion that is missing, not time.
         still_axes: Of a partial start: axes of the imu along which lever arms are guessed, shape (k, 3);
             None: everything is known.
+        turn_axis_cam: Of a rig that turned about it at one rate all the time, camera frame, shape (3,): the
+            delay and the mounting about this axis are guessed, too; None: not so.
     """
 
     state: State | None
     reason: str
     motion_missing: bool = False
     still_axes: FloatArray | None = None
+    turn_axis_cam: FloatArray | None = None
 
 
 def motion_start(
@@ -43,6 +46,7 @@ def motion_start(
     gyro_bias_rps: dict[str, FloatArray],
     options: CalibrationOptions,
     partial: bool = False,
+    turn_axis_cam: FloatArray | None = None,
 ) -> StartResult:
     """Lever arms, velocity and gravity; the state stands at the first pose of the first camera.
 
@@ -53,6 +57,7 @@ def motion_start(
         gyro_bias_rps: As found with each camera, shape (3,).
         options: Switches.
         partial: The motion need not show the lever arms; what it does not show is taken as zero.
+        turn_axis_cam: Of a partial start of a rig that turns at one rate, see `StartResult`: it shows none.
 
     Returns:
         The state, or the reason why not.
@@ -66,7 +71,8 @@ def motion_start(
         inside = [p for p in poses if since < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
-        linear, axes = _linear(buffer, inside, camera, gyro_bias_rps[name], partial)
+        held = None if turn_axis_cam is None else np.eye(3)
+        linear, axes = _linear(buffer, inside, camera, gyro_bias_rps[name], partial, held)
         invisible = linear is not None and float(np.max(linear.sigma_p_imu_cam)) > 0.1
         if linear is None or (invisible and not partial):
             why = f"{name}: lever arm not yet visible: turn the rig about two axes"
@@ -83,7 +89,7 @@ def motion_start(
             "check the target's size in its YAML and the unit of the accelerometer"
         )
         return StartResult(None, why)
-    return StartResult(state, "", still_axes=still)
+    return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam)
 
 
 def _linear(
@@ -92,8 +98,9 @@ def _linear(
     camera: CameraState,
     gyro_bias: FloatArray,
     partial: bool,
+    held: FloatArray | None,
 ) -> tuple[LinearStart | None, FloatArray | None]:
-    """The linear start, and the axes along which a partial one guesses."""
+    """The linear start, and the axes along which a partial one guesses: `held`, or those that are still."""
     R = np.array([p.R_target_cam for p in poses]) @ camera.R_imu_cam.T
     p = np.array([p.p_target_cam for p in poses])
     sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
@@ -101,7 +108,7 @@ def _linear(
     if not partial:
         return linear_start(buffer, t, R, p, gyro_bias, sigma), None
     R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
-    axes = still_axes(R.mean(axis=0))
+    axes = still_axes(R.mean(axis=0)) if held is None else held
     return linear_start(buffer, t, R, p, gyro_bias, sigma, axes), axes
 
 

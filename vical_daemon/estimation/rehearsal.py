@@ -16,7 +16,6 @@ from vical_daemon.estimation.consistency import MODES, Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, LAG, LAG_SIGMA_S, TARGET
-from vical_daemon.estimation.initialise import HELD_M
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
 from vical_daemon.estimation.shared_errors import SharedErrors
@@ -179,7 +178,11 @@ def _about(
 
 
 def wide_filter(
-    state: State, layout: Layout, options: CalibrationOptions, still_axes: FloatArray | None = None
+    state: State,
+    layout: Layout,
+    options: CalibrationOptions,
+    still_axes: FloatArray | None = None,
+    turn_axis_cam: FloatArray | None = None,
 ) -> CalibrationFilter:
     """Build a filter about a start, with sigmas many times what the start is worth.
 
@@ -188,17 +191,17 @@ def wide_filter(
         layout: Where the errors live.
         options: Noise.
         still_axes: Of a partial start, see `StartResult`.
+        turn_axis_cam: Likewise.
     """
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
     off = {IMU, LAG, TARGET} & options.estimate
     root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, imu_off=IMU in off))
-    unshown = None if still_axes is None else UnshownAxes(still_axes)
-    for where in layout.cameras.values():
-        if unshown is not None and where.position is not None:
-            held = unshown.projector
-            root[where.position, where.position] = UNKNOWN_M * (np.eye(3) - held) + HELD_M * held
+    unshown = None if still_axes is None else UnshownAxes(still_axes, turn_axis_cam)
+    if unshown is not None:
+        for where in layout.cameras.values():
+            unshown.hold(root, where)
     agreement = {name: LensAgreement(state.cameras[name].distortion_model) for name in layout.cameras}
     shared = {name: SharedErrors() for name in layout.cameras}
     return CalibrationFilter(

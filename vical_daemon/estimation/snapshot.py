@@ -26,9 +26,13 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     lens = np.maximum(np.sqrt(agreement.factors), spread)
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
-        PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), (spread**2 * pose_covariance(f, where)).tolist()),
+        PoseEstimate(
+            camera.p_imu_cam.tolist(),
+            q.tolist(),
+            (spread**2 * pose_covariance(f, where)).tolist(),
+        ),
         float(camera.timeshift_s),
-        float(sigma[where.timeshift]) if where.timeshift is not None else 0.0,
+        _timeshift_sigma(f, sigma, where),
         camera.intrinsics.tolist(),
         np.hypot(lens[:4] * raw[where.intrinsics], agreement.moved[:4]).tolist()
         if where.intrinsics is not None
@@ -47,6 +51,12 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     )
 
 
+def _timeshift_sigma(f: CalibrationFilter, sigma: FloatArray, where: CameraSlices) -> float:
+    if where.timeshift is None:
+        return 0.0
+    return float(np.hypot(sigma[where.timeshift], f.unshown.timeshift_sigma_s if f.unshown else 0.0))
+
+
 def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
     """Biases and, where asked for, the matrices."""
     sigma = f.sigmas()
@@ -61,7 +71,10 @@ def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
 
 
 def pose_covariance(f: CalibrationFilter, where: CameraSlices) -> FloatArray:
-    """The filter's covariance of T_imu_cam, order [px py pz rx ry rz], shape (6, 6); zeros where fixed."""
+    """What is not known of T_imu_cam, order [px py pz rx ry rz], shape (6, 6).
+
+    The filter's covariance and what it holds; zeros where all is fixed.
+    """
     if where.position is None or where.rotation is None:
         return np.zeros((6, 6))
     rows = [
@@ -70,5 +83,5 @@ def pose_covariance(f: CalibrationFilter, where: CameraSlices) -> FloatArray:
     ]
     covariance = f.covariance(rows)
     if f.unshown is not None:
-        covariance[:3, :3] += f.unshown.covariance()
+        covariance += f.unshown.covariance()
     return covariance

@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vical_daemon.estimation.accel_alignment import align
+from vical_daemon.estimation.accel_alignment import Alignment, align, align_at
+from vical_daemon.estimation.accel_evidence import CameraPath
 from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.initialise import still_axes
 from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.motion_start import StartResult, motion_start
@@ -20,6 +22,7 @@ from vical_daemon.estimation.row_times import at_middle_row
 from vical_daemon.estimation.seen_poses import Lens, PoseCache, SeenPose
 from vical_daemon.estimation.state import CameraState, Layout
 from vical_daemon.estimation.td_icp import TdIcpResult, td_icp
+from vical_daemon.estimation.td_icp_refusals import at_one_rate
 
 _SHIFT_SIGMA_S = 1.0e-3
 _PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
@@ -96,29 +99,51 @@ def partial_attempt(data: StartData, reason: str) -> StartResult:
         A state that is a guess where the motion shows nothing, or the reason again.
     """
     rough: dict[str, _Rough] = {}
+    turn_axis_cam: FloatArray | None = None
     refused = StartResult(None, reason, motion_missing=True)
     for name in data.priors:
         lens, poses = _poses(data, name, data.frames[name][-1][0] - _PARTIAL_STRETCH_S)
         if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < _PARTIAL_MIN_S:
             return refused
-        found = align(
-            data.buffer.rows,
+        path = CameraPath(
             np.array([p.t_cam_s for p in poses]),
             np.array([p.R_target_cam for p in poses]),
             np.array([p.p_target_cam for p in poses]),
             np.maximum([p.sigma_m for p in poses], 2e-4),
             _attitude_sigmas(poses, lens),
-            _PARTIAL_SHIFTS_S,
         )
+        found = align(path, data.buffer.rows, _PARTIAL_SHIFTS_S)
+        if found is not None and not found.trusted and len(data.priors) == 1:
+            found, turn_axis_cam = _steady(data, name, path)
         if found is None or not found.trusted:
             return refused
         camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_s)
         rough[name] = _Rough(camera, poses, found.gyro_bias_rps)
-    result = _with_motion(data, rough, partial=True)
+    result = _with_motion(data, rough, partial=True, turn_axis_cam=turn_axis_cam)
     return refused if result.state is None else replace(result, reason=reason)
 
 
-def _with_motion(data: StartData, rough: dict[str, _Rough], *, partial: bool = False) -> StartResult:
+def _steady(data: StartData, name: str, path: CameraPath) -> tuple[Alignment | None, FloatArray | None]:
+    """For a rig that turns at one rate about one axis: a mounting with the delay as given; the axis, camera.
+
+    Which way gravity points is not known either, so the angle about that axis is as unknown as the delay.
+    """
+    shift_s = data.priors[name].timeshift_cam_imu_s or 0.0
+    rows = data.buffer.rows
+    during = (rows[:, 0] > path.t_cam_s[0] + shift_s) & (rows[:, 0] < path.t_cam_s[-1] + shift_s)
+    if np.count_nonzero(during) < 100 or not at_one_rate(rows[during, 0], rows[during, 1:4]):
+        return None, None
+    axes = still_axes(path.R_target_cam.mean(axis=0))
+    return (align_at(path, rows, shift_s, axes[0]), axes[0]) if len(axes) == 1 else (None, None)
+
+
+def _with_motion(
+    data: StartData,
+    rough: dict[str, _Rough],
+    *,
+    partial: bool = False,
+    turn_axis_cam: FloatArray | None = None,
+) -> StartResult:
     return motion_start(
         data.buffer,
         {name: r.poses for name, r in rough.items()},
@@ -126,6 +151,7 @@ def _with_motion(data: StartData, rough: dict[str, _Rough], *, partial: bool = F
         {name: r.gyro_bias_rps for name, r in rough.items()},
         data.options,
         partial=partial,
+        turn_axis_cam=turn_axis_cam,
     )
 
 

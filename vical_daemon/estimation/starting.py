@@ -120,7 +120,13 @@ class Starting:
             if t + shifts[f.camera] > begin_s - LATE_S
         ]
         frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
-        make = partial(wide_filter, layout=self._layout, options=self._options, still_axes=result.still_axes)
+        make = partial(
+            wide_filter,
+            layout=self._layout,
+            options=self._options,
+            still_axes=result.still_axes,
+            turn_axis_cam=result.turn_axis_cam,
+        )
         found = rehearsed(result.state, frames, make, self._step)
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"

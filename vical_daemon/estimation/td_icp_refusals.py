@@ -38,11 +38,9 @@ def refuse_motion(
             f"camera and imu do not overlap in time: the camera covers {t_cam[0]:.1f} to {t_cam[-1]:.1f} s, "
             f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?)"
         )
-    length = max(1, round(0.2 / float(np.median(np.diff(t_imu)))))
-    kernel = np.ones(length) / length
-    mean_rate = np.stack([np.convolve(gyro[near, i], kernel, mode="valid") for i in range(3)], axis=1)
+    mean_rate = _mean_rates(t_imu, gyro[near])
     rate_imu = float(np.median(np.linalg.norm(mean_rate, axis=1)))
-    change = np.linalg.norm(mean_rate - np.median(mean_rate, axis=0), axis=1)
+    change = _changes(mean_rate)
     swing = float(np.median(change))
     ratio = rate_imu / max(rate_cam, 1e-9)
     if rate_cam < _MIN_RATE_RPS and swing < _MIN_RATE_RPS:
@@ -52,12 +50,40 @@ def refuse_motion(
         )
     if rate_cam < _MIN_RATE_RPS and swing > 5.0 * _MIN_RATE_RPS:
         return "the imu turns but the camera does not: is the camera fixed to the imu, are its poses fresh?"
-    if 0.5 < ratio < 2.0 and float(np.quantile(change, 0.95)) < _STEADY * rate_imu:
+    if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
         return (
             f"it turns at one rate ({rate_imu / _DEG:.0f} deg/s) about one axis all the time: neither delay "
             "nor mounting about that axis show; turn to and fro, and about other axes"
         )
     return _wrong_unit(ratio)
+
+
+def at_one_rate(t_imu: FloatArray, gyro: FloatArray) -> bool:
+    """Whether the rig turns at one rate about one axis all the time.
+
+    Args:
+        t_imu: Instants, s, shape (n,).
+        gyro: Rates, rad/s, shape (n, 3).
+    """
+    rates = _mean_rates(t_imu, gyro)
+    return _is_steady(rates) and float(np.median(np.linalg.norm(rates, axis=1))) > _MIN_RATE_RPS
+
+
+def _is_steady(rates: FloatArray) -> bool:
+    size = float(np.median(np.linalg.norm(rates, axis=1)))
+    return float(np.quantile(_changes(rates), 0.95)) < _STEADY * size
+
+
+def _mean_rates(t_imu: FloatArray, gyro: FloatArray) -> FloatArray:
+    """Means over a fifth of a second, so that noise is not taken for changes."""
+    length = max(1, round(0.2 / float(np.median(np.diff(t_imu)))))
+    kernel = np.ones(length) / length
+    return np.stack([np.convolve(gyro[:, i], kernel, mode="valid") for i in range(3)], axis=1)
+
+
+def _changes(rates: FloatArray) -> FloatArray:
+    out: FloatArray = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)
+    return out
 
 
 def _wrong_unit(ratio: float) -> str:

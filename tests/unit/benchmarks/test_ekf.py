@@ -6,8 +6,23 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.rotations import exp_so3, log_so3
 
 from benchmarks.bound import BoundOptions, bounds
-from benchmarks.ekf import BA, BG, LEVER, MOUNT, SHIFT, SIZE, THETA, G, Nominal, P, PlainEkf, V
-from benchmarks.feed import imu_noise
+from benchmarks.ekf import (
+    BA,
+    BG,
+    LEVER,
+    MOUNT,
+    SHIFT,
+    SIZE,
+    THETA,
+    EkfSubject,
+    G,
+    Nominal,
+    P,
+    PlainEkf,
+    V,
+)
+from benchmarks.feed import StartErrors, camera_prior, feed, imu_noise
+from vical_daemon.estimation.measurements import CalibrationOptions
 
 
 def started_at_the_truth(run, t_s, rng):
@@ -59,3 +74,15 @@ def test_a_plain_ekf_reaches_the_bound_from_close_by():
     # Its prior helps a little in so short a time, hence slightly below 1 is right.
     assert np.all(claimed / least > 0.7)
     assert np.all(claimed / least < 1.15)
+
+
+def test_the_comparator_begins_where_the_product_does():
+    run = simulate(6, 8.0, rig=reference_rig(6, timeshift_cam_imu_s=-0.02))
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=imu_noise(run))
+    prior = camera_prior(run, 6, StartErrors(), exact_lens=True)
+    record = feed(run, EkfSubject(options, prior, run.points_m))
+    assert record.started_s() < 7.0
+    last = record.snapshots[-1]
+    sigma = np.sqrt(np.diag(last.covariance))[:7]
+    assert np.all(np.abs(last.error[:7]) < 5 * sigma)
+    assert sigma[:3].max() < 2e-3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from vical_mocks import trajectory
-from vical_mocks.curves import Pause, Paused
+from vical_mocks.curves import Pause, Paused, Sinusoids
 from vical_mocks.points import simulate
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
 
@@ -74,12 +74,73 @@ def test_a_partial_start_gives_way_to_a_full_one_as_soon_as_the_rig_turns():
     assert sigma[:3].max() < 2e-3
 
 
-def test_turning_on_the_spot_at_one_rate_shows_too_little_to_begin_with():
+def test_turning_at_one_rate_shows_where_the_axis_lies_in_the_imu_and_nothing_else():
     run = run_of(trajectory.constant_rate(T_imu_cam=MOUNT))
-    estimate = calibrate(run).estimate()
+    statuses = []
+    estimate = calibrate(run, each=lambda c: statuses.append(c.estimate().status)).estimate()
+    assert Status.CONVERGED not in statuses
     assert estimate.status == Status.DEGENERATE
-    assert "one rate" in estimate.reason
-    assert estimate.cameras == {}
+    camera = estimate.cameras["cam0"]
+    named = " ".join(camera.unobservable)
+    assert "rotation about the optical axis" in named
+    assert "time shift" in named
+    assert named.count("lever arm") == 3
+    axis = Rotation.from_quat(np.roll(camera.T_imu_cam.q_wxyz, -1)).as_matrix()[:, 2]
+    off = np.arccos(min(axis @ run.rig.R_imu_cam[:, 2], 1.0))
+    _, sigma = errors(estimate, run)
+    assert off < 4.0 * np.hypot(sigma[3], sigma[4])
+    assert sigma[3:5].max() < np.deg2rad(0.15)
+    assert sigma[:3].min() > 0.25
+    assert sigma[5] > 1.0
+    assert sigma[6] > 0.25
+
+
+class Faded:
+    """A curve that is nothing at first and all of itself a second later."""
+
+    def __init__(self, curve, start_s):
+        self.curve, self.start_s = curve, start_s
+
+    def evaluate(self, t_s):
+        t = np.asarray(t_s, dtype=np.float64)[..., None]
+        x = np.clip(t - self.start_s, 0.0, 1.0)
+        w, dw, ddw = x**3 * (10 - 15 * x + 6 * x**2), 30 * (x - x**2) ** 2, 60 * x * (1 - x) * (1 - 2 * x)
+        v, dv, ddv = self.curve.evaluate(t_s)
+        return w * v, dw * v + w * dv, ddw * v + 2 * dw * dv + w * ddv
+
+
+class Sum:
+    def __init__(self, *curves):
+        self.curves = curves
+
+    def evaluate(self, t_s):
+        return tuple(sum(parts) for parts in zip(*(c.evaluate(t_s) for c in self.curves), strict=True))
+
+
+def test_a_rig_that_has_turned_at_one_rate_is_known_as_soon_as_it_turns_otherwise():
+    hand = trajectory.hand_motion(5, T_imu_cam=MOUNT)
+    steady = Sinusoids(np.array([0.0, 0.0, -3.0]), slope=np.deg2rad([0.0, 0.0, 25.0]))
+    motion = trajectory.Trajectory(
+        Sum(Paused(steady, [Pause(13.5, 99.0)]), Faded(hand.rotation, 13.0)),
+        Paused(hand.position, [Pause(-1.0, 13.5)]),
+        hand.R_world_base0,
+        (hand.R_base_imu, hand.p_base_imu),
+    )
+    run = run_of(motion, seconds=30.0)
+    partial, statuses = [], []
+
+    def look(c):
+        partial.append(c.filter is not None and c.filter.unshown is not None)
+        statuses.append(c.estimate().status)
+
+    c = calibrate(run, each=look)
+    assert any(partial)
+    estimate = c.estimate()
+    assert estimate.status == Status.CONVERGED
+    assert statuses.index(Status.CONVERGED) > max(k for k, p in enumerate(partial) if p)
+    x, sigma = errors(estimate, run)
+    assert np.abs(x / sigma).max() < 4.0
+    assert sigma[:3].max() < 3e-3
 
 
 def test_an_axis_that_begins_to_turn_is_released():
