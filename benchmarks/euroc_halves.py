@@ -30,16 +30,16 @@ LENS = (458.654, 457.296, 367.215, 248.375)
 DISTORTION = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 PRIOR = CameraPrior((752, 480), LENS, "radtan", DISTORTION)
 SPLIT_S = 35.5
+_PART_PX = 24
 
 Items = list[tuple[int, object]]
 
 
 class Half(NamedTuple):
-    """A stretch calibrated: the answer, its corners' RMS and noise (px an axis), CPU of each image (s)."""
+    """A stretch calibrated: the answer, its images, CPU of each (s)."""
 
     camera: CameraEstimate
-    rms_px: float
-    noise_px: float
+    used: list[FrameReport]
     steady_s: list[float]
 
 
@@ -61,8 +61,12 @@ def calibrate(
         else:
             c.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
     c.finish()
-    rms_px = float(np.sqrt(np.mean(np.concatenate([r.residual_px[r.accepted] for r in used]) ** 2)))
-    return Half(c.estimate().cameras["cam0"], rms_px, noise_px(used), steady_s)
+    return Half(c.estimate().cameras["cam0"], used, steady_s)
+
+
+def rms_px(reports: list[FrameReport]) -> float:
+    """RMS of the residuals of a stretch, px an axis."""
+    return float(np.sqrt(np.mean(np.concatenate([r.residual_px[r.accepted] for r in reports]) ** 2)))
 
 
 def noise_px(reports: list[FrameReport]) -> float:
@@ -76,8 +80,20 @@ def noise_px(reports: list[FrameReport]) -> float:
     return float(np.sqrt(squares / freedom))
 
 
-def held_back_px(camera: CameraEstimate, other: Items, points: np.ndarray, target_off: bool) -> float:
-    """RMS of corners that had no part in a calibration, with it held fixed, px an axis.
+def where_seen(reports: list[FrameReport], seen: list[FrameReport]) -> list[FrameReport]:
+    """Of `reports` the corners in parts of the picture (24 px wide) in which `seen` has corners, too."""
+    uv = np.concatenate([r.uv_px[r.accepted] for r in seen])
+    known = set(map(tuple, (uv // _PART_PX).astype(int)))
+    return [
+        replace(r, accepted=r.accepted & [tuple(c) in known for c in (r.uv_px // _PART_PX).astype(int)])
+        for r in reports
+    ]
+
+
+def held_back(
+    camera: CameraEstimate, other: Items, points: np.ndarray, target_off: bool
+) -> list[FrameReport]:
+    """Images that had no part in a calibration, with it held fixed.
 
     Where the calibration was made with a target that is not as stated (`target_off`), so it is here: its
     shape is the target's, not the camera's.
@@ -96,7 +112,7 @@ def held_back_px(camera: CameraEstimate, other: Items, points: np.ndarray, targe
         estimate=frozenset({"target_shape"} if target_off else ()),
         imu_noise=NOISE,
     )
-    return calibrate(other, options, points, prior).rms_px
+    return calibrate(other, options, points, prior).used
 
 
 def read(folder: Path) -> Items:
@@ -134,6 +150,24 @@ def row(name: str, a: CameraEstimate, b: CameraEstimate) -> str:
     return f"| {name} | {arm_mm:.2f} | {turn_deg:.3f} | {1e6 * abs(shift):.0f} | {max(z):.1f} | {lens} |"
 
 
+def ratios(held: tuple[list[FrameReport], ...], own: tuple[Half, ...], by: tuple[Half, ...]) -> str:
+    """Residuals of images held back over those of their own half and over its corner noise.
+
+    And over the noise where the half that was calibrated (`by`) had seen corners: elsewhere its lens is
+    extrapolated.
+    """
+    all_px = [rms_px(h) for h in held]
+    seen_px = [rms_px(where_seen(h, x.used)) for h, x in zip(held, by, strict=True)]
+    noise = [noise_px(half.used) for half in own]
+    there = [noise_px(where_seen(half.used, x.used)) for half, x in zip(own, by, strict=True)]
+    columns = [
+        np.divide(all_px, [rms_px(half.used) for half in own]),
+        np.divide(all_px, noise),
+        np.divide(seen_px, there),
+    ]
+    return " | ".join(", ".join(f"{x:.3f}" for x in c) for c in columns) + " |"
+
+
 def main(argv: list[str]) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks euroc_halves", description=__doc__)
@@ -146,10 +180,10 @@ def main(argv: list[str]) -> int:
     split = items[0][0] + int(SPLIT_S * 1e9)
     print(
         "| lens | lever arm mm | rotation deg | time shift us | largest z | z of lens / distortion "
-        "| corners of the other half over own, over corner noise "
+        "| corners of the other half over own | over corner noise | the same, where corners had been seen "
         "| CPU an image once started, ms: mean (median) |"
     )
-    print("|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     halves = [[i for i in items if (i[0] < split) == first] for first in (True, False)]
     held_lens, free = (
         CalibrationOptions(fix=f, imu_noise=NOISE) for f in (frozenset({"intrinsics"}), frozenset())
@@ -163,14 +197,12 @@ def main(argv: list[str]) -> int:
         a, b = (calibrate(h, options, points, prior) for h in halves)
         off = name != "fixed"
         held = (
-            held_back_px(b.camera, halves[0], points, off),
-            held_back_px(a.camera, halves[1], points, off),
+            held_back(b.camera, halves[0], points, off),
+            held_back(a.camera, halves[1], points, off),
         )
-        own = ", ".join(f"{px / half.rms_px:.3f}" for px, half in zip(held, (a, b), strict=True))
-        noise = ", ".join(f"{px / half.noise_px:.3f}" for px, half in zip(held, (a, b), strict=True))
+        cells = [row(name, a.camera, b.camera), ratios(held, (a, b), (b, a))]
         ms = 1e3 * np.array(a.steady_s + b.steady_s)
-        cells = row(name, a.camera, b.camera)
-        print(f"{cells} {own}; {noise} | {np.mean(ms):.1f} ({np.median(ms):.1f}) |", flush=True)
+        print(*cells, f"{np.mean(ms):.1f} ({np.median(ms):.1f}) |", flush=True)
     return 0
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.lens_limit import limit as lens_limit
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
@@ -16,14 +17,13 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
 
     Sigmas are the filter's times the square root of the measured correlation factor: errors that last for
     several images count less than the filter thinks (see `consistency`); those of the lens at least as
-    much as stretches of the data disagree about it (see `lens_agreement`).
+    much as stretches of the data disagree about it (see `lens_agreement`), and as detectors allow
+    (`lens_limit`).
     """
     camera, where = f.state.cameras[name], f.layout.cameras[name]
     spread = float(np.sqrt(f.consistency[name].factor))
-    raw = f.sigmas()
-    sigma = spread * raw
-    agreement = f.agreement[name]
-    lens = np.maximum(np.sqrt(agreement.factors), spread)
+    sigma = spread * f.sigmas()
+    lens_sigma = _lens_sigmas(f, name, spread)
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
         PoseEstimate(
@@ -34,14 +34,10 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         float(camera.timeshift_s),
         _timeshift_sigma(f, sigma, where),
         camera.intrinsics.tolist(),
-        np.hypot(lens[:4] * raw[where.intrinsics], agreement.moved[:4]).tolist()
-        if where.intrinsics is not None
-        else [0.0] * 4,
+        lens_sigma[:4].tolist(),
         camera.distortion_model,
         camera.distortion.tolist(),
-        np.hypot(lens[4:] * raw[where.distortion], agreement.moved[4:]).tolist()
-        if where.distortion is not None
-        else [0.0] * len(camera.distortion),
+        lens_sigma[4:].tolist(),
         float(reprojection_rms_px),
         float(f.corner_noise[name].sigma_px),
         [],
@@ -49,6 +45,18 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         float(sigma[where.readout]) if where.readout is not None else 0.0,
         [int(size) for size in camera.resolution],
     )
+
+
+def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
+    """Of fx fy cx cy and the distortion, shape (n,); zeros where held."""
+    camera, where, agreement = f.state.cameras[name], f.layout.cameras[name], f.agreement[name]
+    if where.intrinsics is None or where.distortion is None:
+        return np.zeros(4 + len(camera.distortion))
+    raw = f.sigmas()
+    filtered = np.maximum(np.sqrt(agreement.factors), spread) * np.concatenate(
+        [raw[where.intrinsics], raw[where.distortion]]
+    )
+    return np.asarray(np.sqrt(filtered**2 + agreement.moved**2 + lens_limit(camera) ** 2))
 
 
 def _timeshift_sigma(f: CalibrationFilter, sigma: FloatArray, where: CameraSlices) -> float:
