@@ -43,9 +43,7 @@ class Lens:
         fx, fy, cx, cy = self.intrinsics
         uv = self._distort(xy) * np.array([fx, fy]) + np.array([cx, cy])
         width, height = self.resolution
-        # Polynomials fold far outside the image back into it; 1.2 + half the diagonal is beyond any of ours.
-        reach = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy) * 1.5 + 0.2
-        near = np.sum(xy * xy, axis=-1) < reach**2 if self.model == "radtan" else in_front
+        near = np.sum(xy * xy, axis=-1) < self._fold_squared() if self.model == "radtan" else in_front
         inside = (
             (uv[..., 0] >= 0) & (uv[..., 0] <= width - 1) & (uv[..., 1] >= 0) & (uv[..., 1] <= height - 1)
         )
@@ -70,6 +68,13 @@ class Lens:
                 axis=-1,
             )
         return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+
+    def _fold_squared(self) -> float:
+        """Square of the radius at which the polynomial turns back; no real lens shows what is beyond."""
+        k1, k2 = self.distortion[:2]
+        turns = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2]).roots()
+        real = turns[np.abs(turns.imag) < 1e-12].real
+        return float(min(real[real > 0.0], default=np.inf))
 
     def _distort(self, xy: FloatArray) -> FloatArray:
         """Distort normalised coordinates, shape (..., 2)."""
