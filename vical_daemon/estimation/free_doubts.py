@@ -1,4 +1,4 @@
-"""Hypotheses that a target-free calibration keeps beside each other: do clocks drift, is the imu off?"""
+"""What a target-free calibration asks beside: do clocks drift, is the imu off, does the shutter roll?"""
 
 from __future__ import annotations
 
@@ -14,8 +14,17 @@ from vical_daemon.estimation.clock_drift import (
     evidence,
     probability,
 )
-from vical_daemon.estimation.free_carry import DRIFT, IMU, Carry
+from vical_daemon.estimation.free_carry import DRIFT, IMU, READOUT, Carry
 from vical_daemon.estimation.free_snapshot import Doubts
+
+_SURELY_ROLLING = 5.0  # sigmas
+_SHORTEST_S = 1e-3  # of a readout that is worth a word
+
+
+def rolling_told(camera: str, readout_s: float, sigma_s: float) -> str:
+    """The announcement of a rolling shutter of which nothing was said."""
+    told = f"{1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms"
+    return f"{camera}: a rolling shutter, by how features move: its readout takes {told}, and is allowed for"
 
 
 class FreeDoubts:
@@ -24,17 +33,20 @@ class FreeDoubts:
     Args:
         camera: Name of the camera.
         imu_asked: The imu's matrices are asked for: they are estimated whatever the evidence.
+        rolling: The shutter is said to be a rolling one, or its readout is asked for.
 
     Attributes:
         drifting: The camera's clock is known to run apart from the imu's.
         imu_sigma: Prior of the entries of the imu's matrices.
+        rolling: The shutter is known to be a rolling one.
     """
 
-    def __init__(self, camera: str, *, imu_asked: bool) -> None:
+    def __init__(self, camera: str, *, imu_asked: bool, rolling: bool) -> None:
         self._camera = camera
         self.imu_asked = self._imu_off = imu_asked
         self.imu_sigma = KNOWN_OFF_SIGMA if imu_asked else hypotheses.ENTRY_SIGMA
         self.drifting = False
+        self.rolling = rolling
 
     def watch(self, carry: Carry, factor: float, compared: bool) -> list[str]:
         """Announce what has got beyond doubt.
@@ -53,6 +65,11 @@ class FreeDoubts:
             self._imu_off = True
             sigmas = np.sqrt(factor * np.diag(carry.calibration())[IMU])
             events.append(imu_told(carry.imu, sigmas))
+        if not self.rolling:
+            sigma_s = float(np.sqrt(factor * carry.calibration()[READOUT, READOUT]))
+            self.rolling = abs(carry.camera.readout_s) > max(_SURELY_ROLLING * sigma_s, _SHORTEST_S)
+            if self.rolling:
+                events.append(rolling_told(self._camera, carry.camera.readout_s, sigma_s))
         return events
 
     def reason(self, carry: Carry, factor: float) -> str:
@@ -69,7 +86,7 @@ class FreeDoubts:
         if not self._imu_off:
             off = hypotheses.probability(self._imu(carry, factor))
             off = off if compared else min(off, 0.5)
-        return Doubts(factor, self.drifting, off, gyro_frame=not self.imu_asked)
+        return Doubts(factor, self.drifting, off, gyro_frame=not self.imu_asked, rolling=self.rolling)
 
     @staticmethod
     def _drift(carry: Carry, factor: float) -> float:

@@ -45,9 +45,12 @@ class FreeJudge:
         options: Switches and targets.
         camera: Name of the camera.
         active: Which of the calibration errors are estimated, shape (FULL,).
+        rolling: The camera is said to have a rolling shutter, or its readout is asked for.
     """
 
-    def __init__(self, options: CalibrationOptions, camera: str, active: BoolArray) -> None:
+    def __init__(
+        self, options: CalibrationOptions, camera: str, active: BoolArray, *, rolling: bool = False
+    ) -> None:
         self.options, self.camera, self.active = options, camera, active
         self._motion = RunningMotion()
         self.imu_samples = self.imu_refused = self.frames_ignored = self.frames_seen = 0
@@ -67,9 +70,9 @@ class FreeJudge:
         self._trace = Trace()
         self._ever_converged = False
         self._bumped = ""
-        self._quiet = ""
+        self._quiet = self._given_up = ""
         self._jitter_told = False
-        self.doubts = FreeDoubts(camera, imu_asked="imu_intrinsics" in options.estimate)
+        self.doubts = FreeDoubts(camera, imu_asked="imu_intrinsics" in options.estimate, rolling=rolling)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -90,7 +93,8 @@ class FreeJudge:
 
     def waiting(self, why: str, motion_missing: bool) -> None:
         """No start yet; `motion_missing`: more motion, not more time, would help."""
-        self._reason, self._motion_missing = why, motion_missing
+        before = "" if motion_missing or not self._given_up else f"{self._given_up}; "
+        self._reason, self._motion_missing = before + why, motion_missing
 
     def started(self, t_s: float) -> None:
         """A window runs from `t_s` on."""
@@ -110,7 +114,7 @@ class FreeJudge:
         if kept is not None and not self._quiet:
             self._quiet = why
         if kept is None:
-            self._started_s, self._windows = None, 0
+            self._started_s, self._windows, self._given_up = None, 0, why
             self._agreement.clear()
 
     def changed(self, why: str) -> None:
@@ -145,7 +149,7 @@ class FreeJudge:
 
     def closed(self) -> None:
         """A window is complete and agreed."""
-        self._windows += 1
+        self._windows, self._given_up = self._windows + 1, ""
         told = jitter_told(self.camera, self.jitter_s)
         if told and not self._jitter_told:
             self._jitter_told = True

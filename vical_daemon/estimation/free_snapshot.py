@@ -39,12 +39,14 @@ class Doubts(NamedTuple):
         drifting: The camera's clock is known to run apart from the imu's.
         imu_off: Probability that the imu's matrices are not the identity.
         gyro_frame: The camera is told in the frame in which the gyro's matrix is symmetric.
+        rolling: The shutter is known to be a rolling one: its readout is told.
     """
 
     factor: float = 1.0
     drifting: bool = False
     imu_off: float = 1.0
     gyro_frame: bool = False
+    rolling: bool = True
 
 
 def camera_estimate(
@@ -76,8 +78,8 @@ def camera_estimate(
         rms_px,
         sigma_px,
         [],
-        float(camera.readout_s),
-        float(sigma[READOUT]),
+        float(camera.readout_s) if doubts.rolling else 0.0,
+        float(sigma[READOUT]) if doubts.rolling else 0.0,
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free_bundle import Bundle, Fit
-from vical_daemon.estimation.free_carry import DRIFT, FULL, LENS, READOUT, SHIFT, Carry
+from vical_daemon.estimation.free_carry import DRIFT, FULL, LENS, SHIFT, Carry
 from vical_daemon.estimation.free_handover import afresh, aged, next_window
 from vical_daemon.estimation.free_judge import FreeJudge
 from vical_daemon.estimation.free_reports import window_reports
@@ -66,8 +66,8 @@ class TargetFreeCalibrator:
         self.active[:6] = "extrinsics" not in options.fix
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         self.active[LENS] = "intrinsics" not in options.fix
-        self.active[READOUT] = "readout" in options.estimate
-        self.judge = FreeJudge(options, self.camera, self.active)
+        rolling = "readout" in options.estimate or self.prior.readout_s != 0.0
+        self.judge = FreeJudge(options, self.camera, self.active, rolling=rolling)
         self.starter = Starter(options, self.prior)
         self.window: Window | None = None
         self.carry: Carry | None = None  # before the window
@@ -250,7 +250,7 @@ class TargetFreeCalibrator:
         assert carry is not None
         if fit.parallax_deg < _MIN_PARALLAX_DEG:
             self.latest = carry if self._closed else None
-            self._lost("the camera stands still or sees no depth")
+            self._lost("the camera stands still, or features are lost before they show depth")
             return
         if self._closed and not self.judge.agrees(fit, carry):
             self._disagreed(carry)

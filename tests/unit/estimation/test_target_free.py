@@ -23,6 +23,7 @@ pytestmark = pytest.mark.timeout(400)
 
 def subject_for(run, *, lens_known=True, seed=0, start=None):
     prior = camera_prior(run, seed, start or StartErrors(0.05, 5.0), exact_lens=lens_known)
+    prior = replace(prior, readout_s=0.0)
     fix = frozenset({"intrinsics"}) if lens_known else frozenset()
     options = CalibrationOptions(fix=fix, target_free=True, imu_noise=imu_noise(run))
     return CalibratorSubject(options, prior, None)
@@ -150,6 +151,26 @@ def test_the_lens_is_found_too():
     assert np.abs(last.error[7:9]).max() < 2.0  # px, from five percent
 
 
+def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told():
+    rig = reference_rig(2, timeshift_cam_imu_s=0.01, readout_s=0.02)
+    run = simulate_tracks(2, 8.0, rig=rig, camera_rate_hz=20.0)
+    subject = subject_for(run, lens_known=False)
+    record = feed(run, subject)
+    assert any("cam0: a rolling shutter, by how features move" in text for _, text in record.events)
+    for snapshot in record.snapshots:
+        assert nees(snapshot.error, snapshot.covariance, 7) < chi2.isf(1e-4, 7)
+    camera = subject.calibrator.estimate().cameras["cam0"]
+    assert 0.0 < camera.readout_sigma_s < 5e-4
+    assert abs(camera.readout_s - 0.02) < 4.0 * camera.readout_sigma_s
+
+
+def test_nothing_is_told_of_the_readout_of_a_global_shutter(followed):
+    _, subject, record = followed
+    assert not any("rolling" in text for _, text in record.events)
+    camera = subject.calibrator.estimate().cameras["cam0"]
+    assert camera.readout_s == camera.readout_sigma_s == 0.0
+
+
 def test_waits_through_darkness_and_goes_on_with_what_it_knew():
     run = simulated(seed=5, seconds=15.0)
     run.frames[:] = [f for f in run.frames if not 7.0 < f.t_s < 10.5]
@@ -194,6 +215,13 @@ def test_standing_still_gives_no_answer_and_says_what_to_do():
     assert record.statuses[-1][1] == "degenerate"
     assert "stands still" in record.statuses[-1][2]
     assert "turn it to and fro" in record.guidance
+
+
+def test_features_that_are_soon_lost_give_no_answer_and_it_says_why():
+    run, _ = draw(42, 8.0, target_free=True)  # 60 images a second, of which each feature is lost in one of 20
+    record = feed(run, subject_for(run))
+    assert not record.snapshots
+    assert "features are lost before they show depth; collecting" in record.statuses[-1][2]
 
 
 def test_one_axis_is_never_called_converged():
