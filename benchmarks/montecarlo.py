@@ -120,14 +120,16 @@ CASES: dict[str, Case] = {
     "target-free, 3 % outliers": Case(
         lens_known=True, target_free=True, simulation={"outlier_fraction": 0.03}, trials=20
     ),
-    "target-free, readout of 20 ms to be found": Case(
-        lens_known=True,
+    "target-free, rolling shutter of 20 ms, nothing said": Case(
         target_free=True,
+        start=StartErrors(0.05, 5.0),
         rig={"readout_s": 0.02},
         bound={"readout": True},
-        estimate=frozenset({"readout"}),
         readout_told=False,
         trials=20,
+    ),
+    "target-free, accelerometer 0.3 ms late": Case(
+        lens_known=True, target_free=True, simulation={"accel_lag_s": 3e-4}, trials=20
     ),
     "target-free, imu matrices 1 % off": Case(
         lens_known=True,

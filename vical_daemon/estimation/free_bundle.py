@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.free_carry import (
     FULL,
-    IMU,
+    INERTIAL,
     Carry,
     calibration_difference,
     carried_out,
@@ -216,7 +216,7 @@ class Bundle:
         w.bias = w.bias + dx[order.knots]
         full = np.zeros(FULL)
         full[self.problem.active] = dx[order.calib]
-        w.camera, w.imu = moved(w.camera, full), w.imu + full[IMU][: len(w.imu)]
+        w.camera, w.imu = moved(w.camera, full), w.imu + full[INERTIAL][: len(w.imu)]
         m = w.landmarks
         bearing = m.bearing + np.matmul(tangents(m.bearing), dl[:, :2, None])[..., 0]
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)

@@ -12,14 +12,16 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.free_window import Window
-from vical_daemon.estimation.imu_scale import ENTRIES
+from vical_daemon.estimation.imu_scale import NUMBERS
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.retract import orthonormal
 from vical_daemon.estimation.state import CameraState
 
 # Of the calibration's errors; the time shift is that at the first image, and drifts from there on.
 ARM, TURN, SHIFT, LENS, DRIFT, READOUT, IMU = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15, 16, slice(17, 32)
-FULL = 32
+LAG = slice(32, 33)
+INERTIAL = slice(IMU.start, LAG.stop)
+FULL = LAG.stop
 _HELD_M = 1e-4
 CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
 
@@ -38,7 +40,7 @@ class Carry:
         root: W with W^T W = information of the errors, shape (d, d).
         active: Which of the calibration errors are estimated, shape (FULL,).
         t_cam_s: Stamp of that image, s.
-        imu: Entries of the imu's matrices, see `Window`.
+        imu: What is not as stated of the imu, see `Window`.
     """
 
     R: FloatArray
@@ -95,7 +97,7 @@ def camera_difference(now: CameraState, then: CameraState) -> FloatArray:
 
 def calibration_difference(window: Window, carry: Carry) -> FloatArray:
     """Errors of the calibration that lead from what was carried in to the window's, shape (FULL,)."""
-    imu = window.imu - carry.imu if len(window.imu) else np.zeros(ENTRIES)
+    imu = window.imu - carry.imu if len(window.imu) else np.zeros(NUMBERS)
     return np.concatenate([camera_difference(window.camera, carry.camera), imu])
 
 

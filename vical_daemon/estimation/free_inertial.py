@@ -19,7 +19,7 @@ class Order:
         F: Images.
         K: Knots.
         k: Calibration errors.
-        imu: How many of them, the last ones, are entries of the imu's matrices.
+        imu: How many of them, the last ones, are numbers of the imu (`imu_scale`).
     """
 
     def __init__(self, F: int, K: int, k: int, imu: int = 0) -> None:
@@ -33,13 +33,13 @@ class Order:
         self.imu = self.calib[k - imu :]
 
     def of_links(self, knots: IntArray) -> IntArray:
-        """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 39)."""
+        """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 40)."""
         entries = np.broadcast_to(self.imu, (len(knots), len(self.imu)))
         return np.concatenate([self.frames[:-1], self.frames[1:], self.knots[knots], entries], axis=1)
 
 
 def link_errors(window: Window, links: Links) -> tuple[FloatArray, FloatArray]:
-    """Whitened errors (F - 1, 9) of the links about the present values; derivatives (F - 1, 9, 24 or 39)."""
+    """Whitened errors (F - 1, 9) of the links about the present values; derivatives (F - 1, 9, 24 or 40)."""
     w = window
     return links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
 

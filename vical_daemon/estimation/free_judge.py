@@ -72,7 +72,7 @@ class FreeJudge:
         self._bumped = ""
         self._quiet = self._given_up = ""
         self._jitter_told = False
-        self.doubts = FreeDoubts(camera, imu_asked="imu_intrinsics" in options.estimate, rolling=rolling)
+        self.doubts = FreeDoubts(camera, asked=options.estimate, rolling=rolling)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens

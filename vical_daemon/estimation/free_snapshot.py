@@ -14,6 +14,7 @@ from vical_daemon.estimation.free_carry import (
     DRIFT,
     FULL,
     IMU,
+    INERTIAL,
     LENS,
     READOUT,
     SHIFT,
@@ -23,7 +24,7 @@ from vical_daemon.estimation.free_carry import (
 )
 from vical_daemon.estimation.gyro_frame import turn
 from vical_daemon.estimation.imu_scale import matrices
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.unshown_axes import held_covariance
@@ -37,14 +38,14 @@ class Doubts(NamedTuple):
     Attributes:
         factor: Measured variance over the stated one; multiplies what is told.
         drifting: The camera's clock is known to run apart from the imu's.
-        imu_off: Probability that the imu's matrices are not the identity.
+        stated: Probabilities, each with the errors that are zero then: what of the imu is as stated.
         gyro_frame: The camera is told in the frame in which the gyro's matrix is symmetric.
         rolling: The shutter is known to be a rolling one: its readout is told.
     """
 
     factor: float = 1.0
     drifting: bool = False
-    imu_off: float = 1.0
+    stated: tuple[tuple[float, IntArray], ...] = ((1.0, np.zeros(0, np.intp)),)
     gyro_frame: bool = False
     rolling: bool = True
 
@@ -85,9 +86,9 @@ def camera_estimate(
 
 def _told(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray]:
     """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `hypotheses`."""
-    camera, entries, P = _over_imu(carry, doubts)
+    camera, numbers, P = _over_imu(carry, doubts)
     if doubts.gyro_frame:
-        camera, P = _in_gyro_frame(camera, entries, P)
+        camera, P = _in_gyro_frame(camera, numbers, P)
     if doubts.drifting or not carry.active[DRIFT]:
         return camera, P
     p = probability(evidence(camera.skew, float(P[DRIFT, DRIFT])))
@@ -97,23 +98,25 @@ def _told(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray]:
 
 
 def _over_imu(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
-    """Camera, entries of the imu's matrices and covariance over both hypotheses about these."""
-    P, p = carry.calibration() * doubts.factor, doubts.imu_off
-    if p == 1.0:
-        return carry.camera, carry.imu, P
-    gain = np.linalg.solve(P[IMU, IMU], P[IMU]).T
-    d = gain @ carry.imu
-    P = P - (1.0 - p) * (gain @ P[IMU]) + p * (1.0 - p) * np.outer(d, d)
-    return moved(carry.camera, -(1.0 - p) * d), p * carry.imu, P
+    """Camera, what is not as stated of the imu, and covariance over the hypotheses about these."""
+    P, numbers = carry.calibration() * doubts.factor, np.zeros(FULL)
+    numbers[INERTIAL] = carry.imu
+    mean, mixed = np.zeros(FULL), np.zeros((FULL, FULL))
+    for p, at in doubts.stated:
+        gain = np.linalg.solve(P[np.ix_(at, at)], P[at]).T
+        d = -gain @ numbers[at]
+        mean += p * d
+        mixed += p * (P - gain @ P[at] + np.outer(d, d))
+    return moved(carry.camera, mean), carry.imu + mean[INERTIAL], mixed - np.outer(mean, mean)
 
 
-def _in_gyro_frame(camera: CameraState, entries: FloatArray, P: FloatArray) -> tuple[CameraState, FloatArray]:
+def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> tuple[CameraState, FloatArray]:
     """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries."""
     J = np.eye(FULL)
     by_entries = turn(np.eye(9).reshape(3, 3, 9))
     J[TURN, _GYRO] = -camera.R_imu_cam.T @ by_entries
     J[ARM, _GYRO] = so3.hat(camera.p_imu_cam) @ by_entries
-    back = so3.exp(-turn(entries[:9].reshape(3, 3)))
+    back = so3.exp(-turn(numbers[:9].reshape(3, 3)))
     camera = replace(camera, R_imu_cam=back @ camera.R_imu_cam, p_imu_cam=back @ camera.p_imu_cam)
     return camera, J @ P @ J.T
 

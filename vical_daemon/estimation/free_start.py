@@ -71,7 +71,7 @@ class LinearStart:
         buffer: Inertial readings.
         frames: (stamp in the camera's clock in s, tracks), in order.
         camera: Time shift and lens must be roughly right.
-        imu: Biases, and entries of the matrices where they are estimated, see `Link`, shape (6,) or (21,).
+        imu: Biases, and numbers of `imu_scale` where they are estimated, see `Link`, shape (6,) or (22,).
         noise: Densities.
         gravity_mps2: Magnitude of gravity.
 

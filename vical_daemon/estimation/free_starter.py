@@ -14,8 +14,9 @@ from vical_daemon.estimation.free_carry import Carry
 from vical_daemon.estimation.free_partial import mounting_about, still_axis
 from vical_daemon.estimation.free_start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.free_window import Window
+from vical_daemon.estimation.hypotheses import LAG_SIGMA_S
 from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.imu_scale import ENTRIES
+from vical_daemon.estimation.imu_scale import ENTRIES, NUMBERS
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.td_icp import td_icp
@@ -28,7 +29,7 @@ class _Found(NamedTuple):
     """What rotations say, or what was known before."""
 
     camera: CameraState
-    imu: FloatArray  # biases, and entries of the matrices, see `Link`
+    imu: FloatArray  # biases, and numbers of `imu_scale`, see `Link`
     arm_sigma_m: float
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 
@@ -168,7 +169,7 @@ class Starter:
             sigma = 1e-4
         if self.prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
             camera.timeshift_s = self.prior.timeshift_cam_imu_s
-        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + ENTRIES)]), sigma, about)
+        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + NUMBERS)]), sigma, about)
 
     def _seeds(
         self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState, *, look_around: bool
@@ -224,7 +225,7 @@ def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
     f = float(camera.intrinsics[0])
     lens = [0.05 * f, 0.05 * f, 0.03 * f, 0.03 * f]
     distortion = [0.1, 0.1, 0.01, 0.01] if camera.distortion_model == "radtan" else [0.05] * 4
-    imu = [imu_sigma] * ENTRIES
+    imu = [imu_sigma] * ENTRIES + [LAG_SIGMA_S]
     return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA, _READOUT_SIGMA_S] + imu)
 
 

@@ -86,7 +86,7 @@ class Window:
         landmarks: What has been placed so far.
         gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
-        imu: Entries of the imu's matrices (`imu_scale`) where they are estimated, shape (15,); else empty.
+        imu: What is not as stated of the imu (`imu_scale`) where it is estimated, shape (16,); else empty.
     """
 
     camera: CameraState

@@ -31,8 +31,10 @@ IN_DOUBT = {
 }
 LAG_SIGMA_S = 3e-4
 """By how much the delays of accelerometer and gyro differ in an IMU where they do, one sigma, s."""
-_OFF = 0.05  # share of rigs of which any one of these is not as stated, to begin with
-_SURE = 0.99
+OFF = 0.05
+"""Share of rigs of which any one of these is not as stated, to begin with."""
+SURE = 0.99
+"""Probability from which on a block is known to be off."""
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
 
@@ -84,11 +86,6 @@ def log_bayes_factor(values: FloatArray, covariance: FloatArray, factor: float) 
     return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(tempered)[1])
 
 
-def probability(log_evidence: float) -> float:
-    """Probability that an imu is not as stated, by the evidence for that alone."""
-    return float(1.0 / (1.0 + (1.0 - _OFF) / _OFF * np.exp(-log_evidence)))
-
-
 def factor(f: CalibrationFilter) -> float:
     """By how much the variances of all that is told exceed the filter's own (see `consistency`)."""
     return max((c.factor for c in f.consistency.values()), default=1.0)
@@ -106,32 +103,50 @@ def misfit(f: CalibrationFilter) -> float:
 def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
     """Probability of each hypothesis; a hypothesis is named by the blocks that are as stated."""
     doubtful = {name: block for name, block in blocks(f).items() if name not in f.off}
-    less = factor(f) * misfit(f)
+    if not doubtful:
+        return {(): 1.0}
+    rows = np.concatenate([f.S[b.where] / b.sigma for b in doubtful.values()])
+    values = {name: b.values / b.sigma for name, b in doubtful.items()}
+    return posterior(values, rows @ rows.T, factor(f) * misfit(f))
+
+
+def posterior(
+    values: dict[str, FloatArray], covariance: FloatArray, less: float
+) -> dict[tuple[str, ...], float]:
+    """Probability of each hypothesis, named by the blocks that are zero; each is in nineteen rigs of twenty.
+
+    Args:
+        values: Of each block, as estimated, over the sigma of its prior.
+        covariance: Of all of them, in order, shape (n, n).
+        less: As the factor of `log_bayes_factor`.
+    """
+    ends = np.cumsum([len(x) for x in values.values()])
+    places = {name: np.arange(end - len(x), end) for (name, x), end in zip(values.items(), ends, strict=True)}
     logs = {}
-    for true in (c for n in range(len(doubtful) + 1) for c in combinations(doubtful, n)):
-        logs[true] = len(true) * np.log(1.0 - _OFF) + (len(doubtful) - len(true)) * np.log(_OFF)
+    for true in (c for n in range(len(values) + 1) for c in combinations(values, n)):
+        logs[true] = len(true) * np.log(1.0 - OFF) + (len(values) - len(true)) * np.log(OFF)
         if true:
-            values = np.concatenate([doubtful[name].values / doubtful[name].sigma for name in true])
-            rows = np.concatenate([f.S[doubtful[name].where] / doubtful[name].sigma for name in true])
-            logs[true] -= log_bayes_factor(values, rows @ rows.T, less)
+            at = np.concatenate([places[name] for name in true])
+            zero = np.concatenate([values[name] for name in true])
+            logs[true] -= log_bayes_factor(zero, covariance[np.ix_(at, at)], less)
     most = max(logs.values())
     total = sum(np.exp(x - most) for x in logs.values())
     return {true: float(np.exp(x - most) / total) for true, x in logs.items()}
 
 
+def not_zero(weights: dict[tuple[str, ...], float], name: str) -> float:
+    """Probability that a block is not zero; 1 where that is none of the hypotheses."""
+    return sum(p for true, p in weights.items() if name not in true)
+
+
 def off(f: CalibrationFilter, name: str) -> float:
     """Probability that a block is not zero; 1 where that was announced, or it was asked for."""
-    return sum(p for true, p in weights(f).items() if name not in true)
-
-
-def is_sure(log_evidence: float) -> bool:
-    """Whether that is beyond doubt."""
-    return probability(log_evidence) > _SURE
+    return not_zero(weights(f), name)
 
 
 def surely_off(f: CalibrationFilter, name: str) -> bool:
     """Whether that is beyond doubt."""
-    return off(f, name) > _SURE
+    return off(f, name) > SURE
 
 
 def in_doubt(f: CalibrationFilter, name: str) -> bool:
@@ -139,7 +154,7 @@ def in_doubt(f: CalibrationFilter, name: str) -> bool:
 
     Images that do not fit may never decide it; what is told covers both then.
     """
-    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > _OFF
+    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > OFF
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:

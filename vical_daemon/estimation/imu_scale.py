@@ -1,7 +1,8 @@
-"""Scale and misalignment of an IMU as fifteen numbers: what is estimated of its two matrices.
+"""Scale and misalignment of an IMU as fifteen numbers, and the lag of its accelerometer as the sixteenth.
 
 omega = M_g (omega_m - b_g), f = M_a (f_m - b_a). Of M_a only the lower triangle: a full matrix could be
 traded against the mounting of the camera. Entries are those of M_g - I, row by row, and of M_a - I.
+The lag, s, is by how much the accelerometer is later than the gyro.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.state import LOWER
 
 ENTRIES = 15
+NUMBERS = ENTRIES + 1
 
 
-def matrices(entries: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """M_g and M_a of their entries, shapes (3, 3)."""
+def matrices(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """M_g and M_a of their entries (the lag may follow), shapes (3, 3)."""
     accel = np.eye(3)
-    accel[LOWER[:, 0], LOWER[:, 1]] += entries[9:]
-    return np.eye(3) + entries[:9].reshape(3, 3), accel
+    accel[LOWER[:, 0], LOWER[:, 1]] += numbers[9:ENTRIES]
+    return np.eye(3) + numbers[:9].reshape(3, 3), accel
 
 
 def by_entries(

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.imu_model import influence, strapdown
-from vical_daemon.estimation.imu_scale import by_entries, matrices
+from vical_daemon.estimation.imu_buffer import ImuBuffer, ImuSegment
+from vical_daemon.estimation.imu_model import Influence, Strapdown, influence, strapdown
+from vical_daemon.estimation.imu_scale import ENTRIES, by_entries, matrices
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
@@ -29,10 +29,10 @@ class Link:
     Attributes:
         dt_s: Length, s.
         dR, dv, dp: Relative rotation, and integrals of the specific force without gravity.
-        by_imu: Derivatives of [rotation (local), velocity, position] by [gyro, accel] bias, and by entries of
-            the matrices (`imu_scale`) where they are estimated, shape (9, 6) or (9, 21).
+        by_imu: Derivatives of [rotation (local), velocity, position] by [gyro, accel] bias, and by the
+            sixteen numbers of `imu_scale` where they are estimated, shape (9, 6) or (9, 22).
         root_information: W with W^T W = inverse covariance of [rotation, velocity, position], (9, 9).
-        imu: Biases (and entries) for which it was integrated, shape (6,) or (21,).
+        imu: Biases (and numbers) for which it was integrated, shape (6,) or (22,).
         rate_begin, rate_end: Measured rates (bias not removed) at both ends, rad/s.
     """
 
@@ -60,7 +60,7 @@ def make_link(
         buffer: Readings.
         from_s: Begin, s.
         to_s: End, s.
-        imu: [gyro, accel] bias, rad/s and m/s^2; with the entries of the matrices where they are estimated.
+        imu: [gyro, accel] bias, rad/s and m/s^2; with the numbers of `imu_scale` where they are estimated.
         noise: Densities.
 
     Returns:
@@ -69,16 +69,7 @@ def make_link(
     segment = buffer.segment(from_s, to_s)
     if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
-    bias, entries = imu[:6], imu[6:]
-    if len(entries):
-        gyro_matrix, accel_matrix = matrices(entries)
-        motion = strapdown(segment, bias[None, :3], bias[None, 3:], gyro_matrix[None], accel_matrix[None])
-        errors = influence(_EYE, motion)
-        by_imu = by_entries(errors, segment, bias, gyro_matrix, accel_matrix)
-    else:
-        motion = strapdown(segment, bias[None, :3], bias[None, 3:])
-        errors = influence(_EYE, motion)
-        by_imu = errors.by_bias()
+    motion, errors, by_imu = _integrated(segment, imu[:6], imu[6:])
     root = np.linalg.inv(np.linalg.cholesky(errors.noise(noise)[_ORDER[:, None], _ORDER]))
     return Link(
         float(motion.t_s[-1]),
@@ -93,6 +84,23 @@ def make_link(
     )
 
 
+def _integrated(
+    segment: ImuSegment, bias: FloatArray, numbers: FloatArray
+) -> tuple[Strapdown, Influence, FloatArray]:
+    """Motion over a segment, what errors do to its end, and its derivatives by bias and numbers."""
+    if not len(numbers):
+        motion = strapdown(segment, bias[None, :3], bias[None, 3:])
+        errors = influence(_EYE, motion)
+        return motion, errors, errors.by_bias()
+    M_g, M_a = matrices(numbers)
+    motion = strapdown(segment, bias[None, :3], bias[None, 3:], M_g[None], M_a[None], numbers[ENTRIES:])
+    errors = influence(_EYE, motion)
+    slope = np.zeros_like(segment.accel) if segment.accel_slope is None else segment.accel_slope
+    by_lag = errors.by_force(slope @ M_a.T)
+    by_imu = np.column_stack([by_entries(errors, segment, bias, M_g, M_a), by_lag])
+    return motion, errors, by_imu
+
+
 class Links(NamedTuple):
     """Links of a window stacked, for batched arithmetic (m of them)."""
 
@@ -102,7 +110,7 @@ class Links(NamedTuple):
     dp: FloatArray
     by_imu: FloatArray
     root: FloatArray
-    imu: FloatArray  # (m, 6) or (m, 21)
+    imu: FloatArray  # (m, 6) or (m, 22)
 
     @classmethod
     def stack(cls, links: list[Link]) -> Links:
@@ -126,7 +134,7 @@ class Links(NamedTuple):
             R: Attitudes at the m + 1 images, shape (m + 1, 3, 3).
             p: Positions in the world, m, shape (m + 1, 3).
             v: Velocities in the world, m/s, shape (m + 1, 3).
-            imu: [gyro, accel] bias on each link, and entries of the matrices, shape (m, q), q = 6 or 21.
+            imu: [gyro, accel] bias on each link, and its numbers, shape (m, q), q = 6 or 22.
             gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
 
         Returns:

@@ -14,7 +14,7 @@ from vical_daemon.estimation.free_bundle import Bundle
 from vical_daemon.estimation.free_carry import (
     DRIFT,
     FULL,
-    IMU,
+    INERTIAL,
     camera_difference,
     first_carry,
     later,
@@ -64,10 +64,10 @@ class Scene:
         self.noise = ImuNoise(d.gyro, d.gyro_walk, d.accel, d.accel_walk)
         self.rig = rig
 
-    def window(self, entries=0):
+    def window(self, numbers=0):
         start = moved(self.camera, np.zeros(FULL))
         start.p_imu_cam = np.zeros(3)
-        imu = np.concatenate([self.rig.gyro_bias.value(0.0), np.zeros(3 + entries)])
+        imu = np.concatenate([self.rig.gyro_bias.value(0.0), np.zeros(3 + numbers)])
         linear = LinearStart(self.buffer, self.frames, start, imu, self.noise, 9.80665)
         return linear.window(ArmPrior(np.zeros(3)))
 
@@ -77,7 +77,7 @@ def scene():
     return Scene()
 
 
-@pytest.mark.parametrize("numbers", [6, 21])
+@pytest.mark.parametrize("numbers", [6, 22])
 def test_links_derivatives_agree_with_differences(scene, numbers):
     zero = np.zeros(numbers)
     links = Links.stack(
@@ -149,12 +149,12 @@ def test_start_finds_lever_arm_and_speed_linearly(scene):
 
 
 def test_links_follow_the_matrices_as_integrating_anew_does(scene):
-    """What a link says of other biases and matrices, against one integrated for them."""
+    """What a link says of other biases, matrices and lags, against one integrated for them."""
     rng = np.random.default_rng(3)
-    at = np.concatenate([[0.01, -0.02, 0.01], [0.1, 0.0, -0.1], 0.02 * rng.standard_normal(15)])
+    at = np.concatenate([[0.01, -0.02, 0.01], [0.1, 0.0, -0.1], 0.02 * rng.standard_normal(15), [2e-4]])
     link = make_link(scene.buffer, 1.0, 1.25, at, scene.noise)
-    for k in range(21):
-        step = np.zeros(21)
+    for k in range(22):
+        step = np.zeros(22)
         step[k] = 1e-4
         up, down = (make_link(scene.buffer, 1.0, 1.25, at + s * step, scene.noise) for s in (1.0, -1.0))
         turn = Rotation.from_matrix(down.dR.T @ up.dR).as_rotvec()
@@ -165,22 +165,22 @@ def test_links_follow_the_matrices_as_integrating_anew_does(scene):
 
 @pytest.mark.parametrize("readout_s", [0.0, 0.02])
 def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s):
-    window = scene.window(entries=15)
+    window = scene.window(numbers=16)
     window.camera = replace(window.camera, readout_s=readout_s)
     active = np.ones(FULL, dtype=bool)
     problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 50.0).problem
     seen, links = window.observe(), window.stacked()
     normal, order = problem.normal(seen, links), problem.order()
     rng = np.random.default_rng(2)
-    scales = np.array([1e-4] * 6 + [1e-5] + [0.01] * 4 + [1e-5] * 4 + [1e-5] * 2 + [1e-6] * 15)
+    scales = np.array([1e-4] * 6 + [1e-5] + [0.01] * 4 + [1e-5] * 4 + [1e-5] * 2 + [1e-6] * 15 + [1e-5])
     for k in range(FULL):
         step = np.zeros(FULL)
         step[k] = scales[k] * rng.choice([-1.0, 1.0])
         camera, costs = window.camera, []
         for d in (step, -step):
-            window.camera, window.imu = moved(camera, d), d[IMU]
+            window.camera, window.imu = moved(camera, d), d[INERTIAL]
             costs.append(problem.normal(seen, links).cost)
-        window.camera, window.imu = camera, np.zeros(15)
+        window.camera, window.imu = camera, np.zeros(16)
         up, down = costs
         slope, wanted = (up - down) / 2.0 / step[k] / 2.0, normal.g[order.calib[k]]
         assert slope == pytest.approx(
