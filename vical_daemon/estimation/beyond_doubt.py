@@ -8,9 +8,9 @@ import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.hypotheses import (
-    ENTRY_SIGMA,
     IMU,
     LAG,
+    SIZE,
     TARGET,
     Block,
     blocks,
@@ -24,6 +24,8 @@ from vical_daemon.estimation.unscented import root, solve_lower
 
 KNOWN_OFF_SIGMA = 1e-2
 """Prior of the entries of an IMU that is known to be off, or where its matrices are asked for."""
+KNOWN_SIZE_SIGMA = 0.1
+"""Of the size of a target that is known to be off, or where it is asked for, relative."""
 _EVERY_S = 1.0
 _MEASURED = 400  # images
 
@@ -35,6 +37,15 @@ def imu_told(entries: FloatArray, sigmas: FloatArray) -> str:
         f"scale or alignment of the imu is off, by {100.0 * off:.2f} +- {100.0 * sigma:.2f} %: "
         "allowed for from now on"
     )
+
+
+def size_told(off: float, sigma: float | None = None) -> str:
+    """The announcement for a target larger (off > 0) or smaller than stated; without a sigma: roughly."""
+    how = "larger" if off > 0 else "smaller"
+    figure = (
+        f"some {100 * abs(off):.0f} %" if sigma is None else f"{100 * abs(off):.2f} +- {100 * sigma:.2f} %"
+    )
+    return f"the target is {figure} {how} than stated: measure it; its size is estimated from now on"
 
 
 def target_told(shape_m: FloatArray, sigmas_m: FloatArray) -> str:
@@ -58,14 +69,14 @@ def _surest(values: FloatArray, sigmas: FloatArray) -> tuple[float, float]:
     return abs(float(values[surest])), float(sigmas[surest])
 
 
-def _widen(f: CalibrationFilter, block: Block) -> None:
-    """Take the prior of the entries back, but for that of an IMU which is known to be off.
+def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
+    """Take the prior of a block back, but for that of one which is known to be off.
 
     With c what the prior's information falls by and E the entries:
     (P^-1 - c E E')^-1 = P + P E (I/c - E' P E)^-1 E' P, and the mean moves by P E (I/c - E' P E)^-1 E' x.
     """
     entries = f.S[block.where]
-    c = ENTRY_SIGMA**-2.0 - KNOWN_OFF_SIGMA**-2.0
+    c = block.sigma**-2.0 - sigma**-2.0
     L = root(np.eye(len(entries)) / c - entries @ entries.T)
     W = solve_lower(L, entries @ f.S.T).T
     dx = W @ solve_lower(L, block.values)
@@ -73,7 +84,13 @@ def _widen(f: CalibrationFilter, block: Block) -> None:
     f.state = retract(f.state, f.layout, dx)
 
 
-_TOLD = {IMU: imu_told, LAG: lag_told, TARGET: target_told}
+_TOLD = {
+    IMU: imu_told,
+    LAG: lag_told,
+    SIZE: lambda off, sigma: size_told(float(off[0]), float(sigma[0])),
+    TARGET: target_told,
+}
+_KNOWN_SIGMA = {IMU: KNOWN_OFF_SIGMA, SIZE: KNOWN_SIZE_SIGMA}
 
 
 @dataclass(slots=True)
@@ -100,8 +117,8 @@ class BeyondDoubt:
 def _off(f: CalibrationFilter, name: str) -> str:
     """Let a block stand by itself; return the announcement."""
     f.off.add(name)
-    if name == IMU:
-        _widen(f, blocks(f)[name])
+    if name in _KNOWN_SIGMA:
+        _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
     if name == TARGET:  # what stretches said of the lens, they said with the target as stated
         f.agreement = {camera: LensAgreement(agreement.model) for camera, agreement in f.agreement.items()}
     block = blocks(f)[name]

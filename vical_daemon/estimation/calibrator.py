@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation import clock_drift, hypotheses
-from vical_daemon.estimation.beyond_doubt import BeyondDoubt
+from vical_daemon.estimation.beyond_doubt import BeyondDoubt, size_told
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, drift_told
@@ -35,6 +35,7 @@ from vical_daemon.estimation.starting import LATE_S, Starting
 from vical_daemon.estimation.state import Layout, make_layout
 
 _KEEP_S = 5.0
+_MOST_SURPRISES = 4  # in one start: shutters that roll, targets that are not as large as stated
 
 
 class Calibrator:
@@ -57,7 +58,11 @@ class Calibrator:
         self.options = options
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
-        self._states = options.estimate | {hypotheses.IMU, hypotheses.LAG}  # always states, see `hypotheses`
+        self._states = options.estimate | {
+            hypotheses.IMU,
+            hypotheses.LAG,
+            hypotheses.SIZE,
+        }  # always, see there
         if "intrinsics" not in options.fix:  # else what is missed may as well be the lens
             self._states |= {hypotheses.TARGET}
         self.layout = self._lay_out()
@@ -72,6 +77,7 @@ class Calibrator:
         self._stale: CalibrationFilter | None = None
         self._held_back = HeldBack()
         self._beyond_doubt = BeyondDoubt()
+        self._size = 1.0  # of the target over the stated one, where it is by far not that
 
     def _lay_out(self) -> Layout:
         models = {name: prior.distortion_model for name, prior in self.priors.items()}
@@ -140,13 +146,20 @@ class Calibrator:
         if not (at_end or self._starting.due(self._buffer.newest_s)):
             return
         found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
-        if found.rolling:
-            self._estimate_readout(found.rolling)
+        for _ in range(_MOST_SURPRISES):
+            if found.rolling:
+                self._estimate_readout(found.rolling)
+            elif found.size is not None:
+                self._resize(found.size)
+            else:
+                break
             found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
         if found.filter is None:
             if self.filter is None:
                 self.judge.waiting(found.reason, found.motion_missing)
             return
+        if self._size != 1.0:
+            self.judge.announce(size_told(self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
         self.filter, self._stale = found.filter, None
         self._held_back = HeldBack()
@@ -160,10 +173,17 @@ class Calibrator:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self._states |= {"readout"}
         self.layout = self.judge.layout = self._lay_out()
-        self._starting.estimate_readout(self.layout)
+        self._starting.go_on_with(self.layout, self.target)
         self.judge.announce(
             f"{camera}: a rolling shutter, by how the target is bent in motion: its readout is estimated, too"
         )
+
+    def _resize(self, size: float) -> None:
+        """The target is by far not as large as stated: go on with one that is; its size is asked for."""
+        self.target = self.target * size
+        self.layout = self.judge.layout = self._lay_out()
+        self._starting.go_on_with(self.layout, self.target, {hypotheses.SIZE})
+        self._size *= size
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""

@@ -1,7 +1,7 @@
 """Which of the things taken for true are not? All answers are kept, each as likely as the data make it.
 
-To ask every rig for the shape of its board, the matrices of its IMU and the lag of its accelerometer would
-make the answer up to three times less certain; to take those that are a little off for true puts it ten
+To ask every rig for size and shape of its board, the matrices of its IMU and the lag of its accelerometer
+would make the answer up to three times less certain; to take those that are a little off for true puts it ten
 stated sigmas off. So the filter always has them among its states. That some of them, or all, are zero are
 hypotheses beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how
 far the states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the
@@ -22,13 +22,16 @@ from vical_daemon.estimation.retract import retract
 from vical_daemon.estimation.state import LOWER
 from vical_daemon.estimation.unscented import root, solve_lower
 
-IMU, LAG, TARGET = "imu_intrinsics", "accel_lag", "target_shape"
+IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
 ENTRY_SIGMA = 2e-3
 """Scale or alignment of an IMU that is not as it says, one sigma of each entry."""
 IN_DOUBT = {
     IMU: "sigmas are small; whether the imu's scale and alignment are true is not sure yet",
+    SIZE: "sigmas are small; whether the target is as large as stated is not sure yet",
     TARGET: "sigmas are small; whether the target is as stated is not sure yet",
 }
+SIZE_SIGMA = 0.02
+"""Of a target that is not as large as stated, relative, one sigma; pages fitted to the paper: 3 to 6 %."""
 LAG_SIGMA_S = 3e-4
 """By how much the delays of accelerometer and gyro differ in an IMU where they do, one sigma, s."""
 OFF = 0.05
@@ -65,6 +68,9 @@ def blocks(f: CalibrationFilter) -> dict[str, Block]:
     if layout.accel_lag is not None:
         where = slice(layout.accel_lag, layout.accel_lag + 1)
         found[LAG] = Block(where, np.array([state.accel_lag_s]), LAG_SIGMA_S)
+    if layout.target_scale is not None:
+        where = slice(layout.target_scale, layout.target_scale + 1)
+        found[SIZE] = Block(where, np.array([state.target_scale - 1.0]), SIZE_SIGMA)
     if layout.target_shape is not None and layout.target_modes is not None:
         found[TARGET] = Block(layout.target_shape, state.target_shape, layout.target_modes.sigma_m)
     return found

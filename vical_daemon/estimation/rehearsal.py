@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from copy import deepcopy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation import so3, unscented
-from vical_daemon.estimation.beyond_doubt import KNOWN_OFF_SIGMA
+from vical_daemon.estimation.beyond_doubt import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.consistency import MODES, Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, LAG, LAG_SIGMA_S, TARGET
+from vical_daemon.estimation.hypotheses import (
+    ENTRY_SIGMA,
+    IMU,
+    LAG,
+    LAG_SIGMA_S,
+    SIZE,
+    SIZE_SIGMA,
+    TARGET,
+)
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
 from vical_daemon.estimation.shared_errors import SharedErrors
@@ -39,8 +48,24 @@ _CHANCE = 2.0  # standard deviations of it up to which larger innovations are no
 _DOUBTED_S = 2e-3  # jitter; a larger one is that of a broken driver
 REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
 
+_FAR = 0.03  # from here to the right size of a target the filter is not straight
+_SURE = 5.0  # sigmas
+
 Frames = list[tuple[float, PointsFrame]]
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
+
+
+class Rehearsed(NamedTuple):
+    """What the runs over the start gave.
+
+    Attributes:
+        filter: Starts again from the same place.
+        size: How large the target is, relative to what was stated, where that is surely and by far not as
+            stated: to be started with anew. None: it may be.
+    """
+
+    filter: CalibrationFilter
+    size: float | None
 
 
 def rehearsed(
@@ -48,7 +73,7 @@ def rehearsed(
     frames: Frames,
     make: Callable[[State], CalibrationFilter],
     step: Step,
-) -> CalibrationFilter | None:
+) -> Rehearsed | None:
     """Run over the start to learn; return a filter that starts again from the same place.
 
     The first run is far from straight: what it says of mounting and delay counts, what it says of the noise
@@ -70,23 +95,24 @@ def rehearsed(
         step: Propagates a filter to an image and corrects it.
 
     Returns:
-        The filter, or None where the start does not hold together.
+        What they gave, or None where the start does not hold together.
     """
     believed = _rehearse(state, frames, make, step, 0.0)
-    if believed is not None and _fits(believed):
+    if believed is not None and (believed.size is not None or _fits(believed.filter)):
         return believed
     doubted = _rehearse(state, frames, make, step, _DOUBTED_S)
-    if doubted is None or not _fits(doubted):
+    if doubted is None or not _fits(doubted.filter):
         return believed
-    shared = any(e.jitter_s or e.shift_px for e in doubted.shared.values())
+    shared = any(e.jitter_s or e.shift_px for e in doubted.filter.shared.values())
     return doubted if shared or believed is None else believed
 
 
 def _rehearse(
     state: State, frames: Frames, make: Callable[[State], CalibrationFilter], step: Step, doubted_s: float
-) -> CalibrationFilter | None:
+) -> Rehearsed | None:
     """The runs; until the noise is known, stamps are allowed a jitter of `doubted_s`."""
-    trial, last = make(deepcopy(state)), None
+    trial = make(deepcopy(state))
+    last: CalibrationFilter | None = None
     _doubt(trial, doubted_s)
     for _ in range(_MOST_RUNS):
         if not _holds_together(trial, frames, step):
@@ -104,7 +130,16 @@ def _rehearse(
         trial, last = fresh, trial
         if stands:
             break
-    return trial
+    return Rehearsed(trial, None if last is None else _by_far(last))
+
+
+def _by_far(f: CalibrationFilter) -> float | None:
+    """See `Rehearsed.size`."""
+    where = f.layout.target_scale
+    if where is None:
+        return None
+    size, sigma = f.state.target_scale, float(f.sigmas()[where])
+    return size if abs(size - 1.0) > max(_FAR, _SURE * sigma) else None
 
 
 def _fits(trial: CalibrationFilter) -> bool:
@@ -158,6 +193,7 @@ def _about(
         v_world_imu=state.v_world_imu,
         cameras={name: replace(camera, skew=0.0) for name, camera in trial.state.cameras.items()},
         # expected as stated, not near what was found last
+        target_scale=state.target_scale,
         target_shape=state.target_shape,
         gyro_matrix=state.gyro_matrix,
         accel_matrix=state.accel_matrix,
@@ -170,8 +206,9 @@ def _about(
     for where in (trial.layout.target_shape, trial.layout.gyro_matrix, trial.layout.accel_matrix):
         if where is not None:
             narrow[where] = wide[where]
-    if trial.layout.accel_lag is not None:
-        narrow[trial.layout.accel_lag] = wide[trial.layout.accel_lag]
+    for at in (trial.layout.accel_lag, trial.layout.target_scale):
+        if at is not None:
+            narrow[at] = wide[at]
     fresh.S = fresh.S * (narrow / wide)[:, None]
     fresh.corner_noise = trial.corner_noise
     return fresh
@@ -196,8 +233,8 @@ def wide_filter(
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
-    off = {IMU, LAG, TARGET} & options.estimate
-    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, imu_off=IMU in off))
+    off = {IMU, LAG, SIZE, TARGET} & options.estimate
+    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, off=off))
     unshown = None if still_axes is None else UnshownAxes(still_axes, turn_axis_cam)
     if unshown is not None:
         for where in layout.cameras.values():
@@ -233,7 +270,7 @@ def _before_board_m(state: State, camera: str) -> float:
     return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
 
 
-def start_sigmas(state: State, layout: Layout, *, partial: bool, imu_off: bool) -> FloatArray:
+def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection[str]) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
     The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
@@ -247,11 +284,11 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, imu_off: bool) 
     s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if imu_off else ENTRY_SIGMA
+        s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA
     if layout.accel_lag is not None:
         s[layout.accel_lag] = LAG_SIGMA_S
     if layout.target_scale is not None:
-        s[layout.target_scale] = 0.002
+        s[layout.target_scale] = KNOWN_SIZE_SIGMA if SIZE in off else SIZE_SIGMA
     if layout.target_modes is not None and layout.target_shape is not None:
         s[layout.target_shape] = layout.target_modes.sigma_m
     for name, where in layout.cameras.items():

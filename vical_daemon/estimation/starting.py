@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -35,6 +35,7 @@ class Attempt:
         reason: Why there is none, or what the motion does not show.
         motion_missing: It is motion that is missing, not time.
         rolling: Name of a camera that has a rolling shutter of which nothing was said.
+        size: See `Rehearsed`.
     """
 
     filter: CalibrationFilter | None
@@ -42,6 +43,7 @@ class Attempt:
     reason: str
     motion_missing: bool = False
     rolling: str = ""
+    size: float | None = None
 
 
 class Starting:
@@ -131,11 +133,14 @@ class Starting:
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)
-        return Attempt(found, frames, result.reason)
+        if found.size is not None:
+            return Attempt(None, [], "", size=found.size)
+        return Attempt(found.filter, frames, result.reason)
 
-    def estimate_readout(self, layout: Layout) -> None:
-        """Go on with a layout that has readouts among the unknowns."""
-        self._layout = layout
+    def go_on_with(self, layout: Layout, target: FloatArray, off: Collection[str] = ()) -> None:
+        """Keep what was seen, for another target or with other unknowns; `off`: known not to be as stated."""
+        self._layout, self._target = layout, target
+        self._options = replace(self._options, estimate=self._options.estimate | set(off))
         self._caches.clear()
 
     def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> str:
