@@ -48,6 +48,7 @@ class Case:
         estimate: Optional blocks of the estimator.
         readout_told: The readout of a rolling shutter is told.
         crooked: The board is not as stated: see `vical_mocks.points.crooked_board`.
+        board_size: True size of the board over its stated size.
         imu_off: One sigma of each entry of the imu's matrices, of which the gyro's is symmetric (what is not
             is a turn of the imu's frame).
     """
@@ -66,6 +67,7 @@ class Case:
     estimate: frozenset[str] = frozenset()
     readout_told: bool = True
     crooked: bool = False
+    board_size: float = 1.0
     imu_off: float = 0.0
 
     @property
@@ -97,6 +99,8 @@ CASES: dict[str, Case] = {
     "rolling shutter of 20 ms, nothing said": Case(
         rig={"readout_s": 0.02}, bound={"readout": True}, readout_told=False, trials=20
     ),
+    "board 3 % smaller than stated": Case(board_size=0.97, bound={"target_scale_prior": 0.1}, trials=20),
+    "board 30 % larger than stated": Case(board_size=1.3, bound={"target_scale_prior": 0.1}, trials=20),
     "crooked board": Case(crooked=True, trials=20),
     "crooked board, its shape found": Case(crooked=True, estimate=frozenset({"target_shape"}), trials=20),
     "crooked board, lens known": Case(crooked=True, lens_known=True, trials=20),
@@ -169,7 +173,7 @@ def make_run(case: Case, seed: int, seconds: float) -> SimulatedRun:
     rig = reference_rig(seed, timeshift_cam_imu_s=shift, clock_skew_ppm=case.skew_ppm, **changes)
     if case.target_free:
         return simulate_tracks(seed, seconds, rig=rig, **case.simulation)
-    points_m = crooked_board(seed) if case.crooked else None
+    points_m = crooked_board(seed) if case.crooked else case.board_size * board_points()
     return simulate(seed, seconds, rig=rig, points_m=points_m, **case.simulation)
 
 
@@ -187,8 +191,7 @@ def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject
     )
     if kind == "ekf":
         return EkfSubject(options, prior, run.points_m)
-    stated_m = board_points() if case.crooked else run.points_m
-    return CalibratorSubject(options, prior, None if case.target_free else stated_m)
+    return CalibratorSubject(options, prior, None if case.target_free else board_points())
 
 
 def bound_options(case: Case, run: SimulatedRun) -> BoundOptions:

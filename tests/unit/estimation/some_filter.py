@@ -9,7 +9,7 @@ from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.consistency import Consistency
 from vical_daemon.estimation.corner_noise import CornerNoise
-from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, LAG, LAG_SIGMA_S, TARGET
+from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, LAG, LAG_SIGMA_S, SIZE, SIZE_SIGMA, TARGET
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.retract import retract
@@ -36,29 +36,32 @@ class Dense:
         return self.H.T @ self.H / self.noise**2
 
 
-def some_filter(imu=1.0, target=0.0, lag=0.0, factor=1.0, scale=1.0):
-    """A filter whose imu, target and lag lie so many times half their prior's sigma off."""
+def some_filter(imu=1.0, target=0.0, lag=0.0, size=0.0, factor=1.0, scale=1.0):
+    """A filter whose imu, target's shape and size, and lag lie so many times half their prior's sigma off."""
     rng = np.random.default_rng(5)
     layout = make_layout(
         {NAME: "radtan"},
         fix=frozenset(),
-        estimate=frozenset({IMU, LAG, TARGET}),
+        estimate=frozenset({IMU, LAG, SIZE, TARGET}),
         target_m=board_points(8, 6, 0.05),
     )
     n = layout.size
     where = {
         IMU: np.arange(layout.gyro_matrix.start, layout.accel_matrix.stop),
         LAG: np.array([layout.accel_lag]),
+        SIZE: np.array([layout.target_scale]),
         TARGET: np.arange(layout.target_shape.start, layout.target_shape.stop),
     }
     sigma = np.full(n, 1e-2)
-    for name, size in ((IMU, ENTRY_SIGMA), (LAG, LAG_SIGMA_S), (TARGET, layout.target_modes.sigma_m)):
-        sigma[where[name]] = size
+    sigmas = {IMU: ENTRY_SIGMA, LAG: LAG_SIGMA_S, SIZE: SIZE_SIGMA, TARGET: layout.target_modes.sigma_m}
+    for name, of_prior in sigmas.items():
+        sigma[where[name]] = of_prior
     H, truth, noise = rng.normal(size=(2 * n, n)), np.zeros(n), 8e-3
     truth[where[IMU]] = imu * 0.5 * ENTRY_SIGMA * rng.normal(size=15)
     truth[where[TARGET]] = target * 0.5 * layout.target_modes.sigma_m * rng.normal(size=11)
     truth[where[LAG]] = lag * 0.5 * LAG_SIGMA_S
-    for name in (TARGET, LAG):
+    truth[where[SIZE]] = size * 0.5 * SIZE_SIGMA
+    for name in (TARGET, LAG, SIZE):
         H[:, where[name]] *= ENTRY_SIGMA / sigma[where[name][0]]
     dense = Dense(H, H @ truth + noise * rng.normal(size=len(H)), noise, sigma, where)
     x, P = dense.posterior()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
-from vical_daemon.estimation.beyond_doubt import KNOWN_OFF_SIGMA, BeyondDoubt
-from vical_daemon.estimation.hypotheses import IMU, LAG, TARGET, off
+from vical_daemon.estimation.beyond_doubt import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA, BeyondDoubt
+from vical_daemon.estimation.hypotheses import IMU, LAG, SIZE, TARGET, off
 
 
 def surest(values, P, where):
@@ -68,3 +68,18 @@ def test_a_lag_is_announced_once_it_is_measured_how_well_images_fit(lag, told):
     assert f"is {1e3 * value:.2f} +- {1e3 * sigma:.2f} ms {told} the gyro" in events[LAG]
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-9, atol=1e-15)
     assert off(f, LAG) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("size", "told"), [(6.0, "larger"), (-6.0, "smaller")])
+def test_a_size_announced_gives_the_answer_of_a_wide_prior(size, told):
+    f, _, _, dense = some_filter(0.0, size=size)
+    events = BeyondDoubt().look(f)
+    assert list(events) == [SIZE]
+    assert off(f, SIZE) == pytest.approx(1.0, abs=1e-12)
+    wide, where = dense.prior.copy(), dense.where[SIZE]
+    wide[where] = KNOWN_SIZE_SIGMA
+    x, P = dense.posterior(wide)
+    np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-6, atol=1e-12)
+    assert f.state.target_scale - 1.0 == pytest.approx(x[where][0], abs=1e-8)
+    value, sigma = surest(x, P, where)
+    assert f"the target is {1e2 * value:.2f} +- {1e2 * sigma:.2f} % {told} than stated" in events[SIZE]

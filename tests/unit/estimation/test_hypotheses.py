@@ -1,4 +1,4 @@
-"""Hypotheses about imu, lag and target: against dense Gaussians, and on recordings."""
+"""Hypotheses about imu, lag, size and shape of the target: against dense Gaussians, and on recordings."""
 
 from itertools import combinations
 
@@ -15,6 +15,8 @@ from vical_daemon.estimation.hypotheses import (
     IMU,
     LAG,
     LAG_SIGMA_S,
+    SIZE,
+    SIZE_SIGMA,
     TARGET,
     averaged,
     in_doubt,
@@ -25,7 +27,7 @@ from vical_daemon.estimation.hypotheses import (
 )
 from vical_daemon.estimation.measurements import CalibrationOptions
 
-EVERY = [true for n in range(4) for true in combinations((IMU, LAG, TARGET), n)]
+EVERY = [true for n in range(5) for true in combinations((IMU, LAG, SIZE, TARGET), n)]
 
 
 def conditioned(x, P, dense, true):
@@ -38,10 +40,11 @@ def conditioned(x, P, dense, true):
 
 
 @pytest.mark.parametrize(
-    ("imu", "target", "lag"), [(0.0, 0.0, 0.0), (1.1, 0.0, 1.5), (0.0, 1.1, 0.0), (1.2, 1.2, 1.0)]
+    ("imu", "target", "lag", "size"),
+    [(0.0, 0.0, 0.0, 0.0), (1.1, 0.0, 1.5, 0.0), (0.0, 1.1, 0.0, 1.5), (1.2, 1.2, 1.0, 1.0)],
 )
-def test_odds_are_those_of_the_measurements_under_each_hypothesis(imu, target, lag):
-    f, _, _, dense = some_filter(imu, target, lag)
+def test_odds_are_those_of_the_measurements_under_each_hypothesis(imu, target, lag, size):
+    f, _, _, dense = some_filter(imu, target, lag, size)
     logs = []
     for true in EVERY:
         prior = dense.prior.copy()
@@ -49,12 +52,12 @@ def test_odds_are_those_of_the_measurements_under_each_hypothesis(imu, target, l
             prior[dense.where[name]] = 0.0
         spread = dense.H @ np.diag(prior**2) @ dense.H.T + dense.noise**2 * np.eye(len(dense.z))
         likelihood = multivariate_normal.logpdf(dense.z, np.zeros(len(dense.z)), spread)
-        logs.append(likelihood + np.log(0.95) * len(true) + np.log(0.05) * (3 - len(true)))
+        logs.append(likelihood + np.log(0.95) * len(true) + np.log(0.05) * (4 - len(true)))
     expected = np.exp(np.array(logs) - max(logs))
     found = weights(f)
     assert set(found) == set(EVERY)
     np.testing.assert_allclose([found[true] for true in EVERY], expected / expected.sum(), rtol=1e-6)
-    for name in (IMU, LAG, TARGET):
+    for name in (IMU, LAG, SIZE, TARGET):
         assert off(f, name) == pytest.approx(
             sum(p for true, p in found.items() if name not in true), rel=1e-9
         )
@@ -82,17 +85,19 @@ def test_nothing_learnt_is_no_evidence_however_long_errors_last():
     for where, sigma in (
         (slice(17, 32), ENTRY_SIGMA),
         (slice(32, 33), LAG_SIGMA_S),
+        (slice(f.layout.target_scale, f.layout.target_scale + 1), SIZE_SIGMA),
         (f.layout.target_shape, f.layout.target_modes.sigma_m),
     ):
         f.S[where, where] = sigma * np.eye(where.stop - where.start)
     f.state.gyro_matrix, f.state.accel_matrix = np.eye(3), np.eye(3)
     f.state.target_shape = np.zeros(11)
-    f.state.accel_lag_s = 0.0
+    f.state.accel_lag_s, f.state.target_scale = 0.0, 1.0
     assert off(f, IMU) == pytest.approx(0.05)
     assert off(f, TARGET) == pytest.approx(0.05)
+    assert off(f, SIZE) == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize(("name", "unsure", "lasting"), [(IMU, 1.6, 2.8), (TARGET, 1.1, 2.0)])
+@pytest.mark.parametrize(("name", "unsure", "lasting"), [(IMU, 1.6, 2.8), (TARGET, 1.9, 3.2)])
 def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_less(name, unsure, lasting):
     def doubted(size, **how):
         return some_filter(*((size, 0.0) if name == IMU else (0.0, size)), **how)[0]
@@ -109,7 +114,7 @@ def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_le
     assert off(misfit, name) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("factor", "sizes"), [(1.0, (1.6, 1.1, 2.0)), (3.0, (2.6, 1.8, 3.0))])
+@pytest.mark.parametrize(("factor", "sizes"), [(1.0, (1.6, 1.1, 2.0, 1.5)), (3.0, (2.6, 1.8, 3.0, 2.0))])
 def test_what_is_told_has_the_moments_of_the_mixture(factor, sizes):
     f, x, P, dense = some_filter(*sizes, factor=factor)
     shares = weights(f)
@@ -125,6 +130,7 @@ def test_what_is_told_has_the_moments_of_the_mixture(factor, sizes):
     assert told.state.cameras[NAME].timeshift_s == pytest.approx(0.004 + mean[shift], rel=1e-8)
     np.testing.assert_allclose(imu_entries(told.state), mean[dense.where[IMU]], atol=1e-12)
     assert told.state.accel_lag_s == pytest.approx(mean[dense.where[LAG]][0], abs=1e-12)
+    assert told.state.target_scale == pytest.approx(1.0 + mean[dense.where[SIZE]][0], abs=1e-12)
     np.testing.assert_allclose(told.state.target_shape, mean[dense.where[TARGET]], atol=1e-12)
     assert f.state.cameras[NAME].timeshift_s == pytest.approx(
         0.004 + x[shift], rel=1e-9
