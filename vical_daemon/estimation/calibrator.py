@@ -28,7 +28,7 @@ from vical_daemon.estimation.measurements import (
     FloatArray,
     PointsFrame,
 )
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
 from vical_daemon.estimation.seen_poses import Lens, pose_of
 from vical_daemon.estimation.stamp_steps import StampSteps
 from vical_daemon.estimation.starting import LATE_S, Starting
@@ -321,7 +321,9 @@ class Calibrator:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
         if self.watch.doubtful or any(clock_drift.in_doubt(f, name) for name in self.priors):
             return clock_drift.CLOCKS_IN_DOUBT
-        return next((why for name, why in hypotheses.IN_DOUBT.items() if hypotheses.in_doubt(f, name)), "")
+        converged = self.judge.status == Status.CONVERGED
+        doubts = hypotheses.IN_DOUBT.items()
+        return next((why for name, why in doubts if hypotheses.in_doubt(f, name, converged=converged)), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

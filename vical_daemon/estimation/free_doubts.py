@@ -82,10 +82,13 @@ class FreeDoubts:
             self._off |= known
         return events
 
-    def reason(self, carry: Carry, factor: float) -> str:
-        """What may not be as it is taken to be, in words; empty where nothing speaks for it."""
-        imu = hypotheses.IMU
-        if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > hypotheses.OFF:
+    def reason(self, carry: Carry, factor: float, *, converged: bool) -> str:
+        """What may not be as it is taken to be, in words; empty where nothing speaks for it.
+
+        For `converged` see `hypotheses.in_doubt`.
+        """
+        imu, enough = hypotheses.IMU, 0.5 if converged else hypotheses.OFF
+        if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > enough:
             return hypotheses.IN_DOUBT[imu]
         if not self.drifting and self._drift(carry, factor) > 1.0:
             return CLOCKS_IN_DOUBT

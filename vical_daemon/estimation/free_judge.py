@@ -207,7 +207,8 @@ class FreeJudge:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
         missing = [] if camera is None or carry is None else self._missing(camera, carry)
-        doubt = "" if carry is None else self.doubts.reason(carry, self.factor())
+        converged = self.status == Status.CONVERGED
+        doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), converged=converged)
         self.status, reason, advice = self._decide(camera is not None, running, missing, doubt)
         if advice and carry is not None:
             advice = shortcoming(self._motion, carry.camera.R_imu_cam, carry.bias[:3]) or advice

@@ -155,12 +155,14 @@ def surely_off(f: CalibrationFilter, name: str) -> bool:
     return off(f, name) > SURE
 
 
-def in_doubt(f: CalibrationFilter, name: str) -> bool:
+def in_doubt(f: CalibrationFilter, name: str, *, converged: bool = False) -> bool:
     """Whether the data speak for a block that is not zero, though not yet surely: they soon will.
 
-    Images that do not fit may never decide it; what is told covers both then.
+    Images that do not fit may never decide it; what is told covers both then. What has `converged` stays so
+    until the block is more likely off than not: of many looks, one sees 5 % by chance.
     """
-    return name in blocks(f) and name not in f.off and misfit(f) == 1.0 and off(f, name) > OFF
+    doubtful = name in blocks(f) and name not in f.off and misfit(f) == 1.0
+    return doubtful and off(f, name) > (0.5 if converged else OFF)
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:

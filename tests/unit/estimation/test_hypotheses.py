@@ -97,7 +97,7 @@ def test_nothing_learnt_is_no_evidence_however_long_errors_last():
     assert off(f, SIZE) == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize(("name", "unsure", "lasting"), [(IMU, 1.6, 2.8), (TARGET, 1.9, 3.2)])
+@pytest.mark.parametrize(("name", "unsure", "lasting"), [(IMU, 1.15, 2.8), (TARGET, 1.9, 3.2)])
 def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_less(name, unsure, lasting):
     def doubted(size, **how):
         return some_filter(*((size, 0.0) if name == IMU else (0.0, size)), **how)[0]
@@ -105,6 +105,9 @@ def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_le
     assert off(doubted(0.0), name) < 0.05
     assert surely_off(doubted(3.0), name)
     assert in_doubt(doubted(unsure), name)
+    assert off(doubted(unsure), name) < 0.5
+    assert not in_doubt(doubted(unsure), name, converged=True)
+    assert in_doubt(doubted(unsure * 1.2), name, converged=True)
     misfit, long = doubted(lasting, scale=4.0), doubted(lasting, factor=4.0)
     assert off(misfit, name) == pytest.approx(off(long, name), rel=1e-12)
     assert 0.05 < off(misfit, name) < off(doubted(lasting), name)
