@@ -13,16 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import project_jacobians
 from vical_daemon.estimation.camera_rays import unproject
-from vical_daemon.estimation.imu_model import cross, rotation_steps
+from vical_daemon.estimation.epipolar_pairs import Pairs, make_pairs
+from vical_daemon.estimation.gyro_attitudes import Attitudes
+from vical_daemon.estimation.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
 
-_LAGS_S = (0.1, 0.25, 0.5)
-_MIN_SHARED = 12
 _ITERATIONS = 18
 _BIAS_SIGMA_RPS = 0.02  # of a gyro that was not zeroed
 # What a lens may be off by: focal length and its ratio (relative), centre (of the focal length), distortion.
@@ -59,50 +58,6 @@ class EpipolarFit:
     inliers: float
 
 
-@dataclass(slots=True)
-class _Pairs:
-    """Features seen in both images of a pair, sorted by pair."""
-
-    first: npt.NDArray[np.intp]  # of the pair in the list of images, (P,)
-    second: npt.NDArray[np.intp]
-    begin: npt.NDArray[np.intp]  # first row of the pair, (P,)
-    of: npt.NDArray[np.intp]  # pair of each row, (n,)
-    uv_1: FloatArray
-    uv_2: FloatArray
-
-
-class Attitudes:
-    """Attitude of the imu relative to the first sample, integrated once for a bias.
-
-    Args:
-        t_s: Instants of the gyro samples, s, shape (m,).
-        gyro: rad/s, shape (m, 3).
-        bias: Subtracted, rad/s, shape (3,).
-    """
-
-    def __init__(self, t_s: FloatArray, gyro: FloatArray, bias: FloatArray) -> None:
-        self.t_s = t_s
-        self.rate = gyro - bias
-        steps = rotation_steps(self.rate[None], np.diff(t_s))[0]
-        R = np.empty((len(t_s), 3, 3))
-        R[0] = np.eye(3)
-        for k in range(len(steps)):
-            np.matmul(R[k], steps[k], out=R[k + 1])
-        self.R = R
-        middle = R[:-1] @ so3.exp(0.25 * (self.rate[:-1] + self.rate[1:]) * np.diff(t_s)[:, None])
-        self.area = np.zeros((len(t_s), 3, 3))
-        np.cumsum(middle * np.diff(t_s)[:, None, None], axis=0, out=self.area[1:])
-
-    def at(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Attitude (k, 3, 3), rate (k, 3) and integral of the attitude (k, 3, 3) at instants inside."""
-        k = np.clip(np.searchsorted(self.t_s, t_s, side="right") - 1, 0, len(self.t_s) - 2)
-        h = t_s - self.t_s[k]
-        share = (h / (self.t_s[k + 1] - self.t_s[k]))[:, None]
-        rate = self.rate[k] * (1 - share) + self.rate[k + 1] * share
-        R = self.R[k] @ so3.exp(0.5 * (self.rate[k] + rate) * h[:, None])
-        return R, rate, self.area[k] + 0.5 * (self.R[k] + R) * h[:, None, None]
-
-
 def epipolar_fit(
     t_imu_s: FloatArray,
     gyro_rps: FloatArray,
@@ -132,42 +87,11 @@ def epipolar_fit(
         The fit; None where the tracks do not allow one. Sigmas are empirical (sandwich over half-second
         blocks), so slow errors of the tracker count.
     """
-    pairs = _make_pairs(frames)
+    pairs = make_pairs(frames)
     if pairs is None:
         return None
     fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens, max_step_s)
     return fit.run(R_imu_cam.copy(), timeshift_s, most)
-
-
-def _make_pairs(frames: list[tuple[float, PointsFrame]]) -> _Pairs | None:
-    t = np.array([s for s, _ in frames])
-    first, second, count, uv_1, uv_2 = [], [], [], [], []
-    for lag in _LAGS_S:
-        step = max(1, int(np.median(np.searchsorted(t, t[: len(t) // 2] + lag) - np.arange(len(t) // 2))))
-        for i in range(len(t) - step):
-            j = i + step
-            if not 0.3 * lag < t[j] - t[i] < 3.0 * lag:
-                continue
-            a, b = frames[i][1], frames[j][1]
-            _, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-            if len(ka) < _MIN_SHARED:
-                continue
-            first.append(i)
-            second.append(j)
-            count.append(len(ka))
-            uv_1.append(a.uv_px[ka])
-            uv_2.append(b.uv_px[kb])
-    if len(first) < 10:
-        return None
-    sizes = np.array(count)
-    return _Pairs(
-        np.array(first),
-        np.array(second),
-        np.concatenate([[0], np.cumsum(sizes)[:-1]]),
-        np.repeat(np.arange(len(sizes)), sizes),
-        np.concatenate(uv_1),
-        np.concatenate(uv_2),
-    )
 
 
 class _Fit:
@@ -183,7 +107,7 @@ class _Fit:
         t_imu: FloatArray,
         gyro: FloatArray,
         t_cam: FloatArray,
-        pairs: _Pairs,
+        pairs: Pairs,
         lens: tuple[FloatArray, FloatArray, str],
         fit_lens: bool,
         max_step_s: float,

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.epipolar_fit import Attitudes
 from vical_daemon.estimation.free_start import ArmPrior, LinearStart, NoStartError
+from vical_daemon.estimation.gyro_attitudes import Attitudes
 from vical_daemon.estimation.initialise import still_axes
 from vical_daemon.estimation.measurements import FloatArray
 

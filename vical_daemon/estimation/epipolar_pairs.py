@@ -1,0 +1,67 @@
+"""Pairs of images that share features, for the epipolar constraint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+
+_LAGS_S = (0.1, 0.25, 0.5)
+_MIN_SHARED = 12
+
+
+@dataclass(slots=True)
+class Pairs:
+    """Features seen in both images of a pair, sorted by pair.
+
+    Attributes:
+        first, second: Places of the pair's images in the list of images, shape (P,).
+        begin: First row of the pair, shape (P,).
+        of: Pair of each row, shape (n,).
+        uv_1, uv_2: Pixels in both images, shape (n, 2).
+    """
+
+    first: IntArray
+    second: IntArray
+    begin: IntArray
+    of: IntArray
+    uv_1: FloatArray
+    uv_2: FloatArray
+
+
+def make_pairs(frames: list[tuple[float, PointsFrame]]) -> Pairs | None:
+    """Pair images a tenth, a quarter and half a second apart; None where too few share features.
+
+    Args:
+        frames: (stamp in the camera's clock in s, tracks), in order of time.
+    """
+    t = np.array([s for s, _ in frames])
+    first, second, count, uv_1, uv_2 = [], [], [], [], []
+    for lag in _LAGS_S:
+        step = max(1, int(np.median(np.searchsorted(t, t[: len(t) // 2] + lag) - np.arange(len(t) // 2))))
+        for i in range(len(t) - step):
+            j = i + step
+            if not 0.3 * lag < t[j] - t[i] < 3.0 * lag:
+                continue
+            a, b = frames[i][1], frames[j][1]
+            _, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+            if len(ka) < _MIN_SHARED:
+                continue
+            first.append(i)
+            second.append(j)
+            count.append(len(ka))
+            uv_1.append(a.uv_px[ka])
+            uv_2.append(b.uv_px[kb])
+    if len(first) < 10:
+        return None
+    sizes = np.array(count)
+    return Pairs(
+        np.array(first),
+        np.array(second),
+        np.concatenate([[0], np.cumsum(sizes)[:-1]]),
+        np.repeat(np.arange(len(sizes)), sizes),
+        np.concatenate(uv_1),
+        np.concatenate(uv_2),
+    )
