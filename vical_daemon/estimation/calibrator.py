@@ -11,11 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation import clock_drift, hypotheses
+from vical_daemon.estimation import clock_drift, hypotheses, target_doubt
 from vical_daemon.estimation.beyond_doubt import BeyondDoubt, size_told
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.change_watch import Action, ChangeWatch
-from vical_daemon.estimation.clock_drift import SKEW_SIGMA, SKEW_WALK, drift_told
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.held_back import HeldBack
@@ -237,18 +236,10 @@ class Calibrator:
         for block, told in self._beyond_doubt.look(f).items():
             self.judge.announce(told, once=block)
         self._act(self.watch.look(report, f), frame, t_cam_s)
-        self._maybe_off(f)
+        doubt = target_doubt.told(f.doubt)
+        if doubt:
+            self.judge.announce(doubt, once=hypotheses.TARGET)
         return report
-
-    def _maybe_off(self, f: CalibrationFilter) -> None:
-        """With the lens held, tell that target or lens are not as stated; neither is estimated."""
-        off_mm = [1e3 * float(np.abs(d.off_m).max()) for d in f.doubt.values() if d.off_m is not None]
-        if off_mm:
-            seen = f"corners lie up to {max(off_mm):.1f} mm beside their stated places"
-            self.judge.announce(
-                f"{seen}, or the lens that is held is not this camera's", once=hypotheses.TARGET
-            )
-            f.doubt.clear()
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
         """How well an image was predicted that the held-back copy of the filter has not used."""
@@ -263,22 +254,10 @@ class Calibrator:
         if action is Action.POSE:
             self._pose_anew(f, frame, t_cam_s)
         elif action in (Action.SKEW, Action.WANDER):
-            self._let_drift(f, frame.camera, anew=action is Action.WANDER)
+            anew = action is Action.WANDER
+            self.judge.announce(clock_drift.let_drift(f, frame.camera, self.watch.why, anew=anew))
         elif action is Action.RESTART:
             self._restart(f)
-
-    def _let_drift(self, f: CalibrationFilter, camera: str, *, anew: bool) -> None:
-        """The clock of this camera drifts; `anew`: and not as it did before."""
-        where = f.layout.cameras[camera]
-        assert where.timeshift is not None
-        assert where.skew is not None
-        f.drifting.add(camera)
-        f.walk[where.skew] = SKEW_WALK**2
-        if anew:
-            f.reopen(where.skew, SKEW_SIGMA)
-            f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
-        drift, sigma = f.state.cameras[camera].skew, float(np.linalg.norm(f.S[where.skew]))
-        self.judge.announce(drift_told(camera, self.watch.why, drift, sigma))
 
     def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """After a run of refused images: take attitude and position from the image, keep the calibration."""

@@ -73,6 +73,19 @@ def surely_apart(f: CalibrationFilter, camera: str) -> bool:
     return apart(f, camera) > SURE
 
 
+def let_drift(f: CalibrationFilter, camera: str, why: str, *, anew: bool) -> str:
+    """From now on the clock of this camera drifts (`anew`: and not as it did before); the announcement."""
+    where = f.layout.cameras[camera]
+    assert where.timeshift is not None
+    assert where.skew is not None
+    f.drifting.add(camera)
+    f.walk[where.skew] = SKEW_WALK**2
+    if anew:
+        f.reopen(where.skew, SKEW_SIGMA)
+        f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
+    return drift_told(camera, why, f.state.cameras[camera].skew, float(np.linalg.norm(f.S[where.skew])))
+
+
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
     """Return the filter as it is to be told: mean and covariance over both hypotheses, for each camera."""
     for name in f.layout.cameras:

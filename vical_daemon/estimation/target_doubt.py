@@ -58,3 +58,13 @@ class TargetDoubt:
         told = self._stretches.compared(np.full(modes, _WEAK * self.modes.half_m))
         z = np.abs(told.values) / np.sqrt(told.factors * np.diag(told.covariance))
         self.off_m = told.values if z.max() > _BEYOND_DOUBT else None
+
+
+def told(doubts: dict[str, TargetDoubt]) -> str:
+    """What is to be announced, once: then the cameras' doubts are forgotten. Empty while there is nothing."""
+    off_mm = [1e3 * float(np.abs(d.off_m).max()) for d in doubts.values() if d.off_m is not None]
+    if not off_mm:
+        return ""
+    doubts.clear()
+    seen = f"corners lie up to {max(off_mm):.1f} mm beside their stated places"
+    return f"{seen}, or the lens that is held is not this camera's"
