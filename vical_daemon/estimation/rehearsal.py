@@ -24,6 +24,7 @@ from vical_daemon.estimation.hypotheses import (
     SIZE,
     SIZE_SIGMA,
     TARGET,
+    averaged,
 )
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
@@ -42,8 +43,8 @@ from vical_daemon.estimation.state import (
 from vical_daemon.estimation.target_doubt import TargetDoubt
 from vical_daemon.estimation.unshown_axes import UNKNOWN_M, UnshownAxes
 
-_MOST_RUNS = 6
-_STANDS = 3.0  # sigmas by which the answer may have moved: the next run moves it by a tenth of that
+_MOST_RUNS = 8
+_STANDS = 1.5  # sigmas by which the answer may have moved: the next run moves it by far less
 _CHANCE = 2.0  # standard deviations of it up to which larger innovations are not the stamps' fault
 _DOUBTED_S = 2e-3  # jitter; a larger one is that of a broken driver
 REHEARSED = 5.0  # sigmas after the rehearsal: so much wider for the run that counts
@@ -78,7 +79,7 @@ def rehearsed(
 
     The first run is far from straight: what it says of mounting and delay counts, what it says of the noise
     does not (its innovations are large for other reasons). The second one, about its answer, measures the
-    noise. Each next run takes what the last one found as its mean, and five times its sigmas: so wide that
+    noise. Each next run takes what the last one tells as its mean, and five times its sigmas: so wide that
     the data, counted again, add 4 % of information; so narrow that the model is straight from the first
     image on, and nothing is lost to its curvature. Where the answer still moved a lot, the last run was not
     straight either (lever arms that are hardly shown), and there is another one.
@@ -185,13 +186,14 @@ def _about(
     trial: CalibrationFilter, state: State, make: Callable[[State], CalibrationFilter]
 ) -> CalibrationFilter:
     """A filter that begins where `trial` did, with the calibration it found and five times its sigmas."""
+    told = averaged(trial)
     begin = replace(
-        trial.state,
+        told.state,
         t_s=state.t_s,
         R_world_imu=state.R_world_imu,
         p_world_imu=state.p_world_imu,
         v_world_imu=state.v_world_imu,
-        cameras={name: replace(camera, skew=0.0) for name, camera in trial.state.cameras.items()},
+        cameras={name: replace(camera, skew=0.0) for name, camera in told.state.cameras.items()},
         # expected as stated, not near what was found last
         target_scale=state.target_scale,
         target_shape=state.target_shape,
@@ -201,7 +203,7 @@ def _about(
     )
     fresh = make(begin)
     wide = np.diag(fresh.S)
-    narrow = np.minimum(wide, REHEARSED * trial.sigmas())
+    narrow = np.minimum(wide, REHEARSED * told.sigmas())
     narrow[: MOTION.stop] = wide[: MOTION.stop]
     for where in (trial.layout.target_shape, trial.layout.gyro_matrix, trial.layout.accel_matrix):
         if where is not None:
