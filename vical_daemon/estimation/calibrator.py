@@ -34,6 +34,7 @@ from vical_daemon.estimation.starting import LATE_S, Starting
 from vical_daemon.estimation.state import Layout, make_layout
 
 _KEEP_S = 5.0
+_ALWAYS = {hypotheses.IMU, hypotheses.LAG, hypotheses.SIZE}  # are states, see `hypotheses`
 _MOST_SURPRISES = 4  # in one start: shutters that roll, targets that are not as large as stated
 
 
@@ -57,11 +58,7 @@ class Calibrator:
         self.options = options
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
-        self._states = options.estimate | {
-            hypotheses.IMU,
-            hypotheses.LAG,
-            hypotheses.SIZE,
-        }  # always, see there
+        self._states = options.estimate | _ALWAYS
         if "intrinsics" not in options.fix:  # else what is missed may as well be the lens
             self._states |= {hypotheses.TARGET}
         self.layout = self._lay_out()
