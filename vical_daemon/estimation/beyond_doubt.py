@@ -11,11 +11,13 @@ from vical_daemon.estimation.hypotheses import (
     IMU,
     LAG,
     SIZE,
+    SURE,
     TARGET,
     Block,
     blocks,
     factor,
-    surely_off,
+    not_zero,
+    weights,
 )
 from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import FloatArray
@@ -104,14 +106,11 @@ class BeyondDoubt:
         if f.state.t_s < self._next_s:
             return {}
         self._next_s = f.state.t_s + _EVERY_S
-        return {name: _off(f, name) for name in blocks(f) if self._known(f, name)}
-
-    @staticmethod
-    def _known(f: CalibrationFilter, name: str) -> bool:
-        """A lag is small beside what images that do not fit do: only once that is measured is it known."""
-        if name in f.off or (name == LAG and max(c.images for c in f.consistency.values()) < _MEASURED):
-            return False
-        return surely_off(f, name)
+        shares = weights(f)
+        # a lag is small beside what images that do not fit do: only once that is measured is it known
+        early = {LAG} if max(c.images for c in f.consistency.values()) < _MEASURED else set()
+        known = [n for n in blocks(f) if n not in f.off | early and not_zero(shares, n) > SURE]
+        return {name: _off(f, name) for name in known}
 
 
 def _off(f: CalibrationFilter, name: str) -> str:

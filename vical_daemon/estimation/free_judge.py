@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from vical_daemon.estimation.free_bundle import Fit
 from vical_daemon.estimation.free_carry import CALIBRATION, DRIFT, FULL, Carry
@@ -171,7 +171,7 @@ class FreeJudge:
         d = vectors.T @ (fit.change / scale)
         statistic, dof = float((d[told] ** 2 / values[told]).sum()), int(told.sum())
         factor = self.factor()
-        limit = float(chi2.isf(_DOUBT, dof)) * factor
+        limit = float(chdtri(dof, _DOUBT)) * factor
         if self._windows < _LEARNING:  # not enough seen yet to tell a poor model from a changed rig
             limit *= 50.0
         doubtful = statistic > limit and (factor < _MODEL_FITS or self._matters(fit.change))

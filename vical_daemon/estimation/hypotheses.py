@@ -140,19 +140,14 @@ def posterior(
     return {true: float(np.exp(x - most) / total) for true, x in logs.items()}
 
 
-def not_zero(weights: dict[tuple[str, ...], float], name: str) -> float:
+def not_zero(shares: dict[tuple[str, ...], float], name: str) -> float:
     """Probability that a block is not zero; 1 where that is none of the hypotheses."""
-    return sum(p for true, p in weights.items() if name not in true)
+    return sum(p for true, p in shares.items() if name not in true)
 
 
 def off(f: CalibrationFilter, name: str) -> float:
     """Probability that a block is not zero; 1 where that was announced, or it was asked for."""
     return not_zero(weights(f), name)
-
-
-def surely_off(f: CalibrationFilter, name: str) -> bool:
-    """Whether that is beyond doubt."""
-    return off(f, name) > SURE
 
 
 def in_doubt(f: CalibrationFilter, name: str, *, converged: bool = False) -> bool:

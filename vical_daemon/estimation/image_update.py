@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from vical_daemon.estimation import unscented
 from vical_daemon.estimation.linearise import Image, Linear
@@ -16,8 +16,8 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray
 _ITERATIONS = 5
 _LEAST = 4  # points for a correction
 _CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
-_CORNER_GATE = float(chi2.isf(1e-4, 2))
-_RESIDUAL_GATE = float(chi2.isf(2e-5, 2))
+_CORNER_GATE = float(chdtri(2, 1e-4))
+_RESIDUAL_GATE = float(chdtri(2, 2e-5))
 _FRAME_GATE_P = 1e-9
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
@@ -27,7 +27,7 @@ Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread 
 @lru_cache(maxsize=256)
 def frame_limit(dof: int) -> float:
     """Chi-square limit of a whole frame (scipy takes half a millisecond for it)."""
-    return float(chi2.isf(_FRAME_GATE_P, dof))
+    return float(chdtri(dof, _FRAME_GATE_P))
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from vical_daemon.estimation.measurements import FloatArray
 
@@ -128,6 +128,6 @@ class Stretches:
         ratio = ((without - values) ** 2 / usual).mean(axis=0)
         # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
-        limit = chi2.isf(_SIGNIFICANT / k, dof) / dof
+        limit = chdtri(dof, _SIGNIFICANT / k) / dof
         student = dof / np.maximum(dof - 2.0, 1.0)
         return Told(values, P, np.where(ratio > limit, student * ratio, 1.0))

@@ -17,12 +17,12 @@ from vical_daemon.estimation.hypotheses import (
     LAG_SIGMA_S,
     SIZE,
     SIZE_SIGMA,
+    SURE,
     TARGET,
     averaged,
     in_doubt,
     log_bayes_factor,
     off,
-    surely_off,
     weights,
 )
 from vical_daemon.estimation.measurements import CalibrationOptions
@@ -103,7 +103,7 @@ def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_le
         return some_filter(*((size, 0.0) if name == IMU else (0.0, size)), **how)[0]
 
     assert off(doubted(0.0), name) < 0.05
-    assert surely_off(doubted(3.0), name)
+    assert off(doubted(3.0), name) > SURE
     assert in_doubt(doubted(unsure), name)
     assert off(doubted(unsure), name) < 0.5
     assert not in_doubt(doubted(unsure), name, converged=True)

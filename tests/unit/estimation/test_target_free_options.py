@@ -97,7 +97,7 @@ def test_an_imu_that_is_true_pays_nothing():
 
 @pytest.mark.parametrize("lag_s", [3e-4, -3e-4])
 def test_an_accelerometer_out_of_step_is_told_and_every_answer_is_right(lag_s):
-    # taken as in step, the time shift of this rig was 60 us off after half a minute, NEES/7 4.6
+    # taken as in step: NEES/7 4.6 after half a minute, `converged`
     _, calibrator, record = followed(3, set(), seconds=24.0, accel_lag_s=lag_s, rate_hz=20.0)
     where = "ms behind the gyro" if lag_s > 0 else "ms ahead of the gyro"
     assert any(text.startswith("the accelerometer is ") and where in text for _, text in record.events)
