@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 from vical_daemon.topics import parse_key
@@ -84,6 +85,7 @@ class Bus(Protocol):
         ...
 
 
+@lru_cache(maxsize=4096)  # asked for each sample, about the same few keys
 def key_matches(expression: str, key: str) -> bool:
     """Tell whether a key matches a zenoh key expression made of chunks, ``*`` and ``**``.
 
