@@ -12,18 +12,16 @@ from functools import partial
 
 import numpy as np
 
-from vical_daemon.estimation import unscented
+from vical_daemon.estimation import lessons, unscented
 from vical_daemon.estimation.consistency import Consistency, normalised
 from vical_daemon.estimation.corner_noise import CornerNoise
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.image_update import (
-    ImageFit,
     corner_gate,
     curved_share,
     frame_limit,
     rows_of,
     solve,
-    whitened,
 )
 from vical_daemon.estimation.imu_buffer import ImuSegment
 from vical_daemon.estimation.lens_agreement import LensAgreement
@@ -161,7 +159,7 @@ class CalibrationFilter:
                 f"innovation of the image is {level:.1f} times what it should be",
             )
         self.nis_level += 0.05 * (level - self.nis_level)
-        self._measure(image, lin, fit)
+        lessons.learn(self, image, lin, fit)
         self._accept(fit.S, fit.dx)
         self._pay_for_jitter(image.camera)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
@@ -199,40 +197,6 @@ class CalibrationFilter:
             column = np.zeros(self.layout.size)
             column[index] = np.sqrt(owed)
             self.loosen(column)
-
-    def _measure(self, image: Image, lin: Linear, fit: ImageFit) -> None:
-        """What an image says about shared errors, lens and target before it is used."""
-        where = self.layout.cameras[image.camera]
-        shared, agreement = self.shared.get(image.camera), self.agreement.get(image.camera)
-        if shared is not None:
-            # a fit far from straight is linearised elsewhere
-            ways, innovation = whitened(image, lin, fit.keep) if lin.curved.size else (fit.ways, fit.r)
-            level = self.consistency[image.camera].level
-            by_shared = ways @ (lin.by_error @ shared_ways(self.state, self.layout, image.camera))
-            shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
-        doubt = self.doubt.get(image.camera)
-        if where.intrinsics is not None and where.distortion is not None and agreement is not None:
-            by_lens = lin.by_error[:, where.intrinsics.start : where.distortion.stop]
-            self._ask_lens(agreement, image, lin, fit, by_lens)
-        elif doubt is not None and doubt.due(self.state.t_s):
-            ways, innovation = whitened(image, lin, fit.keep)
-            by_pose = ways @ lin.by_error[:, :6]
-            # a point that moves in the world looks as if the camera moved the other way
-            by_place = -by_pose[:, 3:].reshape(-1, 2, 3)
-            by_shape = (by_place @ doubt.modes.fields(image.points[fit.keep])).reshape(len(ways), -1)
-            doubt.learn(self.state.t_s, innovation, by_pose, by_shape)
-
-    def _ask_lens(
-        self, agreement: LensAgreement, image: Image, lin: Linear, fit: ImageFit, by_lens: FloatArray
-    ) -> None:
-        """What an image would have the lens be: with the target as stated until it is known not to be."""
-        ways, innovation = whitened(image, lin, fit.keep)
-        shape = self.layout.target_shape
-        if shape is not None and "target_shape" not in self.off:
-            innovation = innovation + ways @ (lin.by_error[:, shape] @ self.state.target_shape)
-        camera = self.state.cameras[image.camera]
-        values = np.concatenate([camera.intrinsics, camera.distortion])
-        agreement.learn(self.state.t_s, innovation, ways @ lin.by_error[:, :6], ways @ by_lens, values)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""

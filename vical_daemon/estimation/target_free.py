@@ -23,18 +23,16 @@ from vical_daemon.estimation.free_reports import window_reports
 from vical_daemon.estimation.free_starter import Starter
 from vical_daemon.estimation.free_window import Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.stamp_steps import StampSteps
 from vical_daemon.estimation.thinning import Thinning
 from vical_daemon.estimation.unshown_axes import has_turned
+from vical_daemon.estimation.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
-STEP_S = 1.5  # the window is adjusted again after this much new data
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
 WINDOW_S = 6.0
-_SLACK_S = 1e-3  # stamps are not quite even
-_MAX_GAP_S = 1.5  # images further apart are not tied by inertial data alone
 _MIN_PARALLAX_DEG = 0.4
 _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
@@ -77,12 +75,11 @@ class TargetFreeCalibrator:
         self._buffer: ImuBuffer | None = None
         self._base_ns = 0
         self._stamps = StampSteps()
-        self._pending: list[tuple[float, PointsFrame]] = []
+        self._pending: list[Stamped] = []
         self._newest_s = -np.inf  # stamp of the last image, used or not
         self._thinning = Thinning(MAX_RATE_HZ)
         self._doubted: Carry | None = None
         self._reports: list[FrameReport] = []
-        self._gap_follows = False  # the images that are ready are the last before a hole
 
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -109,10 +106,7 @@ class TargetFreeCalibrator:
         self._newest_s = t_cam_s
         if not self._thinning.takes(t_cam_s):
             return
-        ok: BoolArray = np.asarray(np.isfinite(frame.uv_px).all(axis=1))
-        _, first = np.unique(frame.ids, return_index=True)
-        ok[np.setdiff1d(np.arange(len(ok)), first)] = False
-        frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok])
+        frame = cleaned(frame)
         self.judge.saw_points(t_cam_s, len(frame.ids))
         if len(frame.ids) >= 4:
             self._pending.append((t_cam_s, frame))
@@ -134,38 +128,26 @@ class TargetFreeCalibrator:
                 if not self._try_start(flush):
                     break
                 continue
-            ready = self._ready()
-            if not ready:
+            window = self.window
+            found = self._ready(window)
+            if not found.frames:
                 break
-            new_s = ready[-1][0] - self.window.frames[-1][0]
-            if new_s < STEP_S - _SLACK_S and not (flush or self._gap_follows):
+            new_s = found.frames[-1][0] - window.frames[-1][0]
+            if new_s < STEP_S - SLACK_S and not (flush or found.gap_follows):
                 break
-            self._grow(self.window, ready)
+            self._grow(window, found.frames)
         self._trim()
         reports, self._reports = self._reports, []
         return reports
 
-    def _ready(self) -> list[tuple[float, PointsFrame]]:
+    def _ready(self, window: Window) -> Ready:
         """Images that inertial data cover, at most a step's worth, up to the first gap."""
         assert self._buffer is not None
-        assert self.window is not None
-        end = self._buffer.newest_s - self.window.shift_s - _LATE_S
-        begin = before = self.window.frames[-1][0]
-        out: list[tuple[float, PointsFrame]] = []
-        self._gap_follows = False
-        for t, frame in self._pending:
-            if t > end or before - begin > STEP_S - _SLACK_S:
-                break
-            if t - before > _MAX_GAP_S:
-                self._gap_follows = True
-                if not out:
-                    self._lost(f"no usable images for {t - before:.1f} s", keep=True)
-                break
-            out.append((t, frame))
-            before = t
-        if not out and self._pending and end - begin > 2.0 * _MAX_GAP_S:
-            self._lost(f"no usable images for {end - begin:.1f} s", keep=True)
-        return out
+        end_s = self._buffer.newest_s - window.shift_s - _LATE_S
+        found = ready(self._pending, window.frames[-1][0], end_s)
+        if found.hole_s:
+            self._lost(f"no usable images for {found.hole_s:.1f} s", keep=True)
+        return found
 
     def _trim(self) -> None:
         """Memory stays bounded whatever happens."""
@@ -211,14 +193,14 @@ class TargetFreeCalibrator:
         return True
 
     # ------------------------------------------------------------------ windows
-    def _grow(self, window: Window, ready: list[tuple[float, PointsFrame]]) -> None:
+    def _grow(self, window: Window, frames: list[Stamped]) -> None:
         """Take images into the window and adjust it; close it when it is long enough."""
         assert self._buffer is not None
         assert self.carry is not None
-        added = window.extend(self._buffer, ready)
-        done = {id(f) for _, f in ready}
+        added = window.extend(self._buffer, frames)
+        done = {id(f) for _, f in frames}
         self._pending = [x for x in self._pending if id(x[1]) not in done]
-        if added < len(ready):
+        if added < len(frames):
             self._lost("inertial data have a gap", keep=True)
             return
         if len(window.frames) < 8:

@@ -1,0 +1,58 @@
+"""Images with tracks that wait for inertial data: cleaned, and taken in order up to a hole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import BoolArray, PointsFrame
+
+STEP_S = 1.5  # the window is adjusted again after this much new data
+SLACK_S = 1e-3  # stamps are not quite even
+_MAX_GAP_S = 1.5  # images further apart are not tied by inertial data alone
+
+Stamped = tuple[float, PointsFrame]
+
+
+class Ready(NamedTuple):
+    """What can be taken into a window.
+
+    Attributes:
+        frames: (stamp in s, tracks), in order.
+        gap_follows: They are the last before a hole.
+        hole_s: Length of a hole that begins at once, s; 0: none.
+    """
+
+    frames: list[Stamped]
+    gap_follows: bool = False
+    hole_s: float = 0.0
+
+
+def ready(waiting: Sequence[Stamped], begin_s: float, end_s: float) -> Ready:
+    """Choose the images to go on with: a step's worth at most, up to the first hole.
+
+    Args:
+        waiting: All that came since, in order.
+        begin_s: Stamp of the window's last image, s.
+        end_s: Stamp up to which inertial data reach, s.
+    """
+    before, out = begin_s, list[Stamped]()
+    for t, frame in waiting:
+        if t > end_s or before - begin_s > STEP_S - SLACK_S:
+            break
+        if t - before > _MAX_GAP_S:
+            return Ready(out, gap_follows=True, hole_s=0.0 if out else t - before)
+        out.append((t, frame))
+        before = t
+    silent = not out and bool(waiting) and end_s - begin_s > 2.0 * _MAX_GAP_S
+    return Ready(out, hole_s=end_s - begin_s if silent else 0.0)
+
+
+def cleaned(frame: PointsFrame) -> PointsFrame:
+    """Return the tracks with finite pixels, each identity once."""
+    ok: BoolArray = np.asarray(np.isfinite(frame.uv_px).all(axis=1))
+    _, first = np.unique(frame.ids, return_index=True)
+    ok[np.setdiff1d(np.arange(len(ok)), first)] = False
+    return PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok])
