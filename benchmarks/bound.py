@@ -15,56 +15,31 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from vical_mocks.points import SimulatedFrame, SimulatedRun, simulate
-from vical_mocks.rig import Rig
 from vical_mocks.tracks import simulate_tracks
 
 from benchmarks.error_model import STATE, inertial_factors, pixel_jacobians
+from benchmarks.information import DRAW, BoundOptions, Constants, Information
 
 FloatArray = npt.NDArray[np.float64]
 
-# One-sigma priors so wide that they tell nothing next to seconds of data (rad, m/s, m, rad/s, m/s^2).
-_STATE_PRIOR = np.repeat([3.0, 10.0, 10.0, 0.3, 2.0], 3)
-
 
 @dataclass(frozen=True)
-class BoundOptions:
-    """Which parameters are unknown.
+class Draw:
+    """The noise of one recording (`luck.draw_of`), to follow what it makes of an efficient estimate.
 
     Attributes:
-        corner_sigma_px: White noise per axis and corner.
-        frame_sigma_px: Noise common to the corners of a frame, per axis.
-        stamp_jitter_s: Independent error of each frame's stamp.
-        intrinsics: fx fy cx cy unknown.
-        distortion: The four coefficients unknown.
-        timeshift: Time shift unknown.
-        drift_prior: One-sigma prior of its drift, s/s; the time shift is then that at the end. 0: no drift.
-        extrinsics: Lever arm and mounting unknown.
-        readout: Rolling-shutter readout unknown.
-        target_scale_prior: One-sigma relative prior of the target's size; 0: known.
-        imu_matrix_prior: Prior of each entry of the gyro (9) and accelerometer (6, lower triangle)
-            matrices; 0: known.
-        gravity: "free" (three numbers), "magnitude" (its direction is unknown) or "known".
-        target_free: World points are unknown; the first pose fixes the world.
+        pushes: What the noise of the inertial readings, and the walk of the biases, does from one frame to
+            the next, shape (frames - 1, 15).
+        pixels: Noise of each frame's corners that are no outliers, px, shapes (2n,).
     """
 
-    corner_sigma_px: float = 0.5
-    frame_sigma_px: float = 0.0
-    stamp_jitter_s: float = 0.0
-    intrinsics: bool = True
-    distortion: bool = True
-    timeshift: bool = True
-    drift_prior: float = 0.0
-    extrinsics: bool = True
-    readout: bool = False
-    target_scale_prior: float = 0.0
-    imu_matrix_prior: float = 0.0
-    gravity: str = "magnitude"
-    target_free: bool = False
+    pushes: FloatArray
+    pixels: list[FloatArray]
 
 
 @dataclass(frozen=True)
@@ -78,11 +53,14 @@ class Bound:
             accel_matrix, gyro_bias (rad/s), accel_bias (m/s^2), and of the newest frame attitude,
             velocity, position.
         covariance: Of all of them.
+        error: Estimate minus truth, to first order, of the estimator that reaches the bound (weighted least
+            squares over all data up to here), where its noise was given; else zero.
     """
 
     t_s: float
     slices: dict[str, slice]
     covariance: FloatArray
+    error: FloatArray
 
     def sigma(self, name: str) -> FloatArray:
         """One-sigma bounds of one block."""
@@ -93,118 +71,6 @@ class Bound:
         """Joint covariance of several blocks, in the order given."""
         index = np.concatenate([np.arange(self.slices[n].start, self.slices[n].stop) for n in names])
         return self.covariance[np.ix_(index, index)]
-
-
-@dataclass
-class _Constants:
-    """Places and priors of the constant parameters after the state."""
-
-    slices: dict[str, slice] = field(default_factory=dict)
-    prior_sigma: list[float] = field(default_factory=list)
-
-    def add(self, name: str, size: int, sigma: float) -> None:
-        start = STATE + len(self.prior_sigma)
-        self.slices[name] = slice(start, start + size)
-        self.prior_sigma += [sigma] * size
-
-    @classmethod
-    def of(cls, options: BoundOptions) -> _Constants:
-        c = cls()
-        if options.extrinsics:
-            c.add("p_imu_cam", 3, 1.0)
-            c.add("r_imu_cam", 3, 3.0)
-        if options.timeshift:
-            c.add("timeshift", 1, 1.0)
-            if options.drift_prior > 0:
-                c.add("drift", 1, options.drift_prior)
-        c.add("gravity", 3, 1e-7 if options.gravity == "known" else 10.0)
-        if options.intrinsics:
-            c.add("intrinsics", 4, 100.0)
-        if options.distortion:
-            c.add("distortion", 4, 1.0)
-        if options.readout:
-            c.add("readout", 1, 0.1)
-        if options.target_scale_prior > 0 and not options.target_free:
-            c.add("target_scale", 1, options.target_scale_prior)
-        if options.imu_matrix_prior > 0:
-            c.add("gyro_matrix", 9, options.imu_matrix_prior)
-            c.add("accel_matrix", 6, options.imu_matrix_prior)
-        return c
-
-
-class _Information:
-    """The information matrix over [state, constants, landmarks], with elimination."""
-
-    def __init__(self, constants: _Constants, rig: Rig, options: BoundOptions) -> None:
-        self.constants = constants
-        state_sigma = _STATE_PRIOR.copy()
-        if options.target_free:
-            state_sigma[[0, 1, 2, 6, 7, 8]] = 1e-7  # the first pose *is* the world
-        self.matrix = np.diag(np.concatenate([state_sigma, constants.prior_sigma]) ** -2.0)
-        self.fixed = len(self.matrix)
-        self.landmarks: list[int] = []
-        if options.gravity == "magnitude":
-            place = constants.slices["gravity"]
-            direction = rig.gravity_world_mps2 / np.linalg.norm(rig.gravity_world_mps2)
-            self.matrix[place, place] += np.outer(direction, direction) / 1e-6**2
-
-    def propagate(self, transition: FloatArray, inputs: FloatArray, noise: FloatArray) -> None:
-        """Move from one frame's state to the next.
-
-        Args:
-            transition: d new / d old state, (15, 15).
-            inputs: d new / d constants, (15, constants).
-            noise: Covariance of the new state given the old one and the constants, (15, 15).
-        """
-        size = len(self.matrix)
-        scale = 1 / np.sqrt(np.diag(noise))
-        weight = np.linalg.inv(noise * np.outer(scale, scale)) * np.outer(scale, scale)
-        jacobian = np.zeros((STATE, STATE + size))  # columns: old state, new state, constants, landmarks
-        jacobian[:, :STATE], jacobian[:, STATE : 2 * STATE] = -transition, np.eye(STATE)
-        jacobian[:, 2 * STATE : STATE + self.fixed] = -inputs
-        joint = jacobian.T @ weight @ jacobian
-        old = np.r_[np.arange(STATE), np.arange(2 * STATE, STATE + size)]
-        joint[np.ix_(old, old)] += self.matrix
-        self.matrix = _eliminate(joint, np.arange(STATE))
-
-    def add_landmark(self, identity: int) -> None:
-        """Take an unknown world point up (weak prior of 100 m)."""
-        size = len(self.matrix)
-        grown = np.zeros((size + 3, size + 3))
-        grown[:size, :size] = self.matrix
-        grown[size:, size:] = np.eye(3) / 100.0**2
-        self.matrix = grown
-        self.landmarks.append(identity)
-
-    def remove_landmarks(self, identities: set[int]) -> None:
-        """Eliminate points that will not be seen again."""
-        if not identities:
-            return
-        rows = [self.fixed + 3 * i for i, name in enumerate(self.landmarks) if name in identities]
-        self.matrix = _eliminate(self.matrix, np.concatenate([np.arange(r, r + 3) for r in rows]))
-        self.landmarks = [name for name in self.landmarks if name not in identities]
-
-    def landmark_place(self, identity: int) -> slice:
-        start = self.fixed + 3 * self.landmarks.index(identity)
-        return slice(start, start + 3)
-
-    def covariance(self) -> FloatArray:
-        """Of state and constants, landmarks marginalised."""
-        information = _eliminate(self.matrix, np.arange(self.fixed, len(self.matrix)))
-        scale = 1 / np.sqrt(np.diag(information))
-        return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
-
-
-def _eliminate(information: FloatArray, gone: npt.NDArray[np.int64]) -> FloatArray:
-    """Schur complement: the information left about the other variables."""
-    if len(gone) == 0:
-        return information
-    kept = np.setdiff1d(np.arange(len(information)), gone)
-    scale = 1 / np.sqrt(np.diag(information)[gone])
-    inner = information[np.ix_(gone, gone)] * np.outer(scale, scale)
-    cross = information[np.ix_(kept, gone)] * scale
-    left = information[np.ix_(kept, kept)] - cross @ np.linalg.solve(inner, cross.T)
-    return np.asarray((left + left.T) / 2)
 
 
 def _pixel_information(jacobian: FloatArray, by_time: FloatArray, options: BoundOptions) -> FloatArray:
@@ -225,7 +91,10 @@ def _pixel_information(jacobian: FloatArray, by_time: FloatArray, options: Bound
 
 
 def bounds(
-    run: SimulatedRun, options: BoundOptions | None = None, times_s: Sequence[float] | None = None
+    run: SimulatedRun,
+    options: BoundOptions | None = None,
+    times_s: Sequence[float] | None = None,
+    draw: Draw | None = None,
 ) -> list[Bound]:
     """The bound after each of `times_s` (s since the start; None: at the end only).
 
@@ -233,8 +102,8 @@ def bounds(
     """
     chosen = options or BoundOptions(corner_sigma_px=run.options.corner_sigma_px)
     wanted = list(times_s) if times_s is not None else [run.duration_s]
-    information = _Information(_Constants.of(chosen), run.rig, chosen)
-    frames = [f for f in run.frames if 0.0 <= f.t_s <= run.duration_s]
+    information = Information(Constants.of(chosen, drawn=draw is not None), run.rig, chosen)
+    frames = frames_of(run)
     last_seen = {int(i): n for n, f in enumerate(frames) for i in f.ids} if chosen.target_free else {}
     factors = inertial_factors(run.rig, np.array([f.t_s for f in frames]), chosen.imu_matrix_prior > 0)
     seen = _derivatives(run, frames)
@@ -245,14 +114,20 @@ def bounds(
         if len(found) == len(wanted):
             return found
         if n > 0:
-            _propagate(information, *(factor[n - 1] for factor in factors))
-        _update(information, frame, next(seen), chosen)
+            push = None if draw is None else draw.pushes[n - 1]
+            _propagate(information, *(factor[n - 1] for factor in factors), push)
+        _update(information, frame, next(seen), chosen, None if draw is None else draw.pixels[n])
         if chosen.target_free:
             information.remove_landmarks({i for i in information.landmarks if last_seen[i] <= n})
     return found + [_snapshot(information, t_s) for t_s in wanted[len(found) :]]
 
 
-def _snapshot(information: _Information, t_s: float) -> Bound:
+def frames_of(run: SimulatedRun) -> list[SimulatedFrame]:
+    """The frames that the imu's stretch covers."""
+    return [f for f in run.frames if 0.0 <= f.t_s <= run.duration_s]
+
+
+def _snapshot(information: Information, t_s: float) -> Bound:
     state = {
         "attitude": slice(0, 3),
         "velocity": slice(3, 6),
@@ -260,16 +135,21 @@ def _snapshot(information: _Information, t_s: float) -> Bound:
         "gyro_bias": slice(9, 12),
         "accel_bias": slice(12, 15),
     }
-    places, covariance = information.constants.slices, information.covariance()
+    places = {name: place for name, place in information.constants.slices.items() if name != DRAW}
+    covariance, error = information.solution()
     if "drift" in places:  # the shift at the end, where inside it is that at the start
         to_end = np.eye(len(covariance))
         to_end[places["timeshift"], places["drift"]] = t_s
-        covariance = to_end @ covariance @ to_end.T
-    return Bound(t_s, state | places, covariance)
+        covariance, error = to_end @ covariance @ to_end.T, to_end @ error
+    return Bound(t_s, state | places, covariance, error)
 
 
 def _propagate(
-    information: _Information, transition: FloatArray, influence: FloatArray, noise: FloatArray
+    information: Information,
+    transition: FloatArray,
+    influence: FloatArray,
+    noise: FloatArray,
+    push: FloatArray | None,
 ) -> None:
     inputs = np.zeros((STATE, information.fixed - STATE))
     columns = {"gravity": slice(0, 3), "gyro_matrix": slice(3, 12), "accel_matrix": slice(12, 18)}
@@ -277,6 +157,8 @@ def _propagate(
         if name in information.constants.slices:
             place = information.constants.slices[name]
             inputs[:, place.start - STATE : place.stop - STATE] = influence[:, source]
+    if push is not None:
+        inputs[:, information.constants.slices[DRAW].start - STATE] = push
     information.propagate(transition, inputs, noise)
 
 
@@ -289,7 +171,11 @@ def _derivatives(run: SimulatedRun, frames: Sequence[SimulatedFrame]) -> Iterato
 
 
 def _update(
-    information: _Information, frame: SimulatedFrame, by: dict[str, FloatArray], options: BoundOptions
+    information: Information,
+    frame: SimulatedFrame,
+    by: dict[str, FloatArray],
+    options: BoundOptions,
+    noise: FloatArray | None,
 ) -> None:
     ids = frame.ids[~frame.outlier]
     if len(ids) == 0:
@@ -305,6 +191,8 @@ def _update(
             full[:, place] = by[name]
     if "drift" in information.constants.slices:
         full[:, information.constants.slices["drift"]] = by["timeshift"] * frame.t_s
+    if noise is not None:
+        full[:, information.constants.slices[DRAW].start] = -noise
     if options.target_free:
         for n, identity in enumerate(ids):
             full[2 * n : 2 * n + 2, information.landmark_place(int(identity))] = by["points"][
@@ -343,7 +231,7 @@ def main(argv: list[str]) -> int:
             continue
         runs = [bounds(make(seed, args.seconds), options, times) for seed in range(args.seeds)]
         for at_time in zip(*runs, strict=True):
-            mean = Bound(at_time[0].t_s, at_time[0].slices, np.mean([b.covariance for b in at_time], axis=0))
+            mean = replace(at_time[0], covariance=np.mean([b.covariance for b in at_time], axis=0))
             print(f"| {name} | {describe(mean)} |", flush=True)
     return 0
 

@@ -33,7 +33,7 @@ def inertial_factors(
         accelerometer matrix 6] (n, 15, 18); noise covariances (n, 15, 15).
     """
     gaps_s = np.diff(times_s)
-    counts = np.maximum(1, np.ceil(gaps_s / _MAX_STEP_S)).astype(np.int64)
+    counts = np.array([steps_in(gap_s)[1] for gap_s in gaps_s])
     inputs = 18 if matrices else 3
     transition, influence = np.empty((len(gaps_s), STATE, STATE)), np.empty((len(gaps_s), STATE, inputs))
     noise = np.empty((len(gaps_s), STATE, STATE))
@@ -44,6 +44,12 @@ def inertial_factors(
         )
         transition[some], influence[some] = total[:, :STATE, :STATE], total[:, :STATE, STATE:]
     return transition, influence, noise
+
+
+def steps_in(gap_s: float) -> tuple[float, int]:
+    """Length (s) and number of the equal steps, of 10 ms at most, that a gap is integrated in."""
+    count = max(1, int(np.ceil(gap_s / _MAX_STEP_S)))
+    return gap_s / count, count
 
 
 def _integrate(
@@ -58,7 +64,7 @@ def _integrate(
     total = np.tile(eye, (len(start_s), 1, 1))
     noise = np.zeros((len(start_s), STATE, STATE))
     for k in range(count):
-        slopes = _error_slopes(rig, start_s + (k + 0.5) * step_s)[:, :used, :used]
+        slopes = error_slopes(rig, start_s + (k + 0.5) * step_s)[:, :used, :used]
         a = slopes * step_s[:, None, None]
         step = eye + a @ (eye + a @ (eye + a / 3) / 2)
         phi, inner = step[:, :STATE, :STATE], a[:, :STATE, :STATE]
@@ -75,7 +81,7 @@ def _spread(phi: FloatArray, diffusion: FloatArray) -> FloatArray:
     return np.asarray((phi * diffusion) @ np.swapaxes(phi, 1, 2))
 
 
-def _error_slopes(rig: Rig, t_s: FloatArray) -> FloatArray:
+def error_slopes(rig: Rig, t_s: FloatArray) -> FloatArray:
     """Time derivative of [state errors, gravity, gyro matrix, accelerometer matrix] as matrices (n, 33, 33).
 
     True attitude = estimate times exp(error); reading = matrix times truth + bias + noise.

@@ -8,6 +8,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from vical_mocks.points import SimulatedRun, board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
@@ -212,11 +213,16 @@ def bound_options(case: Case, run: SimulatedRun) -> BoundOptions:
 
 def bound_sigmas(bound: Bound) -> list[float]:
     """Sigmas of a bound in the order of the error vectors; 0 where not estimated."""
-    sigmas = np.zeros(15)
+    return vector_of(bound, np.sqrt(np.diag(bound.covariance)))
+
+
+def vector_of(bound: Bound, values: npt.NDArray[np.float64]) -> list[float]:
+    """What a bound says of its parameters, in the order of the error vectors; 0 where not estimated."""
+    out = np.zeros(15)
     for name, place in _PLACES:
         if name in bound.slices:
-            sigmas[place] = bound.sigma(name)
-    return sigmas.tolist()
+            out[place] = values[bound.slices[name]]
+    return out.tolist()
 
 
 def bound_trial(case: Case, seconds: float, seed: int) -> runner.Result:
@@ -274,7 +280,7 @@ def code_under_test(kind: str) -> str:
 
 @cache
 def _code_of_the_bound() -> str:
-    files = ("bound", "error_model", "projection")
+    files = ("bound", "information", "error_model", "projection")
     return runner.fingerprint(*(f"benchmarks/{name}.py" for name in files), "mocks/vical_mocks")
 
 

@@ -15,6 +15,7 @@ from vical_daemon.estimation.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.held_back import imu_noise_doubt
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.missing_motion import Missing, RunningMotion, guidance, shortcoming
+from vical_daemon.estimation.picture_cover import Cover
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
 from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.stamp_jitter import jitter_told
@@ -73,6 +74,7 @@ class Judge:
         self._square: dict[str, deque[tuple[float, int]]] = {}
         self._trace: dict[str, Trace] = {}
         self._size: deque[float] = deque(maxlen=400)
+        self._cover = Cover()
 
     # ------------------------------------------------------------------ what happens
     def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
@@ -145,6 +147,7 @@ class Judge:
         good = report.residual_px[report.accepted]
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
+        self._cover.saw(report, f)
         told = jitter_told(report.camera, f.shared[report.camera].jitter_s)
         if told:
             self.announce(told, once=f"jitter {report.camera}")
@@ -179,6 +182,8 @@ class Judge:
         if advice and f is not None:
             first = next(iter(f.state.cameras.values()))
             advice = shortcoming(self._motion, first.R_imu_cam, f.state.gyro_bias) or advice
+        if not advice and f is not None and self.status != Status.INCONSISTENT:
+            advice = self._cover.advice()
         self._ever_converged |= self.status == Status.CONVERGED
         if f is not None and (self.status == Status.DEGENERATE or f.unshown is not None):
             cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
