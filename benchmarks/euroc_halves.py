@@ -16,10 +16,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.consistency import MODES, modes
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import CameraEstimate
+from vical_daemon.estimation.trust.consistency import MODES, modes
 from vical_daemon.messages import decode_imu, decode_points
 from vical_daemon.recording import open_recording
 from vical_daemon.vision.target import load_target

@@ -52,9 +52,9 @@ def figure_start(path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from vical_daemon.estimation.rotation_curves import GyroCurve
-    from vical_daemon.estimation.rotation_start import camera_turns, shift_costs
     from vical_daemon.estimation.so3 import quat_from_matrix
+    from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+    from vical_daemon.estimation.temporal.rotation_start import camera_turns, shift_costs
 
     shift, rng, motion = 1.3, np.random.default_rng(1), hand_motion(1, 60.0)
     t_imu = np.arange(0.0, 16.0, 1.0 / IMU_HZ)

@@ -12,11 +12,11 @@ from vical_mocks.rotations import exp_so3, log_so3
 from vical_mocks.trajectory import hand_motion
 
 from benchmarks.td_icp_trials import DEG, GYRO, IMU_HZ, WALK, simulate_gyro
-from vical_daemon.estimation.camera_orientations import target_orientations
-from vical_daemon.estimation.lens_refinement import refine_lens
 from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.start.lens_refinement import refine_lens
 from vical_daemon.estimation.td_icp import TdIcpOptions, TdIcpResult, td_icp
-from vical_daemon.estimation.td_icp_joint import OrientationStream, joint_with_gyro
+from vical_daemon.estimation.temporal.camera_orientations import target_orientations
+from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream, joint_with_gyro
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from vical_daemon.publications import (
 from vical_daemon.stamp_order import StampOrder
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.td_icp_watch import DelayWatch
+    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
 
 Keep = Callable[[Sequence[Any]], None]
 Inspect = Callable[[CalibrationEstimate], CalibrationEstimate]

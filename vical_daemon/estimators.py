@@ -12,7 +12,7 @@ from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.priors import calibration_options, camera_prior
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.td_icp_watch import DelayWatch
+    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
 
 
 class Estimator(Protocol):
@@ -70,7 +70,7 @@ def make_watch(config: Config) -> DelayWatch | None:
     if config.target_path is None or config.calibration.mode == "target_free":
         return None
     from vical_daemon.estimation.td_icp import TdIcpOptions
-    from vical_daemon.estimation.td_icp_watch import DelayWatch
+    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
     from vical_daemon.vision.target import load_target
 
     noise = calibration_options(config).imu_noise

@@ -20,7 +20,7 @@ from vical_daemon.messages import (
 )
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.td_icp_watch import DelayVerdict
+    from vical_daemon.estimation.temporal.td_icp_watch import DelayVerdict
 
 Message = tuple[str, bytes]
 

@@ -12,7 +12,7 @@ from vical_mocks.tracks import simulate_tracks
 from benchmarks.bound import BoundOptions, bounds
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from benchmarks.scores import nees
-from vical_daemon.estimation.free_carry import IMU
+from vical_daemon.estimation.free.carry import IMU
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 pytestmark = [pytest.mark.statistical, pytest.mark.timeout(600)]

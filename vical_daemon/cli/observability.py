@@ -12,9 +12,9 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.missing_motion import Missing
     from vical_daemon.estimation.observability import Motion, Observability, Setup
     from vical_daemon.estimation.observability_model import ModelRank
+    from vical_daemon.estimation.trust.missing_motion import Missing
 
 BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
 
@@ -72,8 +72,8 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[Missin
     """What is missing, in words, from the bound with next to no prior."""
     import numpy as np
 
-    from vical_daemon.estimation.missing_motion import RunningMotion, missing_motion
     from vical_daemon.estimation.observability import covariance_of
+    from vical_daemon.estimation.trust.missing_motion import RunningMotion, missing_motion
 
     covariance = covariance_of(result)
     order = [result.blocks[name] for name in ("lever_arm", "rotation", "timeshift")]

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from vical_daemon.estimation.measurements import CameraPrior
     from vical_daemon.estimation.td_icp import TdIcpOptions
-    from vical_daemon.estimation.td_icp_joint import OrientationStream
-    from vical_daemon.estimation.td_icp_monitor import DelayReport
+    from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
+    from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport
     from vical_daemon.priors import Initial
     from vical_daemon.recording import Recording
 
@@ -121,7 +121,7 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     from vical_daemon.cli.td_icp_report import print_single, report_json
     from vical_daemon.cli.td_icp_sources import camera_stream, seconds, track_frames
     from vical_daemon.estimation.td_icp import REFUSED, td_icp
-    from vical_daemon.estimation.track_registration import track_registration
+    from vical_daemon.estimation.temporal.track_registration import track_registration
 
     recording = open_input(args.input)
     cameras = recording.cameras
@@ -181,7 +181,7 @@ def _watch(
     """Replay the streams through the monitor in order of their stamps."""
     import numpy as np
 
-    from vical_daemon.estimation.td_icp_monitor import DelayMonitor
+    from vical_daemon.estimation.temporal.td_icp_monitor import DelayMonitor
 
     monitor = DelayMonitor(options, window_s, window_s / 2.0)
     sigma = np.asarray(stream.rotation_sigma)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.td_icp_sources import seconds
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.td_icp_joint import OrientationStream
+from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

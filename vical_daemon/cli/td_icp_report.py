@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.td_icp import TdIcpResult
-    from vical_daemon.estimation.td_icp_joint import JointResult
-    from vical_daemon.estimation.td_icp_monitor import DelayReport
+    from vical_daemon.estimation.temporal.td_icp_joint import JointResult
+    from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport
 
 
 def report_json(report: DelayReport) -> dict[str, Any]:

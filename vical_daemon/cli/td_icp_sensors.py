@@ -10,7 +10,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.td_icp import choose_gyro, is_trajectory, open_input, options_of, prior_of
 from vical_daemon.cli.td_icp_orientations import pose_topic, trajectory_file
 from vical_daemon.cli.td_icp_sources import camera_stream, seconds
-from vical_daemon.estimation.td_icp_joint import (
+from vical_daemon.estimation.temporal.td_icp_joint import (
     JointResult,
     OrientationStream,
     joint_of_orientations,

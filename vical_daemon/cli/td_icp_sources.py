@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.estimation.camera_orientations import Orientations, target_orientations
-from vical_daemon.estimation.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.lens_refinement import LensFit, refine_lens
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
-from vical_daemon.estimation.seen_poses import Lens
-from vical_daemon.estimation.td_icp_joint import OrientationStream
-from vical_daemon.estimation.track_orientations import track_orientations
+from vical_daemon.estimation.start.intrinsics_start import estimate_intrinsics
+from vical_daemon.estimation.start.lens_refinement import LensFit, refine_lens
+from vical_daemon.estimation.start.seen_poses import Lens
+from vical_daemon.estimation.temporal.camera_orientations import Orientations, target_orientations
+from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
+from vical_daemon.estimation.temporal.track_orientations import track_orientations
 from vical_daemon.recording import Recording, Stream
 
 FloatArray = npt.NDArray[np.float64]

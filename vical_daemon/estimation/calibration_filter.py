@@ -12,9 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from vical_daemon.estimation import lessons, unscented
-from vical_daemon.estimation.consistency import Consistency, normalised
-from vical_daemon.estimation.corner_noise import CornerNoise
+from vical_daemon.estimation import unscented
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.image_update import (
     corner_gate,
@@ -24,7 +22,6 @@ from vical_daemon.estimation.image_update import (
     solve,
 )
 from vical_daemon.estimation.imu_buffer import ImuSegment
-from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.linearise import (
     Image,
     Linear,
@@ -37,9 +34,13 @@ from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFra
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.rates import Rates, rates_after
 from vical_daemon.estimation.retract import orthonormal, retract
-from vical_daemon.estimation.shared_errors import SharedErrors, shared_ways
 from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, State
-from vical_daemon.estimation.target_doubt import TargetDoubt
+from vical_daemon.estimation.trust import lessons
+from vical_daemon.estimation.trust.consistency import Consistency, normalised
+from vical_daemon.estimation.trust.corner_noise import CornerNoise
+from vical_daemon.estimation.trust.lens_agreement import LensAgreement
+from vical_daemon.estimation.trust.shared_errors import SharedErrors, shared_ways
+from vical_daemon.estimation.trust.target_doubt import TargetDoubt
 from vical_daemon.estimation.unshown_axes import UnshownAxes
 
 _EYE = np.eye(3)

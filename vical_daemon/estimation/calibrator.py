@@ -11,15 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation import clock_drift, hypotheses, target_doubt
-from vical_daemon.estimation.beyond_doubt import BeyondDoubt, size_told
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.held_back import HeldBack
 from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.judge import Judge
 from vical_daemon.estimation.measurements import (
     BoolArray,
     CalibrationOptions,
@@ -28,10 +23,15 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
-from vical_daemon.estimation.seen_poses import Lens, pose_of
 from vical_daemon.estimation.stamp_steps import StampSteps
-from vical_daemon.estimation.starting import LATE_S, Starting
+from vical_daemon.estimation.start.seen_poses import Lens, pose_of
+from vical_daemon.estimation.start.starting import LATE_S, Starting
 from vical_daemon.estimation.state import Layout, make_layout
+from vical_daemon.estimation.trust import clock_drift, hypotheses, target_doubt
+from vical_daemon.estimation.trust.beyond_doubt import BeyondDoubt, size_told
+from vical_daemon.estimation.trust.change_watch import Action, ChangeWatch
+from vical_daemon.estimation.trust.held_back import HeldBack
+from vical_daemon.estimation.trust.judge import Judge
 
 _KEEP_S = 5.0
 _ALWAYS = {hypotheses.IMU, hypotheses.LAG, hypotheses.SIZE}  # are states, see `hypotheses`

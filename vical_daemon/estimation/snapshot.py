@@ -6,10 +6,10 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.lens_limit import limit as lens_limit
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 from vical_daemon.estimation.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
+from vical_daemon.estimation.trust.lens_limit import limit as lens_limit
 
 
 def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float) -> CameraEstimate:

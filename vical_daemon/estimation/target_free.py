@@ -1,6 +1,6 @@
 """Calibration without a target: tracks of unknown points and an IMU in, calibration out. No clock, no I/O.
 
-Flow: buffer -> `free_starter.Starter` (rotations and delay from the epipolar constraint, then speed, gravity
+Flow: buffer -> `free.starter.Starter` (rotations and delay from the epipolar constraint, then speed, gravity
 and structure linearly) -> one inertial bundle adjustment per window of a few seconds, grown as images arrive
 -> what the window knows is carried into the next as a prior on tilt, speed, biases and calibration. How far a
 window's own data moved the calibration, against how far they may, says whether to believe it.
@@ -15,20 +15,20 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.free_bundle import Bundle, Fit
-from vical_daemon.estimation.free_carry import DRIFT, FULL, LENS, SHIFT, Carry
-from vical_daemon.estimation.free_handover import afresh, aged, next_window
-from vical_daemon.estimation.free_judge import FreeJudge
-from vical_daemon.estimation.free_reports import window_reports
-from vical_daemon.estimation.free_starter import Starter
-from vical_daemon.estimation.free_window import Window
+from vical_daemon.estimation.free.bundle import Bundle, Fit
+from vical_daemon.estimation.free.carry import DRIFT, FULL, LENS, SHIFT, Carry
+from vical_daemon.estimation.free.handover import afresh, aged, next_window
+from vical_daemon.estimation.free.judge import FreeJudge
+from vical_daemon.estimation.free.reports import window_reports
+from vical_daemon.estimation.free.starter import Starter
+from vical_daemon.estimation.free.thinning import Thinning
+from vical_daemon.estimation.free.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
+from vical_daemon.estimation.free.window import Window
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.stamp_steps import StampSteps
-from vical_daemon.estimation.thinning import Thinning
 from vical_daemon.estimation.unshown_axes import has_turned
-from vical_daemon.estimation.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube

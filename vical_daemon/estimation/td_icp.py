@@ -17,14 +17,18 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
-from vical_daemon.estimation.rotation_curves import GyroCurve
-from vical_daemon.estimation.rotation_registration import Registration, closest_point_registration
-from vical_daemon.estimation.rotation_start import Start, debiased_start
-from vical_daemon.estimation.rotation_suspects import explain
-from vical_daemon.estimation.td_icp_input import clean_gyro, clean_orientations, world_cam_from_cam_target
-from vical_daemon.estimation.td_icp_refusals import judge, refuse_motion, refuse_start
-from vical_daemon.estimation.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions, TdIcpResult
+from vical_daemon.estimation.temporal.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+from vical_daemon.estimation.temporal.rotation_registration import Registration, closest_point_registration
+from vical_daemon.estimation.temporal.rotation_start import Start, debiased_start
+from vical_daemon.estimation.temporal.rotation_suspects import explain
+from vical_daemon.estimation.temporal.td_icp_input import (
+    clean_gyro,
+    clean_orientations,
+    world_cam_from_cam_target,
+)
+from vical_daemon.estimation.temporal.td_icp_refusals import judge, refuse_motion, refuse_start
+from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions, TdIcpResult
 
 __all__ = [
     "DEGENERATE",

@@ -19,7 +19,7 @@ from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.so3 import matrix_from_quat
-from vical_daemon.estimation.td_icp_watch import DelayWatch
+from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
 from vical_daemon.health import StatusSender
 from vical_daemon.messages import (
     DiagnosticStatus,

@@ -7,13 +7,21 @@ from vical_mocks.points import board_points
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.consistency import Consistency
-from vical_daemon.estimation.corner_noise import CornerNoise
-from vical_daemon.estimation.hypotheses import ENTRY_SIGMA, IMU, LAG, LAG_SIGMA_S, SIZE, SIZE_SIGMA, TARGET
-from vical_daemon.estimation.lens_agreement import LensAgreement
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.estimation.retract import retract
 from vical_daemon.estimation.state import LOWER, CameraState, State, make_layout
+from vical_daemon.estimation.trust.consistency import Consistency
+from vical_daemon.estimation.trust.corner_noise import CornerNoise
+from vical_daemon.estimation.trust.hypotheses import (
+    ENTRY_SIGMA,
+    IMU,
+    LAG,
+    LAG_SIGMA_S,
+    SIZE,
+    SIZE_SIGMA,
+    TARGET,
+)
+from vical_daemon.estimation.trust.lens_agreement import LensAgreement
 
 NAME = "cam0"
 

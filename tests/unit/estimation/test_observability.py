@@ -5,7 +5,9 @@ import pytest
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.measurements import ConvergenceTargets
-from vical_daemon.estimation.missing_motion import (
+from vical_daemon.estimation.observability import Motion, Setup, gramian, lost_in_block, pose_sensitivities
+from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
+from vical_daemon.estimation.trust.missing_motion import (
     WIDE,
     RunningMotion,
     axis_words,
@@ -13,8 +15,6 @@ from vical_daemon.estimation.missing_motion import (
     missing_motion,
     shortcoming,
 )
-from vical_daemon.estimation.observability import Motion, Setup, gramian, lost_in_block, pose_sensitivities
-from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
 
 G = np.array([0.0, 6.0, 7.7])
 R_IMU_CAM = so3.exp(np.array([0.3, -1.2, 0.5]))

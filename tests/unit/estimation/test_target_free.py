@@ -13,8 +13,8 @@ from vical_mocks.trajectory import one_axis, still
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, points_frame
 from benchmarks.scores import nees
 from benchmarks.zoo import draw
-from vical_daemon.estimation.free_carry import FULL
-from vical_daemon.estimation.free_judge import FreeJudge
+from vical_daemon.estimation.free.carry import FULL
+from vical_daemon.estimation.free.judge import FreeJudge
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 

@@ -8,7 +8,7 @@ from vical_mocks.tracks import simulate_tracks
 
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from benchmarks.scores import nees
-from vical_daemon.estimation.free_carry import IMU, LAG
+from vical_daemon.estimation.free.carry import IMU, LAG
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 

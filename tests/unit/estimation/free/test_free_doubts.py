@@ -1,0 +1,101 @@
+"""What is told without a target is the mixture over what may not be as stated."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from vical_daemon.estimation.free.carry import CALIBRATION, FULL, IMU, INERTIAL, LAG, Carry, root_of
+from vical_daemon.estimation.free.doubts import FreeDoubts
+from vical_daemon.estimation.free.snapshot import camera_estimate
+from vical_daemon.estimation.state import CameraState
+from vical_daemon.estimation.trust.hypotheses import ENTRY_SIGMA, LAG_SIGMA_S
+
+PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])
+NUMBERS = np.arange(FULL)[INERTIAL]
+STATED = {"both": NUMBERS, "imu": np.arange(FULL)[IMU], "lag": np.arange(FULL)[LAG], "none": NUMBERS[:0]}
+
+
+def carry(seed, off):
+    """A calibration in which what is known of the imu hangs together with all the rest."""
+    rng = np.random.default_rng(seed)
+    size = np.array([1e-3] * 3 + [1e-3] * 3 + [1e-4] + [1.0] * 4 + [1e-3] * 4 + [1e-5, 1e-4, *PRIOR])
+    half = rng.standard_normal((FULL, FULL + 4)) / np.sqrt(FULL)
+    P = half @ half.T * np.outer(size, size) * 0.3
+    whole = np.eye(CALIBRATION + FULL)
+    whole[CALIBRATION:, CALIBRATION:] = P
+    imu = off * np.sqrt(np.diag(P))[NUMBERS] * rng.standard_normal(16)
+    camera = CameraState(
+        np.eye(3),
+        rng.standard_normal(3),
+        0.01,
+        np.array([500.0, 500.0, 320.0, 240.0]),
+        np.zeros(4),
+        "radtan",
+        (640, 480),
+    )
+    active = np.ones(FULL, dtype=bool)
+    return Carry(np.eye(3), np.zeros(3), np.zeros(6), camera, root_of(whole), active, 0.0, imu), P
+
+
+def given_stated(P, x, at):
+    """Mean and covariance where `at` is zero, from the information matrix."""
+    rest = np.setdiff1d(np.arange(FULL), at)
+    information = np.linalg.inv(P)
+    left = np.linalg.inv(information[np.ix_(rest, rest)])
+    mean, covariance = np.zeros(FULL), np.zeros((FULL, FULL))
+    mean[rest] = x[rest] + left @ information[np.ix_(rest, at)] @ x[at]
+    covariance[np.ix_(rest, rest)] = left
+    return mean, covariance
+
+
+def mixture(P, x):
+    """Odds by Savage and Dickey, each hypothesis in one of twenty rigs; mean and covariance over all four."""
+    odds, parts = {}, {}
+    for name, at in STATED.items():
+        k = {"both": 2, "imu": 1, "lag": 1, "none": 0}[name]
+        sigma = PRIOR[at - NUMBERS[0]]
+        posterior = multivariate_normal.pdf(np.zeros(len(at)), x[at], P[np.ix_(at, at)]) if k else 1.0
+        prior = multivariate_normal.pdf(np.zeros(len(at)), None, np.diag(sigma**2)) if k else 1.0
+        odds[name] = 0.95**k * 0.05 ** (2 - k) * posterior / prior
+        parts[name] = given_stated(P, x, at)
+    total = sum(odds.values())
+    mean = sum(odds[n] * parts[n][0] for n in odds) / total
+    return mean, sum(
+        odds[n] / total * (parts[n][1] + np.outer(parts[n][0] - mean, parts[n][0] - mean)) for n in odds
+    )
+
+
+@pytest.mark.parametrize(("seed", "off"), [(1, 0.0), (2, 0.7), (3, 1.5), (4, 2.5)])
+def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
+    known, P = carry(seed, off)
+    x = np.zeros(FULL)
+    x[NUMBERS] = known.imu
+    doubts = FreeDoubts("cam0", asked=frozenset(), rolling=True)
+    doubts.drifting = True
+    told = camera_estimate(
+        known, doubts.weighed(known, 1.0, compared=True)._replace(gyro_frame=False), 0.5, 0.5
+    )
+    mean, covariance = mixture(P, x)
+    assert np.array(told.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(mean[:3], abs=1e-9)
+    assert told.timeshift_cam_imu_s - 0.01 == pytest.approx(mean[6], abs=1e-12)
+    assert np.array(told.T_imu_cam.covariance) == pytest.approx(covariance[:6, :6], rel=1e-6, abs=1e-13)
+    assert told.timeshift_sigma_s == pytest.approx(np.sqrt(covariance[6, 6]), rel=1e-6)
+
+
+def test_what_is_asked_for_is_never_taken_as_stated():
+    known, _ = carry(5, 0.0)
+    doubts = FreeDoubts("cam0", asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
+    ((p, stated),) = doubts.weighed(known, 1.0, compared=True).stated
+    assert (p, len(stated)) == (1.0, 0)
+
+
+def test_until_windows_can_be_compared_the_imu_is_as_likely_true_as_not():
+    known, _ = carry(6, 8.0)
+    doubts = FreeDoubts("cam0", asked=frozenset(), rolling=False)
+    for compared, least in ((False, 0.5), (True, 0.0)):
+        shares = {len(stated): p for p, stated in doubts.weighed(known, 1.0, compared=compared).stated}
+        assert shares[16] == pytest.approx(least, abs=1e-6)
+        assert sum(p for p, _ in doubts.weighed(known, 1.0, compared=compared).stated) == pytest.approx(1.0)
+    assert not any("scale" in text for text in doubts.watch(known, 1.0, compared=False))
+    assert any("scale or alignment" in text for text in doubts.watch(known, 1.0, compared=True))
+    assert doubts.watch(known, 1.0, compared=True) == []  # said once

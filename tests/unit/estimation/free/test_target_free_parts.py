@@ -1,0 +1,316 @@
+"""Pieces of the target-free calibration, each against something that does not share its code."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from vical_mocks.rig import reference_rig
+from vical_mocks.tracks import simulate_tracks
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.free.bundle import Bundle
+from vical_daemon.estimation.free.carry import (
+    DRIFT,
+    FULL,
+    INERTIAL,
+    camera_difference,
+    first_carry,
+    later,
+    moved,
+    tangents,
+)
+from vical_daemon.estimation.free.epipolar_fit import epipolar_fit
+from vical_daemon.estimation.free.inertial import Order
+from vical_daemon.estimation.free.jitter import Lateness
+from vical_daemon.estimation.free.quality import correlation
+from vical_daemon.estimation.free.start import ArmPrior, LinearStart
+from vical_daemon.estimation.free.starter import start_sigmas
+from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial_links import Links, make_link
+from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
+from vical_daemon.estimation.state import CameraState
+
+SHIFT_S = 0.013
+
+
+class Scene:
+    """Four seconds of tracks, and the truth in the form of a camera."""
+
+    def __init__(self, seed=3, seconds=4.5):
+        rig = reference_rig(seed, timeshift_cam_imu_s=SHIFT_S)
+        self.run = simulate_tracks(seed, seconds, rig=rig)
+        base = int(self.run.t_imu_ns[0])
+        self.buffer = ImuBuffer(base)
+        for t, w, f in zip(self.run.t_imu_ns, self.run.gyro_rps, self.run.specific_force_mps2, strict=True):
+            self.buffer.append((int(t) - base) * 1e-9, w, f)
+        self.frames = [
+            ((f.t_cam_ns - base) * 1e-9, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px))
+            for f in self.run.frames
+        ]
+        self.frames = [x for x in self.frames if 0.1 < x[0] < seconds - 0.2]
+        lens = rig.lens
+        self.camera = CameraState(
+            rig.R_imu_cam,
+            rig.p_imu_cam,
+            SHIFT_S,
+            np.array(lens.intrinsics),
+            np.array(lens.distortion),
+            lens.model,
+            lens.resolution,
+            0.0,
+        )
+        d = rig.densities
+        self.noise = ImuNoise(d.gyro, d.gyro_walk, d.accel, d.accel_walk)
+        self.rig = rig
+
+    def window(self, numbers=0):
+        start = moved(self.camera, np.zeros(FULL))
+        start.p_imu_cam = np.zeros(3)
+        imu = np.concatenate([self.rig.gyro_bias.value(0.0), np.zeros(3 + numbers)])
+        linear = LinearStart(self.buffer, self.frames, start, imu, self.noise, 9.80665)
+        return linear.window(ArmPrior(np.zeros(3)))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+@pytest.mark.parametrize("numbers", [6, 22])
+def test_links_derivatives_agree_with_differences(scene, numbers):
+    zero = np.zeros(numbers)
+    links = Links.stack(
+        [make_link(scene.buffer, 0.3 + 0.05 * k, 0.35 + 0.05 * k, zero, scene.noise) for k in range(3)]
+    )
+    rng = np.random.default_rng(1)
+    R = Rotation.from_rotvec(0.4 * rng.standard_normal((4, 3))).as_matrix()
+    p, v = rng.standard_normal((2, 4, 3))
+    bias = 0.01 * rng.standard_normal((3, numbers))
+    gravity = np.array([0.0, 0.0, -9.8])
+    e0, J = links.errors(R, p, v, bias, gravity)
+    h = 1e-6
+    for k in range(18 + numbers):
+        R2, p2, v2, b2 = R.copy(), p.copy(), v.copy(), bias.copy()
+        image, axis = (1 if k < 9 else 2), k % 9
+        if k >= 18:
+            b2[1, k - 18] += h
+        elif axis < 3:
+            R2[image] = R[image] @ Rotation.from_rotvec(h * np.eye(3)[axis]).as_matrix()
+        elif axis < 6:
+            p2[image, axis - 3] += h
+        else:
+            v2[image, axis - 6] += h
+        change = (links.errors(R2, p2, v2, b2, gravity)[0][1] - e0[1]) / h
+        np.testing.assert_allclose(J[1, :, k], change, rtol=2e-3, atol=1e-3 * np.abs(J[1]).max())
+
+
+def test_link_carries_the_true_motion(scene):
+    biases = np.concatenate([scene.rig.gyro_bias.value(1.2), scene.rig.accel_bias.value(1.2)])
+    link = make_link(scene.buffer, 1.0, 1.5, biases, scene.noise)
+    offset = (scene.run.t_imu_ns[0] - scene.run.options.epoch_ns) * 1e-9
+    move, g = scene.rig.trajectory, scene.rig.gravity_world_mps2
+    a, b = 1.0 + offset, 1.5 + offset
+    R = move.R_world_imu(a).T @ move.R_world_imu(b)
+    dv = move.R_world_imu(a).T @ (move.v_world_imu(b) - move.v_world_imu(a) - 0.5 * g)
+    e = np.concatenate([Rotation.from_matrix(link.dR.T @ R).as_rotvec(), dv - link.dv])
+    assert np.abs(link.root_information[:6, :6] @ e).max() < 4.5
+
+
+def test_a_link_is_not_made_over_a_hole_in_the_readings():
+    buffer = ImuBuffer(0)
+    for t in (0.0, 0.01, 0.02, 0.2, 0.21):
+        buffer.append(t, np.zeros(3), np.zeros(3))
+    assert make_link(buffer, 0.0, 0.02, np.zeros(6), ImuNoise()) is not None
+    assert make_link(buffer, 0.01, 0.205, np.zeros(6), ImuNoise()) is None
+    assert make_link(buffer, 0.0, 0.3, np.zeros(6), ImuNoise()) is None
+
+
+def test_epipolar_fit_finds_mounting_delay_and_bias_without_knowing_any(scene):
+    rows = scene.buffer.rows
+    start = scene.camera.R_imu_cam @ Rotation.from_rotvec([0.15, -0.1, 0.2]).as_matrix()
+    lens = (scene.camera.intrinsics * [1.03, 1.03, 1.0, 1.0], np.zeros(4), "radtan")
+    fit = epipolar_fit(rows[:, 0], rows[:, 1:4], scene.frames, lens, start, -0.02, fit_lens=True)
+    off = Rotation.from_matrix(scene.camera.R_imu_cam.T @ fit.R_imu_cam).as_rotvec()
+    assert np.all(np.abs(off) < np.maximum(4.5 * np.sqrt(np.diag(fit.rotation_covariance)), 2e-3))
+    assert abs(fit.timeshift_s - SHIFT_S) < max(4.5 * fit.timeshift_sigma_s, 3e-4)
+    np.testing.assert_allclose(fit.gyro_bias, scene.rig.gyro_bias.value(2.0), atol=3e-3)
+    assert fit.intrinsics[0] == pytest.approx(scene.camera.intrinsics[0], rel=0.015)
+    assert fit.inliers > 0.9
+
+
+def test_start_finds_lever_arm_and_speed_linearly(scene):
+    window = scene.window()
+    assert np.linalg.norm(window.camera.p_imu_cam - scene.camera.p_imu_cam) < 0.03
+    offset = (scene.run.t_imu_ns[0] - scene.run.options.epoch_ns) * 1e-9
+    t = np.array([s for s, _ in window.frames]) + SHIFT_S + offset
+    speed = np.linalg.norm(scene.rig.trajectory.v_world_imu(t), axis=1)
+    assert np.abs(np.linalg.norm(window.v, axis=1) - speed).max() < 0.1
+
+
+def test_links_follow_the_matrices_as_integrating_anew_does(scene):
+    """What a link says of other biases, matrices and lags, against one integrated for them."""
+    rng = np.random.default_rng(3)
+    at = np.concatenate([[0.01, -0.02, 0.01], [0.1, 0.0, -0.1], 0.02 * rng.standard_normal(15), [2e-4]])
+    link = make_link(scene.buffer, 1.0, 1.25, at, scene.noise)
+    for k in range(22):
+        step = np.zeros(22)
+        step[k] = 1e-4
+        up, down = (make_link(scene.buffer, 1.0, 1.25, at + s * step, scene.noise) for s in (1.0, -1.0))
+        turn = Rotation.from_matrix(down.dR.T @ up.dR).as_rotvec()
+        change = np.concatenate([turn, up.dv - down.dv, up.dp - down.dp]) / 2e-4
+        scale = np.repeat(np.abs(link.by_imu).max(axis=1).reshape(3, 3).max(axis=1), 3)
+        np.testing.assert_allclose(link.by_imu[:, k] / scale, change / scale, atol=6e-3)
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.02])
+def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s):
+    window = scene.window(numbers=16)
+    window.camera = replace(window.camera, readout_s=readout_s)
+    active = np.ones(FULL, dtype=bool)
+    problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 50.0).problem
+    seen, links = window.observe(), window.stacked()
+    normal, order = problem.normal(seen, links), problem.order()
+    rng = np.random.default_rng(2)
+    scales = np.array([1e-4] * 6 + [1e-5] + [0.01] * 4 + [1e-5] * 4 + [1e-5] * 2 + [1e-6] * 15 + [1e-5])
+    for k in range(FULL):
+        step = np.zeros(FULL)
+        step[k] = scales[k] * rng.choice([-1.0, 1.0])
+        camera, costs = window.camera, []
+        for d in (step, -step):
+            window.camera, window.imu = moved(camera, d), d[INERTIAL]
+            costs.append(problem.normal(seen, links).cost)
+        window.camera, window.imu = camera, np.zeros(16)
+        up, down = costs
+        slope, wanted = (up - down) / 2.0 / step[k] / 2.0, normal.g[order.calib[k]]
+        assert slope == pytest.approx(
+            wanted, rel=0.02, abs=0.02 * np.sqrt(normal.H[order.calib[k], order.calib[k]])
+        ), k
+
+
+def test_late_images_move_the_errors_of_links_as_told(scene):
+    window = scene.window()
+    links, knots = window.stacked(), window.knots()
+    e, J = links.errors(window.R, window.p, window.v, window.bias[knots], window.gravity)
+    order = Order(len(window.frames), len(window.bias), 0)
+    at = np.concatenate([order.frames[:-1], order.frames[1:], order.knots[knots]], axis=1)
+    rates, push = window.rates(), np.gradient(window.v, [t for t, _ in window.frames], axis=0)
+    late = np.random.default_rng(4).normal(0.0, 1e-5, len(window.frames))[:, None]
+    moved_back = links.errors(
+        window.R @ so3.exp(-late * rates),
+        window.p - late * window.v,
+        window.v - late * push,
+        window.bias[knots],
+        window.gravity,
+    )[0]
+    # the same with the delays as unknowns of their own
+    F, size = len(window.frames), order.size
+    B = np.zeros((e.size, F))
+    for k in range(F):
+        alone = np.zeros((F, 1))
+        alone[k] = 1e-5
+        B[:, k] = (
+            links.errors(
+                window.R @ so3.exp(-alone * rates),
+                window.p - alone * window.v,
+                window.v - alone * push,
+                window.bias[knots],
+                window.gravity,
+            )[0]
+            - e
+        ).ravel() / 1e-5
+    np.testing.assert_allclose(
+        B @ late[:, 0], (moved_back - e).ravel(), atol=2e-3 * np.abs(moved_back - e).max()
+    )
+    wide = np.zeros((e.size, size))
+    for k in range(F - 1):
+        wide[9 * k : 9 * k + 9, at[k]] += J[k]
+    sigma_s = 5e-4
+    M = B.T @ B + np.eye(F) / sigma_s**2
+    gain = np.linalg.solve(M, B.T)
+    H, g = wide.T @ wide, wide.T @ e.ravel()
+    delays = Lateness(window, e, J, sigma_s)
+    wanted_H, wanted_g = H - wide.T @ B @ gain @ wide, g - wide.T @ B @ gain @ e.ravel()
+    delays.eliminate(H, g, J, at)
+    np.testing.assert_allclose(H, wanted_H, atol=1e-4 * np.abs(wanted_H).max())
+    np.testing.assert_allclose(g, wanted_g, atol=1e-4 * np.abs(wanted_g).max())
+    assert delays.explained() == pytest.approx(e.ravel() @ B @ gain @ e.ravel(), rel=1e-3)
+    wanted = -gain @ e.ravel()
+    np.testing.assert_allclose(delays.delays()[0], wanted, atol=3e-3 * np.abs(wanted).max())
+
+
+def test_adjusted_window_is_right_within_its_own_sigmas(scene):
+    window = scene.window()
+    active = np.arange(FULL) < 7
+    bundle = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 1.0)
+    fit = bundle.solve(scene.buffer, 25)
+    error = camera_difference(fit.carry.camera, scene.camera)[:7]
+    P = fit.carry.covariance()[11:, 11:]
+    assert error @ np.linalg.solve(P, error) < 24.3  # chi-square, 7 degrees of freedom, 99.9 %
+    assert np.sqrt(np.diag(P))[:3].max() < 2e-3
+    assert fit.sigma_px == pytest.approx(0.5, rel=0.06)
+    assert fit.spread < 1.15
+
+
+def test_a_drift_carries_into_the_time_shift_of_the_next_window(scene):
+    window = scene.window()
+    active = (np.arange(FULL) < 7) | (np.arange(FULL) == DRIFT)
+    fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 1.0).solve(
+        scene.buffer, 25
+    )
+    first, carry = window.camera, fit.carry
+    assert carry.camera.timeshift_s == pytest.approx(
+        first.timeshift_s + first.skew * window.span_s, abs=1e-12
+    )
+    at_end, shift, drift = carry.calibration(), 6, DRIFT
+    back = later(active, -window.span_s)
+    k = np.flatnonzero(active)
+    at_first = back @ at_end[np.ix_(k, k)] @ back.T
+    # drift and shift: an uncertain slope about the middle of the data
+    assert at_end[shift, drift] > 0.0 > at_first[6, 7]
+    assert abs(first.skew) < 4.0 * np.sqrt(at_end[drift, drift])
+
+
+def test_where_north_and_origin_are_changes_nothing(scene):
+    active = np.arange(FULL) < 7
+    results = []
+    for turn in (0.0, 2.0):
+        window = scene.window()
+        world = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
+        window.R, window.v = world @ window.R, window.v @ world.T
+        window.p = window.p @ world.T + turn * np.array([3.0, -1.0, 0.5])
+        fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 0.5).solve(
+            scene.buffer, 25
+        )
+        results.append(fit)
+    a, b = (np.sqrt(np.diag(r.carry.covariance())) for r in results)
+    np.testing.assert_allclose(a, b, rtol=0.02)
+    change = camera_difference(results[0].carry.camera, results[1].carry.camera)[:7]
+    assert np.abs(change / a[11:]).max() < 0.05
+
+
+def test_errors_that_last_are_counted_once():
+    rng = np.random.default_rng(5)
+    frames, marks, memory = 60, 40, 0.8
+    e = rng.standard_normal((marks, frames, 2))
+    for k in range(1, frames):
+        e[:, k] = memory * e[:, k - 1] + np.sqrt(1 - memory**2) * e[:, k]
+
+    class Seen:
+        landmark = np.repeat(np.arange(marks), frames)
+        frame = np.tile(np.arange(frames), marks)
+
+    wanted = (1 + memory) / (1 - memory)
+    assert correlation(e.reshape(-1, 2), Seen) == pytest.approx(wanted, rel=0.15)
+    white = rng.standard_normal((marks * frames, 2))
+    assert correlation(white, Seen) < 1.15
+
+
+def test_tangents_are_orthonormal_everywhere():
+    bearings = np.random.default_rng(7).standard_normal((500, 3))
+    bearings = np.vstack([bearings, np.eye(3), -np.eye(3)])
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    frame = np.concatenate([bearings[..., None], tangents(bearings)], axis=2)
+    np.testing.assert_allclose(
+        np.swapaxes(frame, 1, 2) @ frame, np.broadcast_to(np.eye(3), frame.shape), atol=1e-12
+    )

@@ -1,0 +1,70 @@
+"""readout_start.py: how long rows take, from how they bend a board in motion; nothing else bends it so."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vical_mocks.points import board_points, crooked_board, simulate
+from vical_mocks.rig import reference_rig
+
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.start.readout_start import looks_rolling, readout
+from vical_daemon.estimation.start.seen_poses import Lens
+
+BOARD = board_points()
+
+
+def seen(seed, readout_s, seconds=4.0, **options):
+    rig = replace(reference_rig(seed, timeshift_cam_imu_s=0.01), readout_s=readout_s)
+    run = simulate(seed, seconds, rig=rig, **options)
+    frames = [(f.t_s, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px)) for f in run.frames]
+    return frames, Lens(np.array([530.0, 530.0, 322.0, 236.0]), np.zeros(4), "radtan", (640, 480))
+
+
+@pytest.mark.parametrize("readout_s", [-0.03, 0.008, 0.033])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_rolling_shutter_is_seen_either_way_up(seed, readout_s):
+    frames, lens = seen(seed, readout_s)
+    assert looks_rolling(frames, lens, BOARD)
+    assert readout(frames, lens, BOARD, 0.0) == pytest.approx(readout_s, abs=1e-3 + 0.1 * abs(readout_s))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"points_m": crooked_board(3)},
+        {"corner_sigma_px": 0.1, "stamp_jitter_s": 1e-3},
+        {"frame_sigma_px": 0.3},
+        {"outlier_fraction": 0.05},
+        {"outlier_fraction": 0.02, "camera_rate_hz": 5.0, "corner_sigma_px": 0.15},
+    ],
+)
+@pytest.mark.parametrize("seed", [1, 3])
+def test_nothing_else_looks_like_it(seed, options):
+    frames, lens = seen(seed, 0.0, **options)
+    assert not looks_rolling(frames, lens, BOARD)
+
+
+def test_a_rig_that_stands_still_shows_nothing():
+    still = reference_rig(1, mean_rate_dps=0.05)
+    run = simulate(1, 4.0, rig=replace(still, readout_s=0.02))
+    frames = [(f.t_s, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px)) for f in run.frames]
+    lens = Lens(np.array([530.0, 530.0, 322.0, 236.0]), np.zeros(4), "radtan", (640, 480))
+    assert not looks_rolling(frames, lens, BOARD)
+    assert readout(frames, lens, BOARD, 0.011) == 0.011
+
+
+def test_views_that_show_no_pose_are_left_out():
+    frames, lens = seen(1, 0.02)
+    nowhere = np.full_like(frames[20][1].uv_px, 7.0)
+    for k in (20, 30, 40):  # chosen for sure: nothing else lies there
+        f = frames[k][1]
+        frames[k] = (frames[k][0], PointsFrame(f.camera, f.t_cam_ns, f.ids, nowhere[: len(f.ids)]))
+    assert looks_rolling(frames, lens, BOARD)
+
+
+def test_too_few_images_show_nothing():
+    frames, lens = seen(1, 0.02)
+    assert not looks_rolling(frames[:6], lens, BOARD)
+    assert not looks_rolling([], lens, BOARD)

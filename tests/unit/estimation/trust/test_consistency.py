@@ -1,0 +1,129 @@
+"""Scale, factor and alarm: silent on honest innovations, right on inflated, correlated and jumping ones."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from vical_daemon.estimation.trust import consistency
+from vical_daemon.estimation.trust.consistency import Consistency, modes
+from vical_daemon.estimation.trust.corner_noise import CornerNoise
+from vical_daemon.estimation.trust.drift_watch import DriftWatch
+
+UV = np.stack(np.meshgrid(np.linspace(100, 400, 8), np.linspace(80, 300, 6)), -1).reshape(-1, 2)
+SIGMA = np.full(len(UV), 0.5)
+LINEAR = np.zeros((2 * len(UV), 3))
+
+
+def feed(c, rng, frames, size=1.0, common=None):
+    for k in range(frames):
+        e = 0.5 * size * rng.normal(size=UV.shape)
+        if common is not None:
+            e = e + (modes(UV) @ common[k]).reshape(-1, 2)
+        c.learn(UV, e, LINEAR, np.eye(LINEAR.shape[1]), SIGMA * np.sqrt(c.scale))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_honest_innovations_change_nothing(seed):
+    c = Consistency()
+    feed(c, np.random.default_rng(seed), 1200)
+    assert c.scale == 1.0
+    assert c.factor == 1.0
+    assert not c.alarmed
+
+
+def test_larger_innovations_raise_the_scale_to_their_level():
+    c = Consistency()
+    feed(c, np.random.default_rng(0), 1500, size=2.0)
+    assert c.scale == pytest.approx(4.0, rel=0.15)
+    assert c.factor == 1.0
+
+
+def test_errors_that_last_raise_the_factor_to_their_long_run_variance():
+    rng, rho, n = np.random.default_rng(1), 0.8, 3000
+    a = np.zeros((n, 8))
+    for k in range(1, n):
+        a[k] = rho * a[k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=8)
+    c = Consistency()
+    feed(c, rng, n, common=a)
+    assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)  # 9, less what the taper cuts
+
+
+def test_a_jump_is_an_alarm_within_half_a_second():
+    c = Consistency()
+    feed(c, np.random.default_rng(2), 400)
+    for k in range(10):
+        feed(c, np.random.default_rng(k), 1, common=np.full((1, 8), 0.5))
+        if c.alarmed:
+            return
+    pytest.fail("no alarm")
+
+
+def test_the_larger_the_misfit_the_more_it_takes_to_alarm():
+    """Half a board at the edge of a badly fitting lens is no knock; a jump of two sigmas still is one."""
+    c, rng = Consistency(), np.random.default_rng(0)
+    feed(c, rng, 1500, size=2.0)
+    c.alarm = 1.9 * consistency._CUSUM_LIMIT
+    assert c.scale == pytest.approx(4.0, rel=0.15)
+    assert not c.alarmed
+    alarms = []
+    for _ in range(10):
+        feed(c, rng, 1, size=2.0, common=np.full((1, 8), 1.0))
+        alarms.append(c.alarmed)
+    assert any(alarms)
+
+
+def test_most_small_changes_are_an_alarm_within_two_seconds():
+    """Innovations of twice their variance; what is not noticed soon is taken for noise, by the scale."""
+    delays = []
+    for seed in range(20):
+        c, rng = Consistency(), np.random.default_rng(seed)
+        feed(c, rng, 400)
+        while not c.alarmed and c.images < 600:
+            feed(c, rng, 1, size=np.sqrt(2.0))
+        delays.append(c.images - 390)
+    assert np.median(delays) <= 40
+
+
+def test_chance_is_no_alarm():
+    """Chernoff: exp(-h limit) with E exp(h (ratio - drift)) = 1, ratio of eight degrees of freedom."""
+    h = brentq(lambda h: -4.0 * np.log(1.0 - h / 4.0) - h * consistency._CUSUM_DRIFT, 0.1, 3.99)
+    assert np.exp(-h * consistency._CUSUM_LIMIT) < 1e-10
+
+
+def test_corner_noise_is_learnt_and_outliers_cannot_blow_it_up():
+    rng, noise = np.random.default_rng(3), CornerNoise(0.5)
+    for _ in range(300):
+        noise.learn(float((0.2 / noise.sigma_px) ** 2 * rng.chisquare(60)), 60)
+    assert noise.sigma_px == pytest.approx(0.2, rel=0.05)
+    noise.learn(1e9, 60)
+    assert noise.sigma_px < 0.25
+
+
+def test_corner_noise_keeps_the_detectors_relative_weights():
+    noise = CornerNoise(0.4)
+    s = noise.sigmas(np.array([0.1, 0.1, 0.2]), 3)
+    assert s[2] == pytest.approx(2 * s[0])
+    assert np.sqrt(np.mean(s**2)) == pytest.approx(0.4)
+
+
+def kalman_constant(rng, steps, slope=0.0):
+    """A filter that takes a parameter as constant, and the parameter it tracks."""
+    x, P = 0.0, 1e-6
+    for t in range(steps):
+        z = slope * t + 1e-3 * rng.normal()
+        K = P / (P + 1e-6)
+        x, P = x + K * (z - x), (1 - K) * P
+        yield float(t), x, P
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_drift_is_seen_where_there_is_none(seed):
+    watch = DriftWatch(1e-9)
+    assert not any(
+        watch.drifts(t, x, P, 1.0) for t, x, P in kalman_constant(np.random.default_rng(seed), 600)
+    )
+
+
+def test_a_slow_drift_is_seen():
+    watch = DriftWatch(1e-9)
+    assert any(watch.drifts(t, x, P, 1.0) for t, x, P in kalman_constant(np.random.default_rng(0), 200, 2e-4))

@@ -1,0 +1,138 @@
+"""What a target-free calibration asks beside: do clocks drift, is the imu off, does the shutter roll?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.free.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, Carry
+from vical_daemon.estimation.free.snapshot import Doubts
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.trust import hypotheses
+from vical_daemon.estimation.trust.beyond_doubt import KNOWN_OFF_SIGMA, imu_told, lag_told
+from vical_daemon.estimation.trust.clock_drift import (
+    CLOCKS_APART,
+    CLOCKS_IN_DOUBT,
+    SURE,
+    drift_told,
+    evidence,
+    probability,
+)
+
+_SURELY_ROLLING = 5.0  # sigmas
+_SHORTEST_S = 1e-3  # of a readout that is worth a word
+_WHERE = {hypotheses.IMU: np.arange(FULL)[IMU], hypotheses.LAG: np.arange(FULL)[LAG]}
+_SIGMA = {hypotheses.IMU: hypotheses.ENTRY_SIGMA, hypotheses.LAG: hypotheses.LAG_SIGMA_S}
+_TOLD = {hypotheses.IMU: imu_told, hypotheses.LAG: lag_told}
+
+Weights = dict[tuple[str, ...], float]
+
+
+def rolling_told(camera: str, readout_s: float, sigma_s: float) -> str:
+    """The announcement of a rolling shutter of which nothing was said."""
+    told = f"{1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms"
+    return f"{camera}: a rolling shutter, by how features move: its readout takes {told}, and is allowed for"
+
+
+class FreeDoubts:
+    """Follows what the windows say about clocks, imu and shutter.
+
+    Args:
+        camera: Name of the camera.
+        asked: What is asked for (`CalibrationOptions.estimate`): estimated whatever the evidence.
+        rolling: The shutter is said to be a rolling one, or its readout is asked for.
+
+    Attributes:
+        drifting: The camera's clock is known to run apart from the imu's.
+        imu_asked: The imu's matrices are asked for.
+        imu_sigma: Prior of the entries of the imu's matrices.
+        rolling: The shutter is known to be a rolling one.
+    """
+
+    def __init__(self, camera: str, *, asked: frozenset[str], rolling: bool) -> None:
+        self._camera = camera
+        self._off = asked & set(_WHERE)
+        self.imu_asked = hypotheses.IMU in asked
+        self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else hypotheses.ENTRY_SIGMA
+        self.drifting = False
+        self.rolling = rolling
+
+    def watch(self, carry: Carry, factor: float, compared: bool) -> list[str]:
+        """Announce what has got beyond doubt.
+
+        Args:
+            carry: What is known.
+            factor: Measured variance over the stated one.
+            compared: Windows could be compared; before, what looks like the imu may as well be the images.
+        """
+        events = []
+        if not self.drifting and probability(self._drift(carry, factor)) >= SURE:
+            self.drifting = True
+            sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
+            events.append(drift_told(self._camera, CLOCKS_APART, carry.camera.skew, sigma))
+        sigmas = np.sqrt(factor * np.diag(carry.calibration()))
+        if not self.rolling:
+            readout_s, sigma_s = carry.camera.readout_s, float(sigmas[READOUT])
+            self.rolling = abs(readout_s) > max(_SURELY_ROLLING * sigma_s, _SHORTEST_S)
+            events += [rolling_told(self._camera, readout_s, sigma_s)] if self.rolling else []
+        if compared:
+            weights = self._weights(carry, factor)
+            known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > hypotheses.SURE}
+            news = [(name, _WHERE[name]) for name in sorted(known - self._off)]
+            events += [_TOLD[name](_numbers(carry)[at], sigmas[at]) for name, at in news]
+            self._off |= known
+        return events
+
+    def reason(self, carry: Carry, factor: float, *, converged: bool) -> str:
+        """What may not be as it is taken to be, in words; empty where nothing speaks for it.
+
+        For `converged` see `hypotheses.in_doubt`.
+        """
+        imu, enough = hypotheses.IMU, 0.5 if converged else hypotheses.OFF
+        if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > enough:
+            return hypotheses.IN_DOUBT[imu]
+        if not self.drifting and self._drift(carry, factor) > 1.0:
+            return CLOCKS_IN_DOUBT
+        return ""
+
+    def weighed(self, carry: Carry, factor: float, compared: bool) -> Doubts:
+        """How likely each is, for what is told; arguments as for `watch`."""
+        weights = self._weights(carry, factor)
+        every = max(weights, key=len)
+        if not compared and weights[every] < 0.5:
+            others = 0.5 / max(1.0 - weights[every], 1e-300)
+            weights = {true: 0.5 if true == every else others * p for true, p in weights.items()}
+        stated = tuple(
+            (p, np.concatenate([np.zeros(0, np.intp), *(_WHERE[name] for name in true)]))
+            for true, p in weights.items()
+        )
+        return Doubts(factor, self.drifting, stated, gyro_frame=not self.imu_asked, rolling=self.rolling)
+
+    @staticmethod
+    def _drift(carry: Carry, factor: float) -> float:
+        """How much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated."""
+        if not carry.active[DRIFT]:
+            return 0.0
+        return evidence(carry.camera.skew, factor * float(carry.calibration()[DRIFT, DRIFT]))
+
+    def _weights(self, carry: Carry, factor: float) -> Weights:
+        """Probability of each hypothesis about the imu, named by what is as stated.
+
+        Where windows disagree although all is free, it is the images, and what they say about the imu is
+        worth less by as much again.
+        """
+        doubtful = [name for name in _WHERE if name not in self._off]
+        if not doubtful:
+            return {(): 1.0}
+        numbers = _numbers(carry)
+        at = np.concatenate([_WHERE[name] for name in doubtful])
+        sigma = np.concatenate([np.full(len(_WHERE[name]), _SIGMA[name]) for name in doubtful])
+        covariance = carry.calibration()[np.ix_(at, at)] / np.outer(sigma, sigma)
+        values = {name: numbers[_WHERE[name]] / _SIGMA[name] for name in doubtful}
+        return hypotheses.posterior(values, covariance, factor**2)
+
+
+def _numbers(carry: Carry) -> FloatArray:
+    """What is not as stated of the imu, at its place among the errors, shape (FULL,)."""
+    out = np.zeros(FULL)
+    out[INERTIAL] = carry.imu
+    return out

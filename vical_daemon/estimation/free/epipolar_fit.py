@@ -1,0 +1,296 @@
+"""Mounting, delay and gyro bias from feature tracks alone: the epipolar constraint with the gyro's rotation.
+
+Between two images the rays a, b of one feature obey t . (a x R b) = 0 for an unknown direction t. The gyro
+gives R = R_imu_cam^T dR(t_i + shift, t_j + shift; bias) R_imu_cam, so that all pairs of a stretch share the
+same seven unknowns, whatever the depths and translations are; the direction t of each pair is eliminated
+[after Kneip & Lynen, "Direct optimization of frame-to-frame rotation", 2013, with the gyro's rotation in
+place of a free one]. Unlike strung-together two-view rotations nothing accumulates. The focal length can be
+fitted along: a turn by a known angle moves a feature by a length in pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.camera_model import project_jacobians
+from vical_daemon.estimation.camera_rays import unproject
+from vical_daemon.estimation.free.epipolar_pairs import Pairs, make_pairs
+from vical_daemon.estimation.free.gyro_attitudes import Attitudes
+from vical_daemon.estimation.imu_model import cross
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
+
+_ITERATIONS = 18
+_BIAS_SIGMA_RPS = 0.02  # of a gyro that was not zeroed
+# What a lens may be off by: focal length and its ratio (relative), centre (of the focal length), distortion.
+_FOCAL_SIGMA, _RATIO_SIGMA, _CENTRE_SIGMA = 0.1, 0.003, 0.03
+_DISTORTION_SIGMA = {"radtan": (0.1, 0.1, 0.005, 0.005), "equidistant": (0.05, 0.05, 0.05, 0.05)}
+_LENS_AFTER = 4  # iterations with the lens as given
+_BLOCK_S = 0.5  # errors of the fit are taken as independent beyond this
+
+
+@dataclass(slots=True)
+class EpipolarFit:
+    """What the tracks say together with the gyro.
+
+    Attributes:
+        R_imu_cam: Mounting, shape (3, 3).
+        timeshift_s: t_imu = t_cam + timeshift_s, s.
+        gyro_bias: rad/s, shape (3,).
+        intrinsics: fx fy cx cy, px; as given unless the lens was fitted.
+        distortion: Four coefficients; likewise.
+        rotation_covariance: Of the mounting, about the camera's axes, rad^2, shape (3, 3).
+        timeshift_sigma_s: s.
+        error: RMS epipolar error of the pairs used, in focal lengths.
+        inliers: Share of the feature pairs that fit.
+    """
+
+    R_imu_cam: FloatArray
+    timeshift_s: float
+    gyro_bias: FloatArray
+    intrinsics: FloatArray
+    distortion: FloatArray
+    rotation_covariance: FloatArray
+    timeshift_sigma_s: float
+    error: float
+    inliers: float
+
+
+def epipolar_fit(
+    t_imu_s: FloatArray,
+    gyro_rps: FloatArray,
+    frames: list[tuple[float, PointsFrame]],
+    lens: tuple[FloatArray, FloatArray, str],
+    R_imu_cam: FloatArray,
+    timeshift_s: float,
+    *,
+    fit_lens: bool = False,
+    max_step_s: float = 0.02,
+    most: int = _ITERATIONS,
+) -> EpipolarFit | None:
+    """Fit mounting, delay, gyro bias (and the focal length) to tracks.
+
+    Args:
+        t_imu_s: Stamps of the gyro, s, shape (m,).
+        gyro_rps: Rates, rad/s, imu frame, shape (m, 3).
+        frames: (stamp in the camera's clock in s, tracks), in order of time.
+        lens: fx fy cx cy, distortion, model.
+        R_imu_cam: Start of the mounting, good to some 20 degrees.
+        timeshift_s: Start of the delay, good to some 0.1 s.
+        fit_lens: Fit the lens too, within what a rough lens may be off by.
+        max_step_s: Largest change of the delay in one iteration, s.
+        most: Iterations.
+
+    Returns:
+        The fit; None where the tracks do not allow one. Sigmas are empirical (sandwich over half-second
+        blocks), so slow errors of the tracker count.
+    """
+    pairs = make_pairs(frames)
+    if pairs is None:
+        return None
+    fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens, max_step_s)
+    return fit.run(R_imu_cam.copy(), timeshift_s, most)
+
+
+class _Fit:
+    """Gauss-Newton with the translations' directions eliminated.
+
+    Errors are angles: a longer focal length makes those of the same pixels smaller, and would be preferred
+    without any reason in the scene. What that adds to the gradient of fx and fy (`shrinking`) is taken out;
+    on a cart, where nothing else tells fy, it had come out 60 % too long.
+    """
+
+    def __init__(
+        self,
+        t_imu: FloatArray,
+        gyro: FloatArray,
+        t_cam: FloatArray,
+        pairs: Pairs,
+        lens: tuple[FloatArray, FloatArray, str],
+        fit_lens: bool,
+        max_step_s: float,
+    ) -> None:
+        self.t_imu, self.gyro, self.t_cam = t_imu, gyro, t_cam
+        self.pairs, self.fit_lens, self.max_step_s = pairs, fit_lens, max_step_s
+        self.intrinsics, self.distortion, self.model = lens[0].copy(), lens[1].copy(), lens[2]
+        self.given = (lens[0].copy(), lens[1].copy())
+        self.dray: list[FloatArray] = []
+        self.shrinking = np.zeros((len(pairs.of), 2))
+        self._rays()
+
+    def _rays(self) -> None:
+        p, lens = self.pairs, (self.intrinsics, self.distortion, self.model)
+        self.a, ok_a = unproject(p.uv_1, *lens)
+        self.b, ok_b = unproject(p.uv_2, *lens)
+        self.ok: BoolArray = ok_a & ok_b
+        self.a, self.b = (np.where(self.ok[:, None], r, [0.0, 0.0, 1.0]) for r in (self.a, self.b))
+        if self.fit_lens:
+            self.dray = [self._ray_change(rays) for rays in (self.a, self.b)]
+
+    def _ray_change(self, rays: FloatArray) -> FloatArray:
+        """D ray / d (fx fy cx cy, distortion) for a fixed pixel, shape (n, 3, 8).
+
+        The pixel stays: J_ray d ray + J_lens d lens = 0, and the ray keeps its length: since J_ray ray = 0,
+        d ray = -J_ray^T (J_ray J_ray^T)^-1 J_lens d lens does both.
+        """
+        with np.errstate(all="ignore"):
+            _, J, J_lens = project_jacobians(rays, self.intrinsics, self.distortion, self.model)
+            (a, b), c = (np.einsum("nk,njk->jn", J[:, 0], J)), np.einsum("nk,nk->n", J[:, 1], J[:, 1])
+            inverse = np.stack([c, -b, -b, a], axis=-1).reshape(-1, 2, 2) / (a * c - b * b)[:, None, None]
+            out = -np.swapaxes(J, 1, 2) @ (inverse @ J_lens)
+        out[~np.isfinite(out).all(axis=(1, 2))] = 0.0
+        return np.asarray(out)
+
+    def run(self, R: FloatArray, shift: float, most: int) -> EpipolarFit | None:
+        bias = np.zeros(3)
+        weight = np.where(self.ok, 1.0, 0.0)
+        for step in range(most):
+            lin = self._linearise(R, shift, bias)
+            if lin is None:
+                return None
+            e, J, Jt = lin
+            spread = 1.4826 * float(np.median(np.abs(e[self.ok]))) + 1e-9
+            k = 4.0 if step < 5 else 2.5
+            weight = np.where(self.ok, 1.0 / (1.0 + (e / (k * spread)) ** 2) ** 2, 0.0)
+            size = 15 if self.fit_lens and step >= _LENS_AFTER else 7
+            H, g, _ = self._normal(e, J[:, :size], Jt, weight / spread**2)
+            if size > 7:
+                g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
+            self._prior(H, g, bias)
+            dx = np.asarray(-np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g), np.float64)
+            dx *= min(
+                1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12), self.max_step_s / max(abs(dx[3]), 1e-12)
+            )
+            R = R @ so3.exp(dx[:3])
+            shift += float(dx[3])
+            bias = bias + dx[4:7]
+            if size > 7:
+                self.intrinsics = self.intrinsics + dx[7:11]
+                self.distortion = self.distortion + dx[11:]
+                self._rays()
+            if step > _LENS_AFTER + 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
+                break
+        return self._result(R, shift, bias, weight)
+
+    def _prior(self, H: FloatArray, g: FloatArray, bias: FloatArray) -> None:
+        """Add what is known before: of the bias, and of the lens where it is among the unknowns."""
+        H[range(4, 7), range(4, 7)] += _BIAS_SIGMA_RPS**-2
+        g[4:7] += bias / _BIAS_SIGMA_RPS**2
+        if len(g) == 7:
+            return
+        f = self.given[0][0]
+        focal = np.eye(2) * _FOCAL_SIGMA**-2 + np.array([[1.0, -1.0], [-1.0, 1.0]]) * _RATIO_SIGMA**-2
+        P = np.zeros((8, 8))
+        P[:2, :2] = focal / f**2
+        P[2:4, 2:4] = np.eye(2) / (_CENTRE_SIGMA * f) ** 2
+        P[4:, 4:] = np.diag(np.array(_DISTORTION_SIGMA[self.model]) ** -2.0)
+        off = np.concatenate([self.intrinsics - self.given[0], self.distortion - self.given[1]])
+        H[7:, 7:] += P
+        g[7:] += P @ off
+
+    def _linearise(
+        self, R: FloatArray, shift: float, bias: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Normalised errors (n,), derivatives by the shared unknowns (n, 7 or 15) and by t (n, 2)."""
+        p = self.pairs
+        t = self.t_cam + shift
+        curve = Attitudes(self.t_imu, self.gyro, bias)
+        inside = (t > self.t_imu[0]) & (t < self.t_imu[-1])
+        if inside.mean() < 0.7:
+            return None
+        A, rate, area = curve.at(np.clip(t, self.t_imu[0], self.t_imu[-1]))
+        A1, A2 = A[p.first], A[p.second]
+        dR = np.swapaxes(A1, 1, 2) @ A2
+        R12 = R.T @ dR @ R
+        usable = (inside[p.first] & inside[p.second])[p.of] & self.ok
+        b = np.matmul(R12[p.of], self.b[..., None])[..., 0]
+        n = cross(self.a, b) * usable[:, None]
+        M = np.add.reduceat(n[:, :, None] * n[:, None, :], p.begin)
+        vectors = np.linalg.eigh(M)[1]
+        d, Bt = vectors[:, :, 0][p.of], vectors[:, :, 1:][p.of]
+        ta, tb = cross(d, self.a), cross(d, b)
+        length = np.sqrt((ta**2).sum(-1) + (tb**2).sum(-1)) + 1e-6
+        e = np.where(usable, (d * n).sum(-1) / length, 0.0)
+        if self.fit_lens:
+            across = ta[:, :2] ** 2 + tb[:, :2] ** 2
+            self.shrinking = usable[:, None] * across / across.sum(-1, keepdims=True) / self.intrinsics[:2]
+        # a turn delta local to the second image: d . (a x R (delta x b)) = delta . (b x R^T (d x a))
+        local = cross(self.b, np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0])
+        by_turn = self._turns(R, R12, dR, rate, area, A2)
+        J = np.einsum("ni,nik->nk", local, by_turn[p.of])
+        if self.fit_lens:
+            back = np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0]
+            lens = np.einsum("ni,nik->nk", back, self.dray[1]) - np.einsum("ni,nik->nk", tb, self.dray[0])
+            J = np.concatenate([J, lens], axis=1)
+        Jt = np.einsum("ni,nik->nk", n, Bt)
+        return e, J * (usable / length)[:, None], Jt * (usable / length)[:, None]
+
+    def _turns(
+        self,
+        R: FloatArray,
+        R12: FloatArray,
+        dR: FloatArray,
+        rate: FloatArray,
+        area: FloatArray,
+        A2: FloatArray,
+    ) -> FloatArray:
+        """Local turn of the second image by mounting, delay and bias, shape (P, 3, 7)."""
+        p = self.pairs
+        out = np.empty((len(dR), 3, 7))
+        out[:, :, :3] = np.eye(3) - np.swapaxes(R12, 1, 2)
+        spin = rate[p.second] - np.matmul(np.swapaxes(dR, 1, 2), rate[p.first][..., None])[..., 0]
+        out[:, :, 3] = spin @ R
+        out[:, :, 4:] = -R.T @ np.swapaxes(A2, 1, 2) @ (area[p.second] - area[p.first])
+        return out
+
+    def _normal(
+        self, e: FloatArray, J: FloatArray, Jt: FloatArray, weight: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal equations with the directions eliminated, and each pair's share of the gradient."""
+        begin = self.pairs.begin
+        wJ, wJt = J * weight[:, None], Jt * weight[:, None]
+        tt = np.add.reduceat(wJt[:, :, None] * Jt[:, None, :], begin) + 1e-9 * np.eye(2)
+        tx = np.add.reduceat(wJt[:, :, None] * J[:, None, :], begin)
+        te = np.add.reduceat(wJt * e[:, None], begin)
+        solved = np.linalg.solve(tt, np.concatenate([tx, te[..., None]], axis=2))
+        xt = np.swapaxes(tx, 1, 2)
+        H = wJ.T @ J - (xt @ solved[..., :-1]).sum(axis=0)
+        each = np.add.reduceat(wJ * e[:, None], begin) - np.matmul(xt, solved[..., -1:])[..., 0]
+        return H, each.sum(axis=0), each
+
+    def _result(
+        self, R: FloatArray, shift: float, bias: FloatArray, weight: FloatArray
+    ) -> EpipolarFit | None:
+        lin = self._linearise(R, shift, bias)
+        if lin is None:
+            return None
+        e, J, Jt = lin
+        good = weight > 0.25
+        error = float(np.sqrt(np.mean(e[good] ** 2))) if good.any() else np.inf
+        H, g, each = self._normal(e, J, Jt, weight / max(error, 1e-9) ** 2)
+        self._prior(H, g, bias)
+        try:
+            inverse = np.linalg.inv(H)
+        except np.linalg.LinAlgError:
+            return None
+        t = self.t_cam[self.pairs.first]
+        block = ((t - t[0]) / _BLOCK_S).astype(int)
+        sums = np.zeros((int(block.max()) + 1, H.shape[0]))
+        np.add.at(sums, block, each)
+        covariance = inverse @ (sums.T @ sums) @ inverse + inverse
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
+            return None
+        return EpipolarFit(
+            R,
+            shift,
+            bias,
+            self.intrinsics,
+            self.distortion,
+            covariance[:3, :3],
+            float(sigma[3]),
+            error,
+            float(good[self.ok].mean()),
+        )

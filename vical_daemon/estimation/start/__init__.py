@@ -1,0 +1,1 @@
+"""From nothing to a running filter: a closed-form start, then rehearsals that learn the noise."""

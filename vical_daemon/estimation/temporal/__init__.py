@@ -1,0 +1,1 @@
+"""The parts of TD-ICP: curves of orientation, their registration in time and space, and the watch."""

@@ -1,0 +1,214 @@
+"""The least-squares problem of temporal calibration, linearised: all orientation sensors, one rotation curve.
+
+Model for sensor s: `R_world_s(t) = R_world_ref R_ref_imu(t + shift_s) R_imu_s Exp(noise)`. Parameters per
+sensor: mounting (3, local), shift; then the gyro's symmetric matrix (6). States: drift (3), bias (3) and, for
+several sensors, the slow error of each (3): the first one's starts at zero, the others' at anything, which
+stands for the orientation of their worlds. A single sensor's slow error joins the drift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.temporal.drift_smoother import DriftProblem
+from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+_MIN_INTERVAL_S = 2e-5  # two sensors may see the same instant; their drift may not be told apart to infinity
+_SLOW_START = -1.5  # where the search for log(slow error after a second / noise of one orientation) starts
+_TURN_UNKNOWN = 1.0 / 5.0**2  # information about a world that may be turned by any angle
+# The gyro's scale errors and the symmetric part of its misalignment: xx yy zz, xy yz xz. The antisymmetric
+# part is a rotation of the gyro's axes and cannot be told from the mounting.
+_SYMMETRIC = np.zeros((9, 6))
+_SYMMETRIC[[0, 4, 8], [0, 1, 2]] = 1.0
+_SYMMETRIC[[1, 3, 5, 7, 2, 6], [3, 3, 4, 4, 5, 5]] = 1.0
+
+
+@dataclass(frozen=True)
+class OrientationSensor:
+    """A stream of orientations with its present registration.
+
+    Attributes:
+        t_s: Stamps in the sensor's clock, s, shape (n,).
+        R_world_sensor: Orientations, shape (n, 3, 3).
+        covariance: Of the local (right) rotation error, up to a common scale, rad^2, shape (n, 3, 3).
+        timeshift_s: t_imu - t_sensor, s.
+        R_imu_sensor: Mounting, shape (3, 3).
+        R_world_ref: The curve's reference frame in the sensor's world, shape (3, 3).
+        used: Orientations that passed the gate, shape (n,).
+        log_scale: Log of the factor by which the noise is larger than `covariance` says (in sigma).
+        log_slow: Log of the slow error that a second brings over the noise of one orientation. Slow errors
+            come from lens and board models which are not exact, and change with the view.
+        jitter_s: Standard deviation of the stamps, s; independent from orientation to orientation.
+    """
+
+    t_s: FloatArray
+    R_world_sensor: FloatArray
+    covariance: FloatArray
+    timeshift_s: float
+    R_imu_sensor: FloatArray
+    R_world_ref: FloatArray
+    used: BoolArray
+    log_scale: float = 0.0
+    log_slow: float = _SLOW_START
+    jitter_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class DriftNoise:
+    """Noise of the curve.
+
+    Attributes:
+        density: Gyro noise density, rad/s/sqrt(Hz).
+        walk: Bias walk, rad/s^2/sqrt(Hz).
+        bias_sigma_rps: Prior of the bias around zero, rad/s.
+        log_sigma: How well `density` is known, as the sigma of its logarithm.
+        estimate: Estimate the noises' scales from the data; else take them as given.
+        matrix_sigma: Prior sigma of each entry of the gyro's scale and misalignment errors; 0: none.
+    """
+
+    density: float
+    walk: float
+    bias_sigma_rps: float
+    log_sigma: float
+    estimate: bool
+    matrix_sigma: float = 0.0
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The linearised problem in order of time, before scaling of the noises.
+
+    Attributes:
+        problem: With unscaled weights; its steps' noise is set by `orientation_noise.scaled`.
+        sensor: Which sensor each row belongs to, shape (n,).
+        order: Sorted row to row of the sensors strung together, shape (n,).
+        used: Rows that take part, shape (n,).
+        drift: Variance per axis of the gyro's drift over each step, rad^2, shape (n - 1,).
+        walk: Variance per axis of the bias over each step, (rad/s)^2, shape (n - 1,).
+        middle_s: Time of each row from the middle of the data, s, shape (n,).
+        slow: Covariance of each sensor's slow error over each step per unit of scale, shape (S, n - 1, 3, 3).
+        slow_inverse: Its inverse.
+        slow_log_determinant: Its log determinant, summed over the steps, shape (S,).
+    """
+
+    problem: DriftProblem
+    sensor: npt.NDArray[np.intp]
+    order: npt.NDArray[np.intp]
+    used: BoolArray
+    drift: FloatArray
+    walk: FloatArray
+    middle_s: FloatArray
+    slow: FloatArray
+    slow_inverse: FloatArray
+    slow_log_determinant: FloatArray
+
+
+def linearise(
+    curve: RotationCurve, sensors: tuple[OrientationSensor, ...], bias: FloatArray, noise: DriftNoise
+) -> Linear:
+    """Residuals and derivatives in the curve's reference frame, sorted by time."""
+    S = len(sensors)
+    p = 4 * S + (6 if noise.matrix_sigma > 0.0 else 0)
+    low, high = curve.span_s
+    raw = np.concatenate([s.t_s + s.timeshift_s for s in sensors])
+    order = np.argsort(np.clip(raw, low, high), kind="stable")
+    index = np.repeat(np.arange(S), [len(s.t_s) for s in sensors])[order]
+    raw = raw[order]
+    tau = np.clip(raw, low, high)
+    R, rate, integral = curve.at(tau)
+    turn = (R @ rate[..., None])[..., 0]
+    R_ref_sensor = R @ np.stack([s.R_imu_sensor for s in sensors])[index]
+    measured = np.concatenate([s.R_world_ref.T @ s.R_world_sensor for s in sensors])[order]
+    J = _derivatives(R_ref_sensor, turn, index, p)
+    if p > 4 * S:
+        J[:, :, 4 * S :] = curve.matrix_effect(tau) @ _SYMMETRIC
+    used = np.concatenate([s.used for s in sensors])[order] & (raw >= low) & (raw <= high)
+    C = _noise(sensors, R_ref_sensor, turn, index, order)
+    dt = np.maximum(np.diff(tau), _MIN_INTERVAL_S)
+    H, F, first_mean, first_information = _states(S, index, integral, bias, noise)
+    problem = DriftProblem(
+        so3.log(measured @ np.swapaxes(R_ref_sensor, 1, 2)),
+        J,
+        H,
+        np.asarray(np.linalg.inv(C) * used[:, None, None], dtype=np.float64),
+        F,
+        np.zeros_like(F),
+        0.0,
+        first_mean,
+        first_information,
+        _prior(S, p, noise.matrix_sigma),
+    )
+    drift = np.maximum(np.diff(curve.variance(tau, noise.density)), 1e-4 * noise.density**2 * _MIN_INTERVAL_S)
+    slow = np.empty((S, len(dt), 3, 3))
+    for i, s in enumerate(sensors):
+        A = R[:-1] @ s.R_imu_sensor
+        slow[i] = dt[:, None, None] * (A @ s.covariance.mean(axis=0) @ np.swapaxes(A, 1, 2))
+    middle = tau - 0.5 * (tau[0] + tau[-1])
+    slow_inverse = np.asarray(np.linalg.inv(slow), dtype=np.float64)
+    determinant = np.log(np.linalg.det(slow)).sum(axis=1)
+    walk = noise.walk**2 * dt
+    return Linear(problem, index, order, used, drift, walk, middle, slow, slow_inverse, determinant)
+
+
+def _derivatives(
+    R_ref_sensor: FloatArray, turn: FloatArray, index: npt.NDArray[np.intp], p: int
+) -> FloatArray:
+    """Of the residuals by mountings and shifts, shape (n, 3, p); the gyro's matrix is left zero."""
+    J = np.zeros((len(turn), 3, p))
+    rows = np.arange(len(turn))
+    for i in range(3):
+        J[rows, :, 4 * index + i] = R_ref_sensor[:, :, i]
+    J[rows, :, 4 * index + 3] = turn
+    return J
+
+
+def _noise(
+    sensors: tuple[OrientationSensor, ...],
+    R_ref_sensor: FloatArray,
+    turn: FloatArray,
+    index: npt.NDArray[np.intp],
+    order: npt.NDArray[np.intp],
+) -> FloatArray:
+    """Covariance of each residual in the reference frame: the sensor's own and jitter of the stamps."""
+    own = np.concatenate([s.covariance for s in sensors])[order]
+    C: FloatArray = R_ref_sensor @ own @ np.swapaxes(R_ref_sensor, 1, 2)
+    jitter2 = np.array([s.jitter_s**2 * np.exp(-2.0 * s.log_scale) for s in sensors])[index]
+    return C + jitter2[:, None, None] * turn[:, :, None] * turn[:, None, :]
+
+
+def _states(
+    S: int, index: npt.NDArray[np.intp], integral: FloatArray, bias: FloatArray, noise: DriftNoise
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """How the states enter the residuals, how they move, and what is known of the first one."""
+    d = 6 if S == 1 else 6 + 3 * S
+    n = len(index)
+    H = np.zeros((n, 3, d))
+    H[:, :, :3] = np.eye(3)
+    if S > 1:
+        for i in range(3):
+            H[np.arange(n), i, 6 + 3 * index + i] = 1.0
+    F = np.tile(np.eye(d), (n - 1, 1, 1))
+    F[:, :3, 3:6] = -np.diff(integral, axis=0)
+    information = np.zeros(d)
+    information[3:6] = 1.0 / noise.bias_sigma_rps**2
+    information[6:9] = 1e10  # of several sensors, the first one's slow error starts at zero
+    information[9:] = _TURN_UNKNOWN
+    mean = np.zeros(d)
+    mean[3:6] = -bias
+    return H, F, mean, information
+
+
+def _prior(S: int, p: int, matrix_sigma: float) -> FloatArray:
+    """Next to no information: 2 rad on rotations, 0.5 s on shifts; keeps a lost direction finite."""
+    diagonal = np.full(p, 1.0 / 2.0**2)
+    diagonal[3 : 4 * S : 4] = 1.0 / 0.5**2
+    if p > 4 * S:
+        diagonal[4 * S :] = 1.0 / matrix_sigma**2
+    return np.diag(diagonal)

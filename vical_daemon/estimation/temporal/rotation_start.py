@@ -1,0 +1,284 @@
+"""The start of a registration, knowing nothing: delay over several seconds, mounting and gyro bias.
+
+The model (t_imu = t_cam + shift): `R_world_cam(t) = R_world_ref R_ref_imu(t + shift) R_imu_cam`.
+
+1. The angle by which a body turns between two instants does not depend on the frame it is written in. The
+   shift at which the camera's turns match the imu's is found on a grid over several seconds, robustly.
+2. Matched turns are vectors related by R_imu_cam: robust Wahba.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
+
+_GRID_S = 0.01
+_FINE_S = 0.0025
+_BASELINE_S = 0.2  # turns are taken over about this time: long against noise, short against outliers
+_MAX_PAIRS = 300
+_CANDIDATES = 4
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Relative rotations between pairs of camera orientations.
+
+    Attributes:
+        first: Index of the earlier orientation, shape (k,).
+        second: Index of the later one, shape (k,).
+        rotvec_cam: Turn in the camera frame, rad, shape (k, 3).
+        angle: Its length, rad, shape (k,).
+    """
+
+    first: IntArray
+    second: IntArray
+    rotvec_cam: FloatArray
+    angle: FloatArray
+
+
+@dataclass(frozen=True)
+class Start:
+    """A rough registration.
+
+    Attributes:
+        timeshift_s: t_imu - t_cam, s.
+        R_imu_cam: Mounting, shape (3, 3).
+        bias_rps: Rough residual gyro bias, rad/s, shape (3,).
+        agreement: Share of turns that agree in size at this shift, 0 to 1.
+        contrast: Cost at this shift over the median cost of all shifts (1: no better than any other).
+        misfit_rad: Median length of the residual turn vectors.
+        singular_values: Of the matched turns' scatter, largest first, shape (3,).
+        typical_rad: Median size of the camera's turns, for comparison.
+        mirrored: A mirrored mounting (one axis reversed) fits far better: axes are mixed up.
+    """
+
+    timeshift_s: float
+    R_imu_cam: FloatArray
+    bias_rps: FloatArray
+    agreement: float
+    contrast: float
+    misfit_rad: float
+    singular_values: FloatArray
+    mirrored: bool
+    typical_rad: float
+
+
+def camera_turns(t_cam_s: FloatArray, q_world_cam: FloatArray, most: int = _MAX_PAIRS) -> Turns:
+    """Pair each orientation with the one about 0.2 s later (at most 0.6 s: holes are left out).
+
+    Args:
+        t_cam_s: Stamps, increasing, s, shape (n,).
+        q_world_cam: Orientations w x y z, shape (n, 4).
+        most: So many pairs are kept, evenly.
+    """
+    first = np.arange(len(t_cam_s))
+    second = np.searchsorted(t_cam_s, t_cam_s + _BASELINE_S * 0.999)
+    inside = second < len(t_cam_s)
+    first, second = first[inside], second[inside]
+    dt = t_cam_s[second] - t_cam_s[first]
+    keep = dt < max(3.0 * _BASELINE_S, 1.5 * float(np.median(dt)) if len(dt) else 0.0)
+    first, second = first[keep], second[keep]
+    if len(first) > most:
+        chosen = np.linspace(0, len(first) - 1, most).round().astype(np.intp)
+        first, second = first[chosen], second[chosen]
+    turn = so3.rotvec_from_quat(
+        so3.quat_multiply(so3.quat_conjugate(q_world_cam[first]), q_world_cam[second])
+    )
+    return Turns(first, second, turn, np.linalg.norm(turn, axis=1))
+
+
+def angles_between(qa: FloatArray, qb: FloatArray) -> FloatArray:
+    """Angles between orientations given as quaternions (..., 4), rad, shape (...,)."""
+    dot = np.abs(np.einsum("...i,...i->...", qa, qb))
+    out: FloatArray = 2.0 * np.arccos(np.minimum(dot, 1.0))
+    return out
+
+
+def robust_cost(difference: FloatArray, scale: float) -> FloatArray:
+    """Geman-McClure: 0 for agreement, towards 1 for gross disagreement."""
+    d2 = (difference / scale) ** 2
+    out: FloatArray = d2 / (1.0 + d2)
+    return out
+
+
+def shift_costs(
+    curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shifts_s: FloatArray, scale: float
+) -> FloatArray:
+    """Return the mean robust disagreement of turn angles at each shift of a regular grid, shape (s,).
+
+    Pairs that leave the curve's span count as undecided (0.6): a shift with little overlap must not win.
+    """
+    start, end = curve.span_s
+    step = float(shifts_s[1] - shifts_s[0])
+    grid = curve.quaternion(np.arange(start, end, step))
+    offsets = np.round(shifts_s / step).astype(np.intp)
+    a = np.round((t_cam_s[turns.first] - start) / step).astype(np.intp)
+    b = np.round((t_cam_s[turns.second] - start) / step).astype(np.intp)
+    ia, ib = a + offsets[:, None], b + offsets[:, None]
+    inside = (ia >= 0) & (ib < len(grid))
+    angle = angles_between(grid[np.where(inside, ia, 0)], grid[np.where(inside, ib, 0)])
+    cost = np.where(inside, robust_cost(angle - turns.angle, scale), 0.6)
+    out: FloatArray = cost.mean(axis=1)
+    return out
+
+
+def agreement_scale(turns: Turns) -> float:
+    """How far two turns may differ and still agree: a quarter of a usual turn, at least 0.6 deg."""
+    return max(0.25 * float(np.quantile(turns.angle, 0.4)), 0.01)
+
+
+def debiased_start(
+    t_imu_s: FloatArray,
+    gyro_rps: FloatArray,
+    t_cam_s: FloatArray,
+    q_world_cam: FloatArray,
+    shifts_s: tuple[float, float],
+) -> tuple[Start | None, FloatArray]:
+    """Find a start from a raw gyro, anew with the bias it reveals where that bias blurs the agreement.
+
+    Args:
+        t_imu_s: Stamps, s, shape (m,).
+        gyro_rps: Rates, rad/s, shape (m, 3).
+        t_cam_s: Camera stamps, s, shape (n,).
+        q_world_cam: Camera orientations, shape (n, 4).
+        shifts_s: Lowest and highest shift to look at, s.
+
+    Returns:
+        The start or None, and the gyro bias, rad/s, shape (3,).
+    """
+    bias = np.zeros(3)
+    start: Start | None = None
+    for _ in range(3):
+        curve = GyroCurve.integrate(t_imu_s, gyro_rps, bias)
+        start = coarse_start(curve, t_cam_s, q_world_cam, shifts_s)
+        if start is None:
+            break
+        bias = bias + start.bias_rps
+        turns = camera_turns(t_cam_s, q_world_cam)
+        if np.linalg.norm(start.bias_rps) * _BASELINE_S < 0.25 * agreement_scale(turns):
+            break
+    return start, bias
+
+
+def _minima(costs: FloatArray, apart: int) -> list[int]:
+    """Return the lowest points of a sampled curve, best first, none closer than `apart` samples."""
+    found: list[int] = []
+    for i in np.argsort(costs):
+        if all(abs(int(i) - j) >= apart for j in found):
+            found.append(int(i))
+            if len(found) == _CANDIDATES:
+                break
+    return found
+
+
+def coarse_start(
+    curve: RotationCurve, t_cam_s: FloatArray, q_world_cam: FloatArray, shifts_s: tuple[float, float]
+) -> Start | None:
+    """Find shift and mounting without any prior knowledge.
+
+    Several local minima of the angle cost are judged by how well the turns agree as vectors: motion that
+    swings to and fro repeats its angles after half a period, but not its directions.
+
+    Args:
+        curve: The imu's (or any reference's) orientation.
+        t_cam_s: Camera stamps, s, shape (n,).
+        q_world_cam: Camera orientations, shape (n, 4).
+        shifts_s: Lowest and highest shift to look at, s.
+
+    Returns:
+        The best start, or None where fewer than 8 turns can be formed.
+    """
+    turns = camera_turns(t_cam_s, q_world_cam)
+    if len(turns.first) < 8:
+        return None
+    scale = agreement_scale(turns)
+    grid = np.arange(np.floor(shifts_s[0] / _GRID_S), np.ceil(shifts_s[1] / _GRID_S) + 1.0) * _GRID_S
+    if len(grid) < 2:
+        grid = np.array([grid[0], grid[0] + _GRID_S])
+    costs = shift_costs(curve, t_cam_s, turns, grid, scale)
+    level = float(np.median(costs))
+    best: Start | None = None
+    for i in _minima(costs, apart=5):
+        start = _start_at(curve, t_cam_s, turns, float(grid[i]), scale, level)
+        if start is not None and (best is None or start.misfit_rad < best.misfit_rad):
+            best = start
+    return best
+
+
+def _start_at(
+    curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shift_s: float, scale: float, level: float
+) -> Start | None:
+    """Refine the shift around a grid point and solve for the mounting there."""
+    fine = shift_s + np.arange(-6, 7) * _FINE_S
+    low, high = curve.span_s
+    ta, tb = t_cam_s[turns.first] + fine[:, None], t_cam_s[turns.second] + fine[:, None]
+    inside = (ta >= low) & (tb <= high)
+    if np.count_nonzero(inside[6]) < 8:
+        return None
+    difference = angles_between(curve.quaternion(ta), curve.quaternion(tb)) - turns.angle
+    costs = np.where(inside, robust_cost(difference, scale), 0.6).mean(axis=1)
+    best = int(np.argmin(costs))
+    shift = float(fine[best])
+    use = inside[best] & (np.abs(difference[best]) < 1.5 * scale)
+    if np.count_nonzero(use) < 6:
+        return None
+    qa, qb = curve.quaternion(ta[best][use]), curve.quaternion(tb[best][use])
+    turn_imu = so3.rotvec_from_quat(so3.quat_multiply(so3.quat_conjugate(qa), qb))
+    dt = tb[best][use] - ta[best][use]
+    fit = _mounting(turn_imu, turns.rotvec_cam[use], dt)
+    agreement = float(np.mean(np.abs(difference[best][inside[best]]) < scale))
+    # turns whose size does not agree count as badly as a whole turn misplaced
+    share = np.count_nonzero(use) / len(turns.first)
+    return Start(
+        shift,
+        fit.R,
+        fit.bias,
+        agreement,
+        float(costs[best]) / max(level, 1e-12),
+        fit.misfit / share**2,
+        fit.singular_values,
+        fit.mirrored,
+        float(np.median(turns.angle)),
+    )
+
+
+@dataclass(frozen=True)
+class _Mounting:
+    R: FloatArray
+    bias: FloatArray
+    misfit: float
+    singular_values: FloatArray
+    mirrored: bool
+
+
+def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mounting:
+    """Robust Wahba: R with turn_imu = R turn_cam + bias dt, by reweighting; watches for mirrored axes."""
+    weight = np.ones(len(dt))
+    bias = np.zeros(3)
+    R, s = np.eye(3), np.ones(3)
+    residual = turn_imu
+    mirrored = False
+    for i in range(8):
+        target = turn_imu - bias * dt[:, None]
+        U, s, Vt = np.linalg.svd((target * weight[:, None]).T @ turn_cam)
+        sign = np.sign(np.linalg.det(U @ Vt))
+        # the smallest singular value is what a mirrored mounting would gain and a rotation must pay; later
+        # rounds have put aside what disagrees with a rotation
+        if i == 0:
+            mirrored = bool(sign < 0 and s[2] > 0.25 * s[1] and s[2] > 0.02 * s[0])
+        R = (U * np.array([1.0, 1.0, sign])) @ Vt
+        residual = turn_imu - turn_cam @ R.T
+        bias = np.sum(residual * (weight * dt)[:, None], axis=0) / np.sum(weight * dt * dt)
+        residual = residual - bias * dt[:, None]
+        length2 = np.einsum("ij,ij->i", residual, residual)
+        weight = 1.0 / (1.0 + length2 / max(2.0 * float(np.median(length2)), 1e-12)) ** 2
+    misfit = float(np.sqrt(np.median(np.einsum("ij,ij->i", residual, residual))))
+    return _Mounting(R, bias, misfit, s / len(dt), mirrored)

@@ -1,0 +1,157 @@
+"""Why temporal calibration gives no answer, or only part of one, in words a person can act on."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation.temporal.orientation_fit import Fit
+from vical_daemon.estimation.temporal.rotation_start import Start, camera_turns
+from vical_daemon.estimation.temporal.rotation_suspects import stretched
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
+from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions
+
+FloatArray = npt.NDArray[np.float64]
+
+_DEG = np.pi / 180.0
+_MIN_RATE_RPS = 3.0 * _DEG  # slower than this is "not moving"
+_STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
+_SHIFT_LOST_S = 3e-3
+_ROTATION_LOST_RAD = 3.0 * _DEG
+UNEVEN = 1e-3  # no two crystals are as far apart
+_STRETCHED = 5e-3  # beyond this no delay makes sense
+RATE_SIGMAS = 6.0
+
+
+def refuse_motion(
+    t_imu: FloatArray, gyro: FloatArray, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions
+) -> str:
+    """Say why the motion cannot be used, from the rotation rates alone; empty if it can."""
+    turns = camera_turns(t_cam, q)
+    if len(turns.first) < 8:
+        return "the camera orientations are too far apart in time: at least 5 a second are needed"
+    rate_cam = float(np.median(turns.angle / (t_cam[turns.second] - t_cam[turns.first])))
+    reach = options.search_s + abs(options.timeshift_guess_s)
+    near = (t_imu > t_cam[0] - reach) & (t_imu < t_cam[-1] + reach)
+    if np.count_nonzero(near) < 2 * MIN_ORIENTATIONS:
+        return (
+            f"camera and imu do not overlap in time: the camera covers {t_cam[0]:.1f} to {t_cam[-1]:.1f} s, "
+            f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?)"
+        )
+    mean_rate = _mean_rates(t_imu, gyro[near])
+    rate_imu = float(np.median(np.linalg.norm(mean_rate, axis=1)))
+    change = _changes(mean_rate)
+    swing = float(np.median(change))
+    ratio = rate_imu / max(rate_cam, 1e-9)
+    if rate_cam < _MIN_RATE_RPS and swing < _MIN_RATE_RPS:
+        return (
+            f"no motion: the camera turns at {rate_cam / _DEG:.1f} deg/s (median); "
+            "turn the rig to and fro about all axes at 20 to 60 deg/s"
+        )
+    if rate_cam < _MIN_RATE_RPS and swing > 5.0 * _MIN_RATE_RPS:
+        return "the imu turns but the camera does not: is the camera fixed to the imu, are its poses fresh?"
+    if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
+        return (
+            f"it turns at one rate ({rate_imu / _DEG:.0f} deg/s) about one axis all the time: neither delay "
+            "nor mounting about that axis show; turn to and fro, and about other axes"
+        )
+    return _wrong_unit(ratio)
+
+
+def at_one_rate(t_imu: FloatArray, gyro: FloatArray) -> bool:
+    """Whether the rig turns at one rate about one axis all the time.
+
+    Args:
+        t_imu: Instants, s, shape (n,).
+        gyro: Rates, rad/s, shape (n, 3).
+    """
+    rates = _mean_rates(t_imu, gyro)
+    return _is_steady(rates) and float(np.median(np.linalg.norm(rates, axis=1))) > _MIN_RATE_RPS
+
+
+def _is_steady(rates: FloatArray) -> bool:
+    size = float(np.median(np.linalg.norm(rates, axis=1)))
+    return float(np.quantile(_changes(rates), 0.95)) < _STEADY * size
+
+
+def _mean_rates(t_imu: FloatArray, gyro: FloatArray) -> FloatArray:
+    """Means over a fifth of a second, so that noise is not taken for changes."""
+    length = max(1, round(0.2 / float(np.median(np.diff(t_imu)))))
+    kernel = np.ones(length) / length
+    return np.stack([np.convolve(gyro[:, i], kernel, mode="valid") for i in range(3)], axis=1)
+
+
+def _changes(rates: FloatArray) -> FloatArray:
+    out: FloatArray = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)
+    return out
+
+
+def _wrong_unit(ratio: float) -> str:
+    """Say when the gyro's rates over the camera's look like degrees taken for radians, or the reverse."""
+    if 35.0 < ratio < 95.0:
+        return (
+            f"the gyro's rates are {ratio:.1f} times the camera's: they look like degrees per second "
+            "(factor 57.3); convert them to rad/s"
+        )
+    if 1 / 95.0 < ratio < 1 / 35.0:
+        return (
+            f"the gyro's rates are {1 / ratio:.1f} times smaller than the camera's: they look as if divided "
+            "by 57.3 once too often; they must be in rad/s"
+        )
+    return ""
+
+
+def refuse_start(start: Start | None, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions) -> str:
+    """Say why no start was found; empty if there is one."""
+    reach = f"within {options.search_s:g} s of {options.timeshift_guess_s:g} s"
+    if start is None:
+        return f"no delay {reach} makes the rotations of camera and gyro agree (not the same recording?)"
+    turns = camera_turns(t_cam, q)
+    typical = float(np.median(turns.angle))
+    if start.agreement < 0.3:
+        return (
+            f"no delay {reach} makes the rotations of camera and gyro agree in size "
+            f"(best: {100 * start.agreement:.0f} % of the turns at {start.timeshift_s:+.2f} s)"
+        )
+    if start.mirrored or start.misfit_rad > max(0.5 * typical, 0.01):
+        return (
+            "the rotations agree in size but not in direction: is this the same recording, is the camera "
+            "fixed to the imu, are its orientations those of the camera in the world?"
+        )
+    return ""
+
+
+def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) -> tuple[str, str]:
+    """Status and reason from the final covariance and residuals."""
+    if pairs < max(MIN_ORIENTATIONS, 0.25 * n):
+        return REFUSED, f"only {pairs} of {n} orientations fit the gyro at the best delay"
+    rate, rate_sigma = float(fit.stamp_rate[0]), float(fit.stamp_rate_sigma[0])
+    if abs(rate) > max(_STRETCHED, RATE_SIGMAS * rate_sigma):
+        return REFUSED, stretched(rate)
+    if noise > 3.0 * _DEG:
+        return REFUSED, f"gyro and camera disagree by {noise / _DEG:.1f} deg (rms) at the best delay"
+    reasons = lost_in_words(covariance, fit.sensors[0].R_imu_sensor)
+    if abs(rate) > max(UNEVEN, RATE_SIGMAS * rate_sigma):
+        reasons.append(stretched(rate))
+    return (DEGENERATE if reasons else OK), "; ".join(reasons)
+
+
+def lost_in_words(covariance: FloatArray, R_imu_cam: FloatArray) -> list[str]:
+    """Name what a covariance [mounting, bias, shift] leaves open, and the motion that would show it."""
+    reasons = []
+    if covariance[6, 6] > _SHIFT_LOST_S**2:
+        reasons.append(
+            f"the delay is not determined (sigma {1e3 * np.sqrt(covariance[6, 6]):.1f} ms): "
+            "the rotation rate hardly changed; turn to and fro"
+        )
+    values, vectors = np.linalg.eigh(covariance[:3, :3])
+    if values[2] > _ROTATION_LOST_RAD**2:
+        axis = R_imu_cam @ vectors[:, 2]
+        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+        words = " ".join(f"{a:+.2f}" for a in axis)
+        reasons.append(
+            f"the mounting about the axis ({words}) of the imu is not determined "
+            f"(sigma {np.sqrt(values[2]) / _DEG:.0f} deg): the motion turned about this axis only; "
+            "turn about another"
+        )
+    return reasons
