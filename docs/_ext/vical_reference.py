@@ -195,7 +195,8 @@ class _Generated(SphinxDirective):
     make: Any = None
 
     def run(self) -> list[nodes.Node]:
-        """Parse the generated text where the directive stands."""
+        """Parse the generated text where the directive stands; anew each time: the source may differ."""
+        self.env.note_reread()
         return self.parse_text_to_nodes(type(self).make(), allow_section_headings=True)
 
 
