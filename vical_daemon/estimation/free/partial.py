@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation import so3
-from vical_daemon.estimation.free.gyro_attitudes import Attitudes
 from vical_daemon.estimation.free.start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.initialise import still_axes
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
 
 _STEP_RAD = float(np.deg2rad(15.0))
 _FINE_RAD = float(np.deg2rad(4.0))

@@ -9,7 +9,6 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.free.carry import Carry
-from vical_daemon.estimation.free.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.free.partial import mounting_about, still_axis
 from vical_daemon.estimation.free.start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.free.window import Window
@@ -18,6 +17,7 @@ from vical_daemon.estimation.imu_scale import ENTRIES, NUMBERS
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.state import CameraState
 from vical_daemon.estimation.td_icp import td_icp
+from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 from vical_daemon.estimation.trust.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.trust.hypotheses import LAG_SIGMA_S

@@ -1,1 +1,1 @@
-"""The parts of TD-ICP: curves of orientation, their registration in time and space, and the watch."""
+"""Delay and mounting from rotations: TD-ICP on curves of orientation, the epipolar constraint, the watch."""

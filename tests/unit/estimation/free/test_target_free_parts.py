@@ -20,7 +20,6 @@ from vical_daemon.estimation.free.carry import (
     moved,
     tangents,
 )
-from vical_daemon.estimation.free.epipolar_fit import epipolar_fit
 from vical_daemon.estimation.free.inertial import Order
 from vical_daemon.estimation.free.jitter import Lateness
 from vical_daemon.estimation.free.quality import correlation
@@ -30,6 +29,7 @@ from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial_links import Links, make_link
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
 from vical_daemon.estimation.state import CameraState
+from vical_daemon.estimation.temporal.epipolar_fit import epipolar_fit
 
 SHIFT_S = 0.013
 

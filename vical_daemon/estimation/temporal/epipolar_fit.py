@@ -17,10 +17,10 @@ import numpy as np
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.camera_model import project_jacobians
 from vical_daemon.estimation.camera_rays import unproject
-from vical_daemon.estimation.free.epipolar_pairs import Pairs, make_pairs
-from vical_daemon.estimation.free.gyro_attitudes import Attitudes
 from vical_daemon.estimation.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
+from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
+from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
 
 _ITERATIONS = 18
 _BIAS_SIGMA_RPS = 0.02  # of a gyro that was not zeroed
