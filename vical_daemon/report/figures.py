@@ -28,13 +28,14 @@ def _panels(
     columns: int = 1,
     ratios: Sequence[float] | None = None,
     width: float = WIDTH,
+    right: float = 0.12,
 ) -> tuple[Figure, npt.NDArray[Any]]:
     """Return a figure and its axes, shape (rows, columns), with margins given in inches.
 
     matplotlib's own layout engine would double the time of every figure.
     """
     figure = Figure(figsize=(width, height))
-    left, right, top, bottom, gap = 0.68, 0.12, 0.30, 0.45, 0.65
+    left, top, bottom, gap = 0.68, 0.30, 0.45, 0.65
     panel_width = (width - left - right - gap * (columns - 1)) / columns
     panel_height = (height - top - bottom - gap * (rows - 1)) / rows
     axes = figure.subplots(
@@ -165,8 +166,8 @@ def consistency(points: CameraResiduals | None, trace: Sequence[dict[str, Any]])
 
 def residual_map(cell_map: CellMap, size: tuple[int, int]) -> Figure:
     """Draw mean residual arrows, RMS and number of points per cell over the image."""
-    height = 0.6 + (WIDTH / 3.0) * size[1] / size[0] * 1.05 + 0.4
-    figure, (panels,) = _panels(max(2.4, height), 1, 3)
+    height = 0.8 + (WIDTH / 3.0) * size[1] / size[0] * 0.72
+    figure, (panels,) = _panels(max(2.0, height), 1, 3, right=0.35)
     x = 0.5 * (cell_map.x_edges[:-1] + cell_map.x_edges[1:])
     y = 0.5 * (cell_map.y_edges[:-1] + cell_map.y_edges[1:])
     length = np.linalg.norm(cell_map.mean_px, axis=-1)
@@ -179,12 +180,12 @@ def residual_map(cell_map: CellMap, size: tuple[int, int]) -> Figure:
     _style(panels[0], f"Mean residual (one cell = {reach / 1.2:.2g} px)")
     extent = (0, size[0], size[1], 0)
     rms = panels[1].imshow(cell_map.rms_px, extent=extent, cmap="magma_r", vmin=0, aspect="equal")
-    figure.colorbar(rms, ax=panels[1], shrink=0.8).ax.tick_params(labelsize=8)
+    figure.colorbar(rms, ax=panels[1]).ax.tick_params(labelsize=8)
     _style(panels[1], "RMS residual, px")
     count = np.where(cell_map.count > 0, cell_map.count, np.nan)
     seen = panels[2].imshow(count, extent=extent, cmap="viridis", aspect="equal")
-    figure.colorbar(seen, ax=panels[2], shrink=0.8).ax.tick_params(labelsize=8)
-    _style(panels[2], f"Points per cell (cover {100 * cell_map.coverage:.0f} %)")
+    figure.colorbar(seen, ax=panels[2]).ax.tick_params(labelsize=8)
+    _style(panels[2], "Points per cell")
     for panel in panels:
         panel.set_xlim(0, size[0])
         panel.set_ylim(size[1], 0)
@@ -234,7 +235,7 @@ def frame_rms(points: CameraResiduals) -> Figure:
 def correlation(covariance: FloatArray) -> Figure:
     """Draw the correlation of the six numbers of `T_imu_cam`."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    figure, ((axes,),) = _panels(2.9, width=3.4)
+    figure, ((axes,),) = _panels(2.9, width=3.4, right=0.4)
     shown = axes.imshow(covariance / np.outer(sigma, sigma), vmin=-1, vmax=1, cmap="RdBu")
     labels = ["px", "py", "pz", "rx", "ry", "rz"]
     axes.set_xticks(range(6), labels)

@@ -22,6 +22,7 @@ table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
 th,td{text-align:left;padding:5px 10px 5px 0;border-bottom:1px solid var(--line);vertical-align:top}
 th{font-weight:600;color:var(--soft);font-size:13px}
 td.n,th.n{text-align:right}
+td:last-child:not(.n){overflow-wrap:anywhere}
 .pair td,th{white-space:nowrap}
 .warn{border-left:4px solid #b35c00;background:#fff7ec}
 .bad{border-left:4px solid #b3261e;background:#fdf0ef}

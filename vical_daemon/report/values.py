@@ -41,7 +41,7 @@ def camera_rows(camera: dict[str, Any]) -> list[Row]:
     for name, (angle, spread) in zip(("roll (X)", "pitch (Y)", "yaw (Z)"), angles, strict=True):
         rows.append((f"rotation {name}", *value(angle, spread), "deg"))
     rows.append(("quaternion w x y z", " ".join(f"{v:+.6f}" for v in q), "", ""))
-    about = " ".join(f"{s:.2g}" for s in np.degrees(sigma[3:]))
+    about = " ".join(f"{s:.4f}" for s in np.degrees(sigma[3:]))
     rows.append(("sigma about cam x y z", about, "", "deg"))
     shift = value(1e3 * camera["timeshift_cam_imu_s"], 1e3 * camera["timeshift_sigma_s"])
     rows.append(("time shift (t_imu - t_cam)", *shift, "ms"))

@@ -226,7 +226,8 @@ def _provenance_section(provenance: Provenance) -> str:
         rows = [(name, f"{size:,}", digest) for name, size, digest in provenance.files]
         parts.append(page.table(("input", "bytes", "SHA-256"), rows, numeric_from=9))
     if provenance.settings:
-        parts.append(page.table(("setting", "value"), list(provenance.settings.items()), numeric_from=9))
+        settings = [(name, value or "nothing") for name, value in provenance.settings.items()]
+        parts.append(page.table(("setting", "value"), settings, numeric_from=9))
     versions = ", ".join(f"{k} {v}" for k, v in provenance.versions.items())
     parts.append(f'<p class="note">Made {provenance.made_at} with {versions}.</p>')
     return page.section("To reproduce", *parts)
