@@ -151,7 +151,7 @@ def row(name: str, a: CameraEstimate, b: CameraEstimate) -> str:
 
 
 def ratios(held: tuple[list[FrameReport], ...], own: tuple[Half, ...], by: tuple[Half, ...]) -> str:
-    """Residuals of images held back over those of their own half and over its corner noise.
+    """Residuals of images held back over those of their own half and over its corner noise; (both together).
 
     And over the noise where the half that was calibrated (`by`) had seen corners: elsewhere its lens is
     extrapolated.
@@ -160,12 +160,13 @@ def ratios(held: tuple[list[FrameReport], ...], own: tuple[Half, ...], by: tuple
     seen_px = [rms_px(where_seen(h, x.used)) for h, x in zip(held, by, strict=True)]
     noise = [noise_px(half.used) for half in own]
     there = [noise_px(where_seen(half.used, x.used)) for half, x in zip(own, by, strict=True)]
-    columns = [
-        np.divide(all_px, [rms_px(half.used) for half in own]),
-        np.divide(all_px, noise),
-        np.divide(seen_px, there),
-    ]
-    return " | ".join(", ".join(f"{x:.3f}" for x in c) for c in columns) + " |"
+    columns = [(all_px, [rms_px(half.used) for half in own]), (all_px, noise), (seen_px, there)]
+    count = np.array([sum(int(r.accepted.sum()) for r in h) for h in held], dtype=np.float64)
+    cells = []
+    for seen, stated in columns:
+        both = np.sqrt((count @ np.square(seen)) / (count @ np.square(stated)))
+        cells.append(f"{', '.join(f'{x:.3f}' for x in np.divide(seen, stated))} ({both:.3f})")
+    return " | ".join(cells) + " |"
 
 
 def main(argv: list[str]) -> int:
