@@ -2,48 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from vical_daemon.estimation import so3, unscented
+from vical_daemon.estimation import so3
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.state import (
-    ACCEL_BIAS,
-    ATTITUDE,
-    GRAVITY,
-    GYRO_BIAS,
     MOTION,
-    POSITION,
-    VELOCITY,
-    Layout,
     State,
 )
-from vical_daemon.estimation.trust.beyond_doubt import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA
-from vical_daemon.estimation.trust.clock_drift import SKEW_SIGMA
-from vical_daemon.estimation.trust.consistency import MODES, Consistency
-from vical_daemon.estimation.trust.corner_noise import CornerNoise
+from vical_daemon.estimation.trust.consistency import MODES
 from vical_daemon.estimation.trust.hypotheses import (
-    ENTRY_SIGMA,
     IMU,
-    LAG,
-    LAG_SIGMA_S,
-    SIZE,
-    SIZE_SIGMA,
-    TARGET,
     averaged,
 )
-from vical_daemon.estimation.trust.lens_agreement import LensAgreement
 from vical_daemon.estimation.trust.shared_errors import SharedErrors
-from vical_daemon.estimation.trust.target_doubt import TargetDoubt
-from vical_daemon.estimation.unshown_axes import UNKNOWN_M, UnshownAxes
 
 _MOST_RUNS = 8
+_CREEPING = 6  # runs; most starts need two to four
+_HELD = 1e-4  # of a prior: as good as none
 _STANDS = 1.5  # sigmas by which the answer may have moved: the next run moves it by far less
 _CHANCE = 2.0  # standard deviations of it up to which larger innovations are not the stamps' fault
 _DOUBTED_S = 2e-3  # jitter; a larger one is that of a broken driver
@@ -111,13 +94,60 @@ def rehearsed(
 def _rehearse(
     state: State, frames: Frames, make: Callable[[State], CalibrationFilter], step: Step, doubted_s: float
 ) -> Rehearsed | None:
-    """The runs; until the noise is known, stamps are allowed a jitter of `doubted_s`."""
+    """The runs; until the noise is known, stamps are allowed a jitter of `doubted_s`.
+
+    Where answers creep, run by run, it is the imu's matrices that take up the curvature of lever arm and
+    mounting, and what is missed is put down to them. Then the runs are done with an imu as stated, and if
+    images fit so, on from there with all states.
+    """
+    found = _runs(make(deepcopy(state)), state, frames, make, step, doubted_s)
+    if found is None:
+        return None
     trial = make(deepcopy(state))
+    creeps = found.runs >= _CREEPING and found.told.size is None
+    if not (creeps and _take_imu_as_stated(trial)):
+        return found.told
+    held = _runs(trial, state, frames, make, step, doubted_s, as_stated=True)
+    if held is None or not (held.stands and _fits(held.told.filter)):
+        return found.told
+    opened = _runs(_about(held.last, state, make), state, frames, make, step, doubted_s)
+    return opened.told if opened is not None and opened.stands else found.told
+
+
+class _Runs(NamedTuple):
+    """Outcome of some runs.
+
+    Attributes:
+        told: What they gave.
+        last: The filter at the end of the last one.
+        runs: How many.
+        stands: The last one did not move the answer.
+    """
+
+    told: Rehearsed
+    last: CalibrationFilter
+    runs: int
+    stands: bool
+
+
+def _runs(
+    trial: CalibrationFilter,
+    state: State,
+    frames: Frames,
+    make: Callable[[State], CalibrationFilter],
+    step: Step,
+    doubted_s: float,
+    *,
+    as_stated: bool = False,
+) -> _Runs | None:
+    """Runs until the answer stands, or there were enough; None where the start does not hold together."""
     last: CalibrationFilter | None = None
     _doubt(trial, doubted_s)
-    for _ in range(_MOST_RUNS):
+    runs, stands = 0, False
+    while True:
         if not _holds_together(trial, frames, step):
             return None
+        runs += 1
         fresh = _about(trial, state, make)
         if last is None:
             _doubt(fresh, doubted_s)
@@ -128,10 +158,20 @@ def _rehearse(
             for consistency in fresh.consistency.values():
                 consistency.settle()
         stands = last is not None and _moved(last, trial) < _STANDS
+        if as_stated:
+            _take_imu_as_stated(fresh)
         trial, last = fresh, trial
-        if stands:
-            break
-    return Rehearsed(trial, None if last is None else _by_far(last))
+        if stands or runs == _MOST_RUNS:
+            return _Runs(Rehearsed(trial, _by_far(last)), last, runs, stands)
+
+
+def _take_imu_as_stated(f: CalibrationFilter) -> bool:
+    """Hold the imu's matrices, unless they are none of the states or known to be off; whether it is so."""
+    gyro, accel = f.layout.gyro_matrix, f.layout.accel_matrix
+    if gyro is None or accel is None or IMU in f.off:
+        return False
+    f.S[gyro.start : accel.stop] *= _HELD
+    return True
 
 
 def _by_far(f: CalibrationFilter) -> float | None:
@@ -214,93 +254,3 @@ def _about(
     fresh.S = fresh.S * (narrow / wide)[:, None]
     fresh.corner_noise = trial.corner_noise
     return fresh
-
-
-def wide_filter(
-    state: State,
-    layout: Layout,
-    options: CalibrationOptions,
-    still_axes: FloatArray | None = None,
-    turn_axis_cam: FloatArray | None = None,
-) -> CalibrationFilter:
-    """Build a filter about a start, with sigmas many times what the start is worth.
-
-    Args:
-        state: The start.
-        layout: Where the errors live.
-        options: Noise.
-        still_axes: Of a partial start, see `StartResult`.
-        turn_axis_cam: Likewise.
-    """
-    noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
-    consistency = {name: Consistency() for name in layout.cameras}
-    walk = np.zeros(layout.size)
-    off = {IMU, LAG, SIZE, TARGET} & options.estimate
-    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, off=off))
-    unshown = None if still_axes is None else UnshownAxes(still_axes, turn_axis_cam)
-    if unshown is not None:
-        for where in layout.cameras.values():
-            unshown.hold(root, where)
-    agreement = {name: LensAgreement(state.cameras[name].distortion_model) for name in layout.cameras}
-    shared = {name: SharedErrors() for name in layout.cameras}
-    return CalibrationFilter(
-        state,
-        layout,
-        unscented.lower_root(root),
-        options.imu_noise,
-        noise,
-        walk,
-        consistency,
-        agreement,
-        shared,
-        _doubts(layout),
-        unshown,
-        off=off,
-    )
-
-
-def _doubts(layout: Layout) -> dict[str, TargetDoubt]:
-    """Whether the target is as stated is asked where its shape is no state."""
-    modes = layout.target_modes
-    if modes is None or layout.target_shape is not None:
-        return {}
-    return {name: TargetDoubt(modes) for name in layout.cameras}
-
-
-def _before_board_m(state: State, camera: str) -> float:
-    """How far a camera is from the plane of the board: sigma points must not put it behind."""
-    return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
-
-
-def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection[str]) -> FloatArray:
-    """Standard deviations the filter starts with: many times what the start is really worth.
-
-    The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
-    """
-    s = np.zeros(layout.size)
-    # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
-    lever_arm, position, angle = (UNKNOWN_M, 3.0 * UNKNOWN_M, 0.03)
-    if not partial:
-        before_m = min(_before_board_m(state, name) for name in layout.cameras)
-        lever_arm, position, angle = min(0.15, 0.35 * before_m), min(0.1, 0.25 * before_m), 0.1
-    s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
-    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
-    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA
-    if layout.accel_lag is not None:
-        s[layout.accel_lag] = LAG_SIGMA_S
-    if layout.target_scale is not None:
-        s[layout.target_scale] = KNOWN_SIZE_SIGMA if SIZE in off else SIZE_SIGMA
-    if layout.target_modes is not None and layout.target_shape is not None:
-        s[layout.target_shape] = layout.target_modes.sigma_m
-    for name, where in layout.cameras.items():
-        focal = float(state.cameras[name].intrinsics[0])
-        if where.position is not None and where.rotation is not None:
-            s[where.position], s[where.rotation] = lever_arm, angle
-        if where.timeshift is not None and where.skew is not None:
-            s[where.timeshift], s[where.skew] = 5e-3, SKEW_SIGMA
-        if where.intrinsics is not None and where.distortion is not None:
-            s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
-        if where.readout is not None:
-            s[where.readout] = 0.01
-    return s

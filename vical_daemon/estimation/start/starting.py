@@ -13,8 +13,9 @@ from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.start import closed_form as start
 from vical_daemon.estimation.start.readout_start import looks_rolling
-from vical_daemon.estimation.start.rehearsal import Frames, Step, rehearsed, wide_filter
+from vical_daemon.estimation.start.rehearsal import Frames, Step, rehearsed
 from vical_daemon.estimation.start.seen_poses import Lens, PoseCache
+from vical_daemon.estimation.start.wide_filter import wide_filter
 from vical_daemon.estimation.state import Layout
 
 _MIN_SPAN_S = 3.0
