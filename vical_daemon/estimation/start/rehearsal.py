@@ -19,14 +19,11 @@ from vical_daemon.estimation.state import (
 )
 from vical_daemon.estimation.trust.consistency import MODES
 from vical_daemon.estimation.trust.hypotheses import (
-    IMU,
     averaged,
 )
 from vical_daemon.estimation.trust.shared_errors import SharedErrors
 
 _MOST_RUNS = 8
-_CREEPING = 6  # runs; most starts need two to four
-_HELD = 1e-4  # of a prior: as good as none
 _STANDS = 1.5  # sigmas by which the answer may have moved: the next run moves it by far less
 _CHANCE = 2.0  # standard deviations of it up to which larger innovations are not the stamps' fault
 _DOUBTED_S = 2e-3  # jitter; a larger one is that of a broken driver
@@ -94,60 +91,13 @@ def rehearsed(
 def _rehearse(
     state: State, frames: Frames, make: Callable[[State], CalibrationFilter], step: Step, doubted_s: float
 ) -> Rehearsed | None:
-    """The runs; until the noise is known, stamps are allowed a jitter of `doubted_s`.
-
-    Where answers creep, run by run, it is the imu's matrices that take up the curvature of lever arm and
-    mounting, and what is missed is put down to them. Then the runs are done with an imu as stated, and if
-    images fit so, on from there with all states.
-    """
-    found = _runs(make(deepcopy(state)), state, frames, make, step, doubted_s)
-    if found is None:
-        return None
+    """The runs; until the noise is known, stamps are allowed a jitter of `doubted_s`."""
     trial = make(deepcopy(state))
-    creeps = found.runs >= _CREEPING and found.told.size is None
-    if not (creeps and _take_imu_as_stated(trial)):
-        return found.told
-    held = _runs(trial, state, frames, make, step, doubted_s, as_stated=True)
-    if held is None or not (held.stands and _fits(held.told.filter)):
-        return found.told
-    opened = _runs(_about(held.last, state, make), state, frames, make, step, doubted_s)
-    return opened.told if opened is not None and opened.stands else found.told
-
-
-class _Runs(NamedTuple):
-    """Outcome of some runs.
-
-    Attributes:
-        told: What they gave.
-        last: The filter at the end of the last one.
-        runs: How many.
-        stands: The last one did not move the answer.
-    """
-
-    told: Rehearsed
-    last: CalibrationFilter
-    runs: int
-    stands: bool
-
-
-def _runs(
-    trial: CalibrationFilter,
-    state: State,
-    frames: Frames,
-    make: Callable[[State], CalibrationFilter],
-    step: Step,
-    doubted_s: float,
-    *,
-    as_stated: bool = False,
-) -> _Runs | None:
-    """Runs until the answer stands, or there were enough; None where the start does not hold together."""
     last: CalibrationFilter | None = None
     _doubt(trial, doubted_s)
-    runs, stands = 0, False
-    while True:
+    for _ in range(_MOST_RUNS):
         if not _holds_together(trial, frames, step):
             return None
-        runs += 1
         fresh = _about(trial, state, make)
         if last is None:
             _doubt(fresh, doubted_s)
@@ -158,20 +108,10 @@ def _runs(
             for consistency in fresh.consistency.values():
                 consistency.settle()
         stands = last is not None and _moved(last, trial) < _STANDS
-        if as_stated:
-            _take_imu_as_stated(fresh)
         trial, last = fresh, trial
-        if stands or runs == _MOST_RUNS:
-            return _Runs(Rehearsed(trial, _by_far(last)), last, runs, stands)
-
-
-def _take_imu_as_stated(f: CalibrationFilter) -> bool:
-    """Hold the imu's matrices, unless they are none of the states or known to be off; whether it is so."""
-    gyro, accel = f.layout.gyro_matrix, f.layout.accel_matrix
-    if gyro is None or accel is None or IMU in f.off:
-        return False
-    f.S[gyro.start : accel.stop] *= _HELD
-    return True
+        if stands:
+            break
+    return Rehearsed(trial, None if last is None else _by_far(last))
 
 
 def _by_far(f: CalibrationFilter) -> float | None:
