@@ -109,7 +109,7 @@ def main(argv: list[str]) -> int:
     print("|---|---|---|---|---|---|---|---|")
     for name in args.case or STEPS:
         size = STEPS[name]
-        slug = "".join(c if c.isalnum() else "_" for c in name)
+        slug = runner.slug(name)
         file = f"changes_{slug}_{'known' if args.lens_known else 'unknown'}_{args.seconds:g}s"
         results = runner.run_trials(
             file, partial(trial, size, args.lens_known, args.seconds), runner.seeds_of(args), args, code

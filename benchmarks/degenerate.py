@@ -109,7 +109,7 @@ def main(argv: list[str]) -> int:
     )
     print("|---|---|---|---|---|---|---|")
     for name in args.case or MOTIONS:
-        slug = "".join(c if c.isalnum() else "_" for c in name)
+        slug = runner.slug(name)
         kind = f"{'known' if args.lens_known else 'unknown'}_{'given' if args.given else 'nothing'}"
         kind += "_free" if args.target_free else ""
         results = runner.run_trials(

@@ -1,9 +1,9 @@
 """How much of an error is chance: what the best estimator would have made of the same noise.
 
 The bound says how large errors are on average. A hundred recordings have an average of their own, by chance
-up to a fifth larger. Here the very noise of each recording goes through the linear equations of the bound:
+up to a quarter larger. Here the very noise of each recording goes through the linear equations of the bound:
 out comes, to first order, the error of weighted least squares over all data, linearised at the truth, which
-reaches the bound and which nothing can beat. What vical adds to it is vical's.
+reaches the bound: no unbiased estimator is better on average. What vical adds to it is vical's.
 
     python -m benchmarks luck --case "reference, lens known" --trials 100
 """
@@ -18,15 +18,15 @@ import numpy as np
 import numpy.typing as npt
 from vical_mocks.points import SimulatedRun, project_points
 
-from benchmarks import runner
+from benchmarks import runner, scores
 from benchmarks.bound import Draw, bounds, frames_of
 from benchmarks.error_model import STATE, error_slopes, steps_in
+from benchmarks.feed import PARAMETERS
 from benchmarks.montecarlo import (
     CASES,
     TIMES_S,
     Case,
     bound_options,
-    bound_sigmas,
     code_under_test,
     make_run,
     results_of,
@@ -35,27 +35,17 @@ from benchmarks.montecarlo import (
 
 FloatArray = npt.NDArray[np.float64]
 
-NAMES = (
-    "x",
-    "y",
-    "z",
-    "about x",
-    "about y",
-    "about z",
-    "shift",
-    "fx",
-    "fy",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "p1",
-    "p2",
-)
-
 
 def draw_of(run: SimulatedRun) -> Draw:
-    """The noise that a recording was made with, in the form that `bound.bounds` takes it."""
+    """The noise that a recording was made with, in the form that `bound.bounds` takes it.
+
+    Raises:
+        ValueError: It has errors that are no noise of readings or corners.
+    """
+    options = run.options
+    for what in ("stamp_jitter_s", "imu_stamp_jitter_s", "imu_average_s", "accel_lag_s"):
+        if getattr(options, what):
+            raise ValueError(f"{what} moves what is measured; there is no best estimate to follow with it")
     frames = frames_of(run)
     pixels = []
     for frame in frames:
@@ -88,12 +78,13 @@ def _push(run: SimulatedRun, missed: Missed, begin_s: float, end_s: float) -> Fl
 
 
 class Missed:
-    """What is wrong with the readings [gyro 3, accelerometer 3], linear in between."""
+    """Noise and biases of the readings [gyro 3, accelerometer 3], linear in between."""
 
     def __init__(self, run: SimulatedRun) -> None:
         self._step_s = 1.0 / run.options.imu_rate_hz
-        truth = run.rig.imu_motion(self._step_s * np.arange(len(run.gyro_rps)))
-        self._wrong = np.hstack([run.gyro_rps, run.specific_force_mps2]) - np.hstack(truth)
+        rig, t_s = run.rig, self._step_s * np.arange(len(run.gyro_rps))
+        noise = np.hstack([run.gyro_rps, run.specific_force_mps2]) - np.hstack(rig.imu_reading(t_s))
+        self._wrong = noise + np.hstack([rig.gyro_bias.value(t_s), rig.accel_bias.value(t_s)])
         gained = (self._wrong[:-1] + self._wrong[1:]) * (self._step_s / 2)
         self._sums = np.vstack([np.zeros(6), np.cumsum(gained, axis=0)])
 
@@ -110,22 +101,21 @@ def luck_trial(case: Case, seconds: float, seed: int) -> runner.Result:
     run = make_run(case, seed, seconds)
     times = [t for t in TIMES_S if t <= seconds]
     found = bounds(run, bound_options(case, run), times, draw_of(run))
-    return {f"{b.t_s:g}": {"error": vector_of(b, b.error), "sigma": bound_sigmas(b)} for b in found}
+    return {f"{b.t_s:g}": vector_of(b, b.error) for b in found}
 
 
 def table(case: Case, key: str, ours: list[runner.Result], best: list[runner.Result]) -> None:
     """Rows of one time: RMSE over the bound, of the best estimator and of vical, and how alike they are."""
     both = [(o["at"][key], b[key]) for o, b in zip(ours, best, strict=True) if o["at"][key] is not None]
-    n = case.dof
-    x, y, sigma = (
-        np.array([list(row) for row in rows])[:, :n]
-        for rows in zip(*((o["error"], b["error"], b["sigma"]) for o, b in both), strict=True)
+    x, y, limit = (
+        np.array(rows)[:, : case.dof]
+        for rows in zip(*((o["error"], b, o["bound"]) for o, b in both), strict=True)
     )
-    best_ratio, ratio, added = (np.sqrt(((e / sigma) ** 2).mean(axis=0)) for e in (y, x, x - y))
-    for i in range(n):
+    best_ratio, ratio, added = (scores.rms(e / limit) for e in (y, x, x - y))
+    for i, name in enumerate(PARAMETERS[: case.dof]):
         correlation = np.corrcoef(x[:, i], y[:, i])[0, 1]
         cells = f"{best_ratio[i]:.2f} | {ratio[i]:.2f} | {ratio[i] / best_ratio[i]:.2f} | {added[i]:.2f}"
-        print(f"| {key} | {NAMES[i]} | {cells} | {correlation:.3f} |", flush=True)
+        print(f"| {key} | {name} | {cells} | {correlation:.3f} |", flush=True)
 
 
 def main(argv: list[str]) -> int:
@@ -136,12 +126,17 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     code_under_test(args.subject)
     for name in args.case or ["reference, lens known"]:
+        if name not in CASES:
+            parser.error(f"no case {name!r}; there are: {', '.join(CASES)}")
         case = CASES[name]
+        try:
+            draw_of(make_run(case, args.first_seed, 1.0))
+        except ValueError as error:
+            parser.error(f"{name}: {error}")
         ours = results_of(name, case, args.subject, args)
         code = runner.fingerprint(*(f"benchmarks/{f}.py" for f in _FILES), "mocks/vical_mocks")
-        slug = "".join(c if c.isalnum() else "_" for c in name)
         best = runner.run_trials(
-            f"luck_{slug}_{args.seconds:g}s",
+            f"luck_{runner.slug(name)}_{args.seconds:g}s",
             partial(luck_trial, case, args.seconds),
             runner.seeds_of(args),
             args,

@@ -287,7 +287,7 @@ def _code_of_the_bound() -> str:
 def results_of(name: str, case: Case, kind: str, args: argparse.Namespace) -> list[runner.Result]:
     """Trials of a case joined with their bounds."""
     seeds = runner.seeds_of(args)
-    file = f"{''.join(c if c.isalnum() else '_' for c in name)}_{args.seconds:g}s"
+    file = f"{runner.slug(name)}_{args.seconds:g}s"
     limits = runner.run_trials(
         f"bound_{file}",
         partial(bound_trial, case, args.seconds),
@@ -310,9 +310,8 @@ def print_case(name: str, case: Case, results: list[runner.Result], args: argpar
     covered = scores.coverage(results, case.dof)
     for t_s in (t for t in TIMES_S if t <= args.seconds):
         print(scores.row(name, scores.score(results, t_s, case.dof), covered), flush=True)
-    slug = "".join(c if c.isalnum() else "_" for c in name)
     if not args.no_plots and any(r["trace"]["t_s"] for r in results):
-        scores.plot(results, case.dof, name, args.out / f"{slug}.png")
+        scores.plot(results, case.dof, name, args.out / f"{runner.slug(name)}.png")
 
 
 def print_behaviour(name: str, results: list[runner.Result]) -> None:

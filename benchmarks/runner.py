@@ -55,6 +55,11 @@ def seeds_of(args: argparse.Namespace) -> range:
     return range(args.first_seed, args.first_seed + args.trials)
 
 
+def slug(name: str) -> str:
+    """The name of a case as part of a file's name."""
+    return "".join(c if c.isalnum() else "_" for c in name)
+
+
 def run_trials(
     name: str, trial: Trial, seeds: Iterable[int], args: argparse.Namespace, code: str
 ) -> list[Result]:

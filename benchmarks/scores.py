@@ -77,12 +77,13 @@ def score(results: Sequence[Result], t_s: float, dof: int) -> Score:
     sigma = np.array([row["sigma"] for row in rows]).reshape(-1, 15)
     bound = np.array([row["bound"] for row in rows]).reshape(-1, 15)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio, sigma_ratio = _rms(error / bound), _rms(sigma / bound)
+        ratio, sigma_ratio = rms(error / bound), rms(sigma / bound)
     anees = float(np.mean([row["nees"] for row in rows])) / dof if rows else float("nan")
-    return Score(t_s, len(rows), len(results), _rms(error), _rms(bound), ratio, sigma_ratio, anees, dof)
+    return Score(t_s, len(rows), len(results), rms(error), rms(bound), ratio, sigma_ratio, anees, dof)
 
 
-def _rms(x: FloatArray) -> FloatArray:
+def rms(x: FloatArray) -> FloatArray:
+    """Root mean square over the trials; NaN where there are none."""
     return np.asarray(np.sqrt(np.mean(x**2, axis=0))) if len(x) else np.full(15, np.nan)
 
 

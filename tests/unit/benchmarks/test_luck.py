@@ -69,5 +69,17 @@ def test_they_are_the_errors_of_vical_but_for_what_it_adds():
         assert np.sqrt((apart**2).mean()) < 0.5
 
 
+@pytest.mark.parametrize("what", ["stamp_jitter_s", "accel_lag_s"])
+def test_errors_that_are_no_noise_are_refused(what):
+    with pytest.raises(ValueError, match=what):
+        draw_of(simulate(5, 1.0, **{what: 1e-3}))
+
+
+def test_an_imu_that_is_off_is_no_noise():
+    off = make_run(CASES["imu 1 % off"], 1, 2.0)
+    true = make_run(CASES["reference"], 1, 2.0)
+    assert draw_of(off).pushes == pytest.approx(draw_of(true).pushes)
+
+
 def _range(place):
     return range(place.start, place.stop)
