@@ -26,6 +26,8 @@ def describe(result: dict[str, Any]) -> str:
         lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
     if result.get("events"):
         lines += ["", *(f"  {event}" for event in result["events"])]
+    if result.get("guidance"):
+        lines += ["", f"  what would help: {result['guidance']}"]
     lines += [
         "",
         f"  NIS per degree of freedom {result['nis_per_dof']:.2f} (1 when consistent, less when cautious), "

@@ -58,6 +58,7 @@ def one_line(camera: str, estimate: CalibrationEstimate) -> str:
 def picture(camera: str, estimate: CalibrationEstimate, health: list[str]) -> RenderableType:
     """Return the table of one camera with a bar and what to do next."""
     from rich.console import Group
+    from rich.padding import Padding
     from rich.progress_bar import ProgressBar
     from rich.table import Table
     from rich.text import Text
@@ -76,7 +77,8 @@ def picture(camera: str, estimate: CalibrationEstimate, health: list[str]) -> Re
         f"  {estimate.duration_s:.1f} s, {estimate.frames} frames, {estimate.imu_samples} imu samples, "
         f"NIS/dof {estimate.nis_per_dof:.2f}",
     )
-    bar = ProgressBar(total=1.0, completed=min(max(estimate.progress, 0.0), 1.0), width=40)
+    # padded, it ends its line: what follows would stand beside it, cut off
+    bar = Padding(ProgressBar(total=1.0, completed=min(max(estimate.progress, 0.0), 1.0), width=40), 0)
     advice = Text(estimate.guidance or estimate.reason, style="yellow")
     return Group(head, bar, advice, table, *(Text(line, style="dim") for line in health))
 

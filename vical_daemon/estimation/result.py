@@ -106,7 +106,7 @@ class CalibrationEstimate:
         status: Where the calibration stands.
         reason: Why, in words for a person; empty when converged.
         progress: 0 to 1.
-        guidance: What motion to make next, in words; empty when nothing is missing.
+        guidance: What to do next, in words: a motion, or where to show the target; empty: nothing missing.
         duration_s: Seconds of data used.
         frames: Camera frames used.
         imu_samples: Inertial samples used.

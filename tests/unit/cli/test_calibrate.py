@@ -94,6 +94,7 @@ def test_json_has_the_promised_keys_and_the_same_bits_through_an_mcap(
     )
     assert 1 <= len(first["trace"]) <= 6
     assert "cam0 in the imu frame" in calibration_text.describe(first | {"cpu_s": 1.0})
+    assert "what would help: nod" in calibration_text.describe(first | {"guidance": "nod"})
 
 
 def test_all_that_was_announced_on_the_way_is_told_at_the_end(

@@ -108,6 +108,7 @@ def test_the_screen_shows_cameras_and_health() -> None:
     console.print(live_table.screen({("rover", "cam0"): _estimate()}, health))
     text = console.export_text(clear=False)
     assert "cam0 in the imu frame" in text and "turn about x" in text and "100.0 Hz, 0 lost" in text
+    assert "turn about x" in [line.strip() for line in text.splitlines()]  # a line of its own, not cut off
     assert "<svg" in console.export_svg(title="vical watch")
     console.print(live_table.screen({}, {}))
     assert "is `vical run` (vical.target) up?" in console.export_text()

@@ -1,6 +1,7 @@
 """Edges of the picture without corners, and that they are asked for."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,11 +9,14 @@ from vical_mocks.points import simulate
 
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.trust.picture_cover import PictureCover
+from vical_daemon.estimation.trust.picture_cover import Cover, PictureCover
 
 
 def spread(low, high, count=4000):
     return np.random.default_rng(1).uniform(low, high, (count, 2))
+
+
+PARTLY_SEEN = np.full((8, 2), 300.0)  # a target that is partly in the picture
 
 
 @pytest.mark.parametrize(
@@ -27,6 +31,8 @@ def spread(low, high, count=4000):
 def test_edges_without_corners_are_named(low, high, edges):
     cover = PictureCover((640, 480))
     cover.add(spread(low, high))
+    assert cover.unseen_edges() == []  # whole targets only: their corners may never come so far out
+    cover.add(PARTLY_SEEN)
     assert cover.unseen_edges() == edges
 
 
@@ -35,6 +41,20 @@ def test_a_few_strays_show_no_edge_and_corners_beyond_the_picture_do_no_harm():
     cover.add(spread((100, 100), (540, 380)))
     cover.add(np.array([[2.0, 240.0], [645.0, 240.0], [-3.0, -3.0]]))
     assert cover.unseen_edges() == ["left", "right", "top", "bottom"]
+
+
+@pytest.mark.parametrize(("model", "asked"), [("radtan", True), ("equidistant", False)])
+def test_a_fisheye_is_not_asked_for_edges_that_it_may_not_have(model, asked):
+    camera = SimpleNamespace(distortion_model=model, resolution=(640, 480))
+    f = SimpleNamespace(
+        state=SimpleNamespace(cameras={"cam0": camera}),
+        layout=SimpleNamespace(cameras={"cam0": SimpleNamespace(intrinsics=slice(0, 4))}),
+    )
+    uv = spread((100, 100), (540, 380))
+    cover = Cover()
+    for seen in (uv, PARTLY_SEEN):
+        cover.saw(SimpleNamespace(camera="cam0", uv_px=seen, accepted=np.ones(len(seen), dtype=bool)), f)
+    assert bool(cover.advice()) == asked
 
 
 @pytest.mark.parametrize("fixed", [True, False])
