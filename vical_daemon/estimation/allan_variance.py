@@ -93,8 +93,8 @@ def _degrees_of_freedom(factor: int, alpha: int, samples: int) -> float:
 def _autocovariance(lag: FloatArray, alpha: int) -> FloatArray:
     """Autocovariance of the second differences, up to a factor; `lag` in averaging times.
 
-    The fourth difference of the phase's generalised autocovariance (from the paper): -|t| for a random walk of
-    the phase (white rate noise), t^2 ln |t| for flicker, |t|^3 for a random walk of the rate.
+    The fourth difference of the phase's generalised autocovariance (from the paper): -|t| for a random walk
+    of the phase (white rate noise), t^2 ln |t| for flicker, |t|^3 for a random walk of the rate.
     """
     size = np.abs(lag[:, None] + np.arange(-2.0, 3.0))
     if alpha == 0:

@@ -41,8 +41,8 @@ def test_degrees_of_freedom_are_those_of_the_covariance(alpha, tolerance, factor
     assert found == pytest.approx(brute_edf(alpha, factor, 120), rel=tolerance)
 
 
-# (alpha, m): Greenhall and Riley's procedure as allantools 2024.6 evaluates it,
-# ci.edf_greenhall(alpha, 2, m, 10001, overlapping=True). It takes a phase averaged over a sample, which differs where m is small.
+# (alpha, m): Greenhall and Riley's procedure as allantools 2024.6 evaluates it, ci.edf_greenhall(alpha, 2, m,
+# 10001, overlapping=True). It takes a phase averaged over a sample, which differs where m is small.
 GREENHALL = {
     (2, 1): 5142.6,
     (2, 50): 5105.2,
