@@ -1,40 +1,50 @@
-# Two commands on a fresh machine: make demo, make test. Each makes .venv on first use.
+# Two commands on a fresh machine: make demo, make test. Each makes .venv on first use and installs what it needs.
 PYTHON ?= python3
 BENCH ?= montecarlo
+PYTEST_ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test check bench docs install clean
-demo: $(STAMP)
+.NOTPARALLEL:  # one pip at a time
+.PHONY: demo test check bench docs dist constraints install clean
+demo: $(VENV)/.user
 	$(BIN)/vical demo --out demo_out
 
-test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q tests
+test: $(VENV)/.test
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q $(PYTEST_ARGS) tests
 
-check: $(STAMP)
+check: $(VENV)/.check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	PYTHONPATH=. $(BIN)/lint-imports --no-cache
+	$(BIN)/python .ci/import_everything.py
+	$(BIN)/python .ci/constraints.py check
 
-bench: $(STAMP)
+bench: $(VENV)/.user
 	$(BIN)/python -m benchmarks $(BENCH)
 
-docs: $(STAMP)
+docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -W -q -b html docs docs/_build/html
 
-install: $(STAMP)
-$(STAMP): pyproject.toml constraints.txt
+dist: $(VENV)/.dist  # wheel and sdist in dist/
+	rm -rf dist
+	$(BIN)/python -m hatchling build
+
+constraints: $(VENV)/.check
+	$(BIN)/python .ci/constraints.py write $(ARGS)
+
+install: $(VENV)/.user
+# .venv/.GROUP: the packages of that extra of pyproject.toml are in (user: what runs vical, and nothing else).
+$(VENV)/.user $(VENV)/.test $(VENV)/.check $(VENV)/.docs $(VENV)/.dist: $(VENV)/.%: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "vical needs Python 3.11 or newer; try: make PYTHON=python3.12"; exit 1; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "cannot make $(VENV); on Debian and Ubuntu: apt install python3-venv"; exit 1; }
-	@echo "Installing into $(VENV) (once, one to three minutes) ..."
-	@$(BIN)/python -m pip install -qq --no-compile --constraint constraints.txt --editable '.[dev]'
-	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # on all cores; pip takes one, and twice as long
-	@touch $@
+	@$(BIN)/python -c '' 2>/dev/null || $(PYTHON) -m venv --clear $(VENV) || { echo "cannot make $(VENV); on Debian and Ubuntu: apt install python3-venv"; exit 1; }
+	@echo "Installing into $(VENV): $* (once, about a minute) ..."
+	@$(BIN)/python -m pip install -qq --no-compile --constraint constraints.txt --editable '.$(patsubst %,[%],$(filter-out user,$*))'
+	@touch $(VENV)/.user $@
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache demo_out docs/_build
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache demo_out docs/_build dist

@@ -1,6 +1,11 @@
-"""The order of the whole run: `pytest -n 2` gives files to whoever is free, so the long ones go first."""
+"""The order of the whole run: `pytest -n 2` gives files to whoever is free, so the long ones go first.
+
+A test marked `root` is skipped for everybody else.
+"""
 
 from __future__ import annotations
+
+import os
 
 import pytest
 
@@ -26,3 +31,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first (a stable sort: within a file, and after them, the order stays random)."""
     rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what needs root, before any of its fixtures."""
+    if item.get_closest_marker("root") and os.geteuid() != 0:
+        pytest.skip("needs root: sudo .venv/bin/python -m pytest -m root tests")

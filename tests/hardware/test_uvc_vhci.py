@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -16,7 +15,7 @@ from vical_drivers.camera import CameraSettings, list_cameras
 from vical_drivers.camera.v4l2 import V4l2Camera
 from vical_mocks import usb_camera
 
-pytestmark = [pytest.mark.hardware, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.hardware, pytest.mark.root, pytest.mark.timeout(300)]  # root plugs the camera in
 SECONDS = 20.0
 
 
@@ -25,8 +24,6 @@ def truth_file(tmp_path: Path) -> Iterator[Path]:
     """Plug the emulated camera in; the file with its true exposures."""
     if not usb_camera.ATTACH.exists() or not Path("/sys/module/uvcvideo").exists():
         pytest.skip("no emulated USB bus: sudo modprobe -a vhci_hcd uvcvideo")
-    if os.geteuid() != 0:
-        pytest.skip("plugging an emulated USB device in needs root")
     path = tmp_path / "truth"
     process = subprocess.Popen([sys.executable, "-m", "vical_mocks.usb_camera", str(path)])
     yield path

@@ -5,7 +5,7 @@ Model of the Allan variance (IEEE Std 952, annex C), one term per noise process:
     sigma^2(tau) = 3 Q^2 / tau^2 + N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3
 
 Q quantisation, N white noise (angle or velocity random walk: the `density`), B flicker floor,
-K rate random walk (the `walk`). The curve itself comes from allantools.
+K rate random walk (the `walk`). The curve itself: `allan_variance`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import nnls
 
+from vical_daemon.estimation.allan_variance import TooShortError, allan_deviation, degrees_of_freedom
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, IntArray
 
 FLICKER = 2.0 * np.log(2.0) / np.pi  # Allan variance of 1/f noise of unit coefficient
@@ -26,10 +27,6 @@ TERM_ALPHA = (2, 0, -1, -2)
 TERM_GAIN = 16.0  # drop in chi^2 that admits flicker or quantisation (4 sigma)
 # Ratio of true scatter to the sigma of independent points, per term, by Monte Carlo (benchmarks allan).
 OVERLAP_INFLATION = np.array([1.7, 1.7, 1.8, 1.8])
-
-
-class TooShortError(ValueError):
-    """The recording holds too few samples for an Allan analysis; the message says how many are needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,33 +111,6 @@ def averaging_factors(samples: int, per_octave: int = 4) -> IntArray:
     return np.unique(np.round(2.0**powers)).astype(np.int64)
 
 
-def allan_deviation(
-    signal: FloatArray, rate_hz: float, factors: IntArray, *, overlapping: bool = True
-) -> FloatArray:
-    """Return the Allan deviation at averaging times factors / rate_hz.
-
-    Args:
-        signal: Rate-like signal at rest (angular rate, specific force), evenly sampled, shape (n,).
-        rate_hz: Sampling rate, Hz.
-        factors: Averaging factors, shape (k,).
-        overlapping: All overlapping clusters (better) or only adjacent ones (the classic definition).
-
-    Returns:
-        Allan deviation in the unit of the signal, shape (k,).
-    """
-    import allantools
-
-    function = allantools.oadev if overlapping else allantools.adev
-    centred = np.asarray(signal, dtype=np.float64) - float(np.mean(signal))
-    tau_s = np.asarray(factors, dtype=np.float64) / rate_hz
-    found, adev, _, _ = function(centred, rate=rate_hz, data_type="freq", taus=tau_s)
-    if len(found) != len(tau_s):
-        raise TooShortError(
-            f"averaging over {tau_s[-1]:g} s needs a longer recording than {len(signal)} samples"
-        )
-    return np.asarray(adev, dtype=np.float64)
-
-
 def allan_curve(signal: FloatArray, rate_hz: float, per_octave: int = 4) -> AllanCurve:
     """Return the overlapping Allan deviation of one axis over log-spaced averaging times.
 
@@ -153,21 +123,11 @@ def allan_curve(signal: FloatArray, rate_hz: float, per_octave: int = 4) -> Alla
     factors = averaging_factors(samples, per_octave)
     adev = allan_deviation(signal, rate_hz, factors)
     tau_s = factors / rate_hz
-    edf = _degrees_of_freedom(factors, np.zeros(len(factors), dtype=np.int64), samples)
+    edf = degrees_of_freedom(factors, np.zeros(len(factors), dtype=np.int64), samples)
     terms = _fit_variances(tau_s, adev, edf)[0]
     dominant = np.argmax(_design(tau_s) * terms, axis=1)
-    edf = _degrees_of_freedom(factors, np.asarray(TERM_ALPHA)[dominant], samples)
+    edf = degrees_of_freedom(factors, np.asarray(TERM_ALPHA)[dominant], samples)
     return AllanCurve(tau_s, adev, edf, samples, rate_hz)
-
-
-def _degrees_of_freedom(factors: IntArray, alpha: IntArray, samples: int) -> FloatArray:
-    """Equivalent degrees of freedom (Greenhall and Riley 2003) of overlapping Allan variances."""
-    from allantools.ci import edf_greenhall
-
-    # Greenhall's N counts phase points: one more than there are rate samples.
-    pairs = zip(factors, alpha, strict=True)
-    edf = [edf_greenhall(int(a), 2, int(m), samples + 1, overlapping=True) for m, a in pairs]
-    return np.maximum(np.asarray(edf, dtype=np.float64), 1.0)
 
 
 def _fit_variances(tau_s: FloatArray, adev: FloatArray, edf: FloatArray) -> tuple[FloatArray, FloatArray]:

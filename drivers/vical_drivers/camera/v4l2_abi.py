@@ -257,15 +257,15 @@ class QueryExtCtrl(ctypes.Structure):
 
 
 class QueryMenu(ctypes.Structure):
-    """struct v4l2_querymenu (packed); an integer menu has its int64 in the first bytes of `name`."""
+    """struct v4l2_querymenu (packed, to no effect); an integer menu has its int64 at the start of `name`."""
 
-    _pack_ = 1
     _fields_ = (("id", c_uint32), ("index", c_uint32), ("name", c_char * 32), ("reserved", c_uint32))
 
 
 class ExtControl(ctypes.Structure):
     """struct v4l2_ext_control (packed); 32-bit controls use the low half of `value64`."""
 
+    _layout_ = "ms"  # the only layout that Python 3.14 packs; without bit fields it is that of gcc
     _pack_ = 1
     _fields_ = (("id", c_uint32), ("size", c_uint32), ("reserved2", c_uint32), ("value64", c_int64))
 

@@ -31,7 +31,7 @@ def euroc() -> Path:
 def _first_seconds(euroc: Path, folder: Path, seconds: int) -> Path:
     """Copy the first seconds of the recording, with its target and initial values."""
     for name in ("target.yaml", "initial.yaml"):
-        shutil.copy(euroc / name, folder / name)
+        shutil.copyfile(euroc / name, folder / name)  # not its mode: the original may be read-only
     lines = (euroc / "mav0/imu0/data.csv").read_text().splitlines()[: 200 * seconds]
     end_ns = int(lines[-1].split(",")[0])
     (folder / "mav0/imu0").mkdir(parents=True)

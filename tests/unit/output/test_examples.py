@@ -58,7 +58,7 @@ def test_foxglove_layout_is_json_and_names_our_topics():
 
 @pytest.fixture(scope="module")
 def reference():
-    return load(ROOT / "docs" / "_ext" / "vical_reference.py")
+    return load(ROOT / "docs" / "_ext" / "reference_text.py")
 
 
 def test_reference_pages_cover_the_code(reference):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from vical_drivers.camera import iidc_abi
 from vical_drivers.camera import v4l2_abi as abi
+from vical_mocks import firewire_rig
 
 HEADER = Path("/usr/include/linux/videodev2.h")
 
@@ -82,3 +85,12 @@ def test_constants(c_values: dict[str, int]) -> None:
 def test_sizes_and_offsets(c_values: dict[str, int]) -> None:
     assert {name: c_values[name] for name in abi.SIZES} == {n: size for n, (_, size) in abi.SIZES.items()}
     assert {place: c_values[place] for place in OFFSETS} == OFFSETS
+
+
+@pytest.mark.parametrize("module", [abi, iidc_abi, firewire_rig])
+def test_packed_structures_name_their_layout(module) -> None:
+    """From Python 3.14 on `_pack_` alone is deprecated, from 3.19 on an error."""
+    kinds = (ctypes.Structure, ctypes.Union)
+    found = [c for c in vars(module).values() if isinstance(c, type) and issubclass(c, kinds)]
+    assert found
+    assert [c.__name__ for c in found if "_pack_" in vars(c) and "_layout_" not in vars(c)] == []

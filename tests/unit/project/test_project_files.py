@@ -1,0 +1,107 @@
+"""What the hosting site reads (.github, CITATION.cff), and what the Makefile installs from."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[3]
+WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
+FORMS = sorted(p for p in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml") if p.name != "config.yml")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def triggers(workflow: dict) -> dict:
+    return workflow[True]  # YAML 1.1 reads the key `on` as a truth value
+
+
+def steps(workflow: dict) -> list[dict]:
+    return [step for job in workflow["jobs"].values() for step in job["steps"]]
+
+
+def canonical(requirement: str) -> str:
+    return re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", requirement)[0]).lower()
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda p: p.stem)
+def test_a_workflow_runs_the_makefile_and_nothing_else(path):
+    targets = set(re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.M)[1].split())
+    runs = [step["run"] for step in steps(yaml.safe_load(path.read_text())) if "run" in step]
+    assert runs
+    for command in runs:
+        assert re.fullmatch(r"make [a-z]+", command), command
+        assert command.split()[1] in targets, command
+
+
+def test_every_supported_python_is_tested_on_both_processors_each_night():
+    workflow = yaml.safe_load((ROOT / ".github/workflows/tests.yml").read_text())
+    assert {"push", "pull_request", "schedule"} <= set(triggers(workflow))
+    matrix = workflow["jobs"]["test"]["strategy"]["matrix"]
+    assert matrix["python"] == ["3.11", "3.12", "3.13", "3.14"]
+    assert sorted("arm" in runner for runner in matrix["runner"]) == [False, True]
+    assert {"make check", "make test", "make docs"} <= {step.get("run") for step in steps(workflow)}
+
+
+def test_a_tag_keeps_wheel_and_sdist():
+    workflow = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())
+    assert triggers(workflow)["push"] == {"tags": ["v*"]}
+    assert "make dist" in [step.get("run") for step in steps(workflow)]
+    assert any(step.get("with", {}).get("path") == "dist/" for step in steps(workflow))
+
+
+@pytest.mark.parametrize("path", FORMS, ids=lambda p: p.stem)
+def test_a_form_has_what_the_site_requires(path):
+    form = yaml.safe_load(path.read_text())
+    assert form["name"]
+    assert form["description"]
+    names = [entry["id"] for entry in form["body"]]
+    assert len(set(names)) == len(names)
+    for entry in form["body"]:
+        assert entry["type"] in {"input", "textarea", "dropdown"}
+        assert entry["attributes"]["label"]
+
+
+def test_the_bug_form_asks_for_the_check():
+    assert "vical check -c vical.yaml --json" in (ROOT / ".github/ISSUE_TEMPLATE/bug.yml").read_text()
+
+
+def test_the_citation_names_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+
+
+def test_constraints_pin_every_requirement_and_name_no_index():
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line[:1] != "#"]
+    assert all(re.match(r"[a-z0-9-]+==[^ ]+( ; .+)?$", line) for line in lines)
+    pinned = {canonical(line) for line in lines}
+    groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    assert {canonical(r) for group in groups for r in group} - {"vical"} <= pinned
+
+
+def test_a_user_installs_nothing_for_tests_checks_or_documentation():
+    user = {canonical(r) for r in PROJECT["dependencies"]}
+    for group in ("test", "check", "docs", "dist"):
+        assert not user & {canonical(r) for r in PROJECT["optional-dependencies"][group]}
+
+
+@pytest.mark.parametrize("group", ["user", "test", "check", "docs", "dist"])
+def test_each_group_has_a_stamp_of_its_own(group):
+    done = subprocess.run(
+        ["make", "-n", "-B", f".venv/.{group}"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    wanted = "--editable '.'" if group == "user" else f"--editable '.[{group}]'"
+    assert wanted in done.stdout
+
+
+def test_neither_of_the_two_commands_installs_a_tool_for_developers():
+    for target, group in (("demo", "user"), ("test", "test")):
+        done = subprocess.run(
+            ["make", "-n", "-B", target], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        assert re.findall(r"Installing into .venv: (\w+)", done.stdout) == [group]
