@@ -85,12 +85,14 @@ def _leave(code: int) -> int:
 
 def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     """Run roles as threads of this process; consumers are started first and stopped last."""
+    from vical_daemon import notify
     from vical_daemon.cli.bus_access import open_for_roles
     from vical_daemon.cli.process_sets import RoleThreads
 
     bus = open_for_roles(config, roles, stop)
     if bus is None:  # told to stop while waiting for the router
         return 0
+    notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
     threads = RoleThreads(config, bus)
     try:
         for role in reversed(roles):
@@ -108,16 +110,16 @@ def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, st
     from vical_daemon import notify, topics
     from vical_daemon.liveness import Liveness
 
-    liveness = Liveness(roles)
+    liveness = Liveness(roles, time.monotonic())
     key = topics.STATUS.pattern.format(rig=config.rig, name="*")
     bus.subscribe(key, lambda sample: liveness.take(sample, time.monotonic()))
-    gc.collect()
-    gc.freeze()  # what was loaded stays: the collector need not walk through it in the middle of a read
     ready, said = False, False
     while not stop.is_set() and not threads.failed.is_set():
         stop.wait(_TICK_S)
         if not ready and liveness.ready():
-            ready = notify.ready(liveness.summary()) or True
+            ready = True
+            gc.collect()
+            gc.freeze()  # what was loaded stays: the collector need not walk through it during a read
             _log.info("ready: %s", ", ".join(roles))
         problem = liveness.problem(time.monotonic())
         if not problem:

@@ -96,7 +96,7 @@ def test_systemd_takes_every_setting_as_it_is_written(units: Path, name: str) ->
     for key, values in settings.items():
         if key in told and len(values) == 1 and " " not in values[0]:
             expected = OTHERWISE.get(key, values[0])
-            assert plain(told[key][-1]) == plain(expected), key
+            assert plain(expected) in [plain(value) for value in told[key]], key
             compared += 1
     assert compared >= 35, "systemd prints the settings under other names now"
     for key in written(units / name):
