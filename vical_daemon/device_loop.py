@@ -159,7 +159,9 @@ class DeviceLoop(Generic[T]):
                     self._opened(source)
                     if self._stream():
                         pause_s = 0.1
-            except DriverError as error:
+            except (
+                Exception
+            ) as error:  # a library's own error, of a device that is gone, must not end the loop
                 self._failed(error)
             pause_s = min(2 * pause_s, self._longest_pause_s)
             self._stop.wait(pause_s)
@@ -187,7 +189,7 @@ class DeviceLoop(Generic[T]):
                 return
             try:
                 items = source.read(self._read_timeout_s)
-            except DriverError as error:
+            except DriverError as error:  # any other one closes the source and opens it again
                 self._failed(error)
                 items = []
             self._t_loop_s = time.monotonic()
@@ -211,8 +213,10 @@ class DeviceLoop(Generic[T]):
             notify.event("device_back", f"{self.name} is back", device=self.name)
         self._health = replace(self._health, state="streaming", problem="", info=source.info)
 
-    def _failed(self, error: DriverError) -> None:
-        problem = " ".join(str(error).split())
+    def _failed(self, error: Exception) -> None:
+        text = str(error) if isinstance(error, DriverError) else f"{type(error).__name__}: {error}"
+        problem = " ".join(text.split())
+        _log.debug("%s failed", self.name, exc_info=error)
         if problem != self._health.problem:  # said once, not at each attempt
             _log.warning("%s: %s", self.name, problem)
         if self._health.state in ("streaming", "silent"):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.children import STOP_S, Children
-from vical_daemon.cli.errors import CliError
+from vical_daemon.cli.errors import CliError, report_thread
 from vical_daemon.cli.options import add_config, add_json
 from vical_daemon.cli.stop_signals import die_with, leave_at_once, stop_signals
 
@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.roles:
         return _run_children(args, process_sets.needed_processes(config))
     roles = process_sets.role_names(args.roles)
+    threading.excepthook = report_thread
     with stop_signals(leave_at_once, STOP_S if args.parent else 0) as stop:
         code = _run_roles(config, roles, stop)
     return _leave(code)
