@@ -112,6 +112,15 @@ def test_a_device_loop_survives_whatever_a_library_raises(
     assert all("\n" not in record.getMessage() for record in warnings)
 
 
+def test_another_thread_that_reads_survives_it_as_well() -> None:
+    stop, got = threading.Event(), []
+    loop = DeviceLoop("imu/imu0", lambda: _Broken(TypeError("x")), got.append, stop)
+    loop._opened(_Broken(TypeError("x")))
+    for _ in range(4):
+        loop.read_on()  # as the stand-in calls it
+    assert loop.health().problem == "TypeError: x" and loop._broken and len(got) == 2
+
+
 def test_a_thread_that_dies_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
