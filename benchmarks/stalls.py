@@ -123,6 +123,8 @@ def _outcome(
     parent: subprocess.Popen[bytes], watcher: Watcher, name: str, deed: str, seconds: float
 ) -> Outcome:
     """Do one deed to one process and wait until all is as before."""
+    with suppress(TimeoutError):  # after a deed that lost the calibration
+        _wait(lambda: watcher.converged_since(time.monotonic() - 1.0) is not None, 120.0, "converged")
     before = watcher.last
     if before is None or before.status != "converged":
         return Outcome(name, deed, 0.0, events=[f"not converged before: {before and before.reason}"])
@@ -153,6 +155,8 @@ def _outcome(
 
 def change(before: CalibrationEstimate, after: CalibrationEstimate) -> tuple[float, float]:
     """Return the largest change of pose and time shift, in joint sigmas, and that of the lever arm, mm."""
+    if "cam0" not in after.cameras:  # all is forgotten
+        return float("inf"), float("inf")
     old, new = before.cameras["cam0"], after.cameras["cam0"]
     R_old, R_new = (so3.matrix_from_quat(np.asarray(c.T_imu_cam.q_wxyz)) for c in (old, new))
     moved_m = np.subtract(new.T_imu_cam.p_m, old.T_imu_cam.p_m)
