@@ -43,7 +43,7 @@ _PLAIN = {("builtins", "slice"), ("collections", "deque"), ("numpy", "dtype"), (
         (f"{core}.numeric", "_frombuffer"),
     )
 }
-"""What a state consists of, beside the classes of the estimation."""
+"""What a state consists of, besides the classes of the estimation."""
 
 
 class _Head(msgspec.Struct, frozen=True):

@@ -90,17 +90,17 @@ def test_no_setting_stands_in_a_unit_and_in_the_common_drop_in(units: Path) -> N
 @needs_systemd
 @pytest.mark.parametrize("name", SERVICES)
 def test_systemd_takes_every_setting_as_it_is_written(units: Path, name: str) -> None:
-    told = resolved(units, name)
+    resolved_as = resolved(units, name)
     settings = written(units / "vical-.service.d/10-common.conf") | written(units / name)
     compared = 0
     for key, values in settings.items():
-        if key in told and len(values) == 1 and " " not in values[0]:
+        if key in resolved_as and len(values) == 1 and " " not in values[0]:
             expected = OTHERWISE.get(key, values[0])
-            assert plain(expected) in [plain(value) for value in told[key]], key
+            assert plain(expected) in [plain(value) for value in resolved_as[key]], key
             compared += 1
     assert compared >= 35, "systemd prints the settings under other names now"
     for key in written(units / name):
-        assert key in told or key == "ExecStart", f"{key} cannot be compared"
+        assert key in resolved_as or key == "ExecStart", f"{key} cannot be compared"
 
 
 @needs_systemd
@@ -110,14 +110,14 @@ def test_the_table_in_the_docs_is_what_systemd_resolves(units: Path, name: str) 
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"]
     (header,) = [row for row in rows if row[0] == "setting"]
     table = rows[rows.index(header) + 2 :]
-    told = resolved(units, f"vical-{name}.service")
+    resolved_as = resolved(units, f"vical-{name}.service")
     assert [row[0] for row in table[:3]] == ["`TimeoutStartSec`", "`WatchdogSec`", "`TimeoutStopSec`"]
     column, compared = header.index(name), 0
     for row in table:
         if len(row) != len(header):
             break
         key, default = row[0].strip("`"), {"Nice": "0", "CPUSchedulingPolicy": "other"}
-        value = told.get(key, [default.get(key, "missing")])[-1]
+        value = resolved_as.get(key, [default.get(key, "missing")])[-1]
         assert plain(value) == plain(row[column]), key
         compared += 1
     assert compared >= 7
