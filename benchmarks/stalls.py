@@ -147,7 +147,10 @@ def _outcome(
         again_s, first = watcher.converged_since(back_s) or (0.0, before)
         outcome.again_s = again_s - back_s
         time.sleep(LATE_S)
-        changes = [change(before, after) for after in (first, watcher.last or first)]
+        last = watcher.last or first
+        if last.status != "converged":  # it was not to last
+            outcome.again_s = None
+        changes = [change(before, after) for after in (first, last)]
         outcome.z, outcome.moved_mm = max(changes)
     outcome.events = watcher.events_since(begin_s)
     return outcome
