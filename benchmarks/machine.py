@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+_REPOSITORY = Path(__file__).resolve().parents[1]
+
 
 class MachineError(Exception):
     """The machine cannot be made or does not do what it should."""
@@ -58,15 +60,16 @@ class Machine:
     def boot(self, timeout_s: float = 90.0) -> float:
         """Boot to basic.target; return how long it took, s."""
         begin_s = time.monotonic()
-        log = (self._base / "console").open("wb")
-        self._nspawn = subprocess.Popen(
-            [
-                "systemd-nspawn", "-q", "-D", str(self.root), "--boot", "--register=no", "--keep-unit",
-                "--private-network", f"--machine=vical{os.getpid()}", "--console=pipe",
-                "systemd.unit=basic.target",
-            ],
-            stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-        )  # fmt: skip
+        with (self._base / "console").open("wb") as log:
+            self._nspawn = subprocess.Popen(
+                [
+                    "systemd-nspawn", "-q", "-D", str(self.root), "--boot", "--register=no", "--keep-unit",
+                    "--private-network", f"--machine=vical{os.getpid()}", "--console=pipe",
+                    f"--bind-ro={_REPOSITORY}",  # a checkout below /tmp would be hidden by the machine's own
+                    "systemd.unit=basic.target",
+                ],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
         while time.monotonic() - begin_s < timeout_s:
             time.sleep(0.3)
             children = Path(f"/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children").read_text().split()

@@ -17,6 +17,8 @@ from vical_daemon.recording import open_recording
 from vical_daemon.vision.target import Checkerboard
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+# This checkout runs, whatever is installed.
+SOURCES = ":".join(str(REPOSITORY / name) for name in ("", "drivers", "mocks"))
 PROCESSES = ("acquire", "record", "calibrate")
 FEED = "/run/vical-feed"
 CONFIG = f"""\
@@ -29,10 +31,12 @@ FEED_UNIT = f"""\
 RuntimeDirectory=vical-feed
 Environment=TMPDIR={FEED} OMP_NUM_THREADS=1
 WorkingDirectory={REPOSITORY}
+Environment=PYTHONPATH={SOURCES}
 ExecStart={sys.executable} -m benchmarks.service_feed --runtime /run/vical --port {FEED}/imu
 """
 # The emulated IMU is a pseudo terminal; the rest of the sandbox stays as it is.
 DROP_IN = "[Service]\nDeviceAllow=char-pts rw\n"
+COMMON_DROP_IN = f"[Service]\nEnvironment=PYTHONPATH={SOURCES}\n"
 
 
 def main(argv: list[str]) -> int:
@@ -80,6 +84,7 @@ def _install(machine: Machine) -> None:
     (units / "rig-feed.service").write_text(FEED_UNIT)
     (units / "vical-acquire.service.d").mkdir()
     (units / "vical-acquire.service.d/bench.conf").write_text(DROP_IN)
+    (units / "vical-.service.d/bench.conf").write_text(COMMON_DROP_IN)
 
 
 def _study(machine: Machine, kills: int, victims: tuple[str, ...]) -> list[tuple[str, str]]:
@@ -88,7 +93,7 @@ def _study(machine: Machine, kills: int, victims: tuple[str, ...]) -> list[tuple
     begin_s = time.monotonic()
     machine.run("systemctl", "start", "vical.target")
     for name in PROCESSES:
-        _wait(lambda name=name: machine.show(f"vical-{name}", "ActiveState") == ["active"], f"{name} active")
+        _wait(lambda name=name: _ready_again(machine, name, "0"), f"{name} ready")
     rows.append(("vical.target started, every process ready", f"{time.monotonic() - begin_s:.1f} s"))
     _wait(lambda: "converged" in _status(machine, "calibrate"), "converged", 180)
     rows.append(("calibration converged", _status(machine, "calibrate")[:70]))
@@ -129,8 +134,10 @@ def _kill(machine: Machine, name: str, kills: int, deeds: list[tuple[float, str]
 
 
 def _ready_again(machine: Machine, name: str, old_pid: str) -> bool:
-    pid, state = machine.show(f"vical-{name}", "MainPID", "ActiveState")
-    return state == "active" and pid not in (old_pid, "0")
+    """Whether another process runs and all of its roles have published a status (READY comes before)."""
+    pid, state, text = machine.show(f"vical-{name}", "MainPID", "ActiveState", "StatusText")
+    started = bool(text) and not text.startswith(("starting", "waiting"))
+    return state == "active" and pid not in (old_pid, "0") and started
 
 
 def _hang(machine: Machine, name: str, deeds: list[tuple[float, str]]) -> str:
@@ -153,7 +160,7 @@ def _stops(machine: Machine, count: int) -> tuple[str, str]:
         durations.append(time.monotonic() - begin_s)
         bad += [r for r in machine.show("vical-calibrate", "Result") if r != "success"]
         machine.run("systemctl", "start", "--no-block", "vical-calibrate")
-    _wait(lambda: machine.show("vical-calibrate", "ActiveState") == ["active"], "calibrate active")
+    _wait(lambda: _ready_again(machine, "calibrate", "0"), "calibrate ready")
     result = f"{np.median(durations):.1f} s (longest {max(durations):.1f} s), {', '.join(bad) or 'all clean'}"
     return f"systemctl stop vical-calibrate, {count} times in its first seconds", result
 

@@ -128,6 +128,7 @@ class DeviceLoop(Generic[T]):
         self._longest_pause_s = longest_pause_s
         self._health = DeviceHealth()
         self._source: Source[T] | None = None
+        self._broken = False  # the source raised what it should not: close it
         self._turn = threading.Lock()  # of whoever reads: samples are put in the order of their reading
         self._t_data_s = -float("inf")
         self._t_loop_s = time.monotonic()
@@ -159,7 +160,7 @@ class DeviceLoop(Generic[T]):
                     self._opened(source)
                     if self._stream():
                         pause_s = 0.1
-            except DriverError as error:
+            except Exception as error:  # also what a library raises when its device is gone
                 self._failed(error)
             pause_s = min(2 * pause_s, self._longest_pause_s)
             self._stop.wait(pause_s)
@@ -167,10 +168,13 @@ class DeviceLoop(Generic[T]):
     def _stream(self) -> bool:
         """Read until `stop`, or until nothing came for `silence_s`; True if anything came."""
         t_open_s = time.monotonic()
+        self._broken = False
         try:
             while not self._stop.is_set():
                 self.read_on()
                 self._flush()
+                if self._broken:
+                    break
                 if self._t_loop_s - max(self._t_data_s, t_open_s) > self._silence_s:
                     self._failed(DriverError(f"no data for {self._silence_s:g} s, opening it again"))
                     break
@@ -187,7 +191,8 @@ class DeviceLoop(Generic[T]):
                 return
             try:
                 items = source.read(self._read_timeout_s)
-            except DriverError as error:
+            except Exception as error:  # in whatever thread this is
+                self._broken = not isinstance(error, DriverError)  # the source cannot tell what is left of it
                 self._failed(error)
                 items = []
             self._t_loop_s = time.monotonic()
@@ -211,8 +216,10 @@ class DeviceLoop(Generic[T]):
             notify.event("device_back", f"{self.name} is back", device=self.name)
         self._health = replace(self._health, state="streaming", problem="", info=source.info)
 
-    def _failed(self, error: DriverError) -> None:
-        problem = " ".join(str(error).split())
+    def _failed(self, error: Exception) -> None:
+        text = str(error) if isinstance(error, DriverError) else f"{type(error).__name__}: {error}"
+        problem = " ".join(text.split())
+        _log.debug("%s failed", self.name, exc_info=error)
         if problem != self._health.problem:  # said once, not at each attempt
             _log.warning("%s: %s", self.name, problem)
         if self._health.state in ("streaming", "silent"):

@@ -14,6 +14,8 @@ from vical_daemon.bus import Sample
 from vical_daemon.messages import DiagnosticsMessage, Level, MessageError, decode_diagnostics
 
 FRESH_S = 5.0
+START_S = 300.0
+"""How long a role may take to its first status; a slow card was seen to need 60 s for scipy and OpenCV."""
 
 
 class Liveness:
@@ -21,11 +23,12 @@ class Liveness:
 
     Args:
         roles: Those that run in this process.
+        begin_s: When the roles were started, by the clock of `now_s`.
         fresh_s: A status older than this means that the role hangs.
     """
 
-    def __init__(self, roles: Sequence[str], fresh_s: float = FRESH_S) -> None:
-        self._roles = tuple(roles)
+    def __init__(self, roles: Sequence[str], begin_s: float, fresh_s: float = FRESH_S) -> None:
+        self._roles, self._begin_s = tuple(roles), begin_s
         self._fresh_s = fresh_s
         self._seen: dict[str, tuple[float, DiagnosticsMessage]] = {}
         self._lock = threading.Lock()
@@ -51,7 +54,9 @@ class Liveness:
             seen = dict(self._seen)
         for role in self._roles:
             if role not in seen:
-                return f"{role} has not started"
+                if now_s - self._begin_s > START_S:
+                    return f"{role} has not started within {START_S:.0f} s"
+                continue
             at_s, message = seen[role]
             if now_s - at_s > self._fresh_s:
                 return f"{role} has been silent for {now_s - at_s:.0f} s"
@@ -64,6 +69,8 @@ class Liveness:
         """Return one line for `systemctl status`: each component with its message, the worst first."""
         with self._lock:
             messages = [message for _, message in self._seen.values()]
+            missing = [role for role in self._roles if role not in self._seen]
         statuses = [s for message in messages for s in message.statuses if s.name != "clock"]
         statuses.sort(key=lambda status: -int(status.level))
-        return "; ".join(f"{s.name}: {s.message}" if s.message else s.name for s in statuses)[:500]
+        texts = [f"{s.name}: {s.message}" if s.message else s.name for s in statuses]
+        return "; ".join(([f"starting: {', '.join(missing)}"] if missing else []) + texts)[:500]

@@ -53,6 +53,7 @@ class Memory:
         self._compared: set[str] = set()
         self._saved_s = -float("inf")
         self._status: Status | None = None
+        self._announced: list[str] = []
         pattern = topics.STATUS.pattern
         self._keys = [pattern.format(rig=config.rig, name=role) for role in ("imu", "camera")]
         self._subscriptions = [bus.subscribe(key, self._listen) for key in self._keys]
@@ -73,8 +74,24 @@ class Memory:
             if stored is not None and stored.known.distortion_model == given.distortion_model:
                 self._before[name] = stored
                 known[name] = _merge(given, stored.prior(given.resolution), self._config.calibration.fix)
-                _log.info("%s: starting from the calibration stored for these devices", name)
         return known
+
+    @property
+    def stored(self) -> list[str]:
+        """Cameras for which a calibration of these devices is stored."""
+        return list(self._before)
+
+    @property
+    def devices(self) -> dict[str, str]:
+        """Serial numbers of the devices of this calibration by component; empty while one is unknown."""
+        names = [f"imu/{self._config.calibration_imu}"]
+        names += [f"camera/{name}" for name in self._config.calibration_cameras]
+        known = {name: self._serials[name] for name in names if name in self._serials}
+        return known if len(known) == len(names) else {}
+
+    def announce(self, text: str) -> None:
+        """Add an event to the next estimate."""
+        self._announced.append(text)
 
     def watch(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
         """Look at an estimate before it is published: save it when it is good, announce what changed.
@@ -82,7 +99,8 @@ class Memory:
         Returns:
             The estimate, with an event added where the calibration differs from the stored one.
         """
-        events = list(estimate.events)
+        events = [*self._announced, *estimate.events]
+        self._announced.clear()
         if estimate.status is Status.CONVERGED:
             events += self._changes(estimate)
             if self._status is not Status.CONVERGED:

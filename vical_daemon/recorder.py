@@ -170,6 +170,8 @@ class Recorder:
     def _end(self, problem: str) -> None:
         session, self._session = self._session, None
         self._problem = problem
+        if problem:
+            _log.warning("%s", problem)
         if session is not None:
             session.close(self._clock.now_ns())
 

@@ -31,7 +31,7 @@ class Daemon:
     """A folder with a config, and the `vical` processes started on it."""
 
     def __init__(self, folder: Path, port: str) -> None:
-        self.folder = folder
+        self.folder, self.port = folder, port
         self.processes: list[subprocess.Popen[str]] = []
         self.environment = os.environ | {
             "VICAL_RUNTIME_DIR": str(folder / "run"),
@@ -157,3 +157,90 @@ def test_mistakes_are_one_line(daemon: Daemon, words: list[str], code: int, text
     _, err = process.communicate(timeout=60)
     assert process.returncode == code and text in err.splitlines()[-1]
     assert "Traceback" not in err and ".rs:" not in err  # nor a place in a library's source
+
+
+def _children(parent: subprocess.Popen[str]) -> list[int]:
+    text = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text()
+    return [int(word) for word in text.split()]
+
+
+def _alive(pids: list[int]) -> list[int]:
+    """Those that still run: a zombie that nobody has collected holds nothing."""
+    found = []
+    for pid in pids:
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        except OSError:
+            continue
+        found += [pid] if state != "Z" else []
+    return found
+
+
+def _holders(port: str, pids: list[int]) -> list[int]:
+    """Processes that have the IMU's terminal open."""
+    found = []
+    for pid in pids:
+        for link in Path(f"/proc/{pid}/fd").glob("*"):
+            try:
+                found += [pid] if str(link.readlink()) == port else []
+            except OSError:
+                continue  # closed meanwhile
+    return found
+
+
+def _running(daemon: Daemon, parent: subprocess.Popen[str]) -> list[int]:
+    """Wait until all children run and one holds the IMU; return them."""
+    port = str(Path(daemon.port).resolve())
+    _wait_for(lambda: len(_children(parent)) == 3 and _holders(port, _children(parent)), 120)
+    return _children(parent)
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGKILL])
+def test_no_child_outlives_its_parent(daemon: Daemon, number: signal.Signals) -> None:
+    parent = daemon.vical("run")
+    children = _running(daemon, parent)
+    parent.send_signal(number)
+    parent.wait(60)
+    _wait_for(lambda: not _alive(children), 15)
+    assert parent.returncode == (-signal.SIGKILL if number is signal.SIGKILL else 0)
+
+
+def test_a_second_interrupt_hurries_and_leaves_nobody(daemon: Daemon) -> None:
+    parent = daemon.vical("run")
+    children = _running(daemon, parent)
+    os.kill(children[1], signal.SIGSTOP)  # record does not answer: an orderly stop would wait for it
+    parent.send_signal(signal.SIGINT)
+    time.sleep(0.3)
+    begin_s = time.monotonic()
+    parent.send_signal(signal.SIGINT)
+    parent.wait(60)
+    assert time.monotonic() - begin_s < 10.0
+    assert not _alive(children)
+
+
+def test_a_child_whose_parent_is_already_gone_does_not_start(daemon: Daemon) -> None:
+    process = daemon.vical("run", "acquire", "--parent", "1")  # the test is its parent, not process 1
+    process.communicate(timeout=60)
+    assert process.returncode == 1 and not daemon.socket.exists()
+
+
+def test_nohup_is_respected(daemon: Daemon) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # inherited, as nohup does it
+    try:
+        parent = daemon.vical("run")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    children = _running(daemon, parent)
+    parent.send_signal(signal.SIGHUP)
+    time.sleep(2.0)
+    assert parent.poll() is None and _alive(children) == children
+
+
+def test_a_killed_child_is_started_again(daemon: Daemon) -> None:
+    parent = daemon.vical("run")
+    children = _running(daemon, parent)
+    time.sleep(11.0)  # a child that fails at once is not started again
+    os.kill(children[1], signal.SIGKILL)
+    _wait_for(lambda: len(_alive(_children(parent))) == 3)
+    after = _children(parent)
+    assert children[0] in after and children[2] in after and children[1] not in after

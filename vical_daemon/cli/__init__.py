@@ -15,6 +15,8 @@ from importlib import import_module
 
 from vical_daemon.cli import errors, options, table
 
+logging.raiseExceptions = False  # a log that cannot be written (full disk, closed terminal) is no traceback
+
 # The filter's matrices are small: a BLAS thread pool costs more than it gives and makes runs
 # depend on the machine. It must be set before numpy is imported.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -131,15 +133,10 @@ def _set_up_logging(args: argparse.Namespace) -> None:
 
 def _report(error: Exception) -> int:
     """Turn any failure into one line on stderr; a bug also leaves its traceback in a file."""
-    known = errors.describe_known(error)
-    if known is not None:
-        print(f"vical: error: {known[0]}", file=sys.stderr)
-        return known[1]
-    path = errors.write_crash_log(error)
-    where = f"the traceback is in {path}" if path else "no folder to write the traceback to"
-    line = " ".join(f"{type(error).__name__}: {error}".split())
-    print(f"vical: internal error: {line}; {where}, please report it", file=sys.stderr)
-    return errors.EXIT_FAILURE
+    line, code = errors.describe(error)
+    prefix = "" if line.startswith("internal error") else "error: "
+    print(f"vical: {prefix}{line}", file=sys.stderr)
+    return code
 
 
 def _silence_stdout() -> None:

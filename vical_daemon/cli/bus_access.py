@@ -21,7 +21,6 @@ SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
 _HOSTS = {"imu", "camera"}
 _RETRY_S = 0.5
 _QUIET_S = 2.0
-_PATIENCE_S = 20.0
 
 
 def socket_path(bus: BusConfig) -> Path:
@@ -99,9 +98,8 @@ def _wait_for_router(config: Config, stop: threading.Event) -> ZenohBus | None:
             if not told and time.monotonic() - begin_s > _QUIET_S:  # the host may start beside us
                 _log.info("waiting for the bus: %s", error)
                 told = True
-        if time.monotonic() - begin_s > _PATIENCE_S:  # or systemd takes a late router for our failure
-            notify.ready("waiting for the bus")
-            notify.watchdog()
+        notify.ready("waiting for the bus")  # or systemd takes a late router for our failure
+        notify.watchdog()
         stop.wait(_RETRY_S)
     return None
 

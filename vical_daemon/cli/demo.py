@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -131,6 +132,7 @@ def _run_roles(
     try:
         page = ("web",) if config.web.enabled else ()
         for role in (*page, "record", "estimate", "detect", "camera", "imu"):
+            import_module(f"vical_daemon.roles.{role}")  # before its source starts: it hears the first sample
             options: dict[str, Any] = {"clock": clock}
             if role == "web":
                 options["ready"] = lambda address: _say(f"live page at {address}")

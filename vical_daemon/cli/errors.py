@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import logging
 import os
 import sys
 import tempfile
+import threading
 import traceback
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,6 +19,11 @@ EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE, what a shell reports for `cat big | hea
 EXIT_INTERRUPTED = 130  # 128 + SIGINT
 
 _OURS = ("vical_daemon", "vical_drivers", "vical_mocks")
+_REFUSALS = {
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENODEV, errno.ENXIO, errno.EMFILE, errno.ENFILE,
+}  # fmt: skip
+"""What disks and devices refuse with: no bug, even where the system does not name the file."""
+_log = logging.getLogger(__name__)
 
 
 class CliError(Exception):
@@ -35,10 +44,12 @@ def describe_known(error: BaseException) -> tuple[str, int] | None:
 
     Foreseen are: every exception class that one of our packages defines (they are raised on purpose,
     with a message for a person; `exit_code` on the class or instance chooses the code), and the
-    operating system's refusals that name a file.
+    operating system's refusals that name a file or come from a disk or a device.
     """
     if type(error).__module__.split(".")[0] in _OURS:
         return _one_line(str(error)), int(getattr(error, "exit_code", EXIT_FAILURE))
+    if isinstance(error, OSError) and error.filename is None and error.errno in _REFUSALS:
+        return error.strerror or str(error), EXIT_FAILURE
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror or type(error).__name__}", EXIT_FAILURE
     return None
@@ -49,14 +60,34 @@ def write_crash_log(error: BaseException) -> Path | None:
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S")
     text = f"argv: {sys.argv}\npython: {sys.version}\n\n" + "".join(traceback.format_exception(error))
     for folder in _log_folders():
+        path = folder / f"crash-{stamp}-{os.getpid()}.log"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            path = folder / f"crash-{stamp}-{os.getpid()}.log"
             path.write_text(text, encoding="utf-8")
         except OSError:
+            with suppress(OSError):  # what was written before the disk was full
+                path.unlink(missing_ok=True)
             continue
         return path
     return None
+
+
+def describe(error: BaseException) -> tuple[str, int]:
+    """Return (line, exit code) of any failure; a bug also leaves its traceback in a file."""
+    known = describe_known(error)
+    if known is not None:
+        return known
+    path = write_crash_log(error)
+    where = f"the traceback is in {path}" if path else "no folder to write the traceback to"
+    line = _one_line(f"{type(error).__name__}: {error}")
+    return f"internal error: {line}; {where}, please report it", EXIT_FAILURE
+
+
+def report_thread(args: threading.ExceptHookArgs) -> None:
+    """Report in one line what a thread died of (`threading.excepthook`)."""
+    if args.exc_value is not None and not isinstance(args.exc_value, SystemExit):
+        name = args.thread.name if args.thread is not None else "?"
+        _log.error("thread %s ended: %s", name, describe(args.exc_value)[0])
 
 
 def _log_folders() -> list[Path]:

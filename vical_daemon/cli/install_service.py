@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import indent
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
@@ -19,6 +22,10 @@ from vical_daemon.whole_file import write_whole
 _UNITS = Path("etc/systemd/system")
 _HOMES = ("/home", "/root", "/run/user")
 _CONFIG = Path("etc/vical/vical.yaml")
+_LINKS = Path("dev/vical")
+_MICROSTRAIN = 0x199B  # USB vendor, as in the rules
+_TRIGGER = ("tty", "usb-serial", "video4linux", "firewire")
+"""Subsystems that the rules speak of: what is plugged in already is looked at again."""
 _PLACES = {
     "vical.target": _UNITS / "vical.target",
     "vical-acquire.service": _UNITS / "vical-acquire.service",
@@ -44,7 +51,7 @@ class Step:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.add_argument("--dry-run", action="store_true", help="say what would be done, do nothing")
+    parser.add_argument("--dry-run", action="store_true", help="show what would be done and written")
     parser.add_argument("--remove", action="store_true", help="take everything away but config and data")
     parser.add_argument("--now", action="store_true", help="also enable and start vical.target")
     parser.add_argument(
@@ -76,9 +83,11 @@ def run(args: argparse.Namespace) -> int:
             continue
         if not args.dry_run:
             _perform(step)
-        done.append({"action": step.action, "what": step.what})
+        shown = {"text": step.text} if args.dry_run and step.action == "write" else {}
+        done.append({"action": step.action, "what": step.what, **shown})
         if not args.json:
             print(f"{'would ' if args.dry_run else ''}{step.action:<7}{step.what}")
+            print(indent(shown.get("text", ""), "    "), end="")
     if args.json:
         print(json.dumps({"dry_run": args.dry_run, "steps": done}))
     elif not args.remove and not args.dry_run and not args.now:
@@ -111,7 +120,18 @@ def render(name: str, program: Path, interpreter: Path | None = None) -> str:
     text = (templates() / name).read_text(encoding="utf-8")
     needed = (program, (interpreter or Path(sys.executable)).resolve())
     in_home = any(path.is_relative_to(home) for path in needed for home in _HOMES)
-    return text.replace("@VICAL@", str(program)).replace("@PROTECT_HOME@", "read-only" if in_home else "yes")
+    protect = "read-only" if in_home else "yes"
+    return text.replace("@VICAL@", _quoted(program)).replace("@PROTECT_HOME@", protect)
+
+
+def _quoted(program: Path) -> str:
+    """Return a path as the first word of ``ExecStart=`` (systemd.service(5), systemd.syntax(7)).
+
+    `%` begins a specifier, within quotes as well. Variables are not replaced in the first word. systemd takes
+    no quote and no backslash in it, however they are written (see `_program`).
+    """
+    text = str(program).replace("%", "%%")
+    return text if re.fullmatch(r"[A-Za-z0-9_./%+@:,=-]+", text) else f'"{text}"'
 
 
 def closed_folder(path: Path) -> Path | None:
@@ -130,16 +150,13 @@ def installation(root: Path, program: Path, *, now: bool = False) -> list[Step]:
         same = path.is_file() and path.read_text(encoding="utf-8") == text
         steps.append(Step("keep" if same else "write", str(path), text))
     config = root / _CONFIG
-    example = _example()
+    example = _example().replace("imu-SERIAL", _imu_link())
     if example and not config.exists():
         steps.append(Step("write", str(config), example))
     else:
         steps.append(Step("keep", str(config)))
     steps += [_command("systemd-sysusers"), _command("systemctl", "daemon-reload")]
-    steps += [
-        _command("udevadm", "control", "--reload"),
-        _command("udevadm", "trigger", "--subsystem-match=tty"),
-    ]
+    steps += _udev_steps()
     if now:
         steps.append(_command("systemctl", "enable", "--now", "vical.target"))
     return steps
@@ -150,8 +167,32 @@ def removal(root: Path) -> list[Step]:
     steps = [_command("systemctl", "disable", "--now", "vical.target", "vical-web.service")]
     steps += [_command("systemctl", "stop", "vical-acquire", "vical-record", "vical-calibrate")]
     steps += [Step("remove", str(root / place)) for place in _PLACES.values() if (root / place).exists()]
-    steps += [_command("systemctl", "daemon-reload"), _command("udevadm", "control", "--reload")]
+    folder = root / _UNITS / "vical-.service.d"
+    if {path.name for path in folder.glob("*")} == {"10-common.conf"}:  # nobody else's drop-in is there
+        steps.append(Step("remove", str(folder)))
+    steps += [_command("systemctl", "daemon-reload"), *_udev_steps()]
+    links = root / _LINKS
+    if links.is_dir():  # udev takes its links away itself, if it runs
+        steps += [Step("remove", str(path)) for path in (*sorted(links.iterdir()), links)]
     return steps
+
+
+def _udev_steps() -> list[Step]:
+    return [
+        _command("udevadm", "control", "--reload"),
+        _command("udevadm", "trigger", *(f"--subsystem-match={name}" for name in _TRIGGER)),
+        _command("udevadm", "settle", "--timeout=10"),  # s
+    ]
+
+
+def _imu_link() -> str:
+    """Return the name that the rules give to the IMU that is plugged in; a placeholder unless it is one."""
+    from serial.tools import list_ports
+
+    serials = {port.serial_number for port in list_ports.comports() if port.vid == _MICROSTRAIN}
+    if len(serials) != 1 or not (serial := serials.pop()):
+        return "imu-SERIAL"
+    return "imu-" + re.sub(r"[^A-Za-z0-9#+.:=@_-]", "_", serial)  # udev(7), OPTIONS string_escape=replace
 
 
 def _command(*words: str) -> Step:
@@ -171,6 +212,9 @@ def _program(given: str | None) -> Path:
     candidates = [Path(given)] if given else [Path(sys.argv[0]), Path(sys.executable).with_name("vical")]
     for path in candidates:
         if path.is_file() and os.access(path, os.X_OK):
+            if re.search(r"[\"'\\\x00-\x1f\x7f]", str(path.absolute())):
+                text = "systemd takes no quotes, backslashes or line breaks in the name of a program"
+                raise CliError(f"--program {str(path)!r}: {text}; make a link with another name", 2)
             return path.absolute()
     raise CliError(f"{candidates[0]}: not a program; give it with --program", 2)
 
@@ -189,7 +233,9 @@ def _perform(step: Step) -> None:
         write_whole(path, step.text.encode())
         path.chmod(0o644)
     elif step.action == "remove":
-        Path(step.what).unlink(missing_ok=True)
+        path = Path(step.what)
+        with suppress(FileNotFoundError):
+            path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
     elif step.command:
         done = subprocess.run(step.command, capture_output=True, text=True, check=False)
         if done.returncode:  # a unit that is not loaded cannot be stopped: no reason to give up

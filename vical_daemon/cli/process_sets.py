@@ -80,11 +80,11 @@ class RoleThreads:
 
     def start(self, role: str, options: Mapping[str, Any] | None = None) -> None:
         """Start a role; `options` are further arguments of its `run`."""
-        run = import_module(f"vical_daemon.roles.{role}").run
         stop = self._stops[role] = threading.Event()
 
         def guarded() -> None:
             try:
+                run = import_module(f"vical_daemon.roles.{role}").run  # loads scipy, OpenCV: for a minute
                 run(self._config, self._bus, stop, **(options or {}))
             except Exception as error:
                 self.errors[role] = error

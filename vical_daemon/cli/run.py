@@ -6,18 +6,17 @@ import argparse
 import gc
 import logging
 import os
-import signal
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vical_daemon.cli.errors import CliError
+from vical_daemon.cli.children import STOP_S, Children
+from vical_daemon.cli.errors import CliError, report_thread
 from vical_daemon.cli.options import add_config, add_json
+from vical_daemon.cli.stop_signals import die_with, leave_at_once, stop_signals
 
 if TYPE_CHECKING:
     from vical_daemon.bus import Bus
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _TICK_S = 1.0
-_CHILD_STOP_S = 45.0  # longer than any role may take
+_POLL_S = 0.2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="acquire, record, calibrate, web (processes) or imu, camera, record, detect, estimate, web "
         "(roles); none: all processes that the config asks for, as children",
     )
+    parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # of the children of `run`
     roles.completer = _known_roles  # type: ignore[attr-defined]  # for argcomplete
     add_config(parser)
     add_json(parser)
@@ -53,7 +53,9 @@ def _known_roles(**_: object) -> list[str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGTERM or SIGINT; 1 if a role or a child failed."""
+    """Run until SIGTERM, SIGINT or SIGHUP; 1 if a role or a child failed."""
+    if args.parent and not die_with(args.parent):
+        raise CliError("the `vical run` that started this process has ended")
     from vical_daemon.cli import process_sets
     from vical_daemon.config import load
 
@@ -63,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.roles:
         return _run_children(args, process_sets.needed_processes(config))
     roles = process_sets.role_names(args.roles)
-    with _signals() as stop:
+    threading.excepthook = report_thread
+    with stop_signals(leave_at_once, STOP_S if args.parent else 0) as stop:
         code = _run_roles(config, roles, stop)
     return _leave(code)
 
@@ -75,19 +78,22 @@ def _leave(code: int) -> int:
     foreign code, which aborts the process ("exception not rethrown") and looks like a crash to systemd.
     """
     logging.shutdown()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    with suppress(OSError):  # the terminal may be closed
+        sys.stdout.flush()
+        sys.stderr.flush()
     os._exit(code)
 
 
 def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     """Run roles as threads of this process; consumers are started first and stopped last."""
+    from vical_daemon import notify
     from vical_daemon.cli.bus_access import open_for_roles
     from vical_daemon.cli.process_sets import RoleThreads
 
     bus = open_for_roles(config, roles, stop)
     if bus is None:  # told to stop while waiting for the router
         return 0
+    notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
     threads = RoleThreads(config, bus)
     try:
         for role in reversed(roles):
@@ -105,16 +111,16 @@ def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, st
     from vical_daemon import notify, topics
     from vical_daemon.liveness import Liveness
 
-    liveness = Liveness(roles)
+    liveness = Liveness(roles, time.monotonic())
     key = topics.STATUS.pattern.format(rig=config.rig, name="*")
     bus.subscribe(key, lambda sample: liveness.take(sample, time.monotonic()))
-    gc.collect()
-    gc.freeze()  # what was loaded stays: the collector need not walk through it in the middle of a read
     ready, said = False, False
     while not stop.is_set() and not threads.failed.is_set():
         stop.wait(_TICK_S)
         if not ready and liveness.ready():
-            ready = notify.ready(liveness.summary()) or True
+            ready = True
+            gc.collect()
+            gc.freeze()  # what was loaded stays: the collector need not walk through it during a read
             _log.info("ready: %s", ", ".join(roles))
         problem = liveness.problem(time.monotonic())
         if not problem:
@@ -130,53 +136,23 @@ def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, st
     notify.stopping()
 
 
-@contextmanager
-def _signals() -> Iterator[threading.Event]:
-    """Give an event that SIGTERM and SIGINT set; a second signal ends the process at once."""
-    stop = threading.Event()
-
-    def on_signal(number: int, _frame: object) -> None:
-        if stop.is_set():
-            raise SystemExit(128 + number)
-        stop.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _run_children(args: argparse.Namespace, names: list[str]) -> int:
-    """Start each process as a child; when one ends, all end. Restarting them is systemd's work, not ours."""
-    children: dict[str, subprocess.Popen[bytes]] = {}
+    """Start each process as a child and tend them until a signal comes."""
     more = [flag for flag in ("--verbose", "--quiet") if getattr(args, flag[2:])]
-    config = str(Path(args.config).absolute())
-    with _signals() as stop:
+    config, me = str(Path(args.config).absolute()), str(os.getpid())
+
+    def command(name: str) -> list[str]:
+        program = [sys.executable, "-m", "vical_daemon", "run", name]
+        return [*program, "-c", config, "--parent", me, *more]
+
+    hurry = threading.Event()
+    children = Children(command)
+    with stop_signals(lambda _number: hurry.set()) as stop:
         try:
-            for name in names:
-                command = [sys.executable, "-m", "vical_daemon", "run", name, "-c", config, *more]
-                children[name] = subprocess.Popen(command, start_new_session=True)
-            _log.info("started %s", ", ".join(f"{n} ({c.pid})" for n, c in children.items()))
-            while not stop.is_set():
-                stop.wait(0.2)
-                ended = {n: c.returncode for n, c in children.items() if c.poll() is not None}
-                if ended and not stop.is_set():
-                    name, code = next(iter(ended.items()))
-                    raise CliError(f"process {name} ended with code {code}; see its messages above")
+            started = [f"{name} ({children.start(name)})" for name in names]
+            _log.info("started %s", ", ".join(started))
+            while not stop.wait(_POLL_S):
+                children.tend(stop)
         finally:
-            _stop_children(children)
+            children.stop(hurry)
     return 0
-
-
-def _stop_children(children: dict[str, subprocess.Popen[bytes]]) -> None:
-    """End consumers last to first started: acquire, which hosts the bus, goes last."""
-    for child in reversed(children.values()):
-        if child.poll() is None:
-            child.terminate()
-            try:
-                child.wait(_CHILD_STOP_S)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait()

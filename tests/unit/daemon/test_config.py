@@ -39,7 +39,7 @@ def test_the_example_shows_every_key_and_only_defaults() -> None:
     config = load(EXAMPLE)
     assert config.imus["imu0"].rate_hz == 500 and config.cameras["cam0"].size == (640, 480)
     minimal = loads(
-        "imus: {imu0: {port: /dev/vical/imu0}}\ncameras: {cam0: {uri: 'v4l2:/dev/video0'}}\ntarget: target.yaml"
+        "imus: {imu0: {port: /dev/vical/imu-SERIAL}}\ncameras: {cam0: {uri: 'v4l2:/dev/video0'}}\ntarget: target.yaml"
     )
     assert [getattr(config, f) for f in Config.__slots__ if f != "path"] == [
         getattr(minimal, f) for f in Config.__slots__ if f != "path"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vical_daemon.bus import Sample
-from vical_daemon.liveness import Liveness
+from vical_daemon.liveness import START_S, Liveness
 from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics
 
 
@@ -16,13 +16,13 @@ def _status(role: str, level: Level = Level.OK, message: str = "") -> Sample:
 
 @pytest.fixture
 def liveness() -> Liveness:
-    liveness = Liveness(["imu", "camera"])
+    liveness = Liveness(["imu", "camera"], begin_s=0.0)
     liveness.take(_status("imu"), 10.0)
     return liveness
 
 
 def test_ready_when_every_role_has_spoken(liveness: Liveness) -> None:
-    assert not liveness.ready() and "camera" in liveness.problem(10.0)
+    assert not liveness.ready()
     liveness.take(_status("camera"), 10.5)
     assert liveness.ready() and liveness.problem(11.0) == ""
 
@@ -48,3 +48,11 @@ def test_others_and_junk_are_ignored(liveness: Liveness) -> None:
 def test_the_worst_comes_first_in_the_summary(liveness: Liveness) -> None:
     liveness.take(_status("camera", Level.ERROR, "unplugged"), 10.0)
     assert liveness.summary() == "camera/x: unplugged; imu/x"
+
+
+def test_a_role_that_loads_its_libraries_is_alive_for_a_while(liveness: Liveness) -> None:
+    liveness.take(_status("imu"), START_S - 1.0)
+    assert liveness.problem(START_S - 1.0) == ""
+    assert liveness.summary() == "starting: camera; imu/x"
+    liveness.take(_status("imu"), START_S + 1.0)
+    assert liveness.problem(START_S + 1.0) == f"camera has not started within {START_S:.0f} s"
