@@ -22,7 +22,12 @@ def state_directory() -> Path:
     if given:
         return Path(given)
     home = os.environ.get("XDG_STATE_HOME")
-    return Path(home) / "vical" if home else Path.home() / ".local" / "state" / "vical"
+    if home:
+        return Path(home) / "vical"
+    try:
+        return Path.home() / ".local" / "state" / "vical"
+    except RuntimeError:  # a user without HOME and without an entry in the list of users
+        return runtime_directory() / "state"
 
 
 def make_private(folder: Path) -> Path:

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from vical_daemon.cli import errors, options, table
+from vical_daemon.cli import errors, options, plain_output, table
 
 logging.raiseExceptions = False  # a log that cannot be written (full disk, closed terminal) is no traceback
 
@@ -47,6 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    plain_output.accept_any_encoding()
     try:
         code = _dispatch(words)
         sys.stdout.flush()
@@ -127,8 +128,9 @@ def _set_up_logging(args: argparse.Namespace) -> None:
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
     logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname).1s %(name)s: %(message)s")
     if not args.verbose:  # libraries talk about themselves at INFO
-        for library in ("matplotlib", "asyncio", "aiohttp", "rosbags"):
+        for library in ("asyncio", "aiohttp", "rosbags"):
             logging.getLogger(library).setLevel(logging.WARNING)
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it cannot write to
 
 
 def _report(error: Exception) -> int:
