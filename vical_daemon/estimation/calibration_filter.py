@@ -34,7 +34,7 @@ from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFra
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.rates import Rates, rates_after
 from vical_daemon.estimation.retract import orthonormal, retract
-from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, State
+from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, MotionStart, State
 from vical_daemon.estimation.trust import lessons
 from vical_daemon.estimation.trust.consistency import Consistency, normalised
 from vical_daemon.estimation.trust.corner_noise import CornerNoise
@@ -121,23 +121,13 @@ class CalibrationFilter:
     def _grow(self, moved: Moved, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
         n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
-        dt, noise = moved.seconds, self.imu_noise
-        drift = np.flatnonzero(self.walk)
-        A = np.zeros((n, n + c + 9 + 6 + len(drift)))
+        A = np.zeros((n, n + c + 9))
         A[:, :n] = self.S
         A[:9, :d] = moved.linear
-        for name, where in self.layout.cameras.items():
-            if where.timeshift is not None and where.skew is not None:
-                A[where.timeshift, :n] += dt * self.S[where.skew]
-                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+        self._drift_shifts(A, moved.seconds)
         A[:9, n : n + c] = moved.curved
-        at = n + c
-        A[:9, at : at + 9] = unscented.root(Q)
-        A[GYRO_BIAS, at + 9 : at + 12] = noise.gyro_walk * np.sqrt(dt) * _EYE
-        A[ACCEL_BIAS, at + 12 : at + 15] = noise.accel_walk * np.sqrt(dt) * _EYE
-        if len(drift):
-            A[drift, at + 15 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
-        self.S = unscented.lower_root(A)
+        A[:9, n + c :] = unscented.root(Q)
+        self.S = unscented.lower_root(np.concatenate([A, self._random_walk(moved.seconds)], axis=1))
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -286,15 +276,39 @@ class CalibrationFilter:
         added = columns.reshape(self.layout.size, -1)
         self.S = unscented.lower_root(np.concatenate([self.S, added], axis=1))
 
-    def reset_motion(self, R_world_imu: FloatArray, p_world_imu: FloatArray) -> None:
-        """Forget where the rig is and keep the calibration: motion anew, with no tie to the rest."""
-        self.state.R_world_imu, self.state.p_world_imu = R_world_imu, p_world_imu
-        self.state.v_world_imu = np.zeros(3)
-        A = np.zeros((self.layout.size, self.layout.size + 9))
-        A[:, :-9] = self.S
+    def restart_motion(self, motion: MotionStart) -> None:
+        """Take the motion from elsewhere and keep the calibration, which ages until then.
+
+        Args:
+            motion: Where the rig is, independent of all that the filter knows.
+        """
+        state, dt = self.state, max(motion.t_s - self.state.t_s, 0.0)
+        A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, 9))], axis=1)
+        self._drift_shifts(A, dt)
         A[MOTION] = 0.0
-        A[MOTION, -9:] = np.diag([0.1] * 3 + [0.1] * 3 + [1.0] * 3)
+        A[MOTION, -9:] = np.diag(motion.sigmas)
         self.S = unscented.lower_root(A)
+        state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
+        state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
+        for consistency in self.consistency.values():
+            consistency.settle()
+
+    def _random_walk(self, dt: float) -> FloatArray:
+        """Columns that biases and what else wanders gain in `dt` seconds, shape (n, k)."""
+        drift = np.flatnonzero(self.walk)
+        columns = np.zeros((self.layout.size, 6 + len(drift)))
+        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * _EYE
+        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * _EYE
+        columns[drift, 6 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
+        return columns
+
+    def _drift_shifts(self, A: FloatArray, dt: float) -> None:
+        """Let time shifts drift for `dt` seconds: nominal values, and their rows of the square root `A`."""
+        n = self.layout.size
+        for name, where in self.layout.cameras.items():
+            if where.timeshift is not None and where.skew is not None:
+                A[where.timeshift, :n] += dt * self.S[where.skew]
+                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
 
     def copy(self) -> CalibrationFilter:
         """A filter that can be run ahead of this one; what is measured about the noise stays shared."""
