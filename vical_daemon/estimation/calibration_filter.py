@@ -265,6 +265,11 @@ class CalibrationFilter:
             for c in state.cameras.values()
         )
 
+    def forget(self, index: int, sigma: float) -> None:
+        """Take one error as known to `sigma` only, whatever the rest says about it."""
+        self.S[index] = 0.0
+        self.reopen(index, sigma)
+
     def reopen(self, index: int, sigma: float) -> None:
         """Add independent uncertainty to one error: what was known about it is in doubt."""
         column = np.zeros(self.layout.size)
@@ -282,7 +287,7 @@ class CalibrationFilter:
         Args:
             motion: Where the rig is, independent of all that the filter knows.
         """
-        state, dt = self.state, max(motion.t_s - self.state.t_s, 0.0)
+        state, dt = self.state, motion.elapsed_s
         A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, 9))], axis=1)
         self._drift_shifts(A, dt)
         A[MOTION] = 0.0

@@ -14,7 +14,11 @@ import numpy as np
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.image_intake import ImageIntake
+from vical_daemon.estimation.image_intake import (
+    ImageIntake,
+    by_present_stamps,
+    trace_by_present_stamps,
+)
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import (
@@ -25,6 +29,7 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.recent_past import RecentPast
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
 from vical_daemon.estimation.start.starting import LATE_S, Starting
 from vical_daemon.estimation.state import ATTITUDE, POSITION, Layout, make_layout
@@ -35,6 +40,8 @@ from vical_daemon.estimation.trust.held_back import HeldBack
 from vical_daemon.estimation.trust.judge import Judge
 
 _KEEP_S = 5.0
+_STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
+_STEPPED_LEAST_S = 1e-3
 _BLIND_S = 0.5  # without a usable image the motion is worth a look
 _ALWAYS = {hypotheses.IMU, hypotheses.LAG, hypotheses.SIZE}  # are states, see `hypotheses`
 _MOST_SURPRISES = 4  # in one start: shutters that roll, targets that are not as large as stated
@@ -73,8 +80,10 @@ class Calibrator:
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._lost: MotionRestart | None = None
+        self._used_ns: dict[str, int] = {}  # stamp of the last image used, by camera
         self._held_back = HeldBack()
         self._beyond_doubt = BeyondDoubt()
+        self._past = RecentPast()
         self._size = 1.0  # of the target over the stated one, where it is by far not that
 
     def _lay_out(self) -> Layout:
@@ -89,11 +98,10 @@ class Calibrator:
     # ------------------------------------------------------------------ input
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
-        taken = self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2)
-        if taken is None:
-            self.judge.imu_refused += 1
-            return
-        self.judge.saw_imu(t_imu_ns, *taken)
+        refused = self._imu.refused
+        for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
+            self.judge.saw_imu(*reading)
+        self.judge.imu_refused += self._imu.refused - refused
         self.judge.events += self._imu.news()
 
     @property
@@ -109,11 +117,12 @@ class Calibrator:
         if not ok.all():
             sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
-        t_cam_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
-        if not self._images.takes(frame, t_cam_s):
+        stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
+        t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
+        self.judge.events += self._images.news()
+        if t_cam_s is None:
             self.judge.frames_ignored += 1
             return
-        self.judge.events += self._images.news()
         self.judge.saw_points(t_cam_s, len(frame.ids))
         self._pending.push(t_cam_s, frame)
 
@@ -166,7 +175,7 @@ class Calibrator:
             self.judge.announce(size_told(self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
         self.filter, self._stale = found.filter, None
-        self._held_back, self._lost = HeldBack(), None
+        self._held_back, self._lost, self._past = HeldBack(), None, RecentPast()
         self.judge.started(self.filter.state.t_s, found.reason)
         self.watch.started(self.filter.state.t_s)
         self._starting.anew()
@@ -206,7 +215,7 @@ class Calibrator:
         return reports
 
     def _must_restart(self, t_cam_s: float, frame: PointsFrame) -> bool:
-        """Whether the motion at an image cannot be had from the one before: readings are missing, or drift far.
+        """Whether the motion at an image cannot be had from the one before: readings miss, or drift far.
 
         Far is where the pose from the image itself would be as good.
         """
@@ -229,7 +238,7 @@ class Calibrator:
 
     def _lose_motion(self) -> None:
         """Forget where the rig is, not its calibration; images to come will show it."""
-        self._lost, self._held_back = MotionRestart(self.target), HeldBack()
+        self._lost, self._held_back = MotionRestart(self.target, self._used_ns), HeldBack()
 
     def _find_motion(self, lost: MotionRestart, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
         """Take the motion anew as soon as images show it, and follow those it was taken from."""
@@ -281,6 +290,8 @@ class Calibrator:
             self.watch.why = "the estimate left the range of what a rig can be"
             self._restart(f)
             return [report]
+        self._used_ns[frame.camera] = frame.t_cam_ns
+        self._past.saw(f, report, frame, t_cam_s)
         self.judge.saw_frame(report, f)
         for block, told in self._beyond_doubt.look(f).items():
             self.judge.announce(told, once=block)
@@ -300,6 +311,8 @@ class Calibrator:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
+        if action in (Action.POSE, Action.RESTART) and self._step_shift(f, frame.camera):
+            return
         if action is Action.POSE:
             self._lose_motion()
             self.judge.announce("pose lost and taken anew from the images")
@@ -308,6 +321,25 @@ class Calibrator:
             self.judge.announce(clock_drift.let_drift(f, frame.camera, self.watch.why, anew=anew))
         elif action is Action.RESTART:
             self._restart(f)
+
+    def _step_shift(self, f: CalibrationFilter, camera: str) -> bool:
+        """See whether images disagree because the time shift stepped; then go on with that alone unknown."""
+        assert self._buffer is not None
+        index = self.layout.cameras[camera].timeshift
+        if index is None or f.unshown is not None:
+            return False
+        fit = self._past.find_shift(f, camera, self._buffer, self.target)
+        if fit is None:
+            return False
+        before = self._past.filter(f)
+        step_s = fit.timeshift_s - before.state.cameras[camera].timeshift_s
+        before.state.cameras[camera].timeshift_s = fit.timeshift_s
+        before.forget(index, max(_STEPPED_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
+        self.filter = before
+        self.watch.started(f.state.t_s)
+        self._lose_motion()
+        self.judge.announce(f"{camera}: the time shift stepped by {1e3 * step_s:+.1f} ms; all else is kept")
+        return True
 
     def _restart(self, f: CalibrationFilter) -> None:
         """The rig has changed: forget mounting and delay, and start from the data to come.
@@ -333,7 +365,12 @@ class Calibrator:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
         self.judge.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
-        return self._imu.stamps.told(self.judge.estimate(self.filter, self._stale))
+        offsets = {name: self._offset_s(name) for name in self.priors}
+        return by_present_stamps(self.judge.estimate(self.filter, self._stale), offsets)
+
+    def _offset_s(self, camera: str) -> float:
+        """Time shift by the stamps as they come now, minus that of the filter, s."""
+        return self._imu.shift_s + self._images.offset_s(camera)
 
     def _in_doubt(self, f: CalibrationFilter) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
@@ -345,4 +382,4 @@ class Calibrator:
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
-        return self._imu.stamps.told_trace(self.judge.trace(camera))
+        return trace_by_present_stamps(self.judge.trace(camera), self._offset_s(camera))

@@ -1,10 +1,12 @@
-"""The motion anew from a few images, with the calibration as it is known: after gaps, and where a pose is lost.
+"""The motion anew from a few images, with the calibration as it is known: after gaps, or where a pose is lost.
 
-Pose from the target, velocity linear in positions: p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a, the closed form
+Pose from the target; velocity linear in positions, p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a: the closed form
 of `initialise.linear_start` with everything but p_0 and v_0 known.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,7 +14,15 @@ from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.initialise import integrate_twice
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.start.seen_poses import Lens, SeenPose, pose_of
-from vical_daemon.estimation.state import ATTITUDE, POSITION, VELOCITY, CameraState, Layout, MotionStart, State
+from vical_daemon.estimation.state import (
+    ATTITUDE,
+    POSITION,
+    VELOCITY,
+    CameraState,
+    Layout,
+    MotionStart,
+    State,
+)
 
 _LEAST_IMAGES = 3
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
@@ -29,10 +39,12 @@ class MotionRestart:
 
     Args:
         target: Points of the target, m, shape (n, 3).
+        before_ns: Stamp of the last image used before, by camera, ns.
     """
 
-    def __init__(self, target: FloatArray) -> None:
+    def __init__(self, target: FloatArray, before_ns: Mapping[str, int]) -> None:
         self._target = target
+        self._before_ns = dict(before_ns)
         self.frames: list[tuple[float, PointsFrame]] = []
         self._seen: list[SeenPose | None] = []
 
@@ -58,7 +70,9 @@ class MotionRestart:
         self.frames.append((t_cam_s, frame))
         self._seen.append(seen)
 
-    def motion(self, state: State, layout: Layout, sigmas: FloatArray, buffer: ImuBuffer) -> MotionStart | None:
+    def motion(
+        self, state: State, layout: Layout, sigmas: FloatArray, buffer: ImuBuffer
+    ) -> MotionStart | None:
         """Motion at the first image collected; None while the images do not suffice.
 
         Args:
@@ -84,7 +98,14 @@ class MotionRestart:
         y = p - D + B @ state.accel_bias - 0.5 * (T * T)[:, None] * state.gravity
         start, velocity = np.linalg.lstsq(np.stack([np.ones_like(T), T], axis=1), y, rcond=None)[0]
         wide = self._sigmas(seen[0], layout, sigmas, float(T[-1]))
-        return MotionStart(float(t_s[0]), R[0], start, velocity, wide)
+        elapsed_s = self._elapsed_s(seen[0].frame, float(t_s[0]) - state.t_s)
+        return MotionStart(float(t_s[0]), R[0], start, velocity, wide, elapsed_s)
+
+    def _elapsed_s(self, frame: PointsFrame, by_imu_s: float) -> float:
+        """Time since the motion was lost: the less of what both clocks say, for either may have been set."""
+        before_ns = self._before_ns.get(frame.camera)
+        by_camera_s = np.inf if before_ns is None else 1e-9 * (frame.t_cam_ns - before_ns)
+        return max(min(by_imu_s, by_camera_s), 0.0)
 
     def _sigmas(self, seen: SeenPose, layout: Layout, sigmas: FloatArray, span_s: float) -> FloatArray:
         """Many times what the images give, which will be used once more to correct the motion."""

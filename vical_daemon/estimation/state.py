@@ -200,6 +200,7 @@ class MotionStart(NamedTuple):
         p_world_imu: Position, m.
         v_world_imu: Velocity, m/s.
         sigmas: Of attitude (rad), position (m), velocity (m/s), shape (9,).
+        elapsed_s: Since the state's instant; stamps may have stepped.
     """
 
     t_s: float
@@ -207,6 +208,7 @@ class MotionStart(NamedTuple):
     p_world_imu: FloatArray
     v_world_imu: FloatArray
     sigmas: FloatArray
+    elapsed_s: float
 
 
 def rotation_from_grp(p: FloatArray) -> FloatArray:

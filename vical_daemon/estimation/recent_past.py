@@ -1,0 +1,81 @@
+"""What an estimator remembers of the last seconds, to tell what has changed when images no longer fit."""
+
+from __future__ import annotations
+
+from collections import deque
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.image_intake import SEARCHED_S
+from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.start.seen_poses import Lens, pose_of
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+from vical_daemon.estimation.temporal.shift_step import ShiftFit, find_shift
+
+_EVERY_S = 1.0
+_BEFORE_S = 3.0  # a change is noticed within
+_LOOK_BACK_S = 1.0  # images looked at when none was refused
+_MOST = 200  # images kept, a camera
+
+
+@dataclass(slots=True)
+class RecentPast:
+    """Images of the last seconds by camera, and copies of the filter from before."""
+
+    _frames: dict[str, deque[tuple[float, PointsFrame, bool]]] = field(default_factory=dict)
+    _copies: deque[CalibrationFilter] = field(default_factory=deque)
+
+    def saw(self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float) -> None:
+        """Remember an image, whether it was used, and once a second the filter."""
+        frames = self._frames.setdefault(frame.camera, deque(maxlen=_MOST))
+        frames.append((t_cam_s, frame, report.used))
+        while self._copies and self._copies[0].state.t_s < f.state.t_s - _BEFORE_S - _EVERY_S:
+            self._copies.popleft()
+        if not self._copies or f.state.t_s >= self._copies[-1].state.t_s + _EVERY_S:
+            self._copies.append(deepcopy(f))
+
+    def filter(self, f: CalibrationFilter) -> CalibrationFilter:
+        """The filter as it was before a change that is noticed now, or as long ago as it is remembered."""
+        before = self._copies[0] if self._copies else deepcopy(f)
+        self._copies.clear()
+        return before
+
+    def find_shift(
+        self, f: CalibrationFilter, camera: str, buffer: ImuBuffer, target: FloatArray
+    ) -> ShiftFit | None:
+        """Whether the turns of the latest images fit the gyro at another time shift, and only there."""
+        known = f.state.cameras[camera]
+        lens = Lens(known.intrinsics, known.distortion, known.distortion_model, known.resolution)
+        poses = [p for t, frame in self._suspect(camera) if (p := pose_of(frame, t, lens, target))]
+        rows = buffer.rows
+        if len(poses) < 2 or len(rows) < 2:
+            return None
+        curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
+        return find_shift(
+            curve,
+            np.array([p.t_cam_s for p in poses]),
+            np.array([p.R_target_cam for p in poses]),
+            np.maximum([p.sigma_rad for p in poses], 0.2 / float(known.intrinsics[0])),
+            known.R_imu_cam,
+            known.timeshift_s,
+            SEARCHED_S,
+        )
+
+    def _suspect(self, camera: str) -> list[tuple[float, PointsFrame]]:
+        """Images since the first of the latest run of refused ones, or those of the last second."""
+        frames = list(self._frames.get(camera, ()))
+        run: list[tuple[float, PointsFrame]] = []
+        for t, frame, used in reversed(frames):
+            if used and run:
+                break
+            if not used:
+                run.append((t, frame))
+        if len(run) < 8:
+            since_s = frames[-1][0] - _LOOK_BACK_S if frames else 0.0
+            run = [(t, frame) for t, frame, _ in reversed(frames) if t > since_s]
+        return run[::-1]
