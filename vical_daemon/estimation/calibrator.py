@@ -29,10 +29,11 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
-from vical_daemon.estimation.recent_past import RecentPast
+from vical_daemon.estimation.recent_past import RecentPast, shift_of
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
 from vical_daemon.estimation.start.starting import LATE_S, Starting
 from vical_daemon.estimation.state import ATTITUDE, POSITION, Layout, make_layout
+from vical_daemon.estimation.temporal.shift_step import ShiftFit
 from vical_daemon.estimation.trust import clock_drift, hypotheses, target_doubt
 from vical_daemon.estimation.trust.beyond_doubt import BeyondDoubt, size_told
 from vical_daemon.estimation.trust.change_watch import Action, ChangeWatch
@@ -42,6 +43,7 @@ from vical_daemon.estimation.trust.judge import Judge
 _KEEP_S = 5.0
 _STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
 _STEPPED_LEAST_S = 1e-3
+_SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 _BLIND_S = 0.5  # without a usable image the motion is worth a look
 _ALWAYS = {hypotheses.IMU, hypotheses.LAG, hypotheses.SIZE}  # are states, see `hypotheses`
 _MOST_SURPRISES = 4  # in one start: shutters that roll, targets that are not as large as stated
@@ -84,6 +86,8 @@ class Calibrator:
         self._held_back = HeldBack()
         self._beyond_doubt = BeyondDoubt()
         self._past = RecentPast()
+        self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
+        self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._size = 1.0  # of the target over the stated one, where it is by far not that
 
     def _lay_out(self) -> Layout:
@@ -123,8 +127,18 @@ class Calibrator:
         if t_cam_s is None:
             self.judge.frames_ignored += 1
             return
+        if self._images.offset_s(frame.camera) != self._offsets_s.get(frame.camera, 0.0):
+            self._clock_was_set(frame.camera)
         self.judge.saw_points(t_cam_s, len(frame.ids))
         self._pending.push(t_cam_s, frame)
+
+    def _clock_was_set(self, camera: str) -> None:
+        """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
+        self._offsets_s[camera] = self._images.offset_s(camera)
+        if self.filter is not None:
+            self._lose_motion()
+            self._seek_shift.add(camera)
+            self.watch.started(self.filter.state.t_s)
 
     def _known(self, frame: PointsFrame) -> BoolArray:
         """Which points of a frame can be used at all."""
@@ -246,6 +260,10 @@ class Calibrator:
         assert f is not None
         assert self._buffer is not None
         lost.take(frame, t_cam_s, f.state, self._buffer)
+        if frame.camera in self._seek_shift:
+            if len(lost.frames) < _SEEK_IMAGES:
+                return []
+            lost = self._seek(f, lost, frame.camera)
         self._buffer.trim((lost.frames[0][0] if lost.frames else t_cam_s) - _KEEP_S)
         motion = lost.motion(f.state, self.layout, f.sigmas(), self._buffer)
         if motion is None:
@@ -311,7 +329,7 @@ class Calibrator:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
-        if action in (Action.POSE, Action.RESTART) and self._step_shift(f, frame.camera):
+        if action in (Action.POSE, Action.RESTART) and self._shift_stepped(f, frame.camera):
             return
         if action is Action.POSE:
             self._lose_motion()
@@ -322,24 +340,30 @@ class Calibrator:
         elif action is Action.RESTART:
             self._restart(f)
 
-    def _step_shift(self, f: CalibrationFilter, camera: str) -> bool:
+    def _shift_stepped(self, f: CalibrationFilter, camera: str) -> bool:
         """See whether images disagree because the time shift stepped; then go on with that alone unknown."""
         assert self._buffer is not None
-        index = self.layout.cameras[camera].timeshift
-        if index is None or f.unshown is not None:
+        if self.layout.cameras[camera].timeshift is None or f.unshown is not None:
             return False
         fit = self._past.find_shift(f, camera, self._buffer, self.target)
-        if fit is None:
+        if fit is None or not fit.stepped:
             return False
-        before = self._past.filter(f)
-        step_s = fit.timeshift_s - before.state.cameras[camera].timeshift_s
-        before.state.cameras[camera].timeshift_s = fit.timeshift_s
-        before.forget(index, max(_STEPPED_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
-        self.filter = before
-        self.watch.started(f.state.t_s)
-        self._lose_motion()
+        self.filter = self._past.filter(f)
+        step_s = self._set_shift(self.filter, camera, fit)
         self.judge.announce(f"{camera}: the time shift stepped by {1e3 * step_s:+.1f} ms; all else is kept")
+        self._lose_motion()
         return True
+
+    def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
+        """Take a time shift as found anew, all else as it is known; the step, s."""
+        index, known = self.layout.cameras[camera].timeshift, f.state.cameras[camera]
+        assert index is not None
+        step_s = fit.timeshift_s - known.timeshift_s
+        known.timeshift_s = fit.timeshift_s
+        f.forget(index, max(_STEPPED_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
+        self.watch.started(f.state.t_s)
+        self.judge.reopened(f.state.t_s)
+        return step_s
 
     def _restart(self, f: CalibrationFilter) -> None:
         """The rig has changed: forget mounting and delay, and start from the data to come.
@@ -360,6 +384,20 @@ class Calibrator:
         self.judge.changed(self.watch.why)
         self._stale, self.filter = sound, None
         self._starting = self._new_starting(sound.off if sound else ())
+
+    def _seek(self, f: CalibrationFilter, lost: MotionRestart, camera: str) -> MotionRestart:
+        """After the clock of a camera was set: find its time shift from the images collected."""
+        assert self._buffer is not None
+        self._seek_shift.discard(camera)
+        own = [x for x in lost.frames if x[1].camera == camera]
+        fit = shift_of(own, f, self._buffer, self.target)
+        if fit is None:
+            return lost
+        self._set_shift(f, camera, fit)
+        self._lost = again = MotionRestart(self.target, self._used_ns)
+        for t_cam_s, frame in lost.frames:
+            again.take(frame, t_cam_s, f.state, self._buffer)
+        return again
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

@@ -1,7 +1,7 @@
-"""The motion anew from a few images, with the calibration as it is known: after gaps, or where a pose is lost.
+"""The motion anew from a few images, with the calibration as it is known: after gaps and lost poses.
 
-Pose from the target; velocity linear in positions, p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a: the closed form
-of `initialise.linear_start` with everything but p_0 and v_0 known.
+Pose from the target; velocity linear in positions, p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a: the closed
+form of `initialise.linear_start` with everything but p_0 and v_0 known.
 """
 
 from __future__ import annotations

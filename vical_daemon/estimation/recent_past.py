@@ -19,7 +19,9 @@ from vical_daemon.estimation.temporal.shift_step import ShiftFit, find_shift
 
 _EVERY_S = 1.0
 _BEFORE_S = 3.0  # a change is noticed within
-_LOOK_BACK_S = 1.0  # images looked at when none was refused
+_LOOK_BACK_S = 1.5  # a step shows in the images of so long
+_LEAST_IMAGES = 8
+_LATE_IMAGES = 2  # the newest: the inertial readings that belong to them may not have come
 _MOST = 200  # images kept, a camera
 
 
@@ -48,34 +50,39 @@ class RecentPast:
     def find_shift(
         self, f: CalibrationFilter, camera: str, buffer: ImuBuffer, target: FloatArray
     ) -> ShiftFit | None:
-        """Whether the turns of the latest images fit the gyro at another time shift, and only there."""
-        known = f.state.cameras[camera]
-        lens = Lens(known.intrinsics, known.distortion, known.distortion_model, known.resolution)
-        poses = [p for t, frame in self._suspect(camera) if (p := pose_of(frame, t, lens, target))]
-        rows = buffer.rows
-        if len(poses) < 2 or len(rows) < 2:
-            return None
-        curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
-        return find_shift(
-            curve,
-            np.array([p.t_cam_s for p in poses]),
-            np.array([p.R_target_cam for p in poses]),
-            np.maximum([p.sigma_rad for p in poses], 0.2 / float(known.intrinsics[0])),
-            known.R_imu_cam,
-            known.timeshift_s,
-            SEARCHED_S,
-        )
-
-    def _suspect(self, camera: str) -> list[tuple[float, PointsFrame]]:
-        """Images since the first of the latest run of refused ones, or those of the last second."""
+        """Whether the latest images fit the gyro at another time shift, and only there."""
         frames = list(self._frames.get(camera, ()))
-        run: list[tuple[float, PointsFrame]] = []
-        for t, frame, used in reversed(frames):
-            if used and run:
-                break
-            if not used:
-                run.append((t, frame))
-        if len(run) < 8:
-            since_s = frames[-1][0] - _LOOK_BACK_S if frames else 0.0
-            run = [(t, frame) for t, frame, _ in reversed(frames) if t > since_s]
-        return run[::-1]
+        recent = [x for x in frames if x[0] > frames[-1][0] - _LOOK_BACK_S]
+        refused = [n for n, x in enumerate(recent) if not x[2]]
+        since = refused[0] if len(refused) >= _LEAST_IMAGES else len(recent) // 3
+        return shift_of([(t, frame) for t, frame, _ in recent[since:]], f, buffer, target)
+
+
+def shift_of(
+    frames: list[tuple[float, PointsFrame]], f: CalibrationFilter, buffer: ImuBuffer, target: FloatArray
+) -> ShiftFit | None:
+    """Whether images of one camera fit the gyro at another time shift than the filter's, and only there.
+
+    Args:
+        frames: Stamp, s, and points.
+        f: With the calibration as it is known.
+        buffer: Inertial readings.
+        target: Points of the target, m, shape (n, 3).
+    """
+    if len(frames) < _LEAST_IMAGES + _LATE_IMAGES or len(buffer) < 2:
+        return None
+    known = f.state.cameras[frames[0][1].camera]
+    lens = Lens(known.intrinsics, known.distortion, known.distortion_model, known.resolution)
+    poses = [p for t, frame in frames[:-_LATE_IMAGES] if (p := pose_of(frame, t, lens, target))]
+    if len(poses) < _LEAST_IMAGES:
+        return None
+    rows = buffer.rows
+    return find_shift(
+        GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias),
+        np.array([p.t_cam_s for p in poses]),
+        np.array([p.R_target_cam for p in poses]),
+        np.maximum([p.sigma_rad for p in poses], 0.2 / float(known.intrinsics[0])),
+        known.R_imu_cam,
+        known.timeshift_s,
+        SEARCHED_S,
+    )

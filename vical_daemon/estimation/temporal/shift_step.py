@@ -1,7 +1,7 @@
-"""A step of the time shift, with the mounting known: where on the gyro's curve do the camera's orientations fit?
+"""A step of the time shift, with the mounting known: where do the camera's orientations fit the gyro's curve?
 
-Camera and gyro trace one curve in the rotation group; with the mounting known, only the shift and the rotation
-between the two worlds are free. [docs/math/td_icp.md]
+Camera and gyro trace one curve in the rotation group; with the mounting known, only the time shift and the
+rotation between the two worlds are free. [docs/math/td_icp.md]
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ class ShiftFit(NamedTuple):
     Attributes:
         timeshift_s: t_imu = t_cam + shift, s.
         sigma_s: Of it.
+        stepped: The time shift so far fits worse, beyond five sigma.
     """
 
     timeshift_s: float
     sigma_s: float
+    stepped: bool
 
 
 def find_shift(
@@ -56,8 +58,7 @@ def find_shift(
         most_s: Largest step looked for, s.
 
     Returns:
-        The fit; None where the shift as it is fits no worse, where none fits, where the curve does not reach,
-        or where more than one fits.
+        The fit; None where none fits, more than one does, or the curve does not reach.
     """
     if len(t_cam_s) < _LEAST_IMAGES:
         return None
@@ -91,12 +92,12 @@ def find_shift(
     elsewhere = cost[:-1][np.abs(grid[:-1] - shift_s) > _APART_S]
     dof = 3 * len(t_cam_s) - 4
     level = max(best / dof, 1.0)
-    print('DBG', len(t_cam_s), shift_s-present_s, best/dof, cost[-1]/dof, elsewhere.min()/dof, low_s-present_s, high_s-present_s)
     if best > _MISFIT * float(chdtri(dof, _FITS_P)):
         return None
-    if min(float(elsewhere.min(initial=np.inf)), float(cost[-1])) - best < _SURE * level:
+    sure = best + _SURE * level
+    if float(elsewhere.min(initial=np.inf)) < sure:
         return None
-    return ShiftFit(shift_s, float(np.sqrt(level / curvature)))
+    return ShiftFit(shift_s, float(np.sqrt(level / curvature)), float(cost[-1]) > sure)
 
 
 def _nearest_rotation(M: FloatArray) -> FloatArray:
