@@ -34,7 +34,16 @@ from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFra
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.rates import Rates, rates_after
 from vical_daemon.estimation.retract import orthonormal, retract
-from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, MotionStart, State
+from vical_daemon.estimation.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    MOTION,
+    Layout,
+    MotionStart,
+    State,
+)
 from vical_daemon.estimation.trust import lessons
 from vical_daemon.estimation.trust.consistency import Consistency, normalised
 from vical_daemon.estimation.trust.corner_noise import CornerNoise
@@ -314,6 +323,53 @@ class CalibrationFilter:
             if where.timeshift is not None and where.skew is not None:
                 A[where.timeshift, :n] += dt * self.S[where.skew]
                 self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+
+    def keep_from(self, known: CalibrationFilter) -> None:
+        """After a change of the mounting: take all from an earlier filter but what the change may have moved.
+
+        Found anew, and left as they are here, are motion, gravity in the target's frame, mountings, lever arms
+        and time shifts.
+
+        Args:
+            known: A filter of the same layout.
+        """
+        anew = [MOTION, GRAVITY]
+        for where in self.layout.cameras.values():
+            anew += [s for s in (where.position, where.rotation) if s is not None]
+            anew += [] if where.timeshift is None else [slice(where.timeshift, where.timeshift + 1)]
+        kept = np.ones(self.layout.size, dtype=bool)
+        for block in anew:
+            kept[block] = False
+        elapsed_s = max(self.state.t_s - known.state.t_s, 0.0)
+        old = np.concatenate([known.S, known._random_walk(elapsed_s)], axis=1)
+        rows = kept[:, None]
+        self.S = unscented.lower_root(
+            np.concatenate([np.where(rows, old, 0.0), np.where(rows, 0.0, self.S)], axis=1)
+        )
+        here, there = self.state, known.state
+        self.state = replace(
+            there,
+            t_s=here.t_s,
+            R_world_imu=here.R_world_imu,
+            p_world_imu=here.p_world_imu,
+            v_world_imu=here.v_world_imu,
+            gravity=here.gravity,
+            tilt=here.tilt,
+            cameras={
+                name: replace(
+                    camera,
+                    R_imu_cam=here.cameras[name].R_imu_cam,
+                    p_imu_cam=here.cameras[name].p_imu_cam,
+                    timeshift_s=here.cameras[name].timeshift_s,
+                )
+                for name, camera in there.cameras.items()
+            },
+        )
+        self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
+        self.agreement, self.doubt, self.walk = known.agreement, known.doubt, known.walk
+        self.drifting, self.off = known.drifting, known.off
+        for consistency in self.consistency.values():
+            consistency.settle()
 
     def copy(self) -> CalibrationFilter:
         """A filter that can be run ahead of this one; what is measured about the noise stays shared."""

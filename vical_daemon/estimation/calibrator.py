@@ -29,7 +29,7 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
-from vical_daemon.estimation.recent_past import RecentPast, shift_of
+from vical_daemon.estimation.recent_past import RecentPast
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
 from vical_daemon.estimation.start.starting import LATE_S, Starting
 from vical_daemon.estimation.state import ATTITUDE, POSITION, Layout, make_layout
@@ -43,6 +43,7 @@ from vical_daemon.estimation.trust.judge import Judge
 _KEEP_S = 5.0
 _STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
 _STEPPED_LEAST_S = 1e-3
+_PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 _BLIND_S = 0.5  # without a usable image the motion is worth a look
 _ALWAYS = {hypotheses.IMU, hypotheses.LAG, hypotheses.SIZE}  # are states, see `hypotheses`
@@ -87,6 +88,7 @@ class Calibrator:
         self._beyond_doubt = BeyondDoubt()
         self._past = RecentPast()
         self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
+        self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._size = 1.0  # of the target over the stated one, where it is by far not that
 
@@ -188,7 +190,11 @@ class Calibrator:
         if self._size != 1.0:
             self.judge.announce(size_told(self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
-        self.filter, self._stale = found.filter, None
+        self.filter = found.filter
+        if self._stale is not None and self._stale.layout is self.layout:
+            self.filter.keep_from(self._stale)
+            self._kept_until_s = self.filter.state.t_s + _PROVEN_S
+        self._stale = None
         self._held_back, self._lost, self._past = HeldBack(), None, RecentPast()
         self.judge.started(self.filter.state.t_s, found.reason)
         self.watch.started(self.filter.state.t_s)
@@ -366,15 +372,16 @@ class Calibrator:
         return step_s
 
     def _restart(self, f: CalibrationFilter) -> None:
-        """The rig has changed: forget mounting and delay, and start from the data to come.
+        """The rig has changed: find mounting and delay anew in the data to come, and keep all else.
 
-        Kept are the lens, and what is known not to be as stated.
+        Where what was kept soon turns out not to fit either, nothing is.
         """
         if f.unshown is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
             self._starting.anew()
             return
-        sound = f if f.plausible() else None
+        before = self._past.filter(f)
+        sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
         for name, camera in sound.state.cameras.items() if sound else ():
             self.priors[name] = replace(
                 self.priors[name],
@@ -390,7 +397,7 @@ class Calibrator:
         assert self._buffer is not None
         self._seek_shift.discard(camera)
         own = [x for x in lost.frames if x[1].camera == camera]
-        fit = shift_of(own, f, self._buffer, self.target)
+        fit = self._past.shift_of(own, f, self._buffer, self.target)
         if fit is None:
             return lost
         self._set_shift(f, camera, fit)

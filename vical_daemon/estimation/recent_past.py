@@ -15,13 +15,14 @@ from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.start.seen_poses import Lens, pose_of
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-from vical_daemon.estimation.temporal.shift_step import ShiftFit, find_shift
+from vical_daemon.estimation.temporal.shift_step import Orientations, ShiftFit, find_shift, level_at
 
 _EVERY_S = 1.0
 _BEFORE_S = 3.0  # a change is noticed within
-_LOOK_BACK_S = 1.5  # a step shows in the images of so long
-_LEAST_IMAGES = 8
-_LATE_IMAGES = 2  # the newest: the inertial readings that belong to them may not have come
+_STRETCHES = (10, 15, 30)  # images in which a step is looked for
+_LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
+_BEFORE_IMAGES = 30  # that show how well orientations usually fit
+_CORNER_PX = 0.2  # orientations are never better than a corner's position over the focal length
 _MOST = 200  # images kept, a camera
 
 
@@ -50,39 +51,58 @@ class RecentPast:
     def find_shift(
         self, f: CalibrationFilter, camera: str, buffer: ImuBuffer, target: FloatArray
     ) -> ShiftFit | None:
-        """Whether the latest images fit the gyro at another time shift, and only there."""
-        frames = list(self._frames.get(camera, ()))
-        recent = [x for x in frames if x[0] > frames[-1][0] - _LOOK_BACK_S]
-        refused = [n for n, x in enumerate(recent) if not x[2]]
-        since = refused[0] if len(refused) >= _LEAST_IMAGES else len(recent) // 3
-        return shift_of([(t, frame) for t, frame, _ in recent[since:]], f, buffer, target)
+        """Whether the latest images fit the gyro at another time shift, and only there.
+
+        Nobody knows when it stepped: the shortest stretch that gives an answer is as good as any.
+        """
+        frames = [(t, frame) for t, frame, _ in self._frames.get(camera, ())]
+        for count in _STRETCHES:
+            if len(frames) < count:
+                break
+            fit = self.shift_of(frames[-count:-_LATE_IMAGES], f, buffer, target)
+            if fit is not None and fit.stepped:
+                return fit
+        return None
+
+    def shift_of(
+        self,
+        frames: list[tuple[float, PointsFrame]],
+        f: CalibrationFilter,
+        buffer: ImuBuffer,
+        target: FloatArray,
+    ) -> ShiftFit | None:
+        """Whether images of one camera fit the gyro at one time shift, and only there.
+
+        Args:
+            frames: Stamp, s, and points.
+            f: With the calibration as it is known.
+            buffer: Inertial readings.
+            target: Points of the target, m, shape (n, 3).
+        """
+        seen = _orientations(frames, f, target)
+        if seen is None or len(buffer) < 2:
+            return None
+        known, rows = f.state.cameras[frames[0][1].camera], buffer.rows
+        curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
+        used = [(t, frame) for t, frame, ok in self._frames.get(frames[0][1].camera, ()) if ok]
+        before = _orientations([x for x in used if x[0] < frames[0][0]][-_BEFORE_IMAGES:], f, target)
+        level = 1.0 if before is None else level_at(curve, before, known.R_imu_cam, known.timeshift_s)
+        return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
 
 
-def shift_of(
-    frames: list[tuple[float, PointsFrame]], f: CalibrationFilter, buffer: ImuBuffer, target: FloatArray
-) -> ShiftFit | None:
-    """Whether images of one camera fit the gyro at another time shift than the filter's, and only there.
-
-    Args:
-        frames: Stamp, s, and points.
-        f: With the calibration as it is known.
-        buffer: Inertial readings.
-        target: Points of the target, m, shape (n, 3).
-    """
-    if len(frames) < _LEAST_IMAGES + _LATE_IMAGES or len(buffer) < 2:
+def _orientations(
+    frames: list[tuple[float, PointsFrame]], f: CalibrationFilter, target: FloatArray
+) -> Orientations | None:
+    """What the camera's orientations are by the target alone; None where no image shows one."""
+    if not frames:
         return None
     known = f.state.cameras[frames[0][1].camera]
     lens = Lens(known.intrinsics, known.distortion, known.distortion_model, known.resolution)
-    poses = [p for t, frame in frames[:-_LATE_IMAGES] if (p := pose_of(frame, t, lens, target))]
-    if len(poses) < _LEAST_IMAGES:
+    poses = [p for t, frame in frames if (p := pose_of(frame, t, lens, target)) is not None]
+    if not poses:
         return None
-    rows = buffer.rows
-    return find_shift(
-        GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias),
+    return Orientations(
         np.array([p.t_cam_s for p in poses]),
         np.array([p.R_target_cam for p in poses]),
-        np.maximum([p.sigma_rad for p in poses], 0.2 / float(known.intrinsics[0])),
-        known.R_imu_cam,
-        known.timeshift_s,
-        SEARCHED_S,
+        np.maximum([p.sigma_rad for p in poses], _CORNER_PX / float(known.intrinsics[0])),
     )

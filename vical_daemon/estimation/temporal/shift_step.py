@@ -17,8 +17,8 @@ from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 
 _GRID_S = 5e-3  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
 _LEAST_IMAGES = 8
+_STEPS, _DERIVATIVE_S = 5, 1e-4  # Gauss-Newton from the nearest place on the grid
 _FITS_P = 1e-6  # chance that orientations which fit are said not to
-_MISFIT = 4.0  # times the sum of squares that noise gives: orientations from corners err by the lens, too
 _SURE = 25.0  # of the sum of squares: five sigma
 _APART_S = 0.05  # other places on the curve begin so far from the best
 
@@ -37,67 +37,89 @@ class ShiftFit(NamedTuple):
     stepped: bool
 
 
+class Orientations(NamedTuple):
+    """Orientations of a camera.
+
+    Attributes:
+        t_cam_s: Stamps, s, shape (n,).
+        R_world_cam: In any fixed world, shape (n, 3, 3).
+        sigma_rad: Noise about each axis, shape (n,).
+    """
+
+    t_cam_s: FloatArray
+    R_world_cam: FloatArray
+    sigma_rad: FloatArray
+
+
+def level_at(curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, timeshift_s: float) -> float:
+    """Sum of squares over its degrees of freedom, at least 1, of orientations that fit; 1 where not covered."""
+    t_s = seen.t_cam_s + timeshift_s
+    inside = (t_s > curve.span_s[0]) & (t_s < curve.span_s[1])
+    if inside.sum() < _LEAST_IMAGES:
+        return 1.0
+    e = _errors(curve, Orientations(*(x[inside] for x in seen)), R_imu_cam, np.array([timeshift_s]))
+    return max(float((e**2).sum()) / (e.size - 3), 1.0)
+
+
 def find_shift(
     curve: RotationCurve,
-    t_cam_s: FloatArray,
-    R_world_cam: FloatArray,
-    sigma_rad: FloatArray,
+    seen: Orientations,
     R_imu_cam: FloatArray,
     present_s: float,
     most_s: float,
+    usual_level: float,
 ) -> ShiftFit | None:
     """Find the one time shift at which the orientations of camera and gyro agree.
 
     Args:
         curve: The gyro's, about its bias.
-        t_cam_s: Stamps of the camera's orientations, s, shape (n,).
-        R_world_cam: Orientations, shape (n, 3, 3).
-        sigma_rad: Their noise about each axis, shape (n,).
+        seen: The camera's orientations.
         R_imu_cam: The mounting, held, shape (3, 3).
         present_s: Time shift so far, s.
         most_s: Largest step looked for, s.
+        usual_level: See `level_at`; of orientations from before the change.
 
     Returns:
         The fit; None where none fits, more than one does, or the curve does not reach.
     """
+    t_cam_s = seen.t_cam_s
     if len(t_cam_s) < _LEAST_IMAGES:
         return None
     low_s = max(present_s - most_s, curve.span_s[0] - float(t_cam_s[0]))
     high_s = min(present_s + most_s, curve.span_s[1] - float(t_cam_s[-1]))
     if not low_s <= present_s <= high_s:
         return None
-
-    def errors(shifts_s: FloatArray) -> FloatArray:
-        """Whitened errors of all orientations, the two worlds aligned at each shift, shape (k, 3 n)."""
-        by_gyro = so3.matrix_from_quat(curve.quaternion(t_cam_s + shifts_s[:, None])) @ R_imu_cam
-        weighed = by_gyro / np.square(sigma_rad)[:, None, None]
-        align = _nearest_rotation(np.einsum("nij,knlj->kil", R_world_cam, weighed))
-        missed = np.swapaxes(align[:, None] @ by_gyro, -1, -2) @ R_world_cam
-        return np.asarray((so3.log(missed) / sigma_rad[:, None]).reshape(len(shifts_s), -1))
-
     grid = np.append(np.arange(low_s, high_s, _GRID_S), present_s)
-    cost = (errors(grid) ** 2).sum(axis=1)
+    cost = (_errors(curve, seen, R_imu_cam, grid) ** 2).sum(axis=1)
     shift_s = float(grid[np.argmin(cost)])
-    step_s = 1e-4
-    for _ in range(5):
-        at, ahead = errors(np.array([shift_s, shift_s + step_s]))
-        slope = (ahead - at) / step_s
+    for _ in range(_STEPS):
+        at, ahead = _errors(curve, seen, R_imu_cam, np.array([shift_s, shift_s + _DERIVATIVE_S]))
+        slope = (ahead - at) / _DERIVATIVE_S
         curvature = float(slope @ slope)
         if curvature <= 0.0:
             return None
         shift_s -= float(slope @ at) / curvature
     if not low_s <= shift_s <= high_s:
         return None
-    best = float((errors(np.array([shift_s])) ** 2).sum())
-    elsewhere = cost[:-1][np.abs(grid[:-1] - shift_s) > _APART_S]
+    best = float((_errors(curve, seen, R_imu_cam, np.array([shift_s])) ** 2).sum())
     dof = 3 * len(t_cam_s) - 4
-    level = max(best / dof, 1.0)
-    if best > _MISFIT * float(chdtri(dof, _FITS_P)):
+    if best > usual_level * float(chdtri(dof, _FITS_P)):
         return None
-    sure = best + _SURE * level
-    if float(elsewhere.min(initial=np.inf)) < sure:
+    sure = best + _SURE * usual_level
+    if float(cost[:-1][np.abs(grid[:-1] - shift_s) > _APART_S].min(initial=np.inf)) < sure:
         return None
-    return ShiftFit(shift_s, float(np.sqrt(level / curvature)), float(cost[-1]) > sure)
+    return ShiftFit(shift_s, float(np.sqrt(usual_level / curvature)), float(cost[-1]) > sure)
+
+
+def _errors(
+    curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, shifts_s: FloatArray
+) -> FloatArray:
+    """Whitened errors of all orientations, the two worlds aligned at each shift, shape (k, 3 n)."""
+    by_gyro = so3.matrix_from_quat(curve.quaternion(seen.t_cam_s + shifts_s[:, None])) @ R_imu_cam
+    weighed = by_gyro / np.square(seen.sigma_rad)[:, None, None]
+    align = _nearest_rotation(np.einsum("nij,knlj->kil", seen.R_world_cam, weighed))
+    missed = np.swapaxes(align[:, None] @ by_gyro, -1, -2) @ seen.R_world_cam
+    return np.asarray((so3.log(missed) / seen.sigma_rad[:, None]).reshape(len(shifts_s), -1))
 
 
 def _nearest_rotation(M: FloatArray) -> FloatArray:
