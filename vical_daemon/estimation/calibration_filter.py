@@ -327,13 +327,13 @@ class CalibrationFilter:
     def keep_from(self, known: CalibrationFilter) -> None:
         """After a change of the mounting: take all from an earlier filter but what the change may have moved.
 
-        Found anew, and left as they are here, are motion, gravity in the target's frame, mountings, lever arms
-        and time shifts.
+        Found anew, and left as they are here, are motion, gravity in the target's frame, mountings, lever
+        arms and time shifts.
 
         Args:
             known: A filter of the same layout.
         """
-        anew = [MOTION, GRAVITY]
+        anew: list[slice] = [MOTION, GRAVITY]
         for where in self.layout.cameras.values():
             anew += [s for s in (where.position, where.rotation) if s is not None]
             anew += [] if where.timeshift is None else [slice(where.timeshift, where.timeshift + 1)]

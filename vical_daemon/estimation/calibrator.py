@@ -43,6 +43,7 @@ from vical_daemon.estimation.trust.judge import Judge
 _KEEP_S = 5.0
 _STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
 _STEPPED_LEAST_S = 1e-3
+_STANDS_S = 1.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 _BLIND_S = 0.5  # without a usable image the motion is worth a look
@@ -88,6 +89,7 @@ class Calibrator:
         self._beyond_doubt = BeyondDoubt()
         self._past = RecentPast()
         self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
+        self._unproven: tuple[float, str] | None = None  # when to announce a step, unless images contradict
         self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._size = 1.0  # of the target over the stated one, where it is by far not that
@@ -317,6 +319,9 @@ class Calibrator:
         self._used_ns[frame.camera] = frame.t_cam_ns
         self._past.saw(f, report, frame, t_cam_s)
         self.judge.saw_frame(report, f)
+        if self._unproven is not None and f.state.t_s > self._unproven[0]:
+            self.judge.announce(self._unproven[1])
+            self._unproven = None
         for block, told in self._beyond_doubt.look(f).items():
             self.judge.announce(told, once=block)
         self._act(self.watch.look(report, f), frame)
@@ -356,7 +361,8 @@ class Calibrator:
             return False
         self.filter = self._past.filter(f)
         step_s = self._set_shift(self.filter, camera, fit)
-        self.judge.announce(f"{camera}: the time shift stepped by {1e3 * step_s:+.1f} ms; all else is kept")
+        step = f"{camera}: the time shift stepped by {1e3 * step_s:+.1f} ms; all else is kept"
+        self._unproven = (f.state.t_s + _STANDS_S, step)
         self._lose_motion()
         return True
 
@@ -388,6 +394,7 @@ class Calibrator:
                 intrinsics=tuple(camera.intrinsics.tolist()),
                 distortion=tuple(camera.distortion.tolist()),
             )
+        self._unproven = None
         self.judge.changed(self.watch.why)
         self._stale, self.filter = sound, None
         self._starting = self._new_starting(sound.off if sound else ())

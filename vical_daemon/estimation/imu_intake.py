@@ -36,7 +36,8 @@ class ImuIntake:
     Attributes:
         buffer: The readings, s since the first stamp; None before the first one.
         base_ns: First stamp, ns.
-        refused: Readings left out: repeated, out of order, not finite, or with a wrong stamp.
+        refused: Readings left out: out of order, not finite, or with a wrong stamp.
+        repeated: Readings left out because they repeat the one before, bit by bit.
         gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
     """
 
@@ -44,6 +45,7 @@ class ImuIntake:
         self.buffer: ImuBuffer | None = None
         self.base_ns = 0
         self.refused = 0
+        self.repeated = 0
         self.gap_end_s = -np.inf
         self._steps = StampSteps()
         self._set_back_s = 0.0  # by how much the clock has been set back in all
@@ -77,7 +79,7 @@ class ImuIntake:
             self.refused += 1
             return []
         if (six == self._last).all():
-            self.refused += 1
+            self.repeated += 1
             self._repeats += 1
             return []
         self._last = six
@@ -94,7 +96,6 @@ class ImuIntake:
         """Add a reading, hold it, or add it after the one held."""
         interval_s = t_s - self._newest_s
         if self._bridged(buffer, interval_s):
-            self.refused += self._held is not None
             self._held = None
             self._add(buffer, t_s, reading)
             return [reading]
@@ -102,9 +103,10 @@ class ImuIntake:
             held_s, held = self._held
             jump_s = abs(held_s - self._newest_s)
             if 0.0 < t_s - held_s <= max(GAP_S, buffer.usual_gap_s, _AGAIN * jump_s):
+                self.refused -= 1
                 return self._jump(buffer, held_s, held, t_s, reading)
-            self.refused += 1
         self._held = t_s, reading
+        self.refused += 1
         return []
 
     def _bridged(self, buffer: ImuBuffer, interval_s: float) -> bool:

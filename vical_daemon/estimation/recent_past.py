@@ -44,9 +44,7 @@ class RecentPast:
 
     def filter(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter as it was before a change that is noticed now, or as long ago as it is remembered."""
-        before = self._copies[0] if self._copies else deepcopy(f)
-        self._copies.clear()
-        return before
+        return deepcopy(self._copies[0] if self._copies else f)
 
     def find_shift(
         self, f: CalibrationFilter, camera: str, buffer: ImuBuffer, target: FloatArray

@@ -52,7 +52,7 @@ class Orientations(NamedTuple):
 
 
 def level_at(curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, timeshift_s: float) -> float:
-    """Sum of squares over its degrees of freedom, at least 1, of orientations that fit; 1 where not covered."""
+    """Sum of squares over its degrees of freedom, of orientations that fit: at least 1; 1 if not covered."""
     t_s = seen.t_cam_s + timeshift_s
     inside = (t_s > curve.span_s[0]) & (t_s < curve.span_s[1])
     if inside.sum() < _LEAST_IMAGES:
