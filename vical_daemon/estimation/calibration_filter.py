@@ -78,6 +78,8 @@ class CalibrationFilter:
         off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
+        stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
+        began_s: When the data of this filter begin, s.
     """
 
     state: State
@@ -95,6 +97,8 @@ class CalibrationFilter:
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
+    stamp_sigma_s: float = 0.0
+    began_s: float = 0.0
     _motion_straight: Straightness = field(default_factory=Straightness)
     _view_straight: dict[str, Straightness] = field(default_factory=dict)
 
@@ -367,7 +371,7 @@ class CalibrationFilter:
         )
         self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
         self.agreement, self.doubt, self.walk = known.agreement, known.doubt, known.walk
-        self.drifting, self.off = known.drifting, known.off
+        self.drifting, self.off, self.began_s = known.drifting, known.off, known.began_s
         for consistency in self.consistency.values():
             consistency.settle()
 

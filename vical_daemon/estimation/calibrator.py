@@ -89,6 +89,7 @@ class Calibrator:
         self._beyond_doubt = BeyondDoubt()
         self._past = RecentPast()
         self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
+        self._stamp_sigma_s = 0.0
         self._unproven: tuple[float, str] | None = None  # when to announce a step, unless images contradict
         self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
@@ -104,6 +105,12 @@ class Calibrator:
         return Starting(options, self.layout, self.target, self._step)
 
     # ------------------------------------------------------------------ input
+    def stamps_known_to(self, sigma_s: float) -> None:
+        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        self._stamp_sigma_s = sigma_s
+        if self.filter is not None:
+            self.filter.stamp_sigma_s = sigma_s
+
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         refused = self._imu.refused
@@ -193,6 +200,7 @@ class Calibrator:
             self.judge.announce(size_told(self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
         self.filter = found.filter
+        self.filter.began_s, self.filter.stamp_sigma_s = found.filter.state.t_s, self._stamp_sigma_s
         if self._stale is not None and self._stale.layout is self.layout:
             self.filter.keep_from(self._stale)
             self._kept_until_s = self.filter.state.t_s + _PROVEN_S
@@ -418,7 +426,8 @@ class Calibrator:
         """Return what is known now."""
         self.judge.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
         offsets = {name: self._offset_s(name) for name in self.priors}
-        return by_present_stamps(self.judge.estimate(self.filter, self._stale), offsets)
+        estimate = self.judge.estimate(self.filter, self._stale)
+        return by_present_stamps(estimate, offsets, self._stamp_sigma_s)
 
     def _offset_s(self, camera: str) -> float:
         """Time shift by the stamps as they come now, minus that of the filter, s."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -133,10 +134,22 @@ class ImageIntake:
         return news
 
 
-def by_present_stamps(estimate: CalibrationEstimate, offsets_s: Mapping[str, float]) -> CalibrationEstimate:
-    """Return an estimate made on axes without steps, with time shifts by the stamps as they come now."""
+def by_present_stamps(
+    estimate: CalibrationEstimate, offsets_s: Mapping[str, float], stamp_sigma_s: float
+) -> CalibrationEstimate:
+    """Return an estimate made on axes without steps, with time shifts by the stamps as they come now.
+
+    Args:
+        estimate: By axes without steps.
+        offsets_s: Added to the time shift of each camera, s.
+        stamp_sigma_s: How well the imu's stamps are known now, s; no image can show that.
+    """
     cameras = {
-        name: replace(e, timeshift_cam_imu_s=e.timeshift_cam_imu_s + offsets_s[name])
+        name: replace(
+            e,
+            timeshift_cam_imu_s=e.timeshift_cam_imu_s + offsets_s[name],
+            timeshift_sigma_s=math.hypot(e.timeshift_sigma_s, stamp_sigma_s) if e.timeshift_sigma_s else 0.0,
+        )
         for name, e in estimate.cameras.items()
     }
     return replace(estimate, cameras=cameras)

@@ -86,6 +86,10 @@ class TargetFreeCalibrator:
         self._reports: list[FrameReport] = []
 
     # ------------------------------------------------------------------ input
+    def stamps_known_to(self, sigma_s: float) -> None:
+        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        self.judge.doubts.stamp_sigma_s = sigma_s
+
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         refused = self._imu.refused
@@ -306,7 +310,7 @@ class TargetFreeCalibrator:
         if known is not None and self._buffer is not None:
             known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
         estimate = self.judge.estimate(known, running=self.window is not None, gravity=gravity)
-        return by_present_stamps(estimate, {self.camera: self._offset_s})
+        return by_present_stamps(estimate, {self.camera: self._offset_s}, self.judge.doubts.stamp_sigma_s)
 
     @property
     def _offset_s(self) -> float:

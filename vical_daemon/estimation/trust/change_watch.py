@@ -90,6 +90,7 @@ class ChangeWatch:
         if index is None or camera in f.drifting or t_s < self._started_s + _DRIFT_AFTER_S:
             return Action.NONE
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
+        watch.floor = max(_DRIFT_FLOOR_S, f.stamp_sigma_s)
         if not watch.due(t_s):
             return Action.NONE
         if surely_apart(f, camera):
