@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon import topics
@@ -12,9 +13,11 @@ from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.estimators import Estimator
 from vical_daemon.messages import (
+    DiagnosticsMessage,
     DiagnosticStatus,
     ImuMessage,
     MessageError,
+    decode_diagnostics,
     decode_imu,
     decode_points,
 )
@@ -64,6 +67,7 @@ class EstimateRole:
         self._watch = watch
         self._predictions = Predictions(config.rig)
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
+        self._status_key = topics.STATUS.key(config.rig, "imu")
         self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
         self._next_s = self._next_companion_s = -float("inf")
         self._malformed = 0
@@ -75,11 +79,20 @@ class EstimateRole:
             if sample.key == self._imu_key:
                 imu = decode_imu(sample.payload)
                 self._order.push(imu.stamp_ns, imu)
+            elif sample.key == self._status_key:
+                self._stamps_known(decode_diagnostics(sample.payload))
             else:
                 frame = decode_points(sample.payload).to_frame()
                 self._order.push(frame.t_cam_ns, frame)
         except MessageError:
             self._malformed += 1
+
+    def _stamps_known(self, message: DiagnosticsMessage) -> None:
+        """Pass on what the driver says of its device's clock."""
+        for status in message.statuses:
+            if status.name == f"imu/{self.config.calibration_imu}" and "stamp_sigma_us" in status.values:
+                with suppress(ValueError):
+                    self.estimator.stamps_known_to(1e-6 * float(status.values["stamp_sigma_us"]))
 
     def step(self, now_s: float | None = None) -> list[Message]:
         """Do what can be done with what was taken and return what is to be published.

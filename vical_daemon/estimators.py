@@ -22,6 +22,10 @@ class Estimator(Protocol):
         """Take one inertial sample."""
         ...
 
+    def stamps_known_to(self, sigma_s: float) -> None:
+        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        ...
+
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image."""
         ...
@@ -79,10 +83,11 @@ def make_watch(config: Config) -> DelayWatch | None:
 
 
 def input_keys(config: Config) -> list[str]:
-    """Return the keys that the estimator reads: one IMU, and points or tracks of each camera."""
+    """Return the keys that the estimator reads: one IMU and its status, points or tracks of each camera."""
     key_of = topics.TRACKS.key if config.calibration.mode == "target_free" else topics.POINTS.key
     imu = topics.IMU.key(config.rig, config.calibration_imu)
-    return [imu, *(key_of(config.rig, camera) for camera in config.calibration_cameras)]
+    status = topics.STATUS.key(config.rig, "imu")
+    return [imu, status, *(key_of(config.rig, camera) for camera in config.calibration_cameras)]
 
 
 def _target_free(options: CalibrationOptions, priors: dict[str, CameraPrior]) -> Estimator:

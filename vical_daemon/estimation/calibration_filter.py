@@ -34,7 +34,16 @@ from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFra
 from vical_daemon.estimation.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.rates import Rates, rates_after
 from vical_daemon.estimation.retract import orthonormal, retract
-from vical_daemon.estimation.state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, MOTION, Layout, State
+from vical_daemon.estimation.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    MOTION,
+    Layout,
+    MotionStart,
+    State,
+)
 from vical_daemon.estimation.trust import lessons
 from vical_daemon.estimation.trust.consistency import Consistency, normalised
 from vical_daemon.estimation.trust.corner_noise import CornerNoise
@@ -69,6 +78,8 @@ class CalibrationFilter:
         off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
+        stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
+        began_s: When the data of this filter begin, s.
     """
 
     state: State
@@ -86,6 +97,8 @@ class CalibrationFilter:
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
+    stamp_sigma_s: float = 0.0
+    began_s: float = 0.0
     _motion_straight: Straightness = field(default_factory=Straightness)
     _view_straight: dict[str, Straightness] = field(default_factory=dict)
 
@@ -121,23 +134,13 @@ class CalibrationFilter:
     def _grow(self, moved: Moved, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
         n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
-        dt, noise = moved.seconds, self.imu_noise
-        drift = np.flatnonzero(self.walk)
-        A = np.zeros((n, n + c + 9 + 6 + len(drift)))
+        A = np.zeros((n, n + c + 9))
         A[:, :n] = self.S
         A[:9, :d] = moved.linear
-        for name, where in self.layout.cameras.items():
-            if where.timeshift is not None and where.skew is not None:
-                A[where.timeshift, :n] += dt * self.S[where.skew]
-                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+        self._drift_shifts(A, moved.seconds)
         A[:9, n : n + c] = moved.curved
-        at = n + c
-        A[:9, at : at + 9] = unscented.root(Q)
-        A[GYRO_BIAS, at + 9 : at + 12] = noise.gyro_walk * np.sqrt(dt) * _EYE
-        A[ACCEL_BIAS, at + 12 : at + 15] = noise.accel_walk * np.sqrt(dt) * _EYE
-        if len(drift):
-            A[drift, at + 15 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
-        self.S = unscented.lower_root(A)
+        A[:9, n + c :] = unscented.root(Q)
+        self.S = unscented.lower_root(np.concatenate([A, self._random_walk(moved.seconds)], axis=1))
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -275,6 +278,11 @@ class CalibrationFilter:
             for c in state.cameras.values()
         )
 
+    def forget(self, index: int, sigma: float) -> None:
+        """Take one error as known to `sigma` only, whatever the rest says about it."""
+        self.S[index] = 0.0
+        self.reopen(index, sigma)
+
     def reopen(self, index: int, sigma: float) -> None:
         """Add independent uncertainty to one error: what was known about it is in doubt."""
         column = np.zeros(self.layout.size)
@@ -286,15 +294,86 @@ class CalibrationFilter:
         added = columns.reshape(self.layout.size, -1)
         self.S = unscented.lower_root(np.concatenate([self.S, added], axis=1))
 
-    def reset_motion(self, R_world_imu: FloatArray, p_world_imu: FloatArray) -> None:
-        """Forget where the rig is and keep the calibration: motion anew, with no tie to the rest."""
-        self.state.R_world_imu, self.state.p_world_imu = R_world_imu, p_world_imu
-        self.state.v_world_imu = np.zeros(3)
-        A = np.zeros((self.layout.size, self.layout.size + 9))
-        A[:, :-9] = self.S
+    def restart_motion(self, motion: MotionStart) -> None:
+        """Take the motion from elsewhere and keep the calibration, which ages until then.
+
+        Args:
+            motion: Where the rig is, independent of all that the filter knows.
+        """
+        state, dt = self.state, motion.elapsed_s
+        A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, 9))], axis=1)
+        self._drift_shifts(A, dt)
         A[MOTION] = 0.0
-        A[MOTION, -9:] = np.diag([0.1] * 3 + [0.1] * 3 + [1.0] * 3)
+        A[MOTION, -9:] = np.diag(motion.sigmas)
         self.S = unscented.lower_root(A)
+        state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
+        state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
+        for consistency in self.consistency.values():
+            consistency.settle()
+
+    def _random_walk(self, dt: float) -> FloatArray:
+        """Columns that biases and what else wanders gain in `dt` seconds, shape (n, k)."""
+        drift = np.flatnonzero(self.walk)
+        columns = np.zeros((self.layout.size, 6 + len(drift)))
+        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * _EYE
+        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * _EYE
+        columns[drift, 6 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
+        return columns
+
+    def _drift_shifts(self, A: FloatArray, dt: float) -> None:
+        """Let time shifts drift for `dt` seconds: nominal values, and their rows of the square root `A`."""
+        n = self.layout.size
+        for name, where in self.layout.cameras.items():
+            if where.timeshift is not None and where.skew is not None:
+                A[where.timeshift, :n] += dt * self.S[where.skew]
+                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+
+    def keep_from(self, known: CalibrationFilter) -> None:
+        """After a change of the mounting: take all from an earlier filter but what the change may have moved.
+
+        Found anew, and left as they are here, are motion, gravity in the target's frame, mountings, lever
+        arms and time shifts.
+
+        Args:
+            known: A filter of the same layout.
+        """
+        anew: list[slice] = [MOTION, GRAVITY]
+        for where in self.layout.cameras.values():
+            anew += [s for s in (where.position, where.rotation) if s is not None]
+            anew += [] if where.timeshift is None else [slice(where.timeshift, where.timeshift + 1)]
+        kept = np.ones(self.layout.size, dtype=bool)
+        for block in anew:
+            kept[block] = False
+        elapsed_s = max(self.state.t_s - known.state.t_s, 0.0)
+        old = np.concatenate([known.S, known._random_walk(elapsed_s)], axis=1)
+        rows = kept[:, None]
+        self.S = unscented.lower_root(
+            np.concatenate([np.where(rows, old, 0.0), np.where(rows, 0.0, self.S)], axis=1)
+        )
+        here, there = self.state, known.state
+        self.state = replace(
+            there,
+            t_s=here.t_s,
+            R_world_imu=here.R_world_imu,
+            p_world_imu=here.p_world_imu,
+            v_world_imu=here.v_world_imu,
+            gravity=here.gravity,
+            tilt=here.tilt,
+            cameras={
+                name: replace(
+                    camera,
+                    R_imu_cam=here.cameras[name].R_imu_cam,
+                    p_imu_cam=here.cameras[name].p_imu_cam,
+                    timeshift_s=here.cameras[name].timeshift_s,
+                )
+                for name, camera in there.cameras.items()
+            },
+        )
+        self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
+        self.agreement, self.doubt, self.walk = known.agreement, known.doubt, known.walk
+        self.drifting, self.off, self.began_s = known.drifting, known.off, known.began_s
+        for consistency in self.consistency.values():
+            consistency.settle()
 
     def copy(self) -> CalibrationFilter:
         """A filter that can be run ahead of this one; what is measured about the noise stays shared."""

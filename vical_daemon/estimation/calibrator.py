@@ -14,7 +14,13 @@ import numpy as np
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.image_intake import (
+    ImageIntake,
+    by_present_stamps,
+    trace_by_present_stamps,
+)
 from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import (
     BoolArray,
     CalibrationOptions,
@@ -22,11 +28,12 @@ from vical_daemon.estimation.measurements import (
     FloatArray,
     PointsFrame,
 )
+from vical_daemon.estimation.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.recent_past import RecentPast
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
-from vical_daemon.estimation.stamp_steps import StampSteps
-from vical_daemon.estimation.start.seen_poses import Lens, pose_of
 from vical_daemon.estimation.start.starting import LATE_S, Starting
-from vical_daemon.estimation.state import Layout, make_layout
+from vical_daemon.estimation.state import ATTITUDE, POSITION, Layout, make_layout
+from vical_daemon.estimation.temporal.shift_step import ShiftFit
 from vical_daemon.estimation.trust import clock_drift, hypotheses, target_doubt
 from vical_daemon.estimation.trust.beyond_doubt import BeyondDoubt, size_told
 from vical_daemon.estimation.trust.change_watch import Action, ChangeWatch
@@ -34,6 +41,12 @@ from vical_daemon.estimation.trust.held_back import HeldBack
 from vical_daemon.estimation.trust.judge import Judge
 
 _KEEP_S = 5.0
+_STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
+_STEPPED_LEAST_S = 1e-3
+_STANDS_S = 1.0  # so long images must agree with a step before it is announced
+_PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
+_SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
+_BLIND_S = 0.5  # without a usable image the motion is worth a look
 _ALWAYS = {hypotheses.IMU, hypotheses.LAG, hypotheses.SIZE}  # are states, see `hypotheses`
 _MOST_SURPRISES = 4  # in one start: shutters that roll, targets that are not as large as stated
 
@@ -64,15 +77,22 @@ class Calibrator:
         self.layout = self._lay_out()
         self.judge = Judge(options, self.layout)
         self.filter: CalibrationFilter | None = None
-        self._buffer: ImuBuffer | None = None
-        self._base_ns = 0
-        self._stamps = StampSteps()
+        self._imu = ImuIntake()
+        self._images = ImageIntake()
         self._pending = FrameQueue(list(cameras))
         self._starting = self._new_starting()
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
+        self._lost: MotionRestart | None = None
+        self._used_ns: dict[str, int] = {}  # stamp of the last image used, by camera
         self._held_back = HeldBack()
         self._beyond_doubt = BeyondDoubt()
+        self._past = RecentPast()
+        self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
+        self._stamp_sigma_s = 0.0
+        self._unproven: tuple[float, str] | None = None  # when to announce a step, unless images contradict
+        self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
+        self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._size = 1.0  # of the target over the stated one, where it is by far not that
 
     def _lay_out(self) -> Layout:
@@ -85,17 +105,23 @@ class Calibrator:
         return Starting(options, self.layout, self.target, self._step)
 
     # ------------------------------------------------------------------ input
+    def stamps_known_to(self, sigma_s: float) -> None:
+        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        self._stamp_sigma_s = sigma_s
+        if self.filter is not None:
+            self.filter.stamp_sigma_s = sigma_s
+
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
-        if self._buffer is None:
-            self._base_ns = t_imu_ns
-            self._buffer = ImuBuffer(t_imu_ns)
-        gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
-        if self._buffer.append(self._stamps.even((t_imu_ns - self._base_ns) * 1e-9), gyro, accel):
-            self.judge.saw_imu(t_imu_ns, gyro, accel)
-        else:
-            self.judge.imu_refused += 1
-        self.judge.events += self._stamps.news()
+        refused = self._imu.refused
+        for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
+            self.judge.saw_imu(*reading)
+        self.judge.imu_refused += self._imu.refused - refused
+        self.judge.events += self._imu.news()
+
+    @property
+    def _buffer(self) -> ImuBuffer | None:
+        return self._imu.buffer
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image; those of unknown cameras or off the board are only counted."""
@@ -106,9 +132,24 @@ class Calibrator:
         if not ok.all():
             sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
-        t_cam_s = (frame.t_cam_ns - self._base_ns) * 1e-9
+        stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
+        t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
+        self.judge.events += self._images.news()
+        if t_cam_s is None:
+            self.judge.frames_ignored += 1
+            return
+        if self._images.offset_s(frame.camera) != self._offsets_s.get(frame.camera, 0.0):
+            self._clock_was_set(frame.camera)
         self.judge.saw_points(t_cam_s, len(frame.ids))
         self._pending.push(t_cam_s, frame)
+
+    def _clock_was_set(self, camera: str) -> None:
+        """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
+        self._offsets_s[camera] = self._images.offset_s(camera)
+        if self.filter is not None:
+            self._lose_motion()
+            self._seek_shift.add(camera)
+            self.watch.started(self.filter.state.t_s)
 
     def _known(self, frame: PointsFrame) -> BoolArray:
         """Which points of a frame can be used at all."""
@@ -138,6 +179,7 @@ class Calibrator:
         assert self._buffer is not None
         if self.filter is None:
             self._starting.take(self._pending.take_all())
+            self._buffer.cut(self._imu.gap_end_s)  # a start needs motion in one piece
             self._buffer.trim(self._starting.oldest_s - _KEEP_S)
         if not (at_end or self._starting.due(self._buffer.newest_s)):
             return
@@ -157,8 +199,13 @@ class Calibrator:
         if self._size != 1.0:
             self.judge.announce(size_told(self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
-        self.filter, self._stale = found.filter, None
-        self._held_back = HeldBack()
+        self.filter = found.filter
+        self.filter.began_s, self.filter.stamp_sigma_s = found.filter.state.t_s, self._stamp_sigma_s
+        if self._stale is not None and self._stale.layout is self.layout:
+            self.filter.keep_from(self._stale)
+            self._kept_until_s = self.filter.state.t_s + _PROVEN_S
+        self._stale = None
+        self._held_back, self._lost, self._past = HeldBack(), None, RecentPast()
         self.judge.started(self.filter.state.t_s, found.reason)
         self.watch.started(self.filter.state.t_s)
         self._starting.anew()
@@ -189,10 +236,57 @@ class Calibrator:
             item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
             if item is None:
                 break
-            report = self._one(item[1], item[0])
-            if report is not None:
-                reports.append(report)
+            if self._lost is None and self._must_restart(*item):
+                self._lose_motion()
+            if self._lost is None:
+                reports += self._one(item[1], item[0])
+            else:
+                reports += self._find_motion(self._lost, item[1], item[0])
         return reports
+
+    def _must_restart(self, t_cam_s: float, frame: PointsFrame) -> bool:
+        """Whether the motion at an image cannot be had from the one before: readings miss, or drift far.
+
+        Far is where the pose from the image itself would be as good.
+        """
+        f = self.filter
+        assert f is not None
+        assert self._buffer is not None
+        camera = f.state.cameras[frame.camera]
+        if self._buffer.gap_within(f.state.t_s, t_cam_s + camera.timeshift_s):
+            return True
+        if t_cam_s + camera.timeshift_s < f.state.t_s + _BLIND_S:
+            return False
+        ahead = f.copy()
+        segment = self._buffer.segment(f.state.t_s, t_cam_s + camera.timeshift_s)
+        if segment is None:
+            return False
+        ahead.predict(segment)
+        sigmas = ahead.sigmas()
+        away_m = distance_m(ahead.state.p_world_imu)
+        return bool(sigmas[ATTITUDE].max() > WIDE_RAD or sigmas[POSITION].max() > WIDE_SHARE * away_m)
+
+    def _lose_motion(self) -> None:
+        """Forget where the rig is, not its calibration; images to come will show it."""
+        self._lost, self._held_back = MotionRestart(self.target, self._used_ns), HeldBack()
+
+    def _find_motion(self, lost: MotionRestart, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
+        """Take the motion anew as soon as images show it, and follow those it was taken from."""
+        f = self.filter
+        assert f is not None
+        assert self._buffer is not None
+        lost.take(frame, t_cam_s, f.state, self._buffer)
+        if frame.camera in self._seek_shift:
+            if len(lost.frames) < _SEEK_IMAGES:
+                return []
+            lost = self._seek(f, lost, frame.camera)
+        self._buffer.trim((lost.frames[0][0] if lost.frames else t_cam_s) - _KEEP_S)
+        motion = lost.motion(f.state, self.layout, f.sigmas(), self._buffer)
+        if motion is None:
+            return []
+        self._lost = None
+        f.restart_motion(motion)
+        return [r for t, kept in lost.frames for r in self._one(kept, t)]
 
     def _step(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
         """Propagate a filter to one image and correct it; None where inertial data are missing."""
@@ -208,15 +302,16 @@ class Calibrator:
             return None
         return f.update(f.image(frame, t_cam_s, self.target[frame.ids]))
 
-    def _one(self, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
-        """Follow one image of the stream."""
+    def _one(self, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
+        """Follow one image of the stream; its verdict, or none where it could not be used."""
         f = self.filter
-        assert f is not None
+        if f is None:  # an image before this one ended it
+            return []
         assert self._buffer is not None
         report = self._step(f, frame, t_cam_s)
         if report is None:
             self.judge.frames_ignored += 1
-            return None
+            return []
         if f.unshown is not None:
             self._starting.take([(t_cam_s, frame)])
             f.unshown.follow(f)
@@ -228,15 +323,20 @@ class Calibrator:
         if not f.plausible():
             self.watch.why = "the estimate left the range of what a rig can be"
             self._restart(f)
-            return report
+            return [report]
+        self._used_ns[frame.camera] = frame.t_cam_ns
+        self._past.saw(f, report, frame, t_cam_s)
         self.judge.saw_frame(report, f)
+        if self._unproven is not None and f.state.t_s > self._unproven[0]:
+            self.judge.announce(self._unproven[1])
+            self._unproven = None
         for block, told in self._beyond_doubt.look(f).items():
             self.judge.announce(told, once=block)
-        self._act(self.watch.look(report, f), frame, t_cam_s)
+        self._act(self.watch.look(report, f), frame)
         doubt = target_doubt.told(f.doubt)
         if doubt:
             self.judge.announce(doubt, once=hypotheses.TARGET)
-        return report
+        return [report]
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
         """How well an image was predicted that the held-back copy of the filter has not used."""
@@ -244,54 +344,94 @@ class Calibrator:
         assert self._buffer is not None
         return self._held_back.follow(self.filter, frame, t_cam_s, self.target, self._buffer)
 
-    def _act(self, action: Action, frame: PointsFrame, t_cam_s: float) -> None:
+    def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
+        if action in (Action.POSE, Action.RESTART) and self._shift_stepped(f, frame.camera):
+            return
         if action is Action.POSE:
-            self._pose_anew(f, frame, t_cam_s)
+            self._lose_motion()
+            self.judge.announce("pose lost and taken anew from the images")
         elif action in (Action.SKEW, Action.WANDER):
             anew = action is Action.WANDER
             self.judge.announce(clock_drift.let_drift(f, frame.camera, self.watch.why, anew=anew))
         elif action is Action.RESTART:
             self._restart(f)
 
-    def _pose_anew(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
-        """After a run of refused images: take attitude and position from the image, keep the calibration."""
-        camera = f.state.cameras[frame.camera]
-        lens = Lens(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)
-        seen = pose_of(frame, t_cam_s, lens, self.target)
-        if seen is None:
-            return
-        R = seen.R_target_cam @ camera.R_imu_cam.T
-        f.reset_motion(R, seen.p_target_cam - R @ camera.p_imu_cam)
-        self.judge.announce("pose lost and taken anew from the image")
+    def _shift_stepped(self, f: CalibrationFilter, camera: str) -> bool:
+        """See whether images disagree because the time shift stepped; then go on with that alone unknown."""
+        assert self._buffer is not None
+        if self.layout.cameras[camera].timeshift is None or f.unshown is not None:
+            return False
+        fit = self._past.find_shift(f, camera, self._buffer, self.target)
+        if fit is None or not fit.stepped:
+            return False
+        self.filter = self._past.filter(f)
+        step_s = self._set_shift(self.filter, camera, fit)
+        step = f"{camera}: the time shift stepped by {1e3 * step_s:+.1f} ms; all else is kept"
+        self._unproven = (f.state.t_s + _STANDS_S, step)
+        self._lose_motion()
+        return True
+
+    def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
+        """Take a time shift as found anew, all else as it is known; the step, s."""
+        index, known = self.layout.cameras[camera].timeshift, f.state.cameras[camera]
+        assert index is not None
+        step_s = fit.timeshift_s - known.timeshift_s
+        known.timeshift_s = fit.timeshift_s
+        f.forget(index, max(_STEPPED_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
+        self.watch.started(f.state.t_s)
+        self.judge.reopened(f.state.t_s)
+        return step_s
 
     def _restart(self, f: CalibrationFilter) -> None:
-        """The rig has changed: forget mounting and delay, and start from the data to come.
+        """The rig has changed: find mounting and delay anew in the data to come, and keep all else.
 
-        Kept are the lens, and what is known not to be as stated.
+        Where what was kept soon turns out not to fit either, nothing is.
         """
         if f.unshown is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
             self._starting.anew()
             return
-        sound = f if f.plausible() else None
+        before = self._past.filter(f)
+        sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
         for name, camera in sound.state.cameras.items() if sound else ():
             self.priors[name] = replace(
                 self.priors[name],
                 intrinsics=tuple(camera.intrinsics.tolist()),
                 distortion=tuple(camera.distortion.tolist()),
             )
+        self._unproven = None
         self.judge.changed(self.watch.why)
         self._stale, self.filter = sound, None
         self._starting = self._new_starting(sound.off if sound else ())
+
+    def _seek(self, f: CalibrationFilter, lost: MotionRestart, camera: str) -> MotionRestart:
+        """After the clock of a camera was set: find its time shift from the images collected."""
+        assert self._buffer is not None
+        self._seek_shift.discard(camera)
+        own = [x for x in lost.frames if x[1].camera == camera]
+        fit = self._past.shift_of(own, f, self._buffer, self.target)
+        if fit is None:
+            return lost
+        self._set_shift(f, camera, fit)
+        self._lost = again = MotionRestart(self.target, self._used_ns)
+        for t_cam_s, frame in lost.frames:
+            again.take(frame, t_cam_s, f.state, self._buffer)
+        return again
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
         self.judge.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
-        return self._stamps.told(self.judge.estimate(self.filter, self._stale))
+        offsets = {name: self._offset_s(name) for name in self.priors}
+        estimate = self.judge.estimate(self.filter, self._stale)
+        return by_present_stamps(estimate, offsets, self._stamp_sigma_s)
+
+    def _offset_s(self, camera: str) -> float:
+        """Time shift by the stamps as they come now, minus that of the filter, s."""
+        return self._imu.shift_s + self._images.offset_s(camera)
 
     def _in_doubt(self, f: CalibrationFilter) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
@@ -303,4 +443,4 @@ class Calibrator:
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
-        return self._stamps.told_trace(self.judge.trace(camera))
+        return trace_by_present_stamps(self.judge.trace(camera), self._offset_s(camera))

@@ -71,7 +71,7 @@ def linear_start(
     Returns:
         The solution, or None where the readings do not cover the instants.
     """
-    integrals = _integrate(buffer, t_imu_s, R_world_imu, gyro_bias)
+    integrals = integrate_twice(buffer, t_imu_s, R_world_imu, gyro_bias)
     if integrals is None:
         return None
     D, B = integrals
@@ -110,10 +110,13 @@ def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:
     return still
 
 
-def _integrate(
+def integrate_twice(
     buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bias: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Double integrals D (n, 3) of R f and B (n, 3, 3) of R, attitude re-anchored to vision at each pose."""
+    """Return double integrals D (n, 3) of R f and B (n, 3, 3) of R, re-anchored to vision at each pose.
+
+    None where readings do not cover the instants.
+    """
     n = len(t_s)
     D, B = np.zeros((n, 3)), np.zeros((n, 3, 3))
     Vd, Vb = np.zeros(3), np.zeros((3, 3))

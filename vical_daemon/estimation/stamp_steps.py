@@ -9,12 +9,9 @@ Only stamps that are even but for such steps are touched; others (taken on arriv
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 
 _LEARN = 20  # intervals by which the usual one is known
 _LEAST_S = 1e-4  # smaller steps are like jitter
@@ -88,15 +85,3 @@ class StampSteps:
         """Steps that have become certain since the last call, in words."""
         news, self._news = self._news, []
         return news
-
-    def told(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
-        """An estimate by the even axis, told by the stamps of now."""
-        cameras = {
-            name: replace(e, timeshift_cam_imu_s=e.timeshift_cam_imu_s + self.total_s)
-            for name, e in estimate.cameras.items()
-        }
-        return replace(estimate, cameras=cameras)
-
-    def told_trace(self, points: Iterable[TracePoint]) -> list[TracePoint]:
-        """A trace by the even axis, told by the stamps of now."""
-        return [replace(p, timeshift_s=p.timeshift_s + self.total_s) for p in points]

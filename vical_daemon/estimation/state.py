@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -188,6 +189,26 @@ class State:
     def __post_init__(self) -> None:
         if not len(self.tilt):
             self.tilt = tilt_basis(self.gravity)
+
+
+class MotionStart(NamedTuple):
+    """Motion at one instant, known independently of the calibration.
+
+    Attributes:
+        t_s: Instant, imu clock, s.
+        R_world_imu: Attitude, shape (3, 3).
+        p_world_imu: Position, m.
+        v_world_imu: Velocity, m/s.
+        sigmas: Of attitude (rad), position (m), velocity (m/s), shape (9,).
+        elapsed_s: Since the state's instant; stamps may have stepped.
+    """
+
+    t_s: float
+    R_world_imu: FloatArray
+    p_world_imu: FloatArray
+    v_world_imu: FloatArray
+    sigmas: FloatArray
+    elapsed_s: float
 
 
 def rotation_from_grp(p: FloatArray) -> FloatArray:

@@ -24,10 +24,15 @@ from vical_daemon.estimation.free.starter import Starter
 from vical_daemon.estimation.free.thinning import Thinning
 from vical_daemon.estimation.free.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
 from vical_daemon.estimation.free.window import Window
+from vical_daemon.estimation.image_intake import (
+    ImageIntake,
+    by_present_stamps,
+    trace_by_present_stamps,
+)
 from vical_daemon.estimation.imu_buffer import ImuBuffer
+from vical_daemon.estimation.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
-from vical_daemon.estimation.stamp_steps import StampSteps
 from vical_daemon.estimation.unshown_axes import has_turned
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
@@ -72,9 +77,8 @@ class TargetFreeCalibrator:
         self.latest: Carry | None = None  # after its last adjustment
         self._closed = 0
         self._noise = (options.corner_sigma_px, 1.0, 0.0)  # px, how long errors last, jitter of stamps in s
-        self._buffer: ImuBuffer | None = None
-        self._base_ns = 0
-        self._stamps = StampSteps()
+        self._imu = ImuIntake()
+        self._images = ImageIntake()
         self._pending: list[Stamped] = []
         self._newest_s = -np.inf  # stamp of the last image, used or not
         self._thinning = Thinning(MAX_RATE_HZ)
@@ -82,25 +86,31 @@ class TargetFreeCalibrator:
         self._reports: list[FrameReport] = []
 
     # ------------------------------------------------------------------ input
+    def stamps_known_to(self, sigma_s: float) -> None:
+        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        self.judge.doubts.stamp_sigma_s = sigma_s
+
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
-        if self._buffer is None:
-            self._base_ns = t_imu_ns
-            self._buffer = ImuBuffer(t_imu_ns)
-        gyro, accel = np.asarray(gyro_rps, np.float64), np.asarray(specific_force_mps2, np.float64)
-        if self._buffer.append(self._stamps.even((t_imu_ns - self._base_ns) * 1e-9), gyro, accel):
-            self.judge.saw_imu(t_imu_ns, gyro)
-        else:
-            self.judge.imu_refused += 1
-        self.judge.events += self._stamps.news()
+        refused = self._imu.refused
+        for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
+            self.judge.saw_imu(reading.t_imu_ns, reading.gyro_rps)
+        self.judge.imu_refused += self._imu.refused - refused
+        self.judge.events += self._imu.news()
+
+    @property
+    def _buffer(self) -> ImuBuffer | None:
+        return self._imu.buffer
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
         if frame.camera != self.camera or self._buffer is None:
             self.judge.frames_ignored += 1
             return
-        t_cam_s = (frame.t_cam_ns - self._base_ns) * 1e-9
-        if t_cam_s <= self._newest_s:
+        stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
+        t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
+        self.judge.events += self._images.news()
+        if t_cam_s is None or t_cam_s <= self._newest_s:
             self.judge.frames_ignored += 1
             return
         self._newest_s = t_cam_s
@@ -300,11 +310,18 @@ class TargetFreeCalibrator:
         if known is not None and self._buffer is not None:
             known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
         estimate = self.judge.estimate(known, running=self.window is not None, gravity=gravity)
-        return self._stamps.told(estimate)
+        return by_present_stamps(estimate, {self.camera: self._offset_s}, self.judge.doubts.stamp_sigma_s)
+
+    @property
+    def _offset_s(self) -> float:
+        """Time shift by the stamps as they come now, minus that of the windows, s."""
+        return self._imu.shift_s + self._images.offset_s(self.camera)
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration developed."""
-        return self._stamps.told_trace(self.judge.trace()) if camera == self.camera else []
+        if camera != self.camera:
+            return []
+        return trace_by_present_stamps(self.judge.trace(), self._offset_s)
 
 
 def _full(window: Window) -> bool:

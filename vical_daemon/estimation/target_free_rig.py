@@ -44,6 +44,11 @@ class TargetFreeRig:
         self.parts = {name: TargetFreeCalibrator(options, {name: prior}) for name, prior in cameras.items()}
         self.frames_ignored = 0  # of cameras that nobody asked for
 
+    def stamps_known_to(self, sigma_s: float) -> None:
+        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        for part in self.parts.values():
+            part.stamps_known_to(sigma_s)
+
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2)."""
         for part in self.parts.values():

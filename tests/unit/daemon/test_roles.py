@@ -26,6 +26,7 @@ from vical_daemon.estimation.result import (
 )
 from vical_daemon.estimators import input_keys
 from vical_daemon.messages import (
+    DiagnosticStatus,
     Level,
     decode_calibration,
     decode_camera_info,
@@ -35,6 +36,7 @@ from vical_daemon.messages import (
     decode_points,
     decode_pose,
     decode_transforms,
+    encode_diagnostics,
     encode_image,
     encode_imu,
     encode_points,
@@ -64,6 +66,9 @@ class FakeEstimator:
     def __init__(self) -> None:
         self.fed: list[tuple[str, int]] = []
         self.status = Status.CONVERGING
+
+    def stamps_known_to(self, sigma_s: float) -> None:
+        self.stamp_sigma_s = sigma_s
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         self.fed.append(("imu", t_imu_ns))
@@ -168,7 +173,25 @@ class TestEstimate:
         assert kept == ["verdict", "last"]
 
     def test_input_keys(self, config: Config) -> None:
-        assert input_keys(config) == ["vical/rover/imu/imu0", "vical/rover/camera/cam0/points"]
+        assert input_keys(config) == [
+            "vical/rover/imu/imu0",
+            "vical/rover/status/imu",
+            "vical/rover/camera/cam0/points",
+        ]
+
+    @pytest.mark.parametrize(
+        ("name", "value", "known"),
+        [("imu/imu0", "42.5", 42.5e-6), ("imu/other", "42.5", None), ("imu/imu0", "?", None)],
+    )
+    def test_passes_on_how_well_the_driver_knows_its_clock(
+        self, config: Config, name: str, value: str, known: float | None
+    ) -> None:
+        estimator = FakeEstimator()
+        status = DiagnosticStatus(Level.OK, name, values={"stamp_sigma_us": value})
+        payload = encode_diagnostics(0, "imu", [status])
+        EstimateRole(config, estimator).take(Sample("vical/rover/status/imu", payload, 0))
+        heard = getattr(estimator, "stamp_sigma_s", None)
+        assert heard == (None if known is None else pytest.approx(known))
 
 
 def _frame(t_ms: int, **changes: Any) -> Frame:

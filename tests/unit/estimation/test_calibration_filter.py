@@ -9,7 +9,7 @@ from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.linearise import project_errors
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
 from vical_daemon.estimation.retract import retract
-from vical_daemon.estimation.state import CameraState, State, make_layout
+from vical_daemon.estimation.state import CameraState, MotionStart, State, make_layout
 from vical_daemon.estimation.trust.consistency import Consistency
 from vical_daemon.estimation.trust.corner_noise import CornerNoise
 
@@ -173,10 +173,40 @@ def test_noise_densities_of_zero_are_taken_as_they_are(recording):
     np.testing.assert_allclose(f.sigmas()[9:15], before[9:15], rtol=1e-9)
 
 
-def test_resetting_the_motion_keeps_the_calibration(recording):
+def test_restarting_the_motion_keeps_the_calibration_but_for_its_random_walks(recording):
     f, _, _ = build(recording)
-    keep = f.sigmas()[9:]
-    f.reset_motion(np.eye(3), np.ones(3))
-    np.testing.assert_allclose(f.sigmas()[9:], keep, rtol=1e-12)
-    P = f.S @ f.S.T
-    np.testing.assert_allclose(P[:9, 9:], 0.0, atol=1e-15)
+    before, n = f.S @ f.S.T, f.layout.size
+    where = f.layout.cameras["cam0"]
+    dt = 4.0
+    skew = f.state.cameras["cam0"].skew = 1e-5
+    shift = f.state.cameras["cam0"].timeshift_s
+    sigmas = np.arange(1.0, 10.0)
+    f.restart_motion(MotionStart(f.state.t_s + dt, np.eye(3), np.ones(3), np.zeros(3), sigmas, dt))
+    F = np.eye(n)
+    F[where.timeshift, where.skew] = dt
+    expected = F @ before @ F.T
+    expected[9:12, 9:12] += f.imu_noise.gyro_walk**2 * dt * np.eye(3)
+    expected[12:15, 12:15] += f.imu_noise.accel_walk**2 * dt * np.eye(3)
+    expected[range(n), range(n)] += f.walk * dt
+    expected[:9], expected[:, :9] = 0.0, 0.0
+    expected[range(9), range(9)] = sigmas**2
+    np.testing.assert_allclose(f.S @ f.S.T, expected, rtol=1e-9, atol=1e-15)
+    assert f.state.cameras["cam0"].timeshift_s == pytest.approx(shift + dt * skew)
+    np.testing.assert_array_equal(f.state.p_world_imu, np.ones(3))
+
+
+def test_what_is_kept_over_a_change_is_all_but_motion_gravity_mounting_and_time_shift(recording):
+    known, _, _ = build(recording)
+    anew, _, _ = build(recording)
+    known.state.gyro_bias = known.state.gyro_bias + 1e-3
+    known.S, anew.S = 0.1 * known.S, anew.S.copy()
+    where = known.layout.cameras["cam0"]
+    moved = np.r_[0:9, 15:17, where.position, where.rotation, where.timeshift]
+    kept = np.setdiff1d(np.arange(known.layout.size), moved)
+    P_known, P_anew = known.S @ known.S.T, anew.S @ anew.S.T
+    anew.keep_from(known)
+    P = anew.S @ anew.S.T
+    np.testing.assert_allclose(P[np.ix_(kept, kept)], P_known[np.ix_(kept, kept)], rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(P[np.ix_(moved, moved)], P_anew[np.ix_(moved, moved)], rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(P[np.ix_(moved, kept)], 0.0, atol=1e-18)
+    np.testing.assert_array_equal(anew.state.gyro_bias, known.state.gyro_bias)

@@ -16,6 +16,7 @@ from vical_daemon.estimation.trust.clock_drift import (
     drift_told,
     evidence,
     probability,
+    stamps_variance,
 )
 
 _SURELY_ROLLING = 5.0  # sigmas
@@ -46,6 +47,7 @@ class FreeDoubts:
         imu_asked: The imu's matrices are asked for.
         imu_sigma: Prior of the entries of the imu's matrices.
         rolling: The shutter is known to be a rolling one.
+        stamp_sigma_s: How well the imu's driver knows its device's clock, s.
     """
 
     def __init__(self, camera: str, *, asked: frozenset[str], rolling: bool) -> None:
@@ -55,6 +57,8 @@ class FreeDoubts:
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else hypotheses.ENTRY_SIGMA
         self.drifting = False
         self.rolling = rolling
+        self.stamp_sigma_s = 0.0
+        self._began_s = np.inf
 
     def watch(self, carry: Carry, factor: float, compared: bool) -> list[str]:
         """Announce what has got beyond doubt.
@@ -107,12 +111,14 @@ class FreeDoubts:
         )
         return Doubts(factor, self.drifting, stated, gyro_frame=not self.imu_asked, rolling=self.rolling)
 
-    @staticmethod
-    def _drift(carry: Carry, factor: float) -> float:
+    def _drift(self, carry: Carry, factor: float) -> float:
         """How much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated."""
         if not carry.active[DRIFT]:
             return 0.0
-        return evidence(carry.camera.skew, factor * float(carry.calibration()[DRIFT, DRIFT]))
+        self._began_s = min(self._began_s, carry.t_cam_s)
+        variance = factor * float(carry.calibration()[DRIFT, DRIFT])
+        variance += stamps_variance(self.stamp_sigma_s, carry.t_cam_s - self._began_s)
+        return evidence(carry.camera.skew, variance)
 
     def _weights(self, carry: Carry, factor: float) -> Weights:
         """Probability of each hypothesis about the imu, named by what is as stated.

@@ -18,6 +18,7 @@ from vical_daemon.estimation.trust.drift_watch import DriftWatch
 _REFUSED_POSE = 10  # images in a row before the pose is taken anew
 _REFUSED_CHANGED = 8  # images in a row, soon after that, before the calibration is
 _SOON_S = 4.0
+_LOOK_CLOSER = 10  # images after an alarm: what has changed shows only in those after it
 _SETTLE_S = 3.0  # after a start the innovations still move
 _DRIFT_FLOOR_S = 30e-6
 _DRIFT_AFTER_S = 2.0
@@ -43,13 +44,14 @@ class ChangeWatch:
 
     why: str = ""
     _refused: int = 0
+    _closer: int = 0  # images until what has changed is decided; 0: nothing has
     _pose_taken_s: float = float("-inf")
     _started_s: float = float("inf")
     _drift: dict[str, DriftWatch] = field(default_factory=dict)
 
     def started(self, t_s: float) -> None:
         """A filter starts at `t_s`."""
-        self._refused = 0
+        self._refused = self._closer = 0
         self._pose_taken_s, self._started_s = float("-inf"), t_s
         self._drift.clear()
 
@@ -73,10 +75,12 @@ class ChangeWatch:
         consistency = f.consistency[report.camera]
         if consistency.alarmed:
             consistency.alarm = 0.0
-            if t > self._started_s + _SETTLE_S:
-                self.why = (
-                    "images have come to disagree with the motion (the camera moved, or its delay stepped)"
-                )
+            if t > self._started_s + _SETTLE_S and not self._closer:
+                self._closer = _LOOK_CLOSER
+        if self._closer:
+            self._closer -= 1
+            if not self._closer:
+                self.why = "images have come to disagree with the motion: the camera moved"
                 return Action.RESTART
         return self._look_for_drift(report.camera, f)
 
@@ -86,6 +90,7 @@ class ChangeWatch:
         if index is None or camera in f.drifting or t_s < self._started_s + _DRIFT_AFTER_S:
             return Action.NONE
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
+        watch.floor = max(_DRIFT_FLOOR_S, f.stamp_sigma_s)
         if not watch.due(t_s):
             return Action.NONE
         if surely_apart(f, camera):

@@ -25,6 +25,7 @@ CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks
 SKEW_WALK = 1e-8
 """How such a drift wanders (temperature), s/s per sqrt(s)."""
 _APART = 0.05  # share of rigs whose clocks do not run alike
+_LEAST_S = 1.0
 SURE = 0.99
 """Probability from which on a drift is announced."""
 
@@ -59,8 +60,22 @@ def _evidence(f: CalibrationFilter, camera: str) -> float:
     index = f.layout.cameras[camera].skew
     if index is None:
         return 0.0
-    variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index])
+    variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index]) + stamps_variance(
+        f.stamp_sigma_s, f.state.t_s - f.began_s
+    )
     return evidence(f.state.cameras[camera].skew, variance)
+
+
+def stamps_variance(stamp_sigma_s: float, elapsed_s: float) -> float:
+    """Variance of the drift that errors of the imu's stamps look like, (s/s)^2.
+
+    An error that changes once by one sigma, about halfway, has a slope of two sigmas over the whole time.
+
+    Args:
+        stamp_sigma_s: How well the driver knows its device's clock, s.
+        elapsed_s: Length of the data, s.
+    """
+    return (2.0 * stamp_sigma_s / max(elapsed_s, _LEAST_S)) ** 2
 
 
 def in_doubt(f: CalibrationFilter, camera: str) -> bool:

@@ -66,6 +66,7 @@ class Judge:
         self._first_ns = self._newest_ns = 0
         self._first_frame_s: float | None = None
         self._started_s: float | None = None
+        self._reopened_s = -np.inf
         self._points = [0, 0]
         self._nis: deque[tuple[float, int]] = deque(maxlen=300)
         self._recent_used: deque[bool] = deque(maxlen=_RECENT)
@@ -107,6 +108,10 @@ class Judge:
         if self.bumped:
             self.events.append("started anew after the change")
             self.bumped = ""
+
+    def reopened(self, t_s: float) -> None:
+        """Something that was known has to be found anew: patience begins again at `t_s`."""
+        self._reopened_s = t_s
 
     def announce(self, event: str, once: str = "") -> None:
         """Put an event into the next estimate; of those with the same `once` only the first."""
@@ -253,7 +258,8 @@ class Judge:
                 return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
             return Status.CONVERGED, "", ""
         worst = lacking[0]
-        if span > _PATIENCE_S and worst.excess > _LOST:
+        patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > _PATIENCE_S
+        if patient and worst.excess > _LOST:
             names = "; ".join(g.said for g in lacking[:3])
             return Status.DEGENERATE, f"the motion does not show: {names}", worst.motion
         return Status.CONVERGING, f"{worst.said}", worst.motion

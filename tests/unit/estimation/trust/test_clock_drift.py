@@ -11,7 +11,13 @@ from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.state import CameraState, State, make_layout
-from vical_daemon.estimation.trust.clock_drift import SKEW_SIGMA, apart, as_if_alike, averaged
+from vical_daemon.estimation.trust.clock_drift import (
+    SKEW_SIGMA,
+    apart,
+    as_if_alike,
+    averaged,
+    stamps_variance,
+)
 from vical_daemon.estimation.trust.consistency import Consistency
 from vical_daemon.estimation.trust.corner_noise import CornerNoise
 
@@ -140,3 +146,24 @@ def test_clocks_that_run_alike_pay_little():
 def test_a_drift_too_small_to_be_seen_yet_does_not_make_it_lie():
     out, _ = calibrated(-60.0)
     assert all(abs(error) < 5.0 * sigma for error, sigma, _ in out)
+
+
+def test_a_drift_that_errors_of_the_stamps_explain_is_no_drift():
+    """8 us a second over 10 s, seen to 1 us a second; stamps known to 40 us explain it, 100 ppm they do not."""
+    assert apart(some_filter(8e-5), NAME) > 0.99
+    slow, fast = some_filter(8e-6), some_filter(1e-4)
+    for f in (slow, fast):
+        row = f.layout.cameras[NAME].skew
+        f.S[row] *= 1e-6 / np.linalg.norm(f.S[row])
+        f.state.t_s, f.began_s = 12.0, 2.0
+    assert apart(slow, NAME) > 0.99
+    for f in (slow, fast):
+        f.stamp_sigma_s = 40e-6
+    assert apart(slow, NAME) < 0.05
+    assert apart(fast, NAME) > 0.99
+
+
+def test_stamps_variance_is_the_slope_of_a_step_halfway():
+    t = np.linspace(0.0, 10.0, 2001)
+    slope = np.polyfit(t, np.where(t < 5.0, 0.0, 40e-6), 1)[0]  # least squares: 1.5 steps over the length
+    assert np.sqrt(stamps_variance(40e-6, 10.0)) == pytest.approx(slope, rel=0.4)

@@ -1,0 +1,219 @@
+"""Gaps, frozen sensors and clocks that are set: the motion is found anew, the calibration is kept."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vical_mocks.points import simulate
+from vical_mocks.rig import Bump, reference_rig
+
+from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.motion_restart import MotionRestart
+from vical_daemon.estimation.result import Status
+
+BEGIN_S, END_S = 14.0, 22.0
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate(5, END_S, timeshift_cam_imu_s=-0.035)
+
+
+def stream(run):
+    """(true time s, kind, stamp ns, content) in order of arrival."""
+    epoch = run.options.epoch_ns
+    items = [
+        ((int(t) - epoch) * 1e-9, 0, int(t), (w, f))
+        for t, w, f in zip(run.t_imu_ns, run.gyro_rps, run.specific_force_mps2, strict=True)
+    ]
+    items += [(f.t_s, 1, f.t_cam_ns, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px)) for f in run.frames]
+    return sorted(items, key=lambda item: item[:2])
+
+
+def calibrate(run, change=lambda items: items):
+    """Feed what is left of a recording; the calibrator, its events, and sigmas and status as time goes by."""
+    lens = run.rig.lens
+    prior = {"cam0": CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))}
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise())
+    c = Calibrator(options, prior, run.points_m)
+    events, shots = [], []
+    for n, (t_s, kind, stamp_ns, content) in enumerate(change(stream(run))):
+        if kind:
+            c.add_points(replace(content, t_cam_ns=stamp_ns))
+            c.process()
+        else:
+            c.add_imu(stamp_ns, *content)
+        if n % 20 == 0:
+            estimate = c.estimate()
+            events += estimate.events
+            shots.append((t_s, estimate))
+    c.finish()
+    estimate = c.estimate()
+    return estimate, events + estimate.events, shots
+
+
+@pytest.fixture(scope="module")
+def whole(run):
+    return calibrate(run)[0]
+
+
+def without(kinds, seconds):
+    return lambda items: [x for x in items if not (x[1] in kinds and BEGIN_S <= x[0] < BEGIN_S + seconds)]
+
+
+def stepped(kind, step_s):
+    step_ns = round(step_s * 1e9)
+    return lambda items: [
+        (t, k, stamp + (step_ns if k == kind and t >= BEGIN_S else 0), x) for t, k, stamp, x in items
+    ]
+
+
+def frozen(kind, seconds):
+    def change(items):
+        last, out = None, []
+        for t, k, stamp, x in items:
+            if k == kind and not BEGIN_S <= t < BEGIN_S + seconds:
+                last = x
+            out.append((t, k, stamp, last if k == kind else x))
+        return out
+
+    return change
+
+
+def sigmas(estimate):
+    e = estimate.cameras["cam0"]
+    return np.sqrt([*np.diag(e.T_imu_cam.covariance), e.timeshift_sigma_s**2])
+
+
+def distance_m(a, b):
+    return float(
+        np.linalg.norm(np.subtract(a.cameras["cam0"].T_imu_cam.p_m, b.cameras["cam0"].T_imu_cam.p_m))
+    )
+
+
+def before(shots):
+    return [e for t, e in shots if t < BEGIN_S][-1]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "seconds", "said"),
+    [
+        ((0,), 0.1, "0.1 s without inertial data"),
+        ((0,), 2.0, "2.0 s without inertial data"),
+        ((1,), 2.0, "2.0 s without images from cam0"),
+        ((0, 1), 1.0, "1.0 s without inertial data"),
+        ((0, 1), 5.0, "5.0 s without inertial data"),
+    ],
+    ids=["imu 0.1 s", "imu 2 s", "camera 2 s", "both 1 s", "both 5 s"],
+)
+def test_a_gap_costs_the_motion_and_not_the_calibration(run, whole, kinds, seconds, said):
+    estimate, events, shots = calibrate(run, without(kinds, seconds))
+    assert events.count(said) == 1
+    assert not any(e.startswith(("bumped", "started", "pose lost")) or "stepped" in e for e in events)
+    assert estimate.status == Status.CONVERGED
+    assert all(e.status == Status.CONVERGED for t, e in shots if t > BEGIN_S + seconds + 2.0)
+    grown = sigmas(before(shots))
+    if seconds > 2.0:  # a clock may have drifted meanwhile, by what was known of it
+        grown[6] = np.hypot(grown[6], seconds * 3e-6)
+    assert all(np.all(sigmas(e) < 1.02 * grown) for t, e in shots if t > BEGIN_S)
+    assert distance_m(estimate, whole) < 3e-4
+
+
+@pytest.mark.parametrize(
+    ("kind", "seconds", "said"),
+    [(0, 1.0, "1.0 s in which the IMU repeated one reading"), (1, 3.0, "s in which cam0 repeated one image")],
+    ids=["imu", "camera"],
+)
+def test_a_frozen_sensor_is_a_gap(run, whole, kind, seconds, said):
+    estimate, events, _ = calibrate(run, frozen(kind, seconds))
+    assert sum(said in e for e in events) == 1
+    assert not any(e.startswith(("bumped", "started", "pose lost")) or "stepped" in e for e in events)
+    assert estimate.status == Status.CONVERGED
+    assert distance_m(estimate, whole) < 3e-4
+
+
+@pytest.mark.parametrize("step_s", [0.02, -0.02, 0.5, -0.5, 3600.0, -3600.0])
+@pytest.mark.parametrize("kind", [0, 1], ids=["imu", "camera"])
+def test_a_clock_that_is_set_moves_the_time_shift_alone(run, whole, kind, step_s):
+    estimate, events, _ = calibrate(run, stepped(kind, step_s))
+    shift_s = run.rig.timeshift_cam_imu_s + (step_s if kind == 0 else -step_s)
+    e = estimate.cameras["cam0"]
+    assert not any(x.startswith(("bumped", "started")) for x in events)
+    assert estimate.status == Status.CONVERGED
+    assert distance_m(estimate, whole) < 3e-4
+    assert abs(e.timeshift_cam_imu_s - shift_s) < 4.5 * e.timeshift_sigma_s
+    assert e.timeshift_sigma_s < 3e-4
+
+
+def test_a_gap_while_starting_delays_the_start_and_no_more(run):
+    def change(items):
+        return [x for x in items if not 2.0 <= x[0] < 3.0]
+
+    estimate, events, _ = calibrate(run, change)
+    e = estimate.cameras["cam0"]
+    truth = run.truth()["cameras"]["cam0"]
+    error = np.subtract(e.T_imu_cam.p_m, truth["T_imu_cam"]["p_m"]) / sigmas(estimate)[:3]
+    assert "1.0 s without inertial data" in events
+    assert estimate.status == Status.CONVERGED
+    assert np.abs(error).max() < 4.5
+
+
+def test_a_bump_inside_a_gap_is_announced_soon_after_it():
+    rig = reference_rig(6, bumps=(Bump(BEGIN_S + 1.0, (0.02, 0.02, -0.02), (0.006, -0.006, 0.006)),))
+    bumped = simulate(6, END_S + 2.0, rig=rig)
+    _, events, shots = calibrate(bumped, without((0, 1), 3.0))
+    when = [t for t, e in shots if any(x.startswith("bumped") for x in e.events)]
+    assert sum(e.startswith("bumped") for e in events) == 1
+    assert BEGIN_S + 3.0 < when[0] < BEGIN_S + 6.0
+
+
+def test_two_cameras_go_on_together_after_a_gap(run):
+    lens = run.rig.lens
+    prior = CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise())
+    c = Calibrator(options, {"cam0": prior, "cam1": prior}, run.points_m)
+    rng, events = np.random.default_rng(0), []
+    for n, (_, kind, stamp_ns, content) in enumerate(without((0, 1), 1.0)(stream(run))):
+        if kind:
+            c.add_points(content)
+            c.add_points(replace(content, camera="cam1", uv_px=content.uv_px + 0.2 * rng.standard_normal(2)))
+            c.process()
+        else:
+            c.add_imu(stamp_ns, *content)
+        if n % 50 == 0:
+            events += c.estimate().events
+    c.finish()
+    assert not any(e.startswith("bumped") for e in events)
+    assert c.estimate().status == Status.CONVERGED
+
+
+def test_the_motion_found_anew_is_the_true_one(run):
+    c = Calibrator(
+        CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise()),
+        {
+            "cam0": CameraPrior(
+                (640, 480), tuple(run.rig.lens.intrinsics), "radtan", tuple(run.rig.lens.distortion)
+            )
+        },
+        run.points_m,
+    )
+    for _, kind, stamp_ns, content in stream(run):
+        if kind:
+            c.add_points(content)
+            c.process()
+        else:
+            c.add_imu(stamp_ns, *content)
+    f, base_s = c.filter, (int(run.t_imu_ns[0]) - run.options.epoch_ns) * 1e-9
+    restart = MotionRestart(run.points_m, {})
+    frames = [x for x in run.frames if END_S - 1.5 < x.t_s < END_S - 0.5][:5]
+    for x in frames:
+        t_cam_s = (x.t_cam_ns - int(run.t_imu_ns[0])) * 1e-9
+        restart.take(PointsFrame("cam0", x.t_cam_ns, x.ids, x.uv_px), t_cam_s, f.state, c._buffer)
+    motion = restart.motion(f.state, c.layout, f.sigmas(), c._buffer)
+    tau = np.array([motion.t_s + base_s])
+    truth = run.rig.trajectory
+    turn = np.arccos(np.clip((np.trace(truth.R_world_imu(tau)[0].T @ motion.R_world_imu) - 1) / 2, -1, 1))
+    assert turn < 0.3 * motion.sigmas[0]
+    assert np.abs(truth.p_world_imu(tau)[0] - motion.p_world_imu).max() < 0.5 * motion.sigmas[3]
+    assert np.abs(truth.v_world_imu(tau)[0] - motion.v_world_imu).max() < motion.sigmas[6]

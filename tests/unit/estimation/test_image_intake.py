@@ -1,0 +1,90 @@
+"""What images enter, and what is reported, for cameras and drivers as they are."""
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation.image_intake import ImageIntake
+from vical_daemon.estimation.measurements import PointsFrame
+
+RNG = np.random.default_rng(1)
+IDS = np.arange(20)
+
+
+def image(camera="cam0", uv=None):
+    return PointsFrame(camera, 0, IDS, RNG.uniform(0, 500, (20, 2)) if uv is None else uv)
+
+
+def feed(intake, stamps_s, newest_imu_s, frames=None):
+    frames = [image() for _ in stamps_s] if frames is None else frames
+    return [intake.take(f, t, n) for f, t, n in zip(frames, stamps_s, newest_imu_s, strict=True)]
+
+
+def test_even_images_pass_and_nothing_is_reported():
+    t = 0.05 * np.arange(100)
+    intake = ImageIntake()
+    assert feed(intake, t, t + 0.01) == list(t)
+    assert intake.news() == []
+
+
+def test_a_gap_is_reported_once():
+    t = 0.05 * np.arange(100)
+    t[50:] += 2.0
+    intake = ImageIntake()
+    assert feed(intake, t, t) == list(t)
+    assert intake.news() == ["2.0 s without images from cam0"]
+    assert intake.news() == []
+
+
+def test_a_slow_camera_has_no_gaps():
+    t = 0.7 * np.arange(30)
+    intake = ImageIntake()
+    feed(intake, t, t)
+    assert intake.news() == []
+
+
+def test_a_frozen_camera_is_a_gap():
+    t = 0.05 * np.arange(120)
+    still = image()
+    frames = [still if 40 <= n < 100 else image() for n in range(120)]
+    intake = ImageIntake()
+    taken = feed(intake, t, t, frames)
+    assert sum(x is None for x in taken) == 59
+    assert intake.news() == ["3.0 s in which cam0 repeated one image"]
+
+
+def test_images_without_points_are_not_repetitions():
+    empty = PointsFrame("cam0", 0, np.zeros(0, np.int64), np.zeros((0, 2)))
+    intake = ImageIntake()
+    assert feed(intake, [0.0, 0.1, 0.2], [0.0, 0.1, 0.2], [empty] * 3) == [0.0, 0.1, 0.2]
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0, 10.0])
+def test_a_camera_clock_that_is_set_is_followed_by_the_order_of_arrival(step_s):
+    t = 0.05 * np.arange(200)
+    stamps = np.where(t < 5.0, t, t + step_s)
+    intake = ImageIntake()
+    taken = feed(intake, stamps, t + 0.02)
+    assert sum(x is None for x in taken) == 4
+    np.testing.assert_allclose([x for x in taken if x is not None], np.delete(t, np.r_[100:104]), atol=1e-9)
+    assert intake.news() == [f"cam0: its stamps stepped by about {step_s:+.1f} s against those of the IMU"]
+    assert intake.offset_s("cam0") == pytest.approx(-step_s)
+
+
+def test_an_imu_that_pauses_is_no_step_of_the_camera():
+    t = 0.05 * np.arange(400)
+    newest = np.where((t > 5.0) & (t < 15.0), 5.0, t)
+    intake = ImageIntake()
+    taken = feed(intake, t, newest)
+    assert intake.news() == []
+    assert intake.offset_s("cam0") == 0.0
+    assert taken[-1] == t[-1]
+
+
+def test_cameras_are_followed_apart():
+    t = 0.05 * np.arange(100)
+    intake = ImageIntake()
+    for n, s in enumerate(t):
+        intake.take(image("left"), s + (100.0 if n > 50 else 0.0), s)
+        intake.take(image("right"), s, s)
+    assert intake.offset_s("left") == pytest.approx(-100.0)
+    assert intake.offset_s("right") == 0.0

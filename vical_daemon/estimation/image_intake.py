@@ -1,0 +1,167 @@
+"""Where images enter an estimator: repeated ones left out, gaps and steps of the camera's clock reported."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+
+SEARCHED_S = 1.5
+"""Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
+images and inertial readings arrive shows the greater part."""
+_REPORTED_S = 0.5  # shorter gaps are lost images, which every camera has and the device's status counts
+_GAP_PERIODS = 4.0  # and than this many usual intervals: a slow camera has no gap at every image
+_FOLLOW = 0.1  # by which usual interval and usual lead follow each new image
+_AGREE = 5  # images in a row that show the same step
+
+
+@dataclass(slots=True)
+class _Stream:
+    """One camera.
+
+    Attributes:
+        newest: The last image taken.
+        newest_s: Its stamp, s.
+        lead_s: How far stamps usually are ahead of the newest inertial reading when an image arrives.
+        offset_s: Added to the stamps, for the steps of the clock so far.
+        usual_s: Interval between images.
+        repeats: Copies of the newest image since.
+        stepped_s: Leads of the latest images, all far from the usual one.
+        heard_s: Newest inertial reading when the last image arrived.
+    """
+
+    newest: PointsFrame
+    newest_s: float
+    lead_s: float
+    offset_s: float = 0.0
+    usual_s: float = np.inf
+    repeats: int = 0
+    stepped_s: list[float] = field(default_factory=list)
+    heard_s: float = -np.inf
+
+
+@dataclass(slots=True)
+class ImageIntake:
+    """Looks at the images of all cameras as they arrive.
+
+    A camera or driver that hangs delivers its last image again under new stamps; measured points never repeat
+    to the last bit by themselves. Such images are left out: what remains is a gap like any other.
+
+    A clock that is set by seconds shows in the order of arrival: stamps are suddenly far from those of the
+    inertial readings that arrive with them. They are moved back to where they usually are.
+
+    Attributes:
+        refused: Images left out.
+    """
+
+    refused: int = 0
+    _streams: dict[str, _Stream] = field(default_factory=dict)
+    _news: list[str] = field(default_factory=list)
+
+    def take(self, frame: PointsFrame, t_cam_s: float, newest_imu_s: float) -> float | None:
+        """Look at one image.
+
+        Args:
+            frame: The image.
+            t_cam_s: Its stamp, s.
+            newest_imu_s: Stamp of the newest inertial reading, s.
+
+        Returns:
+            Its stamp on an axis without steps, s; None where the image is to be left out.
+        """
+        stream = self._streams.get(frame.camera)
+        if stream is None:
+            self._streams[frame.camera] = _Stream(frame, t_cam_s, t_cam_s - newest_imu_s)
+            return t_cam_s
+        if _same(stream.newest, frame):
+            stream.repeats += 1
+            self.refused += 1
+            return None
+        t_s = t_cam_s + stream.offset_s
+        if not self._in_step(stream, frame.camera, t_s - newest_imu_s, newest_imu_s):
+            self.refused += 1
+            return None
+        t_s = t_cam_s + stream.offset_s
+        self._measure(stream, frame, t_s)
+        return t_s
+
+    def _in_step(self, stream: _Stream, camera: str, lead_s: float, newest_imu_s: float) -> bool:
+        """Whether a stamp is about where it usually is; a clock that has been set is followed."""
+        heard, stream.heard_s = newest_imu_s > stream.heard_s, newest_imu_s
+        off_s = lead_s - stream.lead_s
+        if abs(off_s) <= SEARCHED_S:
+            stream.lead_s += _FOLLOW * off_s if heard else 0.0
+            stream.stepped_s.clear()
+            return True
+        if not heard:  # no inertial data arrive: nothing to compare with
+            stream.newest_s = lead_s + newest_imu_s
+            return False
+        if stream.stepped_s and abs(off_s - stream.stepped_s[-1]) > SEARCHED_S:
+            stream.stepped_s.clear()
+        stream.stepped_s.append(off_s)
+        if len(stream.stepped_s) < _AGREE:
+            return False
+        step_s = float(np.median(stream.stepped_s))
+        stream.stepped_s.clear()
+        stream.offset_s -= step_s
+        stream.newest_s = np.nan
+        self._news.append(f"{camera}: its stamps stepped by about {step_s:+.1f} s against those of the IMU")
+        return True
+
+    def _measure(self, stream: _Stream, frame: PointsFrame, t_s: float) -> None:
+        """Follow the usual interval; report a gap."""
+        gap_s = t_s - stream.newest_s
+        if gap_s > max(_REPORTED_S, _GAP_PERIODS * stream.usual_s):
+            what = "in which {} repeated one image" if stream.repeats else "without images from {}"
+            self._news.append(f"{gap_s:.1f} s {what.format(frame.camera)}")
+        elif gap_s > 0.0:
+            seen = stream.usual_s
+            stream.usual_s = gap_s if np.isinf(seen) else seen + _FOLLOW * (gap_s - seen)
+        stream.newest, stream.newest_s, stream.repeats = frame, t_s, 0
+
+    def offset_s(self, camera: str) -> float:
+        """Time shift by the stamps as they come now, minus the time shift by the axis without steps, s."""
+        return self._streams[camera].offset_s if camera in self._streams else 0.0
+
+    def news(self) -> list[str]:
+        """Gaps and steps since the last call, in words."""
+        news, self._news = self._news, []
+        return news
+
+
+def by_present_stamps(
+    estimate: CalibrationEstimate, offsets_s: Mapping[str, float], stamp_sigma_s: float
+) -> CalibrationEstimate:
+    """Return an estimate made on axes without steps, with time shifts by the stamps as they come now.
+
+    Args:
+        estimate: By axes without steps.
+        offsets_s: Added to the time shift of each camera, s.
+        stamp_sigma_s: How well the imu's stamps are known now, s; no image can show that.
+    """
+    cameras = {
+        name: replace(
+            e,
+            timeshift_cam_imu_s=e.timeshift_cam_imu_s + offsets_s[name],
+            timeshift_sigma_s=math.hypot(e.timeshift_sigma_s, stamp_sigma_s) if e.timeshift_sigma_s else 0.0,
+        )
+        for name, e in estimate.cameras.items()
+    }
+    return replace(estimate, cameras=cameras)
+
+
+def trace_by_present_stamps(points: list[TracePoint], offset_s: float) -> list[TracePoint]:
+    """Return a trace likewise."""
+    return [replace(p, timeshift_s=p.timeshift_s + offset_s) for p in points]
+
+
+def _same(a: PointsFrame, b: PointsFrame) -> bool:
+    """Whether two images show the same points at the same places, to the last bit; not for empty ones."""
+    return len(a.ids) == len(b.ids) > 0 and bool(
+        (a.ids == b.ids).all() and (np.asarray(a.uv_px) == np.asarray(b.uv_px)).all()
+    )

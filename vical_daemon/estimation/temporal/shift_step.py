@@ -1,0 +1,129 @@
+"""A step of the time shift, with the mounting known: where do the camera's orientations fit the gyro's curve?
+
+Camera and gyro trace one curve in the rotation group; with the mounting known, only the time shift and the
+rotation between the two worlds are free. [docs/math/td_icp.md]
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
+
+_GRID_S = 5e-3  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
+_LEAST_IMAGES = 8
+_STEPS, _DERIVATIVE_S = 5, 1e-4  # Gauss-Newton from the nearest place on the grid
+_FITS_P = 1e-6  # chance that orientations which fit are said not to
+_SURE = 25.0  # of the sum of squares: five sigma
+_APART_S = 0.05  # other places on the curve begin so far from the best
+
+
+class ShiftFit(NamedTuple):
+    """Where the camera's orientations fit.
+
+    Attributes:
+        timeshift_s: t_imu = t_cam + shift, s.
+        sigma_s: Of it.
+        stepped: The time shift so far fits worse, beyond five sigma.
+    """
+
+    timeshift_s: float
+    sigma_s: float
+    stepped: bool
+
+
+class Orientations(NamedTuple):
+    """Orientations of a camera.
+
+    Attributes:
+        t_cam_s: Stamps, s, shape (n,).
+        R_world_cam: In any fixed world, shape (n, 3, 3).
+        sigma_rad: Noise about each axis, shape (n,).
+    """
+
+    t_cam_s: FloatArray
+    R_world_cam: FloatArray
+    sigma_rad: FloatArray
+
+
+def level_at(curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, timeshift_s: float) -> float:
+    """Sum of squares over its degrees of freedom, of orientations that fit: at least 1; 1 if not covered."""
+    t_s = seen.t_cam_s + timeshift_s
+    inside = (t_s > curve.span_s[0]) & (t_s < curve.span_s[1])
+    if inside.sum() < _LEAST_IMAGES:
+        return 1.0
+    e = _errors(curve, Orientations(*(x[inside] for x in seen)), R_imu_cam, np.array([timeshift_s]))
+    return max(float((e**2).sum()) / (e.size - 3), 1.0)
+
+
+def find_shift(
+    curve: RotationCurve,
+    seen: Orientations,
+    R_imu_cam: FloatArray,
+    present_s: float,
+    most_s: float,
+    usual_level: float,
+) -> ShiftFit | None:
+    """Find the one time shift at which the orientations of camera and gyro agree.
+
+    Args:
+        curve: The gyro's, about its bias.
+        seen: The camera's orientations.
+        R_imu_cam: The mounting, held, shape (3, 3).
+        present_s: Time shift so far, s.
+        most_s: Largest step looked for, s.
+        usual_level: See `level_at`; of orientations from before the change.
+
+    Returns:
+        The fit; None where none fits, more than one does, or the curve does not reach.
+    """
+    t_cam_s = seen.t_cam_s
+    if len(t_cam_s) < _LEAST_IMAGES:
+        return None
+    low_s = max(present_s - most_s, curve.span_s[0] - float(t_cam_s[0]))
+    high_s = min(present_s + most_s, curve.span_s[1] - float(t_cam_s[-1]))
+    if not low_s <= present_s <= high_s:
+        return None
+    grid = np.append(np.arange(low_s, high_s, _GRID_S), present_s)
+    cost = (_errors(curve, seen, R_imu_cam, grid) ** 2).sum(axis=1)
+    shift_s = float(grid[np.argmin(cost)])
+    for _ in range(_STEPS):
+        at, ahead = _errors(curve, seen, R_imu_cam, np.array([shift_s, shift_s + _DERIVATIVE_S]))
+        slope = (ahead - at) / _DERIVATIVE_S
+        curvature = float(slope @ slope)
+        if curvature <= 0.0:
+            return None
+        shift_s -= float(slope @ at) / curvature
+    if not low_s <= shift_s <= high_s:
+        return None
+    best = float((_errors(curve, seen, R_imu_cam, np.array([shift_s])) ** 2).sum())
+    dof = 3 * len(t_cam_s) - 4
+    if best > usual_level * float(chdtri(dof, _FITS_P)):
+        return None
+    sure = best + _SURE * usual_level
+    if float(cost[:-1][np.abs(grid[:-1] - shift_s) > _APART_S].min(initial=np.inf)) < sure:
+        return None
+    return ShiftFit(shift_s, float(np.sqrt(usual_level / curvature)), float(cost[-1]) > sure)
+
+
+def _errors(
+    curve: RotationCurve, seen: Orientations, R_imu_cam: FloatArray, shifts_s: FloatArray
+) -> FloatArray:
+    """Whitened errors of all orientations, the two worlds aligned at each shift, shape (k, 3 n)."""
+    by_gyro = so3.matrix_from_quat(curve.quaternion(seen.t_cam_s + shifts_s[:, None])) @ R_imu_cam
+    weighed = by_gyro / np.square(seen.sigma_rad)[:, None, None]
+    align = _nearest_rotation(np.einsum("nij,knlj->kil", seen.R_world_cam, weighed))
+    missed = np.swapaxes(align[:, None] @ by_gyro, -1, -2) @ seen.R_world_cam
+    return np.asarray((so3.log(missed) / seen.sigma_rad[:, None]).reshape(len(shifts_s), -1))
+
+
+def _nearest_rotation(M: FloatArray) -> FloatArray:
+    """Rotations that maximise trace(R' M), shape (k, 3, 3)."""
+    U, _, Vt = np.linalg.svd(M)
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    return np.asarray(U @ Vt)
