@@ -3,7 +3,7 @@
     python -m benchmarks demos --trials 100 --seconds 20 --jobs 1     on an idle machine
     python -m benchmarks demos --trials 100 --seconds 20 --jobs 2     with both cores busy
 
-Each finished run is one line of `benchmarks/results/raw/demos_*.jsonl`; a study that was stopped goes on there.
+Each finished run is one line of `benchmarks/results/raw/demos_*.jsonl`; a study that was stopped goes on.
 """
 
 from __future__ import annotations
@@ -61,13 +61,11 @@ def main(argv: list[str]) -> int:
     def median(key: str) -> float:
         return float(np.median([r[key] for r in good if r.get(key) is not None] or [np.nan]))
 
-    print(
-        "| demos | converged | first answer s (median) | converged after s (median) | error / sigma: median |"
-    )
+    print("| demos | converged | first answer s | converged after s | error / sigma |   (medians)")
     print("|---|---|---|---|---|")
     print(
-        f"| {args.seconds:g} s, {args.jobs} at once | {len(good)} of {len(results)} | {median('first_s'):.1f} "
-        f"| {median('converged_s'):.1f} | {median('largest_sigmas'):.1f} |"
+        f"| {args.seconds:g} s, {args.jobs} at once | {len(good)} of {len(results)} "
+        f"| {median('first_s'):.1f} | {median('converged_s'):.1f} | {median('largest_sigmas'):.1f} |"
     )
     for seed, r in zip(seeds, results, strict=True):
         if r not in good:

@@ -43,7 +43,7 @@ from vical_daemon.estimation.trust.judge import Judge
 _KEEP_S = 5.0
 _STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
 _STEPPED_LEAST_S = 1e-3
-_STANDS_S = 1.0  # so long images must agree with a step before it is announced
+_STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 _BLIND_S = 0.5  # without a usable image the motion is worth a look
@@ -90,7 +90,8 @@ class Calibrator:
         self._past = RecentPast()
         self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
         self._stamp_sigma_s = 0.0
-        self._unproven: tuple[float, str] | None = None  # when to announce a step, unless images contradict
+        # A step of the time shift, until images confirm it: when to announce it, camera, shift before, s.
+        self._unproven: tuple[float, str, float] | None = None
         self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._size = 1.0  # of the target over the stated one, where it is by far not that
@@ -149,7 +150,7 @@ class Calibrator:
         if self.filter is not None:
             self._lose_motion()
             self._seek_shift.add(camera)
-            self.watch.started(self.filter.state.t_s)
+            self.watch.shift_reopened()
 
     def _known(self, frame: PointsFrame) -> BoolArray:
         """Which points of a frame can be used at all."""
@@ -286,6 +287,7 @@ class Calibrator:
             return []
         self._lost = None
         f.restart_motion(motion)
+        self.watch.motion_restarted(motion.t_s)
         return [r for t, kept in lost.frames for r in self._one(kept, t)]
 
     def _step(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> FrameReport | None:
@@ -328,7 +330,7 @@ class Calibrator:
         self._past.saw(f, report, frame, t_cam_s)
         self.judge.saw_frame(report, f)
         if self._unproven is not None and f.state.t_s > self._unproven[0]:
-            self.judge.announce(self._unproven[1])
+            self._announce_step(f, *self._unproven[1:])
             self._unproven = None
         for block, told in self._beyond_doubt.look(f).items():
             self.judge.announce(told, once=block)
@@ -348,7 +350,8 @@ class Calibrator:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
-        if action in (Action.POSE, Action.RESTART) and self._shift_stepped(f, frame.camera):
+        changed = action in (Action.POSE, Action.RESTART)
+        if changed and self._unproven is None and self._shift_stepped(f, frame.camera):
             return
         if action is Action.POSE:
             self._lose_motion()
@@ -369,10 +372,13 @@ class Calibrator:
             return False
         self.filter = self._past.filter(f)
         step_s = self._set_shift(self.filter, camera, fit)
-        step = f"{camera}: the time shift stepped by {1e3 * step_s:+.1f} ms; all else is kept"
-        self._unproven = (f.state.t_s + _STANDS_S, step)
+        self._unproven = (f.state.t_s + _STANDS_S, camera, fit.timeshift_s - step_s)
         self._lose_motion()
         return True
+
+    def _announce_step(self, f: CalibrationFilter, camera: str, before_s: float) -> None:
+        step_ms = 1e3 * (f.state.cameras[camera].timeshift_s - before_s)
+        self.judge.announce(f"{camera}: the time shift stepped by {step_ms:+.1f} ms; all else is kept")
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
         """Take a time shift as found anew, all else as it is known; the step, s."""
@@ -381,7 +387,7 @@ class Calibrator:
         step_s = fit.timeshift_s - known.timeshift_s
         known.timeshift_s = fit.timeshift_s
         f.forget(index, max(_STEPPED_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
-        self.watch.started(f.state.t_s)
+        self.watch.shift_reopened()
         self.judge.reopened(f.state.t_s)
         return step_s
 

@@ -55,6 +55,15 @@ class ChangeWatch:
         self._pose_taken_s, self._started_s = float("-inf"), t_s
         self._drift.clear()
 
+    def motion_restarted(self, t_s: float) -> None:
+        """The motion was taken from images at `t_s`: if images do not fit now, it is not the pose."""
+        self._refused, self._pose_taken_s = 0, t_s
+
+    def shift_reopened(self) -> None:
+        """A time shift is to be found anew: what is known of its drift says nothing now."""
+        self._refused = self._closer = 0
+        self._drift.clear()
+
     @property
     def doubtful(self) -> bool:
         """A time shift may be drifting: too early to say so, too likely to ignore."""

@@ -149,7 +149,7 @@ def test_a_drift_too_small_to_be_seen_yet_does_not_make_it_lie():
 
 
 def test_a_drift_that_errors_of_the_stamps_explain_is_no_drift():
-    """8 us a second over 10 s, seen to 1 us a second; stamps known to 40 us explain it, 100 ppm they do not."""
+    """8 us/s over 10 s, seen to 1 us/s: stamps known to 40 us explain that, but not 100 us/s."""
     assert apart(some_filter(8e-5), NAME) > 0.99
     slow, fast = some_filter(8e-6), some_filter(1e-4)
     for f in (slow, fast):

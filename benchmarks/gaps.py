@@ -1,0 +1,213 @@
+"""Gaps, frozen sensors and clocks that are set: is the calibration kept, and is the right cause reported?
+
+    python -m benchmarks gaps --trials 20                           every case, lens free
+    python -m benchmarks gaps --trials 20 --lens-known
+    python -m benchmarks gaps --trials 20 --target-free
+    python -m benchmarks gaps --trials 20 --case "imu 2 s" --case "camera clock +0.5 s"
+
+A disturbance begins at 20 s; ten seconds follow it. Each recording is run without it, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from vical_mocks.points import SimulatedRun, simulate
+from vical_mocks.rig import Bump, reference_rig
+from vical_mocks.tracks import room_landmarks, simulate_tracks
+
+from benchmarks import runner
+from benchmarks.feed import CalibratorSubject, Record, StartErrors, camera_prior, feed, imu_noise
+from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
+
+AT_S, AFTER_S = 20.0, 10.0
+GAPS_S = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 60.0)
+STEPS_S = (0.02, 0.5, 3600.0)
+Change = Callable[[SimulatedRun], SimulatedRun]
+
+
+def _during(run: SimulatedRun, seconds: float) -> tuple[Any, Any]:
+    """Which inertial samples, and which images, lie within the disturbance."""
+    t_imu_s = (run.t_imu_ns - run.options.epoch_ns) * 1e-9
+    t_cam_s = np.array([f.t_s for f in run.frames])
+    end_s = AT_S + seconds
+    return (t_imu_s >= AT_S) & (t_imu_s < end_s), (t_cam_s >= AT_S) & (t_cam_s < end_s)
+
+
+def cut(sensors: str, seconds: float, run: SimulatedRun) -> SimulatedRun:
+    """Without the data of one sensor, or both."""
+    imu, images = _during(run, seconds)
+    if sensors in ("imu", "both"):
+        run = replace(
+            run,
+            t_imu_ns=run.t_imu_ns[~imu],
+            gyro_rps=run.gyro_rps[~imu],
+            specific_force_mps2=run.specific_force_mps2[~imu],
+        )
+    if sensors in ("camera", "both"):
+        run = replace(run, frames=[f for f, out in zip(run.frames, images, strict=True) if not out])
+    return run
+
+
+def freeze(sensor: str, seconds: float, run: SimulatedRun) -> SimulatedRun:
+    """The last reading, or the last image, again and again."""
+    imu, images = _during(run, seconds)
+    if sensor == "imu":
+        gyro, force = run.gyro_rps.copy(), run.specific_force_mps2.copy()
+        last = int(np.flatnonzero(imu)[0]) - 1
+        gyro[imu], force[imu] = gyro[last], force[last]
+        return replace(run, gyro_rps=gyro, specific_force_mps2=force)
+    last = run.frames[int(np.flatnonzero(images)[0]) - 1]
+    frames = [
+        replace(f, ids=last.ids, uv_px=last.uv_px) if frozen else f
+        for f, frozen in zip(run.frames, images, strict=True)
+    ]
+    return replace(run, frames=frames)
+
+
+class Stepped(CalibratorSubject):
+    """Gets the data in their true order, one sensor's with other stamps from `AT_S` on."""
+
+    sensor, step_ns, at_ns = "", 0, 0
+
+    def add_imu(self, t_ns: int, gyro: Any, force: Any) -> None:
+        """See `Subject`."""
+        super().add_imu(self._stamp("imu", t_ns), gyro, force)
+
+    def add_points(self, frame: PointsFrame) -> None:
+        """See `Subject`."""
+        super().add_points(replace(frame, t_cam_ns=self._stamp("camera", frame.t_cam_ns)))
+
+    def _stamp(self, sensor: str, t_ns: int) -> int:
+        return t_ns + self.step_ns if sensor == self.sensor and t_ns >= self.at_ns else t_ns
+
+
+CASES: dict[str, tuple[Change, float]] = {
+    **{
+        f"{sensors} {seconds:g} s": (partial(cut, sensors, seconds), seconds)
+        for sensors in ("imu", "camera", "both")
+        for seconds in GAPS_S
+    },
+    "imu frozen 1 s": (partial(freeze, "imu", 1.0), 1.0),
+    "camera frozen 3 s": (partial(freeze, "camera", 3.0), 3.0),
+    **{
+        f"{sensor} clock +{step_s:g} s": (lambda run: run, 0.0)
+        for sensor in ("imu", "camera")
+        for step_s in STEPS_S
+    },
+    "bump in a gap of 5 s": (partial(cut, "both", 5.0), 5.0),
+}
+
+
+def simulated(case: str, seed: int, seconds: float, *, target_free: bool) -> SimulatedRun:
+    """The undisturbed recording; a bump of 2 deg and 10 mm where the case asks for one."""
+    bumps: tuple[Bump, ...] = ()
+    if case.startswith("bump"):
+        rng = np.random.default_rng([seed, 77])
+        axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+        turn, move = np.deg2rad(2.0) * axis, 0.01 * way
+        bumps = (Bump(AT_S + 2.0, tuple(turn.tolist()), tuple(move.tolist())),)
+    rig = reference_rig(seed, timeshift_cam_imu_s=0.01, bumps=bumps)
+    if not target_free:
+        return simulate(seed, seconds, rig=rig)
+    return simulate_tracks(seed, seconds, rig=rig, landmarks_m=room_landmarks(seed, 200))
+
+
+def trial(case: str, lens_known: bool, target_free: bool, seed: int) -> runner.Result:
+    """One recording with the disturbance of a case."""
+    change, lasts_s = CASES[case]
+    run = simulated(case, seed, AT_S + lasts_s + AFTER_S, target_free=target_free)
+    options = CalibrationOptions(
+        fix=frozenset({"intrinsics"}) if lens_known else frozenset(),
+        target_free=target_free,
+        imu_noise=imu_noise(run),
+    )
+    prior = camera_prior(run, seed, StartErrors(), exact_lens=lens_known)
+    points = None if target_free else run.points_m
+    subject = Stepped(options, prior, points)
+    added_s = float(case.split("+")[1].split()[0]) if "clock" in case else 0.0
+    subject.sensor, subject.step_ns = case.split()[0], round(added_s * 1e9)
+    subject.at_ns = run.options.epoch_ns + round(AT_S * 1e9)
+    record = feed(change(run), subject, 0.25)
+    return judged(record, lasts_s, added_s if case.startswith("imu") else -added_s)
+
+
+def judged(record: Record, lasts_s: float, shift_moved_s: float) -> runner.Result:
+    """What was reported, how far sigmas grew, when it had converged again, and whether it ever lied."""
+    seen_s = AT_S + lasts_s
+    sigma_before = np.zeros(7)
+    grown, lies = 0.0, []
+    for s in record.snapshots:
+        sigma = np.sqrt(np.diag(s.covariance))[:7]
+        error = s.error[:7].copy()
+        if s.t_s < AT_S:
+            sigma_before = sigma
+        elif s.t_s > seen_s + 0.5:
+            error[6] -= shift_moved_s
+            grown = max(grown, float(np.max(sigma[:6] / sigma_before[:6]))) if sigma_before.any() else grown
+        if s.status == "converged" and not AT_S <= s.t_s < seen_s + 3.0:
+            worst = float(np.max(np.abs(error) / np.maximum(sigma, 1e-12)))
+            if worst > 5.0:
+                lies.append((s.t_s, worst))
+    was = [s.status for s in record.snapshots if s.t_s < AT_S][-1:] == ["converged"]
+    late = [s.t_s for s in record.snapshots if s.t_s > seen_s and s.status != "converged"]
+    bumps = [t for t, text in record.events if text.startswith(("bumped", "started over"))]
+    return {
+        "was_converged": was,
+        "bumped_s": min((t - seen_s for t in bumps if t >= AT_S), default=None),
+        "early": sum(t < AT_S for t in bumps),
+        "reported": [text for t, text in record.events if t >= AT_S],
+        "back_s": max(late) - seen_s + 0.25 if late else 0.0,
+        "grown": grown,
+        "lies": lies,
+    }
+
+
+def _row(case: str, results: list[runner.Result]) -> str:
+    told = [r for r in results if r["was_converged"]]
+    gap = re.compile(r"without|in which|stepped|went back|moved by")
+    named = sum(any(gap.search(text) for text in r["reported"]) for r in results)
+    bumps = [r["bumped_s"] for r in results if r["bumped_s"] is not None]
+    worst = f", at most {max(bumps):.1f} s later" if bumps else ""
+    back = [r["back_s"] for r in told]
+    grown = [r["grown"] for r in told if r["grown"]]
+    return (
+        f"| {case} | {len(results)} | {named} | {len(bumps)}{worst} "
+        f"| {np.median(back) if back else np.nan:.1f} / {max(back, default=np.nan):.1f} "
+        f"| {np.median(grown) if grown else np.nan:.3f} / {max(grown, default=np.nan):.3f} "
+        f"| {sum(bool(r['lies']) for r in results)} |"
+    )
+
+
+def main(argv: list[str]) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks gaps", description=__doc__)
+    runner.add_arguments(parser, trials=20, seconds=AT_S + AFTER_S)
+    parser.add_argument("--lens-known", action="store_true")
+    parser.add_argument("--target-free", action="store_true")
+    args = parser.parse_args(argv)
+    code = runner.fingerprint(
+        "vical_daemon/estimation", "benchmarks/feed.py", "benchmarks/gaps.py", "mocks/vical_mocks"
+    )
+    print(
+        "| disturbance | rigs | reported | announced as bumped | converged again after s (median / worst) "
+        "| sigmas after over before (median / worst) | converged beyond 5 sigma |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    mode = "free" if args.target_free else "known" if args.lens_known else "unknown"
+    for case in args.case or CASES:
+        results = runner.run_trials(
+            f"gaps_{runner.slug(case)}_{mode}",
+            partial(trial, case, args.lens_known, args.target_free),
+            runner.seeds_of(args),
+            args,
+            code,
+        )
+        print(_row(case, results), flush=True)
+    return 0
