@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -90,18 +91,36 @@ def test_a_user_installs_nothing_for_tests_checks_or_documentation():
         assert not user & {canonical(r) for r in PROJECT["optional-dependencies"][group]}
 
 
+def run(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
 @pytest.mark.parametrize("group", ["user", "test", "check", "docs", "dist"])
 def test_each_group_has_a_stamp_of_its_own(group):
-    done = subprocess.run(
-        ["make", "-n", "-B", f".venv/.{group}"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
     wanted = "--editable '.'" if group == "user" else f"--editable '.[{group}]'"
-    assert wanted in done.stdout
+    assert wanted in run("make", "-n", "-B", f".venv/.{group}").stdout
 
 
-def test_neither_of_the_two_commands_installs_a_tool_for_developers():
-    for target, group in (("demo", "user"), ("test", "test")):
-        done = subprocess.run(
-            ["make", "-n", "-B", target], cwd=ROOT, capture_output=True, text=True, check=True
-        )
-        assert re.findall(r"Installing into .venv: (\w+)", done.stdout) == [group]
+@pytest.mark.parametrize(("target", "group"), [("demo", "user"), ("test", "test")])
+def test_neither_of_the_two_commands_installs_a_tool_for_developers(target, group):
+    assert re.findall(r"Installing into .venv: (\w+)", run("make", "-n", "-B", target).stdout) == [group]
+
+
+@pytest.mark.parametrize(("options", "code"), [([], 0), (["-W", "error"], 1)], ids=["user", "ci"])
+def test_a_deprecation_fails_in_ci_and_not_for_a_user(tmp_path, options, code):
+    file = tmp_path / "test_old.py"
+    file.write_text("import warnings\n\ndef test_old():\n    warnings.warn('going', DeprecationWarning)\n")
+    done = run(
+        *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options),
+        *("-c", str(ROOT / "pyproject.toml"), "--rootdir", str(tmp_path), str(file)),
+    )
+    assert done.returncode == code, done.stdout
+    assert "DeprecationWarning: going" in done.stdout
+
+
+def test_ci_raises_deprecations_and_sets_the_usual_limits():
+    script = (ROOT / ".ci/run").read_text()
+    assert "test PYTEST_ARGS='-W error'" in script
+    assert "ulimit -l 8192" in script
+    assert "ulimit -S -n 1024" in script
+    assert run("bash", "-n", ".ci/run").returncode == 0
