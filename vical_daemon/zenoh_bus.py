@@ -81,7 +81,7 @@ def open_bus(
     local = [f"unixsock-stream/{socket}"] if socket else []
     if tcp_port:
         local.append(f"tcp/127.0.0.1:{tcp_port}")
-    config: dict[str, Any] = base_config()
+    config: dict[str, Any] = base_config(router=mode == "router")
     if mode == "router":
         if socket:
             free_socket(Path(socket))

@@ -25,6 +25,15 @@ ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|wss|serial|unixsock-stream|unixpipe
 _PAYLOAD_LIMIT = 256 * 2**20
 RETRY = {"retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}}
 """How a session comes back to its router."""
+_POOL_BYTES = 4 * 2**20
+"""Shared memory of a router, bytes: three images of 1.3 MP. Every receiver of the same user locks it, so it
+stays below the usual limit of 8 MiB, for foreign programs' sake; an image that finds no room is copied."""
+_ENOUGH_LOCKED_BYTES = 64 * 2**20
+"""Limit of locked memory from which memory is shared, bytes: ten routers' pools with their bookkeeping
+(5.4 MiB each, measured: tests/system/test_shared_memory.py)."""
+_CAP_IPC_LOCK = 14
+"""Number of the capability in linux/capability.h."""
+_warned = False
 # Batches of 64 kB: without shared memory an image of 360 kB takes six of "data".
 _QUEUE_SIZES = {
     "control": 2, "real_time": 16, "interactive_high": 2, "interactive_low": 2,
@@ -36,18 +45,49 @@ class BusError(Exception):
     """The bus cannot be opened; the message is one line that says what to try."""
 
 
-def base_config() -> dict[str, Any]:
-    """Return what all sessions have in common."""
+def can_share_memory() -> bool:
+    """Whether this process may lock enough memory for the bus to share images instead of copying them.
+
+    zenoh locks every segment that it maps, its own and those of the sessions that it receives from. Where the
+    limit is reached, it drops what it cannot map, silently. So memory is shared only where the limit leaves
+    room for several routers (docs/bus.md, "Shared memory").
+    """
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    roomy = soft == resource.RLIM_INFINITY or soft >= 64 * 2**20
+    return soft == resource.RLIM_INFINITY or soft >= _ENOUGH_LOCKED_BYTES or _may_lock_anything()
+
+
+def _may_lock_anything() -> bool:
+    """Whether the kernel exempts this process from the limit (CAP_IPC_LOCK, which root has)."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return False
+    found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    return found is not None and bool(int(found[1], 16) >> _CAP_IPC_LOCK & 1)
+
+
+def _warn_of_copies() -> None:
+    """Say once in a process that images are copied, and what to raise."""
+    global _warned
+    if not _warned:
+        _warned = True
+        _log.info(
+            "the bus copies images, because this process may lock too little memory to share them "
+            "(costs processor time, loses nothing); to share: ulimit -l unlimited, or LimitMEMLOCK=infinity "
+            "in a unit"
+        )
+
+
+def base_config(*, router: bool = False) -> dict[str, Any]:
+    """Return what all sessions have in common; only a router has memory to share."""
+    shared = can_share_memory()
     return {
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
         "transport": {
             "shared_memory": {
-                "enabled": True,
-                # the pool is locked into memory: it must fit under LimitMEMLOCK, 8 MiB by default
-                "transport_optimization": {"enabled": True, "pool_size": 2**24 if roomy else 2**22},
+                "enabled": shared,
+                "transport_optimization": {"enabled": shared and router, "pool_size": _POOL_BYTES},
             },
             "link": {
                 "tx": {
@@ -137,14 +177,17 @@ def free_socket(path: Path) -> None:
 
 
 def open_session(config: dict[str, Any]) -> Any:
-    """Open a session; where the kernel forbids locked memory, without shared memory."""
+    """Open a session; where the process may lock too little memory, without shared memory."""
+    shared = config["transport"]["shared_memory"]["enabled"]
+    if not shared:
+        _warn_of_copies()
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError as error:
         text = str(error)
-        if "shm" not in text.lower() and "shared memory" not in text.lower():
+        if not shared or ("shm" not in text.lower() and "shared memory" not in text.lower()):
             raise BusError(_explain(config, text)) from None
-    _log.warning("no shared memory on the bus (LimitMEMLOCK?): images take twice the processor time")
+    _warn_of_copies()  # /dev/shm is missing or full
     config["transport"]["shared_memory"] = {"enabled": False}
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
