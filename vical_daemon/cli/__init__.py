@@ -23,7 +23,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
 _INTRO = (
-    "vical: where does the camera sit on the IMU, and how late is it? Calibrated online, with honest sigmas."
+    "vical calibrates cameras against an IMU while the robot runs: mounting, time shift and lens, with uncertainties."
 )
 _TEACHING = """\
 Start here:
