@@ -32,6 +32,16 @@ class Watch:
         return self.estimate.duration_s if self.estimate is not None else 0.0
 
     @property
+    def frames(self) -> int:
+        """Images used so far."""
+        return self.estimate.frames if self.estimate is not None else 0
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last estimate is."""
+        return self.estimate is not None and self.estimate.status is Status.CONVERGED
+
+    @property
     def converged_for_s(self) -> float:
         """Seconds of data since the status became `converged` (and stayed)."""
         return self.duration_s - self._t_unsure_s
