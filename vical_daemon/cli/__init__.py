@@ -22,9 +22,7 @@ logging.raiseExceptions = False  # a log that cannot be written (full disk, clos
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
-_INTRO = (
-    "vical calibrates cameras against an IMU while the robot runs: mounting, time shift and lens, with uncertainties."
-)
+_INTRO = "vical calibrates cameras against an IMU while the robot runs, and says how far to trust the result."
 _TEACHING = """\
 Start here:
   vical demo                                    no hardware needed; ends with truth beside the estimate

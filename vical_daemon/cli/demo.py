@@ -181,16 +181,17 @@ def _follow(watch: Watch, roles: RoleThreads, args: argparse.Namespace) -> None:
     begin_s, extended = time.monotonic(), False
     with Screen(CAMERA, quiet=args.quiet) as screen:
         while time.monotonic() < begin_s + most_s * (BUSY_FACTOR if extended else 1.0) + 15.0:
-            if watch.duration_s >= most_s and (watch.converged or not _starved(watch.frames, watch.duration_s)):
-                return
             if args.seconds is None and watch.converged_for_s > AFTER_CONVERGENCE:
                 return
-            if watch.duration_s >= most_s and not extended:
-                extended = True
-                _say(
-                    "this machine is too busy to use the images in time: going on until converged, "
-                    f"at most {BUSY_FACTOR * most_s:.0f} s"
-                )
+            if watch.duration_s >= most_s:
+                if watch.converged or not _starved(watch.frames, watch.duration_s):
+                    return
+                if not extended:
+                    extended = True
+                    _say(
+                        "this machine is too busy to use the images in time: going on until converged, "
+                        f"at most {BUSY_FACTOR * most_s:.0f} s"
+                    )
             if roles.failed.wait(0.25):
                 return
             screen.show(watch)
