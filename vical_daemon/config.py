@@ -20,6 +20,9 @@ __all__ = ["Config", "ConfigError", "load", "loads"]
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,62}"  # as `topics.check_name`
 URI = r"(v4l2|iidc|aravis|folder):.+|/.+|\d+"
 Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
+HostName = Annotated[
+    str, Bound(pattern=r"[A-Za-z0-9._-]{1,253}|[0-9A-Fa-f:]{2,45}", hint="a name without port")
+]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
 Pixels = Annotated[int, Bound(low=16, high=16384)]
 Matrix4 = tuple[
@@ -213,6 +216,8 @@ class WebConfig:
         enabled: Serve it.
         host: Address to listen on; 127.0.0.1: this machine only.
         port: Of the page; 0: any free one.
+        hosts: Names under which browsers ask for the page, beyond localhost, this computer's host name and
+            its address (a proxy's name, a name in your DNS); others are refused.
         picture_rate_hz: Pictures a second on the page, at most; each costs about 2 ms of a processor.
         foxglove_port: WebSocket for Foxglove (its usual port is 8765); 0: none.
     """
@@ -220,6 +225,7 @@ class WebConfig:
     enabled: bool = False
     host: str = "127.0.0.1"
     port: Annotated[int, Bound(low=0, high=65535)] = 8080
+    hosts: tuple[HostName, ...] = ()
     picture_rate_hz: Annotated[float, Bound(low=0.1, high=30)] = 2.0
     foxglove_port: Annotated[int, Bound(low=0, high=65535)] = 0
 
