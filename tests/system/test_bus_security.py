@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import socket
 import subprocess
@@ -131,7 +132,8 @@ def test_tls_admits_our_certificates_only(certificates, tmp_path):
     router.close()
 
 
-def test_what_a_certificate_names_can_be_given_rights(certificates, tmp_path):
+def test_what_a_certificate_names_can_be_given_rights(certificates, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     endpoint = f"tls/localhost:{free_port()}"
     router = open_bus(
         mode="router", socket=tmp_path / "z.sock", listen=[endpoint], commanders=["robot"],
@@ -143,6 +145,7 @@ def test_what_a_certificate_names_can_be_given_rights(certificates, tmp_path):
     assert until(lambda: robot.publish(COMMAND, encode_string("start")) or commands)
     robot.publish(KEY, b"forged")
     assert router.latest(KEY) == []
+    assert any("tls 127.0.0.1:" in m and m.endswith("user robot") for m in caplog.messages)
     journal.close()
     for bus in (robot, router):
         bus.close()
