@@ -49,13 +49,7 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def _check_bus(bus: BusConfig) -> Iterator[tuple[str, str]]:
-    """Names and passwords that cannot work."""
-    if bus.user and not bus.password_file:
-        yield (
-            "bus.user",
-            "a router with a password asks everybody for one, its own processes too: "
-            "set password_file, with a line for this user (certificates need no password)",
-        )
+    """A name is worth something only where it has to be proven."""
     proven = bus.password_file or (bus.tls_ca and bus.tls_certificate)
     for key in ("commanders", "publishers"):
         if getattr(bus, key) and not proven:

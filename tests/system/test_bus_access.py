@@ -249,6 +249,12 @@ def test_every_command_is_journalled_with_its_origin(tmp_path, caplog):
         each.close()
 
 
+def test_a_password_that_would_shut_out_our_own_processes_is_refused(tmp_path):
+    bus = BusConfig(socket=str(tmp_path / "z.sock"), user="robot", password="secret")
+    with pytest.raises(BusError, match=r"set bus\.password_file"):
+        open_for_roles(Config(rig="rover", bus=bus), ("imu", "camera"), threading.Event())
+
+
 def test_roles_say_under_which_id_they_are_on_the_bus(tmp_path, caplog):
     config = Config(rig="rover", bus=BusConfig(socket=str(tmp_path / "z.sock")))
     with caplog.at_level(logging.INFO):

@@ -79,6 +79,11 @@ def open_client(config_path: str | None, endpoint: str | None) -> Bus:
 
 def _host(config: Config) -> ZenohBus:
     bus = config.bus
+    if bus.user and not bus.password_file:
+        raise BusError(
+            "a router with bus.user asks everybody for a password, its own processes too: "
+            "set bus.password_file, with a line for this user (certificates need no password)"
+        )
     return open_bus(
         mode="router",
         socket=socket_path(bus),

@@ -88,7 +88,6 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("target: board.yaml", "target: b.yaml\ncalibration: {imu: imu1}", "calibration.imu: there is no imu imu1 (known: imu0) (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {commanders: [anna]}", "bus.commanders: nobody can prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {publishers: [anna], tls_ca: ca.pem}", "bus.publishers: nobody can prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
-        ("target: board.yaml", "target: b.yaml\nbus: {user: rover, password: x}", "bus.user: a router with a password asks everybody for one, its own processes too: set password_file, with a line for this user (certificates need no password) (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nbus: {readers: everybody}", "bus.readers: the text 'everybody' is none of group, loopback (config line 12)"),
         ("target: board.yaml", "target: b.yaml\nweb: {hosts: ['http://a/']}", "web.hosts.0: 'http://a/' is not accepted; a name without port (config line 12)"),
         ("target: board.yaml", "target: 5", "target: expected text, found the number 5; put it in quotes (config line 11)"),
