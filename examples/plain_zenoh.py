@@ -1,6 +1,6 @@
 """Without vical: eclipse-zenoh and rosbags are enough to follow where a camera sits.
 
-    python examples/plain_zenoh.py [ENDPOINT]
+    python examples/plain_zenoh.py [ENDPOINT]      # default: the service on this computer, for its group
 
 Payloads are ROS 2 messages in CDR; the pose comes as geometry_msgs/PoseWithCovarianceStamped beside our
 own, richer message.
@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
-def main(endpoint: str = "tcp/127.0.0.1:7447") -> None:
+def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> None:
     """Ask for the last pose of every camera, then print each new one."""
     typestore = get_typestore(Stores.ROS2_JAZZY)
     config = zenoh.Config()

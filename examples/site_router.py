@@ -1,8 +1,9 @@
 """One router for a site: every robot joins it, whoever watches the site needs one connection.
 
-    python examples/site_router.py CA.pem SITE.pem SITE.key USERS.txt
+    python examples/site_router.py CA.pem SITE.pem SITE.key robot7 robot8 ...
 
-USERS.txt holds `user:password` lines; `viewer` may only look. A robot's side: `examples/site_robot.yaml`.
+Who shows a certificate of CA.pem may look; those whose certificates bear the names given here may publish. A
+robot's side: `examples/site_robot.yaml`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from vical_daemon import client
 from vical_daemon.zenoh_bus import open_bus
 
 
-def main(ca: str, certificate: str, key: str, users: str) -> None:
+def main(ca: str, certificate: str, key: str, *robots: str) -> None:
     """Host the router and print a line when a robot's calibration changes its status."""
     site = open_bus(
         mode="router",
@@ -22,8 +23,7 @@ def main(ca: str, certificate: str, key: str, users: str) -> None:
         tls_ca=ca,
         tls_certificate=certificate,
         tls_key=key,
-        password_file=users,
-        readers=["viewer"],
+        publishers=robots,
     )
     status: dict[tuple[str, str], str] = {}
 
@@ -39,4 +39,4 @@ def main(ca: str, certificate: str, key: str, users: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:5])
+    main(*sys.argv[1:])

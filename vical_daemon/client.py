@@ -231,19 +231,21 @@ def connect(
     """Connect to the bus of a robot, or to the router of a site.
 
     Args:
-        endpoint: zenoh endpoint, e.g. ``tcp/127.0.0.1:7447`` (the default) or ``tls/robot7:7447``.
+        endpoint: zenoh endpoint, e.g. ``tls/robot7:7447``; None: the bus of this computer.
         rig: Name of the robot, or ``*`` for all that are heard.
-        socket: Unix socket of the router instead, on the same host.
+        socket: Unix socket of a router on this computer instead, in an unusual place.
         **security: As in `zenoh_bus.open_bus`: ``tls_ca``, ``tls_certificate``, ``tls_key``, ``user``,
             ``password``.
 
     Raises:
         BusError: Nobody there, or not admitted.
     """
+    from vical_daemon.local_bus import open_local_bus
     from vical_daemon.zenoh_bus import open_bus
 
-    endpoints = [endpoint] if endpoint else ([] if socket else ["tcp/127.0.0.1:7447"])
-    return Client(open_bus(mode="client", connect=endpoints, socket=socket, **security), rig)
+    if endpoint:
+        return Client(open_bus(mode="client", connect=[endpoint], **security), rig)
+    return Client(open_local_bus([Path(socket)] if socket else [], **security), rig)
 
 
 async def connect_async(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from vical_daemon import schema
+from vical_daemon.bus_places import LOOPBACK_PORT
 from vical_daemon.config_rules import contradictions
 from vical_daemon.estimation.measurements import CalibrationOptions, ImuNoise
 from vical_daemon.schema import Bound
@@ -18,8 +19,15 @@ from vical_daemon.strict_yaml import ConfigError, Document, parse, read
 __all__ = ["Config", "ConfigError", "load", "loads"]
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,62}"  # as `topics.check_name`
+NAMESPACE = r"/|/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
+NAMESPACE_HINT = (
+    "a ROS name like robot7 or /site/robot7: letters, digits and _ between slashes, no digit first"
+)
 URI = r"(v4l2|iidc|aravis|folder):.+|/.+|\d+"
 Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
+HostName = Annotated[
+    str, Bound(pattern=r"[A-Za-z0-9._-]{1,253}|[0-9A-Fa-f:]{2,45}", hint="a name without port")
+]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
 Pixels = Annotated[int, Bound(low=16, high=16384)]
 Matrix4 = tuple[
@@ -149,12 +157,14 @@ class CalibrationConfig:
 
 @dataclass(frozen=True, slots=True)
 class BusConfig:
-    """How processes find each other; nothing listens beyond loopback unless told so here.
+    """How processes find each other; nothing listens on a network, loopback included, unless told so here.
 
     Attributes:
-        socket: Unix socket of the router; None: `zenoh.sock` in the runtime directory.
-        tcp_port: Loopback port of the router; 0: none.
-        listen: Further zenoh endpoints of the router (`tls/0.0.0.0:7447`).
+        socket: Unix socket of the router, for its user and group; None: `zenoh.sock` in the runtime folder.
+        readers: Who may read: group: members of the router's group, over the socket, who may write as well;
+            loopback: everybody on this computer, who may not.
+        tcp_port: Loopback port of the router, for reading; 0: none, or 7447 with `readers: loopback`.
+        listen: Further zenoh endpoints of the router (`tls/0.0.0.0:7447`), for reading.
         connect: Endpoints of a site's router that this rig joins.
         tls_ca: Certificate authority, PEM file.
         tls_certificate: This rig's certificate, PEM file.
@@ -162,13 +172,14 @@ class BusConfig:
         password_file: usrpwd dictionary (user:password lines) of those who may connect.
         user: User name for `connect`.
         password: Its password.
-        readers: Users who may only read.
-        ros2: Publish also under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md.
-        ros2_domain: ROS_DOMAIN_ID of those who listen.
+        commanders: Users of `password_file`, or names in client certificates, who may put commands from
+            wherever they come.
+        publishers: The same, who may publish on every key.
     """
 
     socket: str | None = None
-    tcp_port: Annotated[int, Bound(low=0, high=65535)] = 7447
+    readers: Literal["group", "loopback"] = "group"
+    tcp_port: Annotated[int, Bound(low=0, high=65535)] = 0
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     tls_ca: str | None = None
@@ -177,9 +188,27 @@ class BusConfig:
     password_file: str | None = None
     user: str | None = None
     password: str | None = None
-    readers: tuple[str, ...] = ()
-    ros2: bool = False
-    ros2_domain: Annotated[int, Bound(low=0, high=232)] = 0
+    commanders: tuple[str, ...] = ()
+    publishers: tuple[str, ...] = ()
+
+    @property
+    def loopback_port(self) -> int:
+        """Loopback port on which the router listens; 0: none."""
+        return self.tcp_port or (LOOPBACK_PORT if self.readers == "loopback" else 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Config:
+    """Publish also under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md; on where this section stands.
+
+    Attributes:
+        namespace: Before every topic, so that robots on one router do not collide; None: the rig's name;
+            /: none.
+        domain: ROS_DOMAIN_ID of those who listen.
+    """
+
+    namespace: Annotated[str, Bound(pattern=NAMESPACE, hint=NAMESPACE_HINT)] | None = None
+    domain: Annotated[int, Bound(low=0, high=232)] = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +242,8 @@ class WebConfig:
         enabled: Serve it.
         host: Address to listen on; 127.0.0.1: this machine only.
         port: Of the page; 0: any free one.
+        hosts: Names under which browsers ask for the page, beyond localhost, this computer's host name and
+            its address (a proxy's name, a name in your DNS); others are refused.
         picture_rate_hz: Pictures a second on the page, at most; each costs about 2 ms of a processor.
         foxglove_port: WebSocket for Foxglove (its usual port is 8765); 0: none.
     """
@@ -220,6 +251,7 @@ class WebConfig:
     enabled: bool = False
     host: str = "127.0.0.1"
     port: Annotated[int, Bound(low=0, high=65535)] = 8080
+    hosts: tuple[HostName, ...] = ()
     picture_rate_hz: Annotated[float, Bound(low=0.1, high=30)] = 2.0
     foxglove_port: Annotated[int, Bound(low=0, high=65535)] = 0
 
@@ -240,6 +272,7 @@ class Config:
         imus: By name.
         cameras: By name.
         target: Target file (Kalibr's format); relative to the settings file.
+        ros2: ROS 2's names on the bus as well; None: not.
         path: Where this was read from; empty when made in memory.
     """
 
@@ -249,6 +282,7 @@ class Config:
     target: str | None = None
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     bus: BusConfig = field(default_factory=BusConfig)
+    ros2: Ros2Config | None = None
     record: RecordConfig = field(default_factory=RecordConfig)
     web: WebConfig = field(default_factory=WebConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
@@ -263,6 +297,12 @@ class Config:
     def calibration_cameras(self) -> tuple[str, ...]:
         """Names of the cameras to calibrate."""
         return self.calibration.cameras or tuple(self.cameras)
+
+    @property
+    def ros2_namespace(self) -> str:
+        """Namespace of the ROS 2 topics, with its leading slash; empty: none."""
+        given = self.rig if self.ros2 is None or self.ros2.namespace is None else self.ros2.namespace
+        return f"/{given.strip('/')}".rstrip("/")
 
     @property
     def target_path(self) -> Path | None:

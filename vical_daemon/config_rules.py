@@ -10,8 +10,10 @@ import numpy as np
 from vical_daemon.estimation.camera_model import COEFFICIENTS, PLUMB_BOB
 
 if TYPE_CHECKING:
-    from vical_daemon.config import CameraConfig, Config
+    from vical_daemon.config import BusConfig, CameraConfig, Config
 
+NAMESPACE_LENGTH = 128
+"""ROS 2 ends topics at 247 characters (RMW_TOPIC_MAX_NAME_LENGTH); our longest name takes 85 of them."""
 NEEDS_TARGET = "plumb_bob needs a target; without one use radtan"
 
 
@@ -24,6 +26,9 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
         yield from _check_lens(path, camera, config.calibration.fix)
         if config.calibration.mode == "target_free" and camera.lens.distortion_model == PLUMB_BOB:
             yield f"{path}.distortion_model", NEEDS_TARGET
+    yield from _check_bus(config.bus)
+    if config.ros2 is not None and len(config.ros2_namespace) > NAMESPACE_LENGTH:
+        yield "ros2.namespace", f"longer than {NAMESPACE_LENGTH} characters"
     calibration = config.calibration
     if calibration.imu is not None and calibration.imu not in config.imus:
         yield (
@@ -41,6 +46,17 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
             "calibration.mode",
             "target needs `target: FILE` (`vical target` makes one), or mode: target_free",
         )
+
+
+def _check_bus(bus: BusConfig) -> Iterator[tuple[str, str]]:
+    """A name is worth something only where it has to be proven."""
+    proven = bus.password_file or (bus.tls_ca and bus.tls_certificate)
+    for key in ("commanders", "publishers"):
+        if getattr(bus, key) and not proven:
+            yield (
+                f"bus.{key}",
+                "nobody can prove such a name; set password_file, or tls_ca and tls_certificate",
+            )
 
 
 def _check_gx3_rate(path: str, rate_hz: float) -> Iterator[tuple[str, str]]:

@@ -100,6 +100,7 @@ class Recorder:
             self._wanted, self._retry_ns = True, 0
             self.tick()
         elif word == "stop":
+            _log.info("recording stopped by command")
             self._wanted = False
             self.close()
         elif word == "split" and self._session is not None:

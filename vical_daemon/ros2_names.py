@@ -37,11 +37,15 @@ class Ros2Topic:
     depth: int = 10
 
 
-def ros2_topic(key: str) -> Ros2Topic | None:
+def ros2_topic(key: str, namespace: str = "") -> Ros2Topic | None:
     """Return how a bus key looks to ROS 2; None for a key that stays ours.
 
-    >>> ros2_topic("vical/rig0/imu/imu").name
-    '/imu/data'
+    Args:
+        key: Of the bus.
+        namespace: Before every topic, with its leading slash, so that robots on one router do not collide.
+
+    >>> ros2_topic("vical/rig0/imu/imu0", "/rig0").name
+    '/rig0/imu0/data'
     """
     parsed = topics.parse_key(key)
     if parsed is None:
@@ -64,7 +68,7 @@ def ros2_topic(key: str) -> Ros2Topic | None:
         return None
     static = topic.kind == "tf_static"
     reliable = topic.congestion is topics.Congestion.BLOCK or static
-    return Ros2Topic(names[topic.kind], topic.type_name, reliable, static, 1 if static else 10)
+    return Ros2Topic(namespace + names[topic.kind], topic.type_name, reliable, static, 1 if static else 10)
 
 
 def dds_type(type_name: str) -> str:

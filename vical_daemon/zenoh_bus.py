@@ -1,7 +1,8 @@
 """The bus between processes and hosts: zenoh, with the delivery rules of the topics table.
 
-One process of a rig (`acquire`) hosts the router; the others are its clients over a unix socket. Nothing
-multicasts, and nothing listens beyond loopback unless an endpoint says so (`zenoh_session`).
+One process of a rig (`acquire`) hosts the router; the others are its clients over a unix socket that is open
+to the user and group of the host. Nothing multicasts, and nothing listens on a network, loopback included,
+unless an endpoint says so; then those who come over it may only read (`zenoh_rights`).
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ import zenoh
 
 from vical_daemon.bus import Handler, Sample, SampleQueue
 from vical_daemon.topics import Congestion, Priority, Topic, parse_key
+from vical_daemon.zenoh_rights import access_rules
 from vical_daemon.zenoh_session import (
     ENDPOINT,
     RETRY,
     BusError,
     add_security,
     base_config,
+    closed_to_others,
     free_socket,
     open_session,
-    read_only,
 )
 
 __all__ = ["BusError", "ZenohBus", "ZenohSubscription", "open_bus"]
@@ -51,16 +53,18 @@ def open_bus(
     password_file: str | None = None,
     user: str | None = None,
     password: str | None = None,
-    readers: Sequence[str] = (),
+    commanders: Sequence[str] = (),
+    publishers: Sequence[str] = (),
 ) -> ZenohBus:
     """Open the bus.
 
     Args:
         mode: ``router`` (hosts the bus of a rig or a site) or ``client``.
-        socket: Unix socket: where the router listens, where a client connects.
+        socket: Unix socket: where the router listens (for its own user and group), where a client connects.
         tcp_port: Loopback port that the router listens on as well; 0: none. A client without socket and
             endpoints connects to it.
-        listen: Further endpoints of the router, e.g. ``tls/0.0.0.0:7447``.
+        listen: Further endpoints of the router, e.g. ``tls/0.0.0.0:7447``. Who comes over these, over
+            `tcp_port` or over `connect` may only subscribe and ask, unless named below.
         connect: Endpoints of other routers (a site's), e.g. ``tls/site.example:7447``.
         tls_ca: Certificate authority, PEM file; with it TLS demands a certificate of both sides.
         tls_certificate: Own certificate, PEM file.
@@ -68,7 +72,8 @@ def open_bus(
         password_file: Router: ``user:password`` lines of those who may connect.
         user: Own user name.
         password: Own password.
-        readers: Router: users who may subscribe and ask, never publish or answer.
+        commanders: Router: users, or names in client certificates, who may put commands.
+        publishers: Router: users, or names in client certificates, who may publish and answer on all keys.
 
     Raises:
         BusError: No router there, wrong password, socket in use, or settings that zenoh refuses.
@@ -93,9 +98,12 @@ def open_bus(
             raise BusError("no router to connect to: give a socket or an endpoint like tcp/127.0.0.1:7447")
         config |= {"mode": "client", "connect": {"endpoints": endpoints, "timeout_ms": 0, **RETRY}}
     add_security(config, tls_ca, tls_certificate, tls_key, password_file, user, password)
-    if readers:
-        config["access_control"] = read_only(readers)
-    return ZenohBus(open_session(config), is_router=mode == "router")
+    if mode == "client":
+        return ZenohBus(open_session(config), is_router=False)
+    if tcp_port or listen or connect:
+        config["access_control"] = access_rules(commanders, publishers)
+    with closed_to_others():
+        return ZenohBus(open_session(config), is_router=True)
 
 
 class _Outlet:

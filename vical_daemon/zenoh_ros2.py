@@ -1,7 +1,7 @@
-"""Our messages under ROS 2's names on the same zenoh session, so that `ros2 topic echo /imu/data` works.
+"""Our messages under ROS 2's names on the same zenoh session: `ros2 topic echo /rig0/imu0/data` works.
 
 The payloads are ROS 2 CDR already: only key, attachment and tokens are added. A ROS machine needs
-rmw_zenoh_cpp and a route to our router (`tcp/<robot>:7447`; see docs/ros2.md).
+rmw_zenoh_cpp and a route to our router (`tcp/<robot>:7447`; see docs/how-to/ros2.md).
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ class Ros2Outlet:
         session: An open zenoh session.
         node: Name of the node in the ROS graph.
         domain: ROS_DOMAIN_ID.
+        namespace: Of node and topics, with its leading slash; empty: none.
     """
 
-    def __init__(self, session: Any, node: str = "vical", domain: int = 0) -> None:
-        self._session, self._node, self._domain = session, node, domain
+    def __init__(self, session: Any, node: str = "vical", domain: int = 0, namespace: str = "") -> None:
+        self._session, self._node, self._domain, self._namespace = session, node, domain, namespace
         self._session_id = str(session.info.zid())
         self._lock = threading.Lock()
         self._publishers: dict[str, _Publisher | None] = {}
         self._by_topic: dict[str, _Publisher] = {}
-        token = ros2_names.node_token(self._session_id, 0, node, domain)
+        token = ros2_names.node_token(self._session_id, 0, node, domain, namespace)
         self._node_token = session.liveliness().declare_token(token)
 
     def publish(self, key: str, payload: bytes) -> None:
@@ -47,14 +48,15 @@ class Ros2Outlet:
                 publisher.put(payload)
 
     def _publisher(self, key: str) -> _Publisher | None:
-        topic = ros2_names.ros2_topic(key)
+        topic = ros2_names.ros2_topic(key, self._namespace)
         if topic is None:
             return None
         if topic.name not in self._by_topic:  # /diagnostics has many keys
             number = len(self._by_topic) + 1
-            self._by_topic[topic.name] = _Publisher(
-                self._session, self._session_id, number, self._node, topic, self._domain
+            token = ros2_names.publisher_token(
+                self._session_id, 0, number, self._node, topic, self._domain, self._namespace
             )
+            self._by_topic[topic.name] = _Publisher(self._session, topic, self._domain, token)
         return self._by_topic[topic.name]
 
     def close(self) -> None:
@@ -71,10 +73,7 @@ class Ros2Outlet:
 class _Publisher:
     """One ROS topic: publisher, token, sequence number."""
 
-    def __init__(
-        self, session: Any, session_id: str, number: int, node: str, topic: Ros2Topic, domain: int
-    ) -> None:
-        token = ros2_names.publisher_token(session_id, 0, number, node, topic, domain)
+    def __init__(self, session: Any, topic: Ros2Topic, domain: int, token: str) -> None:
         self._gid = ros2_names.gid(token)
         self._sequence = 0
         key = ros2_names.data_key(topic, domain)
@@ -115,11 +114,12 @@ class Ros2Bus:
         bus: The bus.
         node: Name of the node in the ROS graph.
         domain: ROS_DOMAIN_ID.
+        namespace: Of node and topics, with its leading slash; empty: none.
     """
 
-    def __init__(self, bus: ZenohBus, node: str, domain: int) -> None:
+    def __init__(self, bus: ZenohBus, node: str, domain: int, namespace: str = "") -> None:
         self._bus = bus
-        self._outlet = Ros2Outlet(bus.session, node, domain)
+        self._outlet = Ros2Outlet(bus.session, node, domain, namespace)
 
     @property
     def session(self) -> Any:

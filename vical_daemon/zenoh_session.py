@@ -11,12 +11,14 @@ import os
 import re
 import resource
 import socket as sockets
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import zenoh
+
+from vical_daemon.bus_places import Reach, reach, why_closed
 
 _log = logging.getLogger(__name__)
 _SOURCE_PLACE = re.compile(r"[.,]?\s+at /\S+\.rs:\d+\.?")
@@ -134,22 +136,17 @@ def add_security(
         config["transport"]["auth"] = {"usrpwd": {k: v for k, v in given.items() if v}}
 
 
-def read_only(readers: Sequence[str]) -> dict[str, Any]:
-    """Return access rules: these users may subscribe and ask, everything else is refused them."""
-    rule = {
-        "id": "no writing",
-        "permission": "deny",
-        "flows": ["ingress"],
-        "messages": ["put", "delete", "declare_queryable", "reply", "liveliness_token"],
-        "key_exprs": ["**"],
-    }
-    return {
-        "enabled": True,
-        "default_permission": "allow",
-        "rules": [rule],
-        "subjects": [{"id": "readers", "usernames": list(readers)}],
-        "policies": [{"rules": ["no writing"], "subjects": ["readers"]}],
-    }
+@contextmanager
+def closed_to_others() -> Iterator[None]:
+    """Let what is created meanwhile, sockets above all, be for this user and group alone.
+
+    The mask is the whole process's: a router is opened before the roles are started.
+    """
+    before = os.umask(0o007)
+    try:
+        yield
+    finally:
+        os.umask(before)
 
 
 def free_socket(path: Path) -> None:
@@ -201,6 +198,9 @@ def _explain(config: dict[str, Any], text: str) -> str:
     if config["mode"] == "client":
         endpoints = config["connect"]["endpoints"]
         where = ", ".join(endpoint.removeprefix("unixsock-stream/") for endpoint in endpoints)
+        for protocol, _, place in (endpoint.partition("/") for endpoint in endpoints):
+            if protocol == "unixsock-stream" and reach(Path(place)) is Reach.CLOSED:
+                return why_closed(Path(place))
         if any(_answers(endpoint) for endpoint in endpoints):
             return (
                 f"no bus at {where}: a router is there but refuses us; check user and password, certificates"
@@ -216,10 +216,7 @@ def _answers(endpoint: str) -> bool:
     protocol, _, place = endpoint.partition("/")
     try:
         if protocol == "unixsock-stream":
-            with sockets.socket(sockets.AF_UNIX) as probe:
-                probe.settimeout(0.5)
-                probe.connect(place)
-                return True
+            return reach(Path(place)) is Reach.OPEN
         host, _, port = place.partition("#")[0].rpartition(":")
         if protocol not in ("tcp", "tls") or not port.isdigit():
             return False

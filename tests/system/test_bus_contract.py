@@ -275,17 +275,26 @@ def test_robot_works_without_its_site_and_joins_it_later(tmp_path):
     with sockets.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
+    names = ("robot1", "robot2")
+    users = tmp_path / "users.txt"
+    users.write_text("".join(f"{name}:secret\n" for name in names))
     begin = time.monotonic()
     robots = [
-        open_bus(mode="router", socket=tmp_path / f"{name}.sock", connect=[f"tcp/127.0.0.1:{port}"])
-        for name in ("robot1", "robot2")
-    ]
+        open_bus(
+            mode="router", socket=tmp_path / f"{name}.sock", connect=[f"tcp/127.0.0.1:{port}"], user=name,
+            password="secret", password_file=str(users),
+        )
+        for name in names
+    ]  # fmt: skip
     assert time.monotonic() - begin < 5  # does not wait for the site
-    role = open_bus(mode="client", socket=tmp_path / "robot1.sock")
+    role = open_bus(mode="client", socket=tmp_path / "robot1.sock", user="robot1", password="secret")
     role.publish(topics.CALIBRATION.key("robot1", "cam0"), b"1")
     robots[1].publish(topics.CALIBRATION.key("robot2", "cam0"), b"2")
     assert until(lambda: len(robots[0].latest("vical/robot1/calibration/*")) == 1)
-    site = open_bus(mode="router", tcp_port=port)
+    site = open_bus(
+        mode="router", tcp_port=port, password_file=str(users), user="robot1", password="secret",
+        publishers=names,
+    )  # fmt: skip
     assert until(lambda: {s.payload for s in site.latest("vical/*/calibration/*")} == {b"1", b"2"}, 10)
     got: list[str] = []
     subscription = site.subscribe("vical/**", lambda sample: got.append(sample.key))

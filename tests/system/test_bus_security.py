@@ -1,19 +1,26 @@
-"""Who may do what on the bus: nothing beyond loopback, TLS with certificates, passwords, read-only users."""
+"""Who may do what on the bus: no network by default, TLS with certificates, passwords, rights."""
 
 from __future__ import annotations
 
+import logging
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
 from vical_daemon import topics
+from vical_daemon.cli.bus_access import open_for_roles
+from vical_daemon.config import Config
+from vical_daemon.messages import decode_string, encode_string
 from vical_daemon.zenoh_bus import BusError, open_bus
+from vical_daemon.zenoh_commands import CommandJournal
 
 pytestmark = pytest.mark.system
+COMMAND = topics.COMMAND.key("rig0", "record")
 KEY = topics.CALIBRATION.key("rig0", "cam0")
 
 
@@ -47,6 +54,19 @@ def listening() -> set[str]:
             if fields[3] == state and fields[9] in inodes:
                 found.add(f"{table} {fields[1].split(':')[0]}")
     return found
+
+
+def test_by_default_nothing_listens_on_a_network(tmp_path, monkeypatch):
+    """As `vical run` opens it, with a config that says nothing about the bus."""
+    monkeypatch.setenv("VICAL_RUNTIME_DIR", str(tmp_path / "run"))
+    before = listening()
+    bus = open_for_roles(Config(), ("imu", "camera"), threading.Event())
+    assert bus is not None
+    assert listening() - before == set()
+    mode = (tmp_path / "run" / "zenoh.sock").stat().st_mode
+    assert mode & 0o007 == 0
+    assert mode & 0o060 == 0o060  # or members of the group could not connect
+    bus.close()
 
 
 def test_nothing_listens_beyond_loopback(tmp_path):
@@ -112,36 +132,116 @@ def test_tls_admits_our_certificates_only(certificates, tmp_path):
     router.close()
 
 
-def test_passwords_and_read_only_users(tmp_path):
+def test_what_a_certificate_names_can_be_given_rights(certificates, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    endpoint = f"tls/localhost:{free_port()}"
+    router = open_bus(
+        mode="router", socket=tmp_path / "z.sock", listen=[endpoint], commanders=["robot"],
+        **tls(certificates, "robot"),
+    )  # fmt: skip
+    commands = commanded(router)
+    journal = CommandJournal(router.session)
+    robot = open_bus(mode="client", connect=[endpoint], **tls(certificates, "robot"))
+    assert until(lambda: robot.publish(COMMAND, encode_string("start")) or commands)
+    robot.publish(KEY, b"forged")
+    assert router.latest(KEY) == []
+    assert any("tls 127.0.0.1:" in m and m.endswith("user robot") for m in caplog.messages)
+    journal.close()
+    for bus in (robot, router):
+        bus.close()
+
+
+def commanded(bus) -> list[str]:
+    """Collect the words that are put as commands."""
+    words: list[str] = []
+    bus.subscribe("vical/*/command/*", lambda sample: words.append(decode_string(sample.payload)))
+    return words
+
+
+@pytest.fixture
+def rights(tmp_path):
+    """A router with a password file, and a client for each user over TCP."""
     users = tmp_path / "users.txt"
-    users.write_text("robot:geheim\nviewer:schau\n")
+    names = ("robot", "viewer", "boss", "feeder")
+    users.write_text("".join(f"{name}:secret of {name}\n" for name in names))
     port = free_port()
     router = open_bus(
-        mode="router", socket=tmp_path / "z.sock", tcp_port=port,
-        password_file=str(users), readers=["viewer"],
-        user="robot", password="geheim",
+        mode="router", socket=tmp_path / "z.sock", tcp_port=port, password_file=str(users),
+        user="robot", password="secret of robot", commanders=["boss"], publishers=["feeder"],
     )  # fmt: skip
-    endpoint = [f"tcp/127.0.0.1:{port}"]
-    for wrong in ({}, {"user": "robot", "password": "falsch"}, {"user": "nobody", "password": "geheim"}):
+    clients = {
+        name: open_bus(mode="client", tcp_port=port, user=name, password=f"secret of {name}")
+        for name in names[1:]
+    }
+    clients["group"] = open_bus(
+        mode="client", socket=tmp_path / "z.sock", user="robot", password="secret of robot"
+    )
+    yield router, clients, port
+    for bus in (*clients.values(), router):
+        bus.close()
+
+
+def test_wrong_passwords_are_refused(rights):
+    _, _, port = rights
+    for wrong in (
+        {},
+        {"user": "robot", "password": "wrong"},
+        {"user": "nobody", "password": "secret of robot"},
+    ):
         with pytest.raises(BusError, match="user and password"):
-            open_bus(mode="client", connect=endpoint, **wrong)
-    robot = open_bus(mode="client", socket=tmp_path / "z.sock", user="robot", password="geheim")
-    viewer = open_bus(mode="client", connect=endpoint, user="viewer", password="schau")
-    heard: list[bytes] = []
-    subscription = robot.subscribe("vical/**", lambda s: heard.append(s.payload))
+            open_bus(mode="client", tcp_port=port, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "may_command", "may_publish"),
+    [("viewer", False, False), ("boss", True, False), ("feeder", True, True), ("group", True, True)],
+)
+def test_who_may_command_and_who_may_publish(rights, name, may_command, may_publish):
+    router, clients, _ = rights
+    client, group = clients[name], clients["group"]
+    commands, heard = commanded(router), []
+    router.subscribe("vical/*/imu/*", lambda s: heard.append(s.payload))
+    router.subscribe("vical/*/calibration/*", lambda s: heard.append(s.payload))
     seen: list[bytes] = []
-    watching = viewer.subscribe(KEY, lambda s: seen.append(s.payload))
-    assert until(lambda: robot.publish(KEY, b"from robot") or b"from robot" in seen)
-    assert [s.payload for s in viewer.latest(KEY)] == [b"from robot"]
+    client.subscribe("vical/rig0/calibration/other", lambda s: seen.append(s.payload))
+    other = topics.CALIBRATION.key("rig0", "other")
+    assert until(lambda: router.publish(other, b"from the rig") or seen)  # everybody may read
+    assert [s.payload for s in client.latest(other)] == [b"from the rig"]
     for _ in range(20):
-        viewer.publish(KEY, b"forged")
-        viewer.publish(topics.COMMAND.key("rig0", "record"), b"stop")
+        client.publish(COMMAND, encode_string("from the client"))
+        client.publish(topics.IMU.key("rig0", "imu0"), b"imu of the client")
+        client.publish(KEY, b"calibration of the client")
         time.sleep(0.01)
-    robot.publish(KEY, b"end")
-    assert until(lambda: b"end" in heard)
-    assert set(heard) == {b"from robot", b"end"}
-    assert {s.payload for s in robot.latest(KEY)} == {b"end"}  # nor can it answer in our place
-    for item in (subscription, watching):
-        item.close()
-    for bus in (viewer, robot, router):
+    group.publish(COMMAND, encode_string("end"))
+    group.publish(topics.IMU.key("rig0", "imu0"), b"end")
+    assert until(lambda: "end" in commands and b"end" in heard)
+    time.sleep(0.3)  # what was put before the end over another link
+    assert ("from the client" in commands) is may_command
+    assert (b"imu of the client" in heard) is may_publish
+    assert (b"calibration of the client" in heard) is may_publish
+    answers = {s.payload for s in router.latest(KEY)}  # nor can it answer in our place
+    assert answers == ({b"calibration of the client"} if may_publish else set())
+
+
+def test_the_site_cannot_command_its_robots(tmp_path):
+    """What comes down the link to a site's router is somebody else's, too."""
+    port = free_port()
+    users = tmp_path / "users.txt"
+    users.write_text("robot1:secret\n")
+    credentials = {"user": "robot1", "password": "secret", "password_file": str(users)}
+    site = open_bus(mode="router", tcp_port=port, publishers=["robot1"], **credentials)
+    robot = open_bus(
+        mode="router", socket=tmp_path / "z.sock", connect=[f"tcp/127.0.0.1:{port}"], **credentials
+    )
+    key = topics.CALIBRATION.key("robot1", "cam0")
+    commands, seen = commanded(robot), []
+    site.subscribe("vical/**", lambda s: seen.append(s.key))
+    assert until(lambda: robot.publish(key, b"x") or key in seen)
+    for _ in range(20):
+        site.publish(COMMAND, encode_string("stop"))
+        time.sleep(0.01)
+    local = open_bus(mode="client", socket=tmp_path / "z.sock", user="robot1", password="secret")
+    assert until(lambda: local.publish(COMMAND, encode_string("end")) or "end" in commands)
+    assert "stop" not in commands
+    for bus in (local, robot, site):
         bus.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Sequence
@@ -12,12 +11,14 @@ from typing import Any
 
 from vical_daemon import notify
 from vical_daemon.bus import Bus
+from vical_daemon.bus_places import LOOPBACK_PORT, own_socket
 from vical_daemon.config import BusConfig, Config, load
-from vical_daemon.places import make_private, runtime_directory
+from vical_daemon.local_bus import open_local_bus
+from vical_daemon.places import make_private
 from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
+from vical_daemon.zenoh_commands import CommandJournal
 
 _log = logging.getLogger(__name__)
-SERVICE_SOCKET = Path("/run/vical/zenoh.sock")
 _HOSTS = {"imu", "camera"}
 _RETRY_S = 0.5
 _QUIET_S = 2.0
@@ -25,7 +26,7 @@ _QUIET_S = 2.0
 
 def socket_path(bus: BusConfig) -> Path:
     """Where the router of a rig listens."""
-    return Path(bus.socket) if bus.socket else runtime_directory() / "zenoh.sock"
+    return Path(bus.socket) if bus.socket else own_socket()
 
 
 def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) -> Bus | None:
@@ -42,15 +43,19 @@ def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) 
     if _HOSTS & set(roles):
         try:
             bus = _host(config)
+            CommandJournal(bus.session)
         except BusError:
             if set(roles) >= _HOSTS:
                 raise
             _log.info("the bus is hosted by another process: joining it")
     bus = bus or _wait_for_router(config, stop)
-    if bus is not None and config.bus.ros2:
+    if bus is not None:
+        _log.info("on the bus as zenoh id %s", bus.session.info.zid())  # the journal of commands names it
+    if bus is not None and config.ros2 is not None:
         from vical_daemon.zenoh_ros2 import Ros2Bus
 
-        return Ros2Bus(bus, f"{config.rig}_{min(roles, default='vical')}", config.bus.ros2_domain)
+        node = f"{config.rig}_{min(roles, default='vical')}"
+        return Ros2Bus(bus, node, config.ros2.domain, config.ros2_namespace)
     return bus
 
 
@@ -58,33 +63,36 @@ def open_client(config_path: str | None, endpoint: str | None) -> Bus:
     """Open the bus for a command that only listens or asks.
 
     Args:
-        config_path: The rig's YAML; None: the defaults.
+        config_path: The rig's YAML; None: whatever bus is on this computer.
         endpoint: A router to use instead, e.g. ``tcp/127.0.0.1:7447``.
 
     Raises:
-        BusError: Nobody hosts a bus there.
+        BusError: Nobody hosts a bus there, or it is not for this user.
     """
     bus = load(config_path).bus if config_path else BusConfig()
     credentials = _credentials(bus)
     if endpoint:
         return open_bus(mode="client", connect=[endpoint], **credentials)
-    candidates = [socket_path(bus)] if bus.socket or config_path else [socket_path(bus), SERVICE_SOCKET]
-    for path in candidates:
-        if path.exists() and os.access(path, os.W_OK):
-            return open_bus(mode="client", socket=path, **credentials)
-    return open_bus(mode="client", tcp_port=bus.tcp_port or BusConfig().tcp_port, **credentials)
+    sockets = [Path(bus.socket)] if bus.socket else []
+    return open_local_bus(sockets, bus.loopback_port if config_path else LOOPBACK_PORT, **credentials)
 
 
 def _host(config: Config) -> ZenohBus:
     bus = config.bus
+    if bus.user and not bus.password_file:
+        raise BusError(
+            "a router with bus.user asks everybody for a password, its own processes too: "
+            "set bus.password_file, with a line for this user (certificates need no password)"
+        )
     return open_bus(
         mode="router",
         socket=socket_path(bus),
-        tcp_port=bus.tcp_port,
+        tcp_port=bus.loopback_port,
         listen=bus.listen,
         connect=bus.connect,
         password_file=bus.password_file,
-        readers=bus.readers,
+        commanders=bus.commanders,
+        publishers=bus.publishers,
         **_credentials(bus),
     )
 

@@ -55,8 +55,17 @@ def one_line(camera: str, estimate: CalibrationEstimate) -> str:
     )
 
 
-def picture(camera: str, estimate: CalibrationEstimate, health: list[str]) -> RenderableType:
-    """Return the table of one camera with a bar and what to do next."""
+def picture(
+    camera: str, estimate: CalibrationEstimate, health: list[str], silent_s: float | None = None
+) -> RenderableType:
+    """Return the table of one camera with a bar and what to do next.
+
+    Args:
+        camera: Its name.
+        estimate: The last one.
+        health: Lines to put below.
+        silent_s: How long ago the estimates stopped, s; None: they go on.
+    """
     from rich.console import Group
     from rich.padding import Padding
     from rich.progress_bar import ProgressBar
@@ -72,8 +81,9 @@ def picture(camera: str, estimate: CalibrationEstimate, health: list[str]) -> Re
     colour = {"converged": "green", "degenerate": "yellow", "inconsistent": "red"}.get(
         estimate.status, "cyan"
     )
+    stale = "" if silent_s is None else f"stale, {silent_s:.0f} s old, was "
     head = Text.assemble(
-        (f"{estimate.status}", f"bold {colour}"),
+        (f"{stale}{estimate.status}", f"bold {'red' if stale else colour}"),
         f"  {estimate.duration_s:.1f} s, {estimate.frames} frames, {estimate.imu_samples} imu samples, "
         f"NIS/dof {estimate.nis_per_dof:.2f}",
     )
@@ -83,8 +93,16 @@ def picture(camera: str, estimate: CalibrationEstimate, health: list[str]) -> Re
     return Group(head, bar, advice, table, *(Text(line, style="dim") for line in health))
 
 
-def screen(estimates: Estimates, health: Health) -> RenderableType:
-    """Return what `vical watch` shows: every camera, then what each component says of itself."""
+def screen(
+    estimates: Estimates, health: Health, silent: Mapping[tuple[str, str], float] | None = None
+) -> RenderableType:
+    """Return what `vical watch` shows: every camera, then what each component says of itself.
+
+    Args:
+        estimates: The last ones.
+        health: Level and message of each component.
+        silent: Cameras whose estimates have stopped, with the age of the last one, s.
+    """
     from rich.console import Group
     from rich.padding import Padding
     from rich.table import Table
@@ -92,7 +110,8 @@ def screen(estimates: Estimates, health: Health) -> RenderableType:
 
     parts: list[RenderableType] = []
     for (rig, camera), estimate in sorted(estimates.items()):
-        parts += [Text(f"rig {rig}", style="bold"), Padding(picture(camera, estimate, []), (0, 0, 1, 0))]
+        table_of_camera = picture(camera, estimate, [], (silent or {}).get((rig, camera)))
+        parts += [Text(f"rig {rig}", style="bold"), Padding(table_of_camera, (0, 0, 1, 0))]
     if not parts:
         parts.append(Text("waiting for a calibration; is `vical run` (vical.target) up?"))
     table = Table(box=None, pad_edge=False, show_header=False)

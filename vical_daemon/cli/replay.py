@@ -82,10 +82,12 @@ def _open_bus(args: argparse.Namespace) -> Bus:
     settings = load(args.config).bus if args.config else BusConfig()
     path: Path = socket_path(settings)
     make_private(path.parent)
+    port = settings.loopback_port
     print(
-        f"nobody hosts the bus: hosting it at {path} and tcp/127.0.0.1:{settings.tcp_port}", file=sys.stderr
+        f"nobody hosts the bus: hosting it at {path}{f' and tcp/127.0.0.1:{port}' if port else ''}",
+        file=sys.stderr,
     )
-    bus = open_bus(mode="router", socket=path, tcp_port=settings.tcp_port)
+    bus = open_bus(mode="router", socket=path, tcp_port=port)
     time.sleep(args.wait)  # or those who wait for a router miss the beginning
     return bus
 

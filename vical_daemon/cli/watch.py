@@ -74,6 +74,7 @@ class View:
     def __init__(self, rig: str, *, as_json: bool) -> None:
         self._rig, self._json = rig, as_json
         self.estimates: dict[tuple[str, str], CalibrationEstimate] = {}
+        self._heard_s: dict[tuple[str, str], float] = {}
         self.health: dict[tuple[str, str], tuple[str, str]] = {}
         self._unprinted: deque[tuple[str, str, CalibrationEstimate]] = deque(maxlen=10_000)
 
@@ -98,13 +99,27 @@ class View:
             self._on_status(parsed.rig, sample)
 
     def all_converged(self) -> bool:
-        """Whether there is a camera and every one has converged."""
-        return bool(self.estimates) and all(e.status == "converged" for e in self.estimates.values())
+        """Whether there is a camera and every one has converged, and still says so."""
+        return (
+            bool(self.estimates)
+            and all(e.status == "converged" for e in self.estimates.values())
+            and not self.silent()
+        )
+
+    def silent(self) -> dict[tuple[str, str], float]:
+        """Return the cameras whose estimates have stopped, with the age of the last one, s."""
+        from vical_daemon.liveness import FRESH_S
+
+        now_s = time.monotonic()
+        ages = {key: now_s - heard_s for key, heard_s in list(self._heard_s.items())}
+        return {key: age_s for key, age_s in ages.items() if age_s > FRESH_S}
 
     def where(self) -> str:
         """Say in a few words how far each camera is."""
+        silent = self.silent()
         each = [
             f"{camera} of {rig} is {estimate.status} ({estimate.progress:.0%})"
+            + (f", said {silent[rig, camera]:.0f} s ago and silent since" if (rig, camera) in silent else "")
             for (rig, camera), estimate in sorted(self.estimates.items())
         ]
         return ", ".join(each) or "nothing is calibrating here; is `vical run` (vical.target) up?"
@@ -128,6 +143,7 @@ class View:
             estimate = decode_calibration(sample.payload).estimate
         except MessageError:
             return
+        self._heard_s[rig, camera] = time.monotonic()
         self.estimates[rig, camera] = estimate
         self._unprinted.append((rig, camera, estimate))
 
@@ -175,4 +191,4 @@ class _screen:  # noqa: N801 (used like a function)
             return
         from vical_daemon.cli.live_table import screen
 
-        self._live.update(screen(view.estimates, view.health), refresh=True)
+        self._live.update(screen(view.estimates, view.health, view.silent()), refresh=True)

@@ -51,6 +51,7 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     while not stop.is_set():
         inbox.wait(PUBLISH_S / 2)
         if _reset_wanted(commands):
+            _log.info("calibration reset by command")
             checkpoint.forget()
             role.reset(make_estimator(config, priors), make_watch(config))
         while True:  # a bounded number at a time, so that publications stay on time when data pile up

@@ -13,8 +13,6 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from aiohttp import web
-
 from vical_daemon import topics
 from vical_daemon.bus import Bus, Subscription
 from vical_daemon.config import Config
@@ -110,20 +108,19 @@ async def _serve(
     def command(role: str, word: str) -> None:
         bus.publish(topics.COMMAND.key(config.rig, role), encode_string(word))
 
-    rate_hz = config.web.picture_rate_hz
-    server = PageServer(state, feeds.views, feeds.watch, command, read_token(), rate_hz)
-    runner = web.AppRunner(server.application(), access_log=None, shutdown_timeout=0.3)
-    await runner.setup()
-    host, port = config.web.host, config.web.port
+    settings = config.web
+    server = PageServer(
+        state, feeds.views, feeds.watch, command, read_token(), settings.picture_rate_hz, settings.hosts
+    )
+    host, port = settings.host, settings.port
     try:
-        site = web.TCPSite(runner, host, port)
-        await site.start()
+        port = await server.listen(host, port)
     except OSError as error:
-        await runner.cleanup()
+        await server.close()
         code = error.errno or 0  # above 0: of the kernel, whose word is shorter than asyncio's
         reason = os.strerror(code) if code > 0 else error.strerror or str(error)
         raise WebError(f"cannot serve the page on {host}:{port}: {reason}; set web.port") from error
-    address = f"http://{host}:{runner.addresses[0][1]}/"
+    address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
     _log.info("page at %s", address)
     if ready is not None:
         ready(address)
@@ -131,7 +128,7 @@ async def _serve(
     viewer = _foxglove(config, bus)
 
     def statuses() -> list[DiagnosticStatus]:
-        values = {"malformed": str(state.malformed), "address": address}
+        values = {"malformed": str(state.malformed), "address": address} | server.counters()
         return [DiagnosticStatus(Level.OK, "web", address, "", values)]
 
     def stopped() -> bool:
@@ -143,7 +140,7 @@ async def _serve(
     finally:
         if viewer is not None:
             viewer.close()
-        await runner.cleanup()
+        await server.close()
 
 
 def _foxglove(config: Config, bus: Bus) -> FoxgloveServer | None:

@@ -6,13 +6,16 @@ import math
 import re
 
 from vical_daemon.estimation.result import Status
-from vical_daemon.web.state import WebState
+from vical_daemon.web.state import WebState, is_stale
 
 _NAME = re.compile(r"[^a-zA-Z0-9_]")
 
 
 def metrics(state: WebState) -> str:
-    """Return all metrics: calibration per camera, level and every numeric counter per component."""
+    """Return all metrics: calibration per camera, level and every numeric counter per component.
+
+    A camera whose estimates have stopped is in no status; its age says so.
+    """
     families: dict[str, tuple[str, list[str]]] = {}
 
     def add(name: str, help_text: str, labels: dict[str, str], value: float) -> None:
@@ -20,14 +23,15 @@ def metrics(state: WebState) -> str:
             inner = ",".join(f'{k}="{_escape(v)}"' for k, v in labels.items())
             families.setdefault(name, (help_text, []))[1].append(f"{name}{{{inner}}} {value!r}")
 
-    for camera, message in sorted(state.calibrations.items()):
+    for camera, (message, age_s) in sorted(state.calibrations.items()):
         labels = {"rig": state.rig, "camera": camera}
         estimate, known = message.estimate, message.camera_estimate
         for status in Status:
             add(
                 "vical_calibration_status", "1 for the status it is in.",
-                labels | {"status": str(status)}, float(status is estimate.status),
+                labels | {"status": str(status)}, float(status is estimate.status and not is_stale(age_s)),
             )  # fmt: skip
+        add("vical_calibration_age_seconds", "Since the last estimate.", labels, round(age_s, 3))
         add("vical_calibration_progress", "0 to 1.", labels, estimate.progress)
         add("vical_calibration_nis_per_dof", "1 when consistent.", labels, estimate.nis_per_dof)
         add("vical_calibration_rejected_fraction", "Refused share.", labels, estimate.rejected_fraction)

@@ -6,13 +6,16 @@ import asyncio
 import hmac
 import json
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from aiohttp import web
 
+from vical_daemon.log_limit import LogLimit
+from vical_daemon.web.connections import BODY_S, Gate, Malformed, http_logger
+from vical_daemon.web.hosts import AllowedHosts
 from vical_daemon.web.images import CameraView, Sight, drawn_jpeg, picture_event
 from vical_daemon.web.metrics import metrics
 from vical_daemon.web.state import WebState
@@ -57,6 +60,7 @@ class PageServer:
         command: Called with (role, word) for a command; None: read-only.
         token: What a client must show to command; "": nobody may.
         picture_rate_hz: Pictures a second, at most.
+        hosts: Names under which the page may be asked for, beyond this computer's own.
     """
 
     def __init__(
@@ -67,6 +71,7 @@ class PageServer:
         command: Command | None = None,
         token: str = "",
         picture_rate_hz: float = PICTURE_RATE_HZ,
+        hosts: Sequence[str] = (),
     ) -> None:
         self.state, self.views = state, views
         self._watch, self._command, self._token = watch, command, token
@@ -75,6 +80,13 @@ class PageServer:
         self._ticked = asyncio.Condition()
         self._listeners = 0
         self._picture_s = 1.0 / picture_rate_hz
+        self._hosts = AllowedHosts(hosts)
+        self._gate: Gate | None = None
+        self._runner: web.AppRunner | None = None
+        self._listener: asyncio.Server | None = None
+        self._malformed = Malformed()
+        self._refusals = LogLimit(5, 60.0)
+        self._refused = 0
         self._shows = {
             (name, kind): _Show(make)
             for name in views
@@ -83,7 +95,7 @@ class PageServer:
 
     def application(self) -> web.Application:
         """Return the aiohttp application."""
-        app = web.Application(middlewares=[_secure], client_max_size=4096)
+        app = web.Application(middlewares=[self._secure], client_max_size=4096)
         app.router.add_get("/events", self._events)
         app.router.add_get("/camera/{name}/events", self._picture_events)
         app.router.add_get("/camera/{name}.mjpg", self._mjpeg)
@@ -92,6 +104,37 @@ class PageServer:
         app.router.add_get("/metrics", self._metrics)
         app.router.add_get("/{file:[a-z.]*}", self._static)
         return app
+
+    async def listen(self, host: str, port: int) -> int:
+        """Begin to serve; return the port (0 asks for any free one).
+
+        Raises:
+            OSError: The address cannot be used.
+        """
+        self._runner = web.AppRunner(
+            self.application(), access_log=None, shutdown_timeout=0.3, logger=http_logger(self._malformed)
+        )
+        await self._runner.setup()
+        assert self._runner.server is not None
+        self._gate = Gate(self._runner.server)
+        self._listener = await asyncio.get_running_loop().create_server(self._gate, host, port)
+        return int(self._listener.sockets[0].getsockname()[1])
+
+    async def close(self) -> None:
+        """Stop serving; may be called twice."""
+        if self._listener is not None:
+            self._listener.close()
+        if self._runner is not None:
+            await self._runner.cleanup()
+
+    def counters(self) -> dict[str, str]:
+        """Return what the status of the role says about the visitors."""
+        return {
+            "connections": str(self._gate.open if self._gate else 0),
+            "connections_refused": str(self._gate.refused if self._gate else 0),
+            "requests_malformed": str(self._malformed.count),
+            "requests_refused": str(self._refused),
+        }
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Tick until `stopped` says so: digest the bus, wake the listeners."""
@@ -105,6 +148,8 @@ class PageServer:
                 async with self._ticked:
                     self._number += 1
                     self._ticked.notify_all()
+                if self._gate is not None:
+                    self._gate.sweep()
                 await asyncio.sleep(max(TICK_S - (loop.time() - begin_s), 0.01))
         finally:
             for task in pictures:
@@ -134,6 +179,41 @@ class PageServer:
     async def _metrics(self, _request: web.Request) -> web.Response:
         text = metrics(self.state)
         return web.Response(body=text.encode(), headers={"Content-Type": "text/plain; version=0.0.4"})
+
+    @web.middleware
+    async def _secure(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        """Refuse foreign names; add the security headers to every answer (streams have them already)."""
+        assert self._gate is not None
+        connection = request.protocol
+        self._gate.busy(connection)
+        try:
+            self._check_host(request)
+            response = await handler(request)
+            if not response.prepared:
+                _add_headers(response)
+            return response
+        except web.HTTPException as error:
+            _add_headers(error)
+            raise
+        finally:
+            self._gate.idle(connection)
+
+    def _check_host(self, request: web.Request) -> None:
+        named = request.headers.getall("Host", [])
+        own = request.transport.get_extra_info("sockname") if request.transport is not None else None
+        if len(named) == 1 and self._hosts.allows(named[0], own[0] if own else ""):
+            return
+        asked = ", ".join(named)[:80]
+        self._note_refusal(f"a request from {request.remote} for the host {asked!r}; see web.hosts")
+        raise web.HTTPMisdirectedRequest(text=f"this page has another name than {asked!r}; see web.hosts")
+
+    def _note_refusal(self, what: str) -> None:
+        self._refused += 1
+        more = self._refusals.admit()
+        if more is not None:
+            _log.warning("refused %s%s", what, more)
 
     def _full(self) -> dict[str, Any]:
         control = bool(self._token) and self._command is not None
@@ -209,12 +289,16 @@ class PageServer:
         if not self._token or self._command is None:
             raise web.HTTPForbidden(text="this page is read-only: no token is set on the robot")
         given = request.headers.get("Authorization", "").removeprefix("Bearer ")
-        if not hmac.compare_digest(given.encode(), self._token.encode()):
+        if not hmac.compare_digest(given.encode(errors="replace"), self._token.encode()):
+            self._note_refusal(f"a command from {request.remote} without the right token")
             raise web.HTTPUnauthorized(text="wrong token")
         try:
-            document = await request.json()
+            async with asyncio.timeout(BODY_S):
+                document = json.loads(await request.read())
             role, word = COMMANDS[document["command"]]
-        except (json.JSONDecodeError, KeyError, TypeError, UnicodeDecodeError):
+        except TimeoutError:
+            raise web.HTTPRequestTimeout(text="the command did not come") from None
+        except (ValueError, KeyError, TypeError, RecursionError, web.RequestPayloadError):
             raise web.HTTPBadRequest(text=f"command must be one of {', '.join(COMMANDS)}") from None
         self._command(role, word)
         _log.info("command from %s: %s %s", request.remote, role, word)
@@ -258,12 +342,5 @@ def _event(kind: str, document: dict[str, Any]) -> bytes:
     return f"event: {kind}\ndata: ".encode() + msgspec.json.encode(document) + b"\n\n"
 
 
-@web.middleware
-async def _secure(
-    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
-) -> web.StreamResponse:
-    """Add the security headers to every answer that is not a stream (those have them already)."""
-    response = await handler(request)
-    if not response.prepared:
-        response.headers.update({k: v for k, v in _HEADERS.items() if k not in response.headers})
-    return response
+def _add_headers(response: web.StreamResponse) -> None:
+    response.headers.update({k: v for k, v in _HEADERS.items() if k not in response.headers})

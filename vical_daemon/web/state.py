@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vical_daemon import topics
 from vical_daemon.bus import Sample
+from vical_daemon.liveness import FRESH_S
 from vical_daemon.messages import (
     CalibrationMessage,
     DiagnosticStatus,
+    Level,
     MessageError,
     decode_calibration,
     decode_diagnostics,
@@ -20,6 +24,11 @@ from vical_daemon.messages import (
 from vical_daemon.web import words
 
 HISTORY = 1500
+"""Rows kept of each camera: 1.6 MB, which five minutes of estimates at 5 Hz fill."""
+SOURCES = 32
+"""Cameras, and roles, that are shown at most: whoever invents names must not fill the memory."""
+STALE = "stale"
+"""Stands for the status of a camera whose estimates have stopped."""
 # One row of the history; lists of three are flattened in this order.
 COLUMNS = (
     "t_s", "px_mm", "py_mm", "pz_mm", "spx_mm", "spy_mm", "spz_mm", "qw", "qx", "qy", "qz",
@@ -36,12 +45,14 @@ class CameraState:
 
     Attributes:
         latest: The last message.
+        arrived_s: When it came, by the clock of the state.
         rows: History, oldest first, thinned towards the past.
         fresh: Rows since the last tick.
         restarted: The estimator began anew since the last tick.
     """
 
     latest: CalibrationMessage
+    arrived_s: float
     rows: list[Row] = field(default_factory=list)
     fresh: list[Row] = field(default_factory=list)
     restarted: bool = False
@@ -50,31 +61,35 @@ class CameraState:
 class WebState:
     """Collects calibrations and statuses; `take` may be called from any thread.
 
+    A source that has been silent for longer than `FRESH_S` is stale: its last words are shown as such, with
+    their age, and no status of it is repeated as if it still held.
+
     Args:
         rig: Name of the rig.
+        clock: Monotonic seconds.
     """
 
-    def __init__(self, rig: str) -> None:
+    def __init__(self, rig: str, clock: Callable[[], float] = time.monotonic) -> None:
         self.rig = rig
+        self._clock = clock
         self._lock = threading.Lock()
-        self._arrived: deque[Sample] = deque(maxlen=4096)
+        self._arrived: deque[tuple[float, Sample]] = deque(maxlen=4096)
         self._cameras: dict[str, CameraState] = {}
-        self._statuses: dict[str, tuple[DiagnosticStatus, ...]] = {}
-        self._stamps_ns: dict[str, int] = {}
+        self._statuses: dict[str, tuple[float, tuple[DiagnosticStatus, ...]]] = {}
         self.malformed = 0
 
     def take(self, sample: Sample) -> None:
         """Keep a message for the next tick; does next to nothing, so that the bus is not held up."""
         with self._lock:
-            self._arrived.append(sample)
+            self._arrived.append((self._clock(), sample))
 
     def tick(self, *, wanted: bool = True) -> dict[str, Any] | None:
         """Digest what has arrived; return the update for everybody who is up to date, if it is `wanted`."""
         with self._lock:
             arrived, self._arrived = self._arrived, deque(maxlen=4096)
-        for sample in arrived:
+        for arrived_s, sample in arrived:
             try:
-                self._digest(sample)
+                self._digest(sample, arrived_s)
             except MessageError:
                 self.malformed += 1
         document = self._document(full=False) if wanted else None
@@ -88,30 +103,43 @@ class WebState:
 
     @property
     def statuses(self) -> dict[str, tuple[DiagnosticStatus, ...]]:
-        """Last status of every role."""
-        return dict(self._statuses)
+        """Last status of every role; of one that is silent, marked as stale."""
+        now_s = self._clock()
+        return {
+            role: statuses if not is_stale(now_s - arrived_s) else _silent(statuses, now_s - arrived_s)
+            for role, (arrived_s, statuses) in self._statuses.items()
+        }
 
     @property
-    def calibrations(self) -> dict[str, CalibrationMessage]:
-        """Last calibration of every camera."""
-        return {name: camera.latest for name, camera in self._cameras.items()}
+    def calibrations(self) -> dict[str, tuple[CalibrationMessage, float]]:
+        """Last calibration of every camera, and how long ago it came, s."""
+        now_s = self._clock()
+        return {name: (camera.latest, now_s - camera.arrived_s) for name, camera in self._cameras.items()}
 
-    def _digest(self, sample: Sample) -> None:
+    def _digest(self, sample: Sample, arrived_s: float) -> None:
+        """Take in one message.
+
+        Raises:
+            MessageError: It is not what its key says, or one source too many.
+        """
         parsed = topics.parse_key(sample.key)
         if parsed is None:
             return
         if parsed.topic is topics.CALIBRATION:
-            self._calibration(decode_calibration(sample.payload))
+            message = decode_calibration(sample.payload)
+            if message.camera != parsed.name:
+                raise MessageError(f"{sample.key} speaks of {message.camera[:80]}")
+            _admit(parsed.name, self._cameras)
+            self._calibration(message, arrived_s)
         elif parsed.topic is topics.STATUS:
-            message = decode_diagnostics(sample.payload)
-            self._statuses[parsed.name] = message.statuses
-            self._stamps_ns[parsed.name] = message.stamp_ns
+            _admit(parsed.name, self._statuses)
+            self._statuses[parsed.name] = arrived_s, decode_diagnostics(sample.payload).statuses
 
-    def _calibration(self, message: CalibrationMessage) -> None:
-        camera = self._cameras.setdefault(message.camera, CameraState(message))
+    def _calibration(self, message: CalibrationMessage, arrived_s: float) -> None:
+        camera = self._cameras.setdefault(message.camera, CameraState(message, arrived_s))
         if message.estimate.duration_s < camera.latest.estimate.duration_s:
             camera.rows, camera.fresh, camera.restarted = [], [], True
-        camera.latest = message
+        camera.latest, camera.arrived_s = message, arrived_s
         row = history_row(message)
         if row is None or (camera.rows and camera.rows[-1][0] == row[0]):
             return
@@ -122,10 +150,10 @@ class WebState:
             camera.rows = camera.rows[:half:2] + camera.rows[half:]
 
     def _document(self, *, full: bool) -> dict[str, Any]:
-        cameras = {}
+        cameras, now_s = {}, self._clock()
         for name, camera in sorted(self._cameras.items()):
             whole = full or camera.restarted
-            entry = summary(camera.latest)
+            entry = summary(camera.latest, now_s - camera.arrived_s)
             entry["rows" if whole else "fresh"] = camera.rows if whole else camera.fresh
             cameras[name] = entry
         devices = [
@@ -137,7 +165,7 @@ class WebState:
                 "serial": status.hardware_id,
                 "values": status.values,
             }
-            for role, statuses in sorted(self._statuses.items())
+            for role, statuses in sorted(self.statuses.items())
             for status in statuses
             if status.name != "clock"
         ]
@@ -147,13 +175,44 @@ class WebState:
         return document
 
 
-def summary(message: CalibrationMessage) -> dict[str, Any]:
-    """Return what the page says about one camera at this moment."""
+def is_stale(age_s: float) -> bool:
+    """Whether a source whose last message came so long ago must be called silent."""
+    return age_s > FRESH_S
+
+
+def _silent(statuses: tuple[DiagnosticStatus, ...], age_s: float) -> tuple[DiagnosticStatus, ...]:
+    return tuple(
+        replace(status, level=Level.STALE, message=f"silent for {age_s:.0f} s; last: {status.message}")
+        for status in statuses
+    )
+
+
+def _admit(name: str, known: dict[str, Any]) -> None:
+    """Let a source in that is known or for which there is room.
+
+    Raises:
+        MessageError: There is none.
+    """
+    if name not in known and len(known) >= SOURCES:
+        raise MessageError(f"{name}: more than {SOURCES} sources")
+
+
+def summary(message: CalibrationMessage, age_s: float = 0.0) -> dict[str, Any]:
+    """Return what the page says about one camera at this moment.
+
+    Args:
+        message: The last message of the camera.
+        age_s: How long ago it came, s.
+    """
     estimate, camera = message.estimate, message.camera_estimate
     withheld = list(camera.unobservable) if camera else []
+    stale = is_stale(age_s)
     return {
-        "status": str(estimate.status),
-        "sentence": words.sentence(estimate),
+        "status": STALE if stale else str(estimate.status),
+        "last_status": str(estimate.status),
+        "stale": stale,
+        "age_s": round(age_s, 1),
+        "sentence": words.silence(estimate, age_s) if stale else words.sentence(estimate),
         "guidance": estimate.guidance,
         "progress": finite(estimate.progress),
         "duration_s": finite(estimate.duration_s),

@@ -35,6 +35,19 @@ def sentence(estimate: CalibrationEstimate) -> str:
     return f"{text.removesuffix('.')}: {estimate.reason.removesuffix('.')}." if estimate.reason else text
 
 
+def silence(estimate: CalibrationEstimate, age_s: float) -> str:
+    """Return what to say when the estimates of a camera have stopped.
+
+    Args:
+        estimate: The last one.
+        age_s: How long ago it came, s.
+    """
+    return (
+        f"No estimate for {age_s:.0f} s: is the calibrate process running? The values below are old; "
+        f"the last status was {estimate.status}."
+    )
+
+
 def motion(texts: Iterable[str]) -> Motion:
     """Find the axes that guidance texts ask to turn about or to move along.
 

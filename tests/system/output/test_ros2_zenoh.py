@@ -44,7 +44,7 @@ def subscribe(port, topic, type_name, callback):
 
 def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
     session, port = router
-    outlet = Ros2Outlet(session)
+    outlet = Ros2Outlet(session, namespace="/rig0")
     static = Transform(T0_NS, "imu", "cam0", (0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
     outlet.publish("vical/rig0/tf_static", encode_transforms([static]))
     heard, enough = [], threading.Event()
@@ -54,7 +54,7 @@ def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
         if len(heard) >= 20:
             enough.set()
 
-    subscriber = subscribe(port, "/imu/data", "sensor_msgs/msg/Imu", on_imu)
+    subscriber = subscribe(port, "/rig0/imu/data", "sensor_msgs/msg/Imu", on_imu)
     try:
         payload = encode_imu(T0_NS, "imu", (0.1, 0.2, 0.3), (0.0, 0.0, 9.8))
         end = time.monotonic() + 45
@@ -67,8 +67,8 @@ def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
         assert heard[0].header.stamp.nanosec == 123_456_789
 
         names = dict(get_topic_names_and_types(router_port=port))
-        assert names["/imu/data"] == ["sensor_msgs/msg/Imu"]
-        assert "/tf_static" in names
+        assert names["/rig0/imu/data"] == ["sensor_msgs/msg/Imu"]
+        assert "/rig0/tf_static" in names
     finally:
         subscriber.close()
         ZenohSession._instance = None
@@ -78,23 +78,38 @@ def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
 
 def test_the_bus_of_a_process_speaks_ros_when_told(tmp_path):
     from vical_daemon.cli.bus_access import open_for_roles
-    from vical_daemon.config import BusConfig, Config
+    from vical_daemon.config import BusConfig, Config, Ros2Config
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    config = Config(bus=BusConfig(socket=str(tmp_path / "z.sock"), tcp_port=port, ros2=True, ros2_domain=4))
+    config = Config(bus=BusConfig(socket=str(tmp_path / "z.sock"), tcp_port=port), ros2=Ros2Config(domain=4))
     bus = open_for_roles(config, ("imu", "camera"), threading.Event())
     own, ros = [], threading.Event()
     bus.subscribe("vical/rig0/imu/*", own.append)
     with zenoh.open(client_config(port)) as listener:
-        subscriber = listener.declare_subscriber("4/imu0/data/**", lambda _sample: ros.set())
+        subscriber = listener.declare_subscriber("4/rig0/imu0/data/**", lambda _sample: ros.set())
         payload = encode_imu(T0_NS, "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
         end = time.monotonic() + 45
         while not (ros.is_set() and own) and time.monotonic() < end:
             bus.publish("vical/rig0/imu/imu0", payload)
             time.sleep(0.02)
         subscriber.undeclare()
+        tokens = [str(reply.ok.key_expr) for reply in listener.liveliness().get("@ros2_lv/4/**") if reply.ok]
+        assert any("/NN/%/%rig0/" in token for token in tokens)  # the read-only endpoint shows the graph, too
+        assert any("%rig0%imu0%data" in token for token in tokens)
+        static = Transform(T0_NS, "imu", "cam0", (0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
+        bus.publish("vical/rig0/tf_static", encode_transforms([static]))
+        statics: list[object] = []
+        late = zenoh.ext.declare_advanced_subscriber(
+            listener, "4/rig0/tf_static/**", statics.append,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+        )  # fmt: skip
+        end = time.monotonic() + 45
+        while not statics and time.monotonic() < end:
+            time.sleep(0.02)
+        assert statics
+        late.undeclare()
     assert ros.is_set()
     assert own[0].payload == payload
     assert bus.connected

@@ -205,6 +205,26 @@ def test_in_a_browser(fed, browser, tmp_path):
     assert (keep / "page.png").stat().st_size > 20_000
 
 
+def test_a_calibration_that_stops_is_stale_in_a_browser(served, browser, web_feed, tmp_path):
+    rng = np.random.default_rng(0)
+    for k in range(1, 150):
+        web_feed.publish_estimate(served.bus, web_feed.estimate(0.2 * k, rng))
+    web_feed.publish_status(served.bus)
+
+    async def script(page):
+        await page.open(served.address)
+        await page.wait("document.getElementById('status').textContent.startsWith('stale, ')")
+        words = "document.querySelector('main').innerText + document.getElementById('status').innerText"
+        return await page.evaluate(words), page.errors
+
+    words, errors = browser.drive(script, tmp_path / "profile")
+    assert errors == []
+    assert "No estimate for" in words
+    assert "silent for" in words  # of the devices
+    assert "Converged:" not in words
+    assert "nothing is missing" not in words
+
+
 def test_commands_and_a_phone_in_a_browser(fed, browser, tmp_path):
     keep = shots() or tmp_path
 

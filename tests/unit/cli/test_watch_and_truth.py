@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from vical_daemon import topics
 from vical_daemon.bus import LocalBus
-from vical_daemon.cli import bus_access, demo_truth, live_table, main
+from vical_daemon.cli import bus_access, demo_truth, live_table, main, watch
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.euler import euler_sigma_deg
 from vical_daemon.messages import DiagnosticStatus, Level, encode_calibration, encode_diagnostics
@@ -70,6 +70,26 @@ def test_out_of_time_exits_1_and_says_where_it_stands(bus: LocalBus, capsys) -> 
     _publish(bus, "rover", Status.CONVERGING)
     assert main(["watch", "--until-converged", "--timeout", "0.3"]) == 1
     assert "cam0 of rover is converging (50%)" in capsys.readouterr().err
+
+
+def test_estimates_that_stop_are_stale_and_no_longer_count_as_converged(monkeypatch) -> None:
+    from rich.console import Console
+
+    bus, now_s = LocalBus(), [100.0]
+    monkeypatch.setattr("vical_daemon.cli.watch.time.monotonic", lambda: now_s[0])
+    view = watch.View("*", as_json=False)
+    view.begin(bus)
+    _publish(bus, "rover", Status.CONVERGED)
+    assert view.all_converged() and not view.silent()
+    now_s[0] += 12.0
+    assert not view.all_converged()
+    assert view.silent() == {("rover", "cam0"): 12.0}
+    assert "said 12 s ago and silent since" in view.where()
+    shown = io.StringIO()
+    Console(file=shown, width=100).print(live_table.screen(view.estimates, view.health, view.silent()))
+    assert "stale, 12 s old, was converged" in shown.getvalue()
+    _publish(bus, "rover", Status.CONVERGED)
+    assert view.all_converged()
 
 
 def test_junk_on_the_bus_is_ignored(bus: LocalBus, capsys) -> None:

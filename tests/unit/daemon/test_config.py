@@ -86,6 +86,10 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [extrinsics]}", "cameras.cam0.lens: calibration.fix holds extrinsics, so T_cam_imu must be given here (config line 9)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [lens]}", "calibration.fix.0: the text 'lens' is none of intrinsics, timeshift, extrinsics (config line 12)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {imu: imu1}", "calibration.imu: there is no imu imu1 (known: imu0) (config line 12)"),
+        ("target: board.yaml", "target: b.yaml\nbus: {commanders: [anna]}", "bus.commanders: nobody can prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
+        ("target: board.yaml", "target: b.yaml\nbus: {publishers: [anna], tls_ca: ca.pem}", "bus.publishers: nobody can prove such a name; set password_file, or tls_ca and tls_certificate (config line 12)"),
+        ("target: board.yaml", "target: b.yaml\nbus: {readers: everybody}", "bus.readers: the text 'everybody' is none of group, loopback (config line 12)"),
+        ("target: board.yaml", "target: b.yaml\nweb: {hosts: ['http://a/']}", "web.hosts.0: 'http://a/' is not accepted; a name without port (config line 12)"),
         ("target: board.yaml", "target: 5", "target: expected text, found the number 5; put it in quotes (config line 11)"),
         ("imus:\n", "imus: [1]\nx:\n", "imus: expected a section, found a list of 1 (config line 2)"),
     ],
@@ -97,6 +101,21 @@ def test_refusals_name_path_bound_and_line(old: str, new: str, message: str) -> 
         loads(RIG.replace(old, new, 1))
     assert str(refused.value) == message
     assert refused.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "port"),
+    [
+        ("", 0),
+        ("bus: {readers: group}", 0),
+        ("bus: {readers: loopback}", 7447),
+        ("bus: {readers: loopback, tcp_port: 7448}", 7448),
+        ("bus: {tcp_port: 7448}", 7448),
+        ("bus: {publishers: [feeder], password_file: users.txt}", 0),
+    ],
+)
+def test_the_bus_is_on_loopback_only_where_the_config_asks_for_it(text: str, port: int) -> None:
+    assert loads(f"rig: rover\n{text}").bus.loopback_port == port
 
 
 def test_all_problems_are_found_at_once() -> None:

@@ -8,6 +8,7 @@ from zenoh_ros2_sdk.discovery import _parse_liveliness_keyexpr
 
 from vical_daemon import ros2_names as names
 from vical_daemon import topics
+from vical_daemon.config import ConfigError, loads
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = names.Ros2Topic("/chatter", "std_msgs/msg/String", depth=7)
@@ -66,10 +67,54 @@ def test_every_topic_but_commands_has_a_ros_name_of_its_own():
     assert names.ros2_topic("something/else") is None
 
 
+def test_robots_on_one_router_do_not_collide():
+    robots = {
+        names.data_key(
+            names.ros2_topic(topic.key(rig, "dev0"), loads(f"rig: {rig}\nros2: {{}}").ros2_namespace)
+        )
+        for rig in ("robot1", "robot2")
+        for topic in topics.TOPICS
+        if topic is not topics.COMMAND
+    }
+    assert len(robots) == 2 * (len(topics.TOPICS) - 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "namespace"),
+    [
+        ("{}", "/rover"),
+        ("{namespace: robot7}", "/robot7"),
+        ("{namespace: /site/robot7}", "/site/robot7"),
+        ("{namespace: _a/b_2}", "/_a/b_2"),
+        ("{namespace: /}", ""),
+        ("{domain: 7}", "/rover"),
+    ],
+)
+def test_namespace_of_the_config(text, namespace):
+    config = loads(f"rig: rover\nros2: {text}")
+    assert config.ros2 is not None
+    assert config.ros2_namespace == namespace
+    assert names.ros2_topic("vical/rover/imu/imu0", config.ros2_namespace).name == f"{namespace}/imu0/data"
+
+
+@pytest.mark.parametrize(
+    "text", ["7up", "a//b", "a/", "a b", "a/7", "~/a", "a.b", "{a}", "''", "//", "a/*", "a" * 129]
+)
+def test_what_ros_would_refuse_is_refused(text):
+    with pytest.raises(ConfigError, match=r"ros2\.namespace: .*\(config line 2\)"):
+        loads(f"rig: rover\nros2: {{namespace: '{text.strip(chr(39))}'}}")
+
+
+def test_without_the_section_there_are_no_ros_names():
+    assert loads("rig: rover").ros2 is None
+
+
 def test_tokens_are_understood_by_an_independent_parser():
-    topic = names.ros2_topic("vical/rig0/imu/imu")
-    parsed = _parse_liveliness_keyexpr(names.publisher_token("abc", 0, 1, "vical", topic, domain=5))
-    assert parsed["qualified_name"] == "/imu/data"
+    topic = names.ros2_topic("vical/rig0/imu/imu", "/rig0")
+    token = names.publisher_token("abc", 0, 1, "vical", topic, domain=5, namespace="/rig0")
+    parsed = _parse_liveliness_keyexpr(token)
+    assert parsed["qualified_name"] == "/rig0/imu/data"
+    assert parsed["namespace"] in ("/rig0", "%rig0")
     assert parsed["domain_id"] == 5
     assert parsed["dds_type"] == "sensor_msgs::msg::dds_::Imu_"
     assert parsed["node_name"].strip("/") == "vical"

@@ -9,12 +9,13 @@ import pytest
 from vical_daemon import topics
 from vical_daemon.bus import LocalBus, Sample
 from vical_daemon.estimation.result import CalibrationEstimate, Status
-from vical_daemon.messages import decode_calibration, encode_calibration
+from vical_daemon.liveness import FRESH_S
+from vical_daemon.messages import decode_calibration, encode_calibration, encode_diagnostics
 from vical_daemon.vision.image_codec import decode_image
 from vical_daemon.web import words
 from vical_daemon.web.images import CameraView, colour, draw, drawn_jpeg, picture_event, thinned
 from vical_daemon.web.metrics import metrics
-from vical_daemon.web.state import COLUMNS, HISTORY, WebState, history_row
+from vical_daemon.web.state import COLUMNS, HISTORY, SOURCES, WebState, history_row
 
 
 @pytest.fixture
@@ -109,6 +110,49 @@ def test_malformed_messages_are_counted_not_raised(state, web_feed):
     state.take(Sample("other/key", b"", 0))
     state.tick()
     assert state.malformed == 3
+
+
+def test_a_source_that_falls_silent_is_stale_with_its_age(bus, web_feed):
+    now_s = [100.0]
+    state = WebState(web_feed.RIG, lambda: now_s[0])
+    bus.subscribe("vical/**", state.take)
+    rng = np.random.default_rng(6)
+    web_feed.publish_estimate(bus, web_feed.estimate(30.0, rng))
+    web_feed.publish_status(bus)
+    entry = state.tick()["cameras"]["cam0"]
+    assert (entry["status"], entry["stale"], entry["age_s"]) == ("converged", False, 0.0)
+    now_s[0] += FRESH_S + 7.0
+    for document in (state.tick(), state.full()):
+        entry = document["cameras"]["cam0"]
+        assert (entry["status"], entry["stale"], entry["age_s"]) == ("stale", True, FRESH_S + 7.0)
+        assert entry["last_status"] == "converged"
+        assert "12 s" in entry["sentence"]
+        assert "Converged:" not in entry["sentence"]
+        for device in document["devices"]:
+            assert device["level"] == 3
+            assert device["message"].startswith("silent for 12 s")
+    text = metrics(state)
+    assert 'status="converged"} 0.0' in text
+    assert 'vical_calibration_age_seconds{rig="rig0",camera="cam0"} 12.0' in text
+    assert 'vical_component_level{rig="rig0",role="imu",component="imu/imu0"} 3.0' in text
+    web_feed.publish_estimate(bus, web_feed.estimate(31.0, rng))
+    web_feed.publish_status(bus)
+    document = state.tick()
+    assert document["cameras"]["cam0"]["status"] == "converged"
+    assert {device["level"] for device in document["devices"]} == {0}
+
+
+def test_invented_names_do_not_fill_the_memory(bus, state, web_feed):
+    value = web_feed.estimate(30.0, np.random.default_rng(7))
+    for k in range(10 * SOURCES):
+        key = topics.CALIBRATION.key(web_feed.RIG, "cam0")
+        bus.publish(key, encode_calibration(value, f"other{k}"))  # says that it is another camera's
+        bus.publish(topics.CALIBRATION.key(web_feed.RIG, f"c{k}"), encode_calibration(value, f"c{k}"))
+        bus.publish(topics.STATUS.key(web_feed.RIG, f"r{k}"), encode_diagnostics(1, "r", []))
+        state.tick(wanted=False)
+    assert len(state.calibrations) == SOURCES
+    assert len(state.statuses) == SOURCES
+    assert state.malformed == 10 * SOURCES + 2 * 9 * SOURCES
 
 
 def test_devices_and_metrics(bus, state, web_feed):

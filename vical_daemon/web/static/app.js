@@ -2,7 +2,8 @@
 // Listens to /events and draws. Everything from the robot goes in as text, never as HTML.
 
 const $ = (id) => document.getElementById(id);
-const page = { columns: [], rows: {}, latest: {}, devices: [], views: [], control: false, camera: null, span: 0 };
+const page = { columns: [], rows: {}, latest: {}, devices: [], views: [], control: false, camera: null, span: 0, heard: 0 };
+const SILENT_MS = 5000; // the robot speaks 2.5 times a second
 const AXES = ["x", "y", "z"];
 const COLOURS = ["--x", "--y", "--z"];
 
@@ -125,17 +126,18 @@ function round(value, digits) {
 
 function drawWords() {
   const latest = page.latest[page.camera];
-  const status = latest ? latest.status : "waiting";
+  const status = latest ? latest.status : "waiting"; // "stale" when the estimates have stopped
   $("status").className = `pill ${status}`;
-  setText("status", latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
+  document.querySelector("main").classList.toggle("stale", status === "stale");
+  setText("status", status === "stale" ? `stale, ${latest.age_s.toFixed(0)} s old` : latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
   document.querySelector(".say").classList.toggle("converged", status === "converged");
   setText("sentence", latest ? latest.sentence : "No estimate yet: is the calibrate process running?");
-  setText("guidance", latest ? latest.guidance : "");
+  setText("guidance", latest && !latest.stale ? latest.guidance : "");
   $("bar").style.width = `${Math.round(100 * ((latest && latest.progress) || 0))}%`;
   setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples · ± is 3 sigma` : "");
   const withheld = latest ? latest.withheld : [];
   $("withheld").replaceChildren(...withheld.map((line) => element("li", "", line)));
-  const motion = latest ? latest.motion : { rotate: [], translate: [] };
+  const motion = latest && !latest.stale ? latest.motion : { rotate: [], translate: [] };
   for (const axis of AXES) {
     $(`axis-${axis}`).classList.toggle("rotate", motion.rotate.includes(axis));
     $(`axis-${axis}`).classList.toggle("move", motion.translate.includes(axis));
@@ -143,7 +145,7 @@ function drawWords() {
   const asks = motion.rotate.length + motion.translate.length > 0;
   setText("motiontext", asks ? [motion.rotate.length ? `turn about ${motion.rotate.join(", ")}` : "",
     motion.translate.length ? `move along ${motion.translate.join(", ")}` : ""].filter(Boolean).join("; ")
-    : latest && status === "converged" ? "nothing is missing" : "turn and move freely, the board in view");
+    : status === "stale" ? "" : status === "converged" ? "nothing is missing" : "turn and move freely, the board in view");
   const lens = latest && latest.lens;
   setText("lens", lens ? lensText(lens) : "not known yet");
 }
@@ -199,7 +201,20 @@ function draw() {
   drawCharts();
 }
 
+// The robot itself is silent: nobody else can say here that what is shown is old.
+function watchSilence() {
+  const silent = performance.now() - page.heard;
+  if (!page.heard || silent < SILENT_MS) return;
+  for (const latest of Object.values(page.latest)) {
+    if (latest.heardAge === undefined) latest.heardAge = latest.age_s;
+    Object.assign(latest, { status: "stale", stale: true, age_s: latest.heardAge + silent / 1000,
+      sentence: `The robot has not answered for ${(silent / 1000).toFixed(0)} s. The values below are old; the last status was ${latest.last_status}.` });
+  }
+  drawWords();
+}
+
 function take(message, full) {
+  page.heard = performance.now();
   setText("rig", message.rig);
   document.title = `vical ${message.rig}`;
   if (full) {
@@ -257,4 +272,5 @@ $("form").onsubmit = async (event) => {
 };
 
 window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawCharts);
+setInterval(watchSilence, 1000);
 listen();

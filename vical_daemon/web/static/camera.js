@@ -8,6 +8,8 @@ class CameraScreen {
     this.source = null;
     this.last = null;
     this.number = 0;
+    this.shownAt = 0;
+    setInterval(() => this.watchAge(), 1000);
     for (const id of ["show-detected", "show-predicted"]) this.byId(id).onchange = () => this.draw();
   }
 
@@ -37,8 +39,16 @@ class CameraScreen {
     canvas.height = image.naturalHeight;
     canvas.getContext("2d").drawImage(image, 0, 0);
     this.last = picture;
+    this.shownAt = performance.now();
     this.draw();
     document.querySelector(".screen").classList.add("live");
+  }
+
+  watchAge() { // a picture that stands still looks like a rig that stands still
+    const age = (performance.now() - this.shownAt) / 1000;
+    if (!this.last || age < 5) return;
+    document.querySelector(".screen").classList.remove("live");
+    this.byId("nopicture").textContent = `no new picture for ${age.toFixed(0)} s`;
   }
 
   draw() {

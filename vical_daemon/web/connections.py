@@ -1,0 +1,169 @@
+"""How many connections the page holds at a time, and what malformed requests leave in the journal."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+
+from aiohttp.http_exceptions import HttpProcessingError
+
+from vical_daemon.log_limit import LogLimit
+
+CONNECTIONS_LIMIT = 128
+"""Open at a time: twice the viewers that are admitted (32 of values, 32 of pictures)."""
+IDLE_S = 5.0
+"""So long a connection may take to send a whole request header, and may stay without another request."""
+UNSENT_S = 30.0
+"""So long a client may take to fetch the rest of an answer."""
+BODY_S = 5.0
+"""So long a request may take to send its body."""
+REPORT_S = 60.0
+"""A malformed request is one line in the journal, and at most one in so long."""
+_FULL = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+
+
+class Gate:
+    """Counts connections. Where there is no room, the one that has been idle for longest makes some.
+
+    So a thousand half-open connections shut nobody out; a thousand that are being served would, and the next
+    one is refused.
+
+    Args:
+        make: Returns the protocol of a new connection.
+        limit: Open connections at a time.
+        clock: Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], asyncio.Protocol],
+        limit: int = CONNECTIONS_LIMIT,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._make, self._limit, self._clock = make, limit, clock
+        self._open: dict[asyncio.Protocol, asyncio.Transport] = {}
+        self._idle: dict[asyncio.Protocol, float] = {}  # since when; the oldest first
+        self.refused = 0
+
+    def __call__(self) -> asyncio.Protocol:
+        """Return the protocol of a new connection, for `loop.create_server`."""
+        return _Guarded(self._make(), self)
+
+    @property
+    def open(self) -> int:
+        """Connections at this moment."""
+        return len(self._open)
+
+    def admit(self, protocol: asyncio.Protocol, transport: asyncio.Transport) -> bool:
+        """Let a connection in, at the cost of an idle one if need be; False: no room."""
+        if len(self._open) >= self._limit:
+            self.refused += 1
+            oldest = next(iter(self._idle), None)
+            if oldest is None:
+                return False
+            self._end(oldest)
+        self._open[protocol] = transport
+        self._idle[protocol] = self._clock()
+        return True
+
+    def sweep(self) -> None:
+        """Close what has been idle for too long: half-open, or done and gone to sleep."""
+        now_s = self._clock()
+        for protocol, since_s in list(self._idle.items()):
+            unsent = self._open[protocol].get_write_buffer_size()
+            if now_s - since_s > (UNSENT_S if unsent else IDLE_S):
+                self._end(protocol)
+
+    def _end(self, protocol: asyncio.Protocol) -> None:
+        transport = self._open[protocol]
+        self.leave(protocol)
+        transport.abort()
+
+    def leave(self, protocol: asyncio.Protocol) -> None:
+        """Forget a connection; may be called twice."""
+        self._open.pop(protocol, None)
+        self._idle.pop(protocol, None)
+
+    def busy(self, protocol: asyncio.Protocol) -> None:
+        """A request of this connection is being answered: it may take as long as it likes."""
+        self._idle.pop(protocol, None)
+
+    def idle(self, protocol: asyncio.Protocol) -> None:
+        """The answer is out."""
+        if protocol in self._open:
+            self._idle[protocol] = self._clock()
+
+
+class _Guarded(asyncio.Protocol):
+    """Stands between a socket and aiohttp's protocol, which sees only connections that were admitted."""
+
+    def __init__(self, inner: asyncio.Protocol, gate: Gate) -> None:
+        self._inner, self._gate = inner, gate
+        self._admitted = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._admitted = self._gate.admit(self._inner, transport)
+        if self._admitted:
+            self._inner.connection_made(transport)
+        else:
+            transport.write(_FULL)
+            transport.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._admitted:
+            self._gate.leave(self._inner)
+            self._inner.connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._admitted:
+            self._inner.data_received(data)
+
+    def eof_received(self) -> bool | None:
+        return self._inner.eof_received() if self._admitted else None
+
+    def pause_writing(self) -> None:
+        if self._admitted:
+            self._inner.pause_writing()
+
+    def resume_writing(self) -> None:
+        if self._admitted:
+            self._inner.resume_writing()
+
+
+class Malformed(logging.Filter):
+    """Turns what aiohttp logs about a malformed request into one line, seldom; counts all of them.
+
+    A bug of ours keeps its traceback, as seldom.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._limits = {foreign: LogLimit(1, REPORT_S, clock) for foreign in (True, False)}
+        self.count = 0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """See `logging.Filter.filter`."""
+        error = record.exc_info[1] if record.exc_info else None
+        if error is None:
+            return True
+        foreign = isinstance(error, HttpProcessingError | ConnectionError | TimeoutError | UnicodeError)
+        self.count += foreign
+        more = self._limits[foreign].admit()
+        if more is None:
+            return False
+        if foreign:
+            text = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+            record.msg, record.args = "malformed request refused: %s%s", (text, more)
+            record.exc_info, record.levelno, record.levelname = None, logging.INFO, "INFO"
+        return True
+
+
+def http_logger(malformed: Malformed) -> logging.Logger:
+    """Return the logger that aiohttp gets: below ours, with the filter."""
+    logger = logging.Logger("vical_daemon.web.http")
+    logger.parent = logging.getLogger(__name__)
+    logger.addFilter(malformed)
+    return logger
