@@ -78,5 +78,5 @@ def _refuse(path: Path, about: os.stat_result, limit: int | None) -> None:
 
 
 def _too_large(path: Path, limit: int) -> OSError:
-    size = f"{limit / 1e6:g} MB" if limit >= 10**6 else f"{limit / 1e3:g} kB"
+    size = f"{limit / 1e6:.0f} MB" if limit >= 10**6 else f"{limit / 1e3:.0f} kB"
     return OSError(errno.EFBIG, f"larger than {size}, it cannot be the right file", str(path))

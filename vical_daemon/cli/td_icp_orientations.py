@@ -114,20 +114,15 @@ def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
         except LogError as error:
             raise CliError(str(error)) from None
         return
-    yield from _bag_messages(path.parent if path.suffix == ".db3" else path, store)
+    yield from _bag_messages(path.parent if path.suffix == ".db3" else path)
 
 
-def _bag_messages(path: Path, store: Any) -> Iterator[tuple[str, str, Any]]:
-    from rosbags.highlevel import AnyReader
+def _bag_messages(path: Path) -> Iterator[tuple[str, str, Any]]:
+    from vical_daemon.recording.bags import open_bag
 
-    try:
-        with AnyReader([path], default_typestore=None if path.suffix == ".bag" else store) as reader:
-            for c, _, data in reader.messages():
-                yield c.topic, c.msgtype, lambda d=data, k=c.msgtype: reader.deserialize(d, k)
-    except (CliError, GeneratorExit):
-        raise
-    except Exception as error:  # rosbags raises whatever its parsers raise on damaged files
-        raise CliError(f"{path} cannot be read as a bag: {' '.join(str(error).split())[:200]}") from None
+    with open_bag(path) as reader:
+        for c, _, data in reader.messages():
+            yield c.topic, c.msgtype, lambda d=data, k=c.msgtype: reader.deserialize(d, k)
 
 
 def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream, int]:

@@ -79,14 +79,14 @@ def _decompress(compression: bytes, packed: memoryview, limit: int) -> bytes:
     if not compression:
         return bytes(packed[:limit])
     if compression == b"lz4":
-        return _decompress_lz4(packed, limit)
+        return decompress_lz4(packed, limit)
     if compression == b"zstd":
         return _decompress_zstd(packed, limit)
     raise ValueError(f"chunk compression {compression!r} is not known")
 
 
-def _decompress_lz4(packed: memoryview, limit: int) -> bytes:
-    """Unpack piece by piece: lz4 would reserve the whole limit at once."""
+def decompress_lz4(packed: memoryview, limit: int) -> bytes:
+    """Unpack at most `limit` bytes of an lz4 frame, piece by piece: lz4 would reserve it at once."""
     import lz4.frame
 
     unpacker = lz4.frame.LZ4FrameDecompressor()

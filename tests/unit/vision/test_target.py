@@ -97,5 +97,5 @@ def test_missing_binary_and_huge_files(tmp_path: Path) -> None:
     with pytest.raises(TargetError, match="not a text file"):
         load_target(binary)
     binary.write_bytes(b"a" * 100000)
-    with pytest.raises(TargetError, match="too big"):
+    with pytest.raises(TargetError, match="larger than 66 kB"):
         load_target(binary)
