@@ -17,6 +17,8 @@ from vical_daemon.recording.logs import LogRecording, RawMessage
 from vical_daemon.recording.model import RecordingError
 from vical_daemon.strict_yaml import MAX_BYTES
 
+_ROS1 = b"#ROSBAG V2.0\n"  # wiki.ros.org/Bags/Format/2.0
+
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
@@ -56,6 +58,8 @@ def _checked_size(path: Path) -> int:
     for member in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not member.is_dir():
             with open_file(member, MAX_BYTES if member.name == "metadata.yaml" else None) as file:
+                if member.suffix == ".bag" and file.read(len(_ROS1)) != _ROS1:
+                    raise RecordingError(f"{member} is no ROS 1 bag of version 2.0, whatever its name says")
                 size += file.seek(0, io.SEEK_END)
     return size
 
