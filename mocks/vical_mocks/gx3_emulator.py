@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import fcntl
 import os
 import select
 import signal
@@ -27,9 +28,9 @@ import numpy as np
 from vical_mocks.clock import LINKS, SkewedClock, make_link
 from vical_mocks.faults import ByteFaults, FaultyLink
 from vical_mocks.gx3_device import Gx3Device
-from vical_mocks.gx3_mip import MODELS
 from vical_mocks.gx3_state import Identity, Settings
 from vical_mocks.imu import GX3_25_ERRORS, FloatArray, ImuErrors, Motion, at_rest
+from vical_mocks.mip_models import MODELS
 
 _IDLE_S = 0.05
 _BAUD_OF = {getattr(termios, f"B{b}"): b for b in (9600, 19200, 115200, 230400, 460800, 921600)}
@@ -185,6 +186,9 @@ class Gx3Emulator:
         if self._master < 0:
             return _IDLE_S
         now_s = time.monotonic()
+        # The vendor's programs lock the port (TIOCEXCL). A serial port forgets that at its last close; this
+        # terminal would not, because the emulator keeps it open, and the next program would find it busy.
+        fcntl.ioctl(self._slave, termios.TIOCNXCL)
         self._take_input(now_s)
         for t_s, data in self.device.advance(now_s):
             self._link.push(data, t_s)
