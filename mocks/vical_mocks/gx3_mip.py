@@ -196,12 +196,12 @@ class MipFace:
         return [number << 8 | d for number, descriptors in sets.items() for d in descriptors]
 
     def _descriptors(self, data: bytes, k: int) -> bytes:
-        known = [d for d in self._all_descriptors() if not _is_shared(d)]
+        known = [d for d in self._all_descriptors() if not _is_further(d)]
         return ack(0x04) + field(0x82, struct.pack(f">{len(known)}H", *known))
 
     def _more_descriptors(self, data: bytes, k: int) -> bytes:
-        shared = [d for d in self._all_descriptors() if _is_shared(d)]
-        return ack(0x07) + (field(0x86, struct.pack(f">{len(shared)}H", *shared)) if shared else b"")
+        further = [d for d in self._all_descriptors() if _is_further(d)]
+        return ack(0x07) + field(0x86, struct.pack(f">{len(further)}H", *further))
 
     def _built_in_test(self, data: bytes, k: int) -> bytes:
         self._late.append((k + 500, packet(_BASE, ack(0x05), field(0x83, bytes(4)))))
@@ -363,6 +363,6 @@ class MipFace:
         return ack(command)
 
 
-def _is_shared(descriptor: int) -> bool:
-    """Whether data (set << 8 | descriptor) may stand in any data set; the second list tells of those."""
-    return descriptor >> 8 >= SENSOR and descriptor & 0xFF >= 0xD0
+def _is_further(descriptor: int) -> bool:
+    """Whether set << 8 | descriptor stands in the second list: data of the filter, and shared ones."""
+    return descriptor >> 8 == FILTER or (descriptor >> 8 == SENSOR and descriptor & 0xFF >= 0xD0)
