@@ -59,7 +59,9 @@ def _checked_size(path: Path) -> int:
         if not member.is_dir():
             with open_file(member, MAX_BYTES if member.name == "metadata.yaml" else None) as file:
                 if member.suffix == ".bag" and file.read(len(_ROS1)) != _ROS1:
-                    raise RecordingError(f"{member} is no ROS 1 bag of version 2.0, whatever its name says")
+                    raise RecordingError(
+                        f"{member} cannot be read as a bag: it does not begin like one of ROS 1, version 2.0"
+                    )
                 size += file.seek(0, io.SEEK_END)
     return size
 

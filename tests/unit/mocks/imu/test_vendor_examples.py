@@ -127,6 +127,16 @@ def test_the_7_series_stream_imu_example_gets_what_it_configured():
     assert host.fields(0x80) == [(0x04, 0x05, 0x06)] * 5
 
 
+@pytest.mark.parametrize("model", ["gx5", "cv7"])
+def test_the_threading_examples_ping_a_hundred_times_while_data_flow(model):
+    host = Host(Gx3Device(protocol="mip", model=model))
+    for _ in range(100):
+        host.device.receive(encode(0x01, 0x01), host.now_s)
+    answers = [packet for packet in host.listen(1.0) if packet[0] == 0x01]
+    assert answers == [(0x01, [(0xF1, b"\x01\x00")])] * 100
+    assert len(host.fields(0x80)) == pytest.approx(100, abs=2)
+
+
 def test_the_5_series_ahrs_example_sees_the_filter_initialise_and_run():
     host = Host(Gx3Device(protocol="mip", model="gx5"))
     host.begin()
