@@ -209,3 +209,35 @@ def test_a_record_that_states_a_hundred_gigabytes_is_skipped(tmp_path: Path) -> 
     ((_, code, out, _, peak_mb),) = run([["info", str(path)]], tmp_path)
     assert (code, peak_mb < 1000) == (0, True)
     assert "1 damaged piece left out" in out and "UNFINISHED" not in out
+
+
+def png(width: int, height: int) -> bytes:
+    """A PNG whose header states a size; its content is black, as far as it goes."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    content = chunk(b"IDAT", zlib.compress(bytes((width + 1) * height), 9))
+    return b"\x89PNG\r\n\x1a\n" + header + content + chunk(b"IEND", b"")
+
+
+def test_images_that_are_none_or_too_large_are_left_out(tmp_path: Path, sound: Path) -> None:
+    camera = sound / "mav0" / "cam0"
+    (camera / "corners.csv").unlink()
+    (camera / "data").mkdir()
+    large = png(16_384, 16_384)  # 268 Mpx in 260 kB
+    stamps = [1_000_000_000 + 100_000_000 * i for i in range(20)]
+    for number, stamp in enumerate(stamps):
+        (camera / "data" / f"{stamp}.png").write_bytes(large if number % 2 else b"no image")
+    (camera / "data.csv").write_text("".join(f"{stamp},{stamp}.png\n" for stamp in stamps))
+    target, initial = tmp_path / "target.yaml", tmp_path / "initial.yaml"
+    target.write_text("target_type: aprilgrid\ntagCols: 6\ntagRows: 6\ntagSize: 0.05\ntagSpacing: 0.3\n")
+    initial.write_text("cam0: {resolution: [640, 480]}\n")
+    options = ["--target", str(target), "--initial", str(initial)]
+    commands = [[c, str(sound), *options] for c in ("calibrate", "td-icp", "observability")]
+    for words, code, out, err, peak_mb in run(commands, tmp_path):
+        assert code == 1, (words, code, out, err)
+        assert "internal error" not in err and "Traceback" not in err, (words, err)
+        assert "target" in err, (words, err)
+        assert peak_mb < 1000, words
