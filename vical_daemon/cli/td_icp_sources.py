@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +162,7 @@ def _frames(recording: Recording, stream: Stream, target: str) -> list[PointsFra
         if found is not None and len(found.ids):
             frames.append(PointsFrame(stream.name, stamp_ns, found.ids, found.uv_px, found.sigma_px))
     if unreadable:
-        recording.warnings.append(f"{stream.name}: {unreadable} unreadable images left out")
+        print(f"vical: warning: {stream.name}: {unreadable} unreadable images left out", file=sys.stderr)
     return frames
 
 
