@@ -20,9 +20,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from vical_drivers.user_files import read_file
 
 from vical_daemon.config import Config
 from vical_daemon.estimators import Estimator
+from vical_daemon.strict_yaml import MAX_BYTES
 from vical_daemon.wall_clock import WallClock
 from vical_daemon.whole_file import write_whole
 
@@ -162,5 +164,5 @@ def _identity(config: Config, clock: WallClock) -> str:
     files = sorted((Path(__file__).parent / "estimation").rglob("*.py"))
     for path in (*files, *([config.target_path] if config.target_path else [])):
         if path.is_file():
-            digest.update(path.read_bytes())
+            digest.update(read_file(path, MAX_BYTES))
     return digest.hexdigest()

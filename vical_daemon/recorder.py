@@ -7,6 +7,8 @@ import logging
 import threading
 from importlib.metadata import PackageNotFoundError, version
 
+from vical_drivers.user_files import read_file
+
 from vical_daemon.config import Config
 from vical_daemon.mcap_log import Attachment, LogError, LogFolder, LogSession
 from vical_daemon.messages import (
@@ -20,6 +22,7 @@ from vical_daemon.messages import (
 )
 from vical_daemon.record_images import ImageCompressor
 from vical_daemon.record_queue import Arrival, RecordQueue
+from vical_daemon.strict_yaml import MAX_BYTES
 from vical_daemon.topics import CALIBRATION, COMMAND, STATUS, Topic
 from vical_daemon.wall_clock import WallClock
 
@@ -211,7 +214,7 @@ class Recorder:
         items = []
         for name, path in (("config.yaml", self._config.path), ("target.yaml", self._config.target_path)):
             if path is not None and path.is_file():
-                items.append(Attachment(name, "text/yaml", _without_secrets(path.read_bytes())))
+                items.append(Attachment(name, "text/yaml", _without_secrets(read_file(path, MAX_BYTES))))
         estimates = []
         for payload in self._calibrations.values():
             try:

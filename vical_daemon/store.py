@@ -16,6 +16,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from vical_drivers.user_files import read_file
 
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
@@ -137,8 +138,7 @@ class CalibrationStore:
 def read_stored(path: Path) -> StoredCalibration | None:
     """Read one file of a store; None (with a warning) where it is not what it should be."""
     try:
-        with path.open("rb") as file:
-            text = file.read(_SIZE_LIMIT)
+        text = read_file(path, _SIZE_LIMIT)
     except FileNotFoundError:
         return None
     except OSError as error:

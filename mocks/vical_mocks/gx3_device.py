@@ -22,7 +22,7 @@ class Gx3Device:
         motion: True motion over host seconds; None for at rest.
         clock: Its crystal.
         protocol: "single-byte" (firmware below 2) or "mip".
-        model: For MIP: "gx3", "gx5" or "cv7" (see `gx3_mip.MODELS`).
+        model: For MIP: "gx3", "gx5" or "cv7" (see `mip_models.MODELS`).
         errors: Sensor errors; None for none.
         seed: Seed of the sensor noise.
         identity: What it answers when asked who it is.
@@ -58,7 +58,7 @@ class Gx3Device:
         else:
             raise ValueError(f"unknown protocol {protocol!r}; known are single-byte, mip")
         self.sent: deque[tuple[int, float]] = deque(maxlen=2_000_000)
-        self._next_k = 0
+        self._next_k, self._done_k = 0, -1
         self._coming_baud: int | None = None
         self.power_up(self.clock.t_start_s)
         self.state.set_ticks(0, first_ticks)
@@ -94,7 +94,8 @@ class Gx3Device:
         before = self.face.busy
         self.face.receive(data)
         next_k = self._k_after(t_host_s)
-        self._next_k = min(self._next_k, next_k) if before else max(self._next_k, next_k)
+        # Where nothing was to be done, the next cycle stands where a stream would have gone on: ignore it.
+        self._next_k = min(self._next_k, next_k) if before else max(self._done_k + 1, next_k)
 
     def next_s(self) -> float | None:
         """Host time of the next cycle; None while there is nothing to do."""
@@ -104,7 +105,7 @@ class Gx3Device:
         """Run until a host time; return what became ready to send: (host time, bytes)."""
         out: list[tuple[float, bytes]] = []
         while (t_s := self.next_s()) is not None and t_s <= t_host_s:
-            k = self._next_k
+            k = self._done_k = self._next_k
             if data := self.face.cycle(k):
                 out.append((t_s, data))
                 self.sent.append((self.state.ticks(k), t_s))

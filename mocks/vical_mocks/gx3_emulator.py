@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import fcntl
 import os
 import select
 import signal
@@ -27,9 +28,10 @@ import numpy as np
 from vical_mocks.clock import LINKS, SkewedClock, make_link
 from vical_mocks.faults import ByteFaults, FaultyLink
 from vical_mocks.gx3_device import Gx3Device
-from vical_mocks.gx3_mip import MODELS
 from vical_mocks.gx3_state import Identity, Settings
 from vical_mocks.imu import GX3_25_ERRORS, FloatArray, ImuErrors, Motion, at_rest
+from vical_mocks.mip_models import MODELS
+from vical_mocks.openers import Openers
 
 _IDLE_S = 0.05
 _BAUD_OF = {getattr(termios, f"B{b}"): b for b in (9600, 19200, 115200, 230400, 460800, 921600)}
@@ -108,6 +110,7 @@ class Gx3Emulator:
             name = Path(self.port_name)
             name.unlink(missing_ok=True)
             name.symlink_to(os.ttyname(self._slave))
+            self._openers = Openers(self._slave)
             if replugged:
                 self.device.power_up(time.monotonic())
             self._link = FaultyLink(
@@ -123,6 +126,7 @@ class Gx3Emulator:
             if self._master < 0:
                 return
             Path(self.port_name).unlink(missing_ok=True)
+            self._openers.close()
             os.close(self._slave)
             os.close(self._master)
             self._master = self._slave = -1
@@ -174,7 +178,9 @@ class Gx3Emulator:
         while not self._stop.is_set():
             with self._lock:
                 wait_s, master = self._step(), self._master
-            watched = [self._wake_r] if master < 0 else [self._wake_r, master]
+            watched = [self._wake_r]
+            if master >= 0:
+                watched += [fd for fd in (master, self._openers.fileno()) if fd >= 0]
             with contextlib.suppress(OSError, ValueError):  # unplugged meanwhile: the next step sees it
                 ready, _, _ = select.select(watched, [], [], wait_s)
                 if self._wake_r in ready:
@@ -185,6 +191,8 @@ class Gx3Emulator:
         if self._master < 0:
             return _IDLE_S
         now_s = time.monotonic()
+        if self._openers.closed_by_all():
+            self._forget_host()
         self._take_input(now_s)
         for t_s, data in self.device.advance(now_s):
             self._link.push(data, t_s)
@@ -196,6 +204,14 @@ class Gx3Emulator:
         due = [t for t in (self.device.next_s(), self._link.next_s()) if t is not None]
         return max(0.0, min([*due, now_s + _IDLE_S]) - time.monotonic())
 
+    def _forget_host(self) -> None:
+        """Do what a serial port does at its last close, and this terminal not, as the emulator has it open.
+
+        It drops what was not read and is exclusive no more: the vendor's programs lock their port (TIOCEXCL).
+        """
+        fcntl.ioctl(self._slave, termios.TIOCNXCL)
+        termios.tcflush(self._slave, termios.TCIOFLUSH)
+
     def _take_input(self, now_s: float) -> None:
         try:
             data = os.read(self._master, 4096)
@@ -203,9 +219,12 @@ class Gx3Emulator:
             if error.errno not in (errno.EAGAIN, errno.EIO):
                 raise
             return
+        self._openers.count = max(1, self._openers.count)  # whoever writes has it open
         self.device.receive(self._garbled(data), now_s)
 
     def _give(self, data: bytes) -> None:
+        if not self._openers.count:
+            return  # nobody has the port open: a computer drops what comes in
         try:
             os.write(self._master, self._garbled(data))
         except OSError as error:

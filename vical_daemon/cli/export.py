@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from vical_daemon.export import ExportFile, Rig
 
 FORMATS = ("kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json")
+_RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recording: 18 hours
 _EPILOG = """\
   vical calibrate log.mcap --target target.yaml -o result.json
   vical export result.json --format kalibr -o camchain-imucam.yaml
@@ -113,8 +114,10 @@ def read_source(source: str) -> Rig:
 
 def _read_json(path: Path) -> dict[str, Any]:
     """Read a result; of a file with several lines (`vical demo --json`) the last one counts."""
-    text = path.read_text(encoding="utf-8")
+    from vical_drivers.user_files import read_text
+
     try:
+        text = read_text(path, _RESULT_LIMIT)
         document = json.loads(text)
     except json.JSONDecodeError as error:
         lines = [line for line in text.splitlines() if line.strip()]
@@ -122,6 +125,8 @@ def _read_json(path: Path) -> dict[str, Any]:
             document = json.loads(lines[-1]) if lines else None
         except json.JSONDecodeError:
             raise CliError(f"{path}: not JSON: {error}") from None
+    except (UnicodeDecodeError, RecursionError):
+        raise CliError(f"{path}: not JSON; give the result of `vical calibrate -o`") from None
     if not isinstance(document, dict):
         raise CliError(f"{path}: not a result of `vical calibrate --json`")
     return document

@@ -16,6 +16,7 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_drivers.microstrain.session import Session
 
+_CAPTURE_LIMIT = 2**29  # bytes; three hours of 40-byte packets at 1 kHz
 _LINKS = ("auto", "usb", "ftdi", "uart")
 
 
@@ -135,8 +136,9 @@ def _info(args: argparse.Namespace) -> int:
 
 def _decode(args: argparse.Namespace) -> int:
     from vical_drivers.microstrain.capture import Capture
+    from vical_drivers.user_files import read_file
 
-    data = Path(args.file).read_bytes()
+    data = read_file(Path(args.file), _CAPTURE_LIMIT)
     capture = Capture(data, args.protocol, little_endian_floats=args.little_endian_floats)
     for record in capture:
         print(json.dumps({key: _finite(value) for key, value in record.items()}))

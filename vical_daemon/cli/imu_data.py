@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from vical_drivers.user_files import read_text
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.imu_options import COLUMNS
 from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.recording.asl import TABLE_LIMIT
 
 MOVED_RPS, MOVED_MPS2 = 9e-3, 0.2  # 0.5 deg/s; twenty mg
 LOST_LIMIT = 0.02  # a recording that misses more samples than this is refused
@@ -137,18 +140,20 @@ def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, 
 
 def _read_csv(path: Path) -> tuple[IntArray, FloatArray, FloatArray, str]:
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            first = next(csv.reader(stream), [])
+        text = read_text(path, TABLE_LIMIT)
+        first = next(csv.reader(io.StringIO(text)), [])
         if not first:
             raise CliError(f"{path}: is empty")
         skip = int(not _is_number(first[0]))
-        table = np.loadtxt(path, delimiter=",", skiprows=skip, usecols=range(1, 7), ndmin=2, comments="#")
-        stamps = np.loadtxt(
-            path, delimiter=",", skiprows=skip, usecols=0, ndmin=1, comments="#", dtype=np.int64
+        table = np.loadtxt(
+            io.StringIO(text), delimiter=",", skiprows=skip, usecols=range(1, 7), ndmin=2, comments="#"
         )
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())
-        raise CliError(f"{path}: cannot be read as {COLUMNS}: {text}") from error
+        stamps = np.loadtxt(
+            io.StringIO(text), delimiter=",", skiprows=skip, usecols=0, ndmin=1, comments="#", dtype=np.int64
+        )
+    except (ValueError, IndexError, UnicodeDecodeError, csv.Error) as error:
+        reason = " ".join(str(error).split())
+        raise CliError(f"{path}: cannot be read as {COLUMNS}: {reason[:200]}") from error
     if not np.all(np.isfinite(table)) or len(stamps) < 100:
         raise CliError(f"{path}: needs at least 100 lines of finite numbers: {COLUMNS}")
     return stamps, table[:, :3], table[:, 3:], str(path)

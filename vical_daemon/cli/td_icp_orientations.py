@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from vical_drivers.user_files import read_file
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.td_icp_sources import seconds
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
+from vical_daemon.recording.asl import TABLE_LIMIT
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -112,20 +114,15 @@ def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
         except LogError as error:
             raise CliError(str(error)) from None
         return
-    yield from _bag_messages(path.parent if path.suffix == ".db3" else path, store)
+    yield from _bag_messages(path.parent if path.suffix == ".db3" else path)
 
 
-def _bag_messages(path: Path, store: Any) -> Iterator[tuple[str, str, Any]]:
-    from rosbags.highlevel import AnyReader
+def _bag_messages(path: Path) -> Iterator[tuple[str, str, Any]]:
+    from vical_daemon.recording.bags import open_bag
 
-    try:
-        with AnyReader([path], default_typestore=None if path.suffix == ".bag" else store) as reader:
-            for c, _, data in reader.messages():
-                yield c.topic, c.msgtype, lambda d=data, k=c.msgtype: reader.deserialize(d, k)
-    except (CliError, GeneratorExit):
-        raise
-    except Exception as error:  # rosbags raises whatever its parsers raise on damaged files
-        raise CliError(f"{path} cannot be read as a bag: {' '.join(str(error).split())[:200]}") from None
+    with open_bag(path) as reader:
+        for c, _, data in reader.messages():
+            yield c.topic, c.msgtype, lambda d=data, k=c.msgtype: reader.deserialize(d, k)
 
 
 def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream, int]:
@@ -143,7 +140,8 @@ def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream,
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    lines = read_file(path, TABLE_LIMIT).decode("utf-8", "replace").splitlines()
+    for number, line in enumerate(lines, 1):
         text = line.strip()
         if not text or text.startswith("#") or (not rows and not (text[0].isdigit() or text[0] in "-+.")):
             continue
@@ -166,7 +164,7 @@ def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream,
     if np.median(np.diff(t_ns)) < 1000:  # whole seconds or milliseconds would be no trajectory: bare seconds
         t_ns = t_ns * 1_000_000_000
     q = np.array(rows)
-    comma = "," in next(line for line in path.read_text(encoding="utf-8").splitlines() if line[:1].isdigit())
+    comma = "," in next(line for line in lines if line[:1].isdigit())
     q = q if comma else q[:, [3, 0, 1, 2]]
     base = int(t_ns[0]) if base_ns is None else base_ns
     return _from_quaternions(path.name, t_ns, q, base), base

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -150,12 +151,18 @@ def _frames(recording: Recording, stream: Stream, target: str) -> list[PointsFra
     from vical_daemon.vision.target import load_target
 
     detect = BoardDetector(load_target(Path(target))).detect
-    frames = []
+    frames, unreadable = [], 0
     for _, payload in recording.messages([stream]):
-        stamp_ns, image = _image(payload, stream.kind)
+        try:
+            stamp_ns, image = _image(payload, stream.kind)
+        except ValueError:  # damaged, or larger than an image can be: as the service, which counts them
+            unreadable += 1
+            continue
         found = detect(image, stamp_ns)
         if found is not None and len(found.ids):
             frames.append(PointsFrame(stream.name, stamp_ns, found.ids, found.uv_px, found.sigma_px))
+    if unreadable:
+        print(f"vical: warning: {stream.name}: {unreadable} unreadable images left out", file=sys.stderr)
     return frames
 
 

@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import yaml
+from vical_drivers.user_files import read_text
 
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.export.rig import ExportError, Rig, RigCamera
 from vical_daemon.export.text import comment, matrix_rows, number, row
+from vical_daemon.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
 
 
 def write_camchain(rig: Rig) -> str:
@@ -65,8 +67,12 @@ def read_camchain(path: Path) -> Rig:
         ExportError: Not such a file; the message says which key is missing or wrong.
     """
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        text = read_text(path, MAX_BYTES)
+        refuse_hostile(text, path.name)
+        document = yaml.safe_load(text)
+    except OSError as error:
+        raise ExportError(f"{path}: {error.strerror or error}") from None
+    except (ConfigError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ExportError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
     blocks = document if isinstance(document, dict) else {}
     names = sorted(k for k in blocks if isinstance(k, str) and k.startswith("cam"))

@@ -83,7 +83,7 @@ def describe(error: OSError) -> str:
 def _locked(path: Path, how: int) -> Iterator[int]:
     """Hold the lock of a file that nobody is writing; BlockingIOError: somebody is."""
     access = os.O_RDWR if how == fcntl.LOCK_EX else os.O_RDONLY
-    descriptor = os.open(path, access | os.O_CLOEXEC)
+    descriptor = os.open(path, access | os.O_NONBLOCK | os.O_CLOEXEC)  # it may be a pipe: do not wait
     try:
         fcntl.flock(descriptor, how | fcntl.LOCK_NB)
         yield descriptor

@@ -2,11 +2,13 @@
 
 Records are taken from front to back, never through the index, so that a file without its end reads
 like any other. Nothing is believed: lengths must lie in the file, chunks must match their checksum,
-and no chunk may unpack to more than `chunks.CHUNK_LIMIT`.
+no chunk may unpack to more than `chunks.CHUNK_LIMIT`, and all of them together to no more than a recording
+of the file's size can (`chunks.Budget`).
 """
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,8 +20,9 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
+from vical_drivers.user_files import open_file
 
-from vical_daemon.mcap_log.chunks import unpack_chunk
+from vical_daemon.mcap_log.chunks import Budget, SpentError, unpack_chunk
 from vical_daemon.mcap_log.files import LogError, describe
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -30,6 +33,7 @@ _LENGTH = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _END = struct.Struct("<BQQQI8s")  # footer and magic
 _SUMMARY_LIMIT = 64 * 2**20
+_RECORD_LIMIT = 2**30  # bytes; no chunk or attachment of a recording is as large
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,7 @@ class LogReader:
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _channels: dict[int, LogChannel] = field(default_factory=dict)
     _damaged: int = 0
+    _budget: Budget = field(default_factory=lambda: Budget(0))
 
     def __post_init__(self) -> None:
         """Check that this is an MCAP file.
@@ -85,7 +90,7 @@ class LogReader:
             LogError: It cannot be read, or is something else.
         """
         try:
-            with self.path.open("rb") as file:
+            with open_file(self.path) as file:
                 head = file.read(len(MAGIC))
         except OSError as error:
             raise LogError(f"cannot read {self.path}: {describe(error)}") from None
@@ -109,18 +114,23 @@ class LogReader:
             LogError: The disk refuses.
         """
         self._restart()
-        size = self.path.stat().st_size
+        stopped = False
         try:
-            with self.path.open("rb") as file:
+            with open_file(self.path) as file:
+                size = os.fstat(file.fileno()).st_size
+                self._budget = Budget(size)
                 self._learn_from_summary(file, size)
                 file.seek(len(MAGIC))
                 yield from self._read_data(file, size)
         except OSError as error:
             raise LogError(f"cannot read {self.path}: {describe(error)}") from None
+        except SpentError as error:
+            stopped = True
+            self.warnings.append(f"{self.path.name}: {error}")
         if self._damaged:
             pieces = "1 damaged piece" if self._damaged == 1 else f"{self._damaged} damaged pieces"
             self.warnings.append(f"{self.path.name}: {pieces} left out")
-        if not self.complete:
+        if not self.complete and not stopped:
             self.warnings.append(f"{self.path.name}: the end is missing; what is there is used")
 
     def _restart(self) -> None:
@@ -160,9 +170,13 @@ class LogReader:
                 return
             if length > size - file.tell():
                 if opcode == Opcode.CHUNK:
-                    yield from self._read_open_chunk(file.read())
+                    yield from self._read_open_chunk(file.read(_RECORD_LIMIT))
                 return
-            if opcode in (
+            self._budget.spend(0)
+            if length > _RECORD_LIMIT:
+                self._damaged += 1
+                file.seek(length, 1)
+            elif opcode in (
                 Opcode.CHUNK,
                 Opcode.MESSAGE,
                 Opcode.METADATA,
@@ -181,7 +195,7 @@ class LogReader:
     def _read_record(self, opcode: int, content: bytes) -> Iterator[LogMessage]:
         try:
             if opcode == Opcode.CHUNK:
-                yield from self._read_records(unpack_chunk(content))
+                yield from self._read_records(unpack_chunk(content, self._budget))
             elif opcode == Opcode.MESSAGE:
                 message = self._message(content, 0, len(content))
                 if message is not None:
@@ -199,7 +213,7 @@ class LogReader:
     def _read_open_chunk(self, content: bytes) -> Iterator[LogMessage]:
         """Take what can be taken from the chunk that was being written when the process died."""
         try:
-            yield from self._read_records(unpack_chunk(content, whole=False))
+            yield from self._read_records(unpack_chunk(content, self._budget, whole=False))
         except _DAMAGE:
             return
 
@@ -208,6 +222,7 @@ class LogReader:
         while position + _LENGTH.size <= end:
             opcode, length = _LENGTH.unpack_from(data, position)
             position += _LENGTH.size
+            self._budget.spend(0)
             if length > end - position:
                 return
             if opcode == _OP_MESSAGE:

@@ -58,10 +58,10 @@ def check_recording(recording: Recording) -> None:
 
 def _open(path: Path, topics: Collection[str] | None) -> Recording:
     if path.is_dir():
+        if any(path.glob("*.mcap")):  # also of a ROS 2 bag folder: our reader bears damage
+            return McapRecording(path, topics)
         if (path / "metadata.yaml").is_file():
             return BagRecording(path, topics)
-        if any(path.glob("*.mcap")):
-            return McapRecording(path, topics)
         return AslRecording(path)
     if path.suffix == ".bag":
         return BagRecording(path, topics)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from vical_drivers.user_files import open_file, read_file, read_text
 
 from vical_daemon.estimation.measurements import IntArray
 from vical_daemon.messages import encode_compressed_image, encode_imu, encode_points
@@ -24,13 +26,17 @@ from vical_daemon.recording.model import (
     Stream,
     stream_statistics,
 )
+from vical_daemon.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
 from vical_daemon.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
 _IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
-_UNPACKED_LIMIT = 2 * 2**30
+TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
+_IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
+_SMALL = 2**25  # bytes; so much a packed table may always unpack to
+_SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +153,7 @@ class AslRecording(Recording):
         def build(i: int) -> bytes:
             path = files[i]
             try:
-                data = path.read_bytes()
+                data = read_file(path, _IMAGE_LIMIT)
             except OSError as error:
                 raise RecordingError(f"{path}: {error.strerror}") from None
             return encode_compressed_image(
@@ -217,16 +223,30 @@ def _width(dtype: np.dtype[Any]) -> int:
 
 def _read_text(path: Path) -> bytes:
     try:
-        if path.suffix != ".gz":
-            return path.read_bytes()
-        with gzip.open(path) as file:
-            text = file.read(_UNPACKED_LIMIT)
+        text = _unpacked(path) if path.suffix == ".gz" else read_file(path, TABLE_LIMIT)
     except (EOFError, zlib.error, gzip.BadGzipFile):
         raise RecordingError(f"{path} is no sound gzip file; unpack or download it again") from None
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror or error}") from None
-    if not text.strip():
+    if not text or text.isspace():
         raise RecordingError(f"{path} is empty")
+    return text
+
+
+def _unpacked(path: Path) -> bytes:
+    """Unpack a table, no further than a table of this size can be.
+
+    Raises:
+        RecordingError: It goes on.
+    """
+    with open_file(path, TABLE_LIMIT) as packed:
+        limit = min(TABLE_LIMIT, max(_SMALL, _SHRINKS * os.fstat(packed.fileno()).st_size))
+        with gzip.GzipFile(fileobj=packed) as file:
+            text = file.read(limit + 1)
+    if len(text) > limit:
+        raise RecordingError(
+            f"{path} unpacks to more than {limit / 1e6:.0f} MB; a table does not, is it one?"
+        )
     return text
 
 
@@ -268,13 +288,15 @@ def _resolution(folder: Path) -> tuple[int, int] | None:
         import yaml
 
         try:
-            size = yaml.safe_load(sensor.read_text())["resolution"]
+            text = read_text(sensor, MAX_BYTES)
+            refuse_hostile(text, sensor.name)
+            size = yaml.safe_load(text)["resolution"]
             return int(size[0]), int(size[1])
-        except (yaml.YAMLError, OSError, KeyError, TypeError, ValueError, IndexError):
+        except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
             pass  # EuRoC's own files begin with %YAML:1.0 and are no YAML for some parsers
     first = next(iter(sorted((folder / "data").glob("*.png"))), None)
     if first is not None:
-        with first.open("rb") as file:
+        with open_file(first) as file:
             head = file.read(24)
         if head[12:16] == b"IHDR":
             width, height = struct.unpack(">II", head[16:24])

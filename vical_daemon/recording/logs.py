@@ -165,7 +165,8 @@ class LogRecording(Recording):
         if self._wanted is not None:
             return f"{self.path}: none of the topics {', '.join(sorted(self._wanted))} holds {wanted}"
         found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self._others.items())[:8])
-        return f"{self.path}: no sensor data: expected {wanted}; found {found or 'no messages at all'}"
+        what = found or "; ".join(["no messages at all", *self.warnings])
+        return f"{self.path}: no sensor data: expected {wanted}; found {what}"
 
     def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]:
         return in_stamp_order(self._stamped(keys))

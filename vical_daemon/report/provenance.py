@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from vical_drivers.user_files import open_file
+
 PACKAGES = (
     "vical",
     "numpy",
@@ -66,7 +68,7 @@ def _size_and_hash(path: Path) -> tuple[int, str]:
     for member in members:
         if path.is_dir():
             digest.update(str(member.relative_to(path)).encode())
-        with member.open("rb") as stream:
+        with open_file(member) as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)
                 size += len(block)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
+from vical_drivers.user_files import read_text
 
-MAX_FILE_BYTES = 65536
+MAX_FILE_BYTES = 65_536  # a target file has ten short lines
 
 
 class TargetError(ValueError):
@@ -135,15 +136,13 @@ class TargetFile:
 
 def _read_text(path: Path) -> str:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise TargetError(f"{path}: too big for a target file; give the target YAML, not a recording")
-        return path.read_text(encoding="utf-8")
+        return read_text(path, MAX_FILE_BYTES)
     except FileNotFoundError:
         raise TargetError(f"{path}: no such file; `vical target` makes a board and its YAML") from None
     except UnicodeDecodeError:
         raise TargetError(f"{path}: not a text file; give the target YAML") from None
     except OSError as error:
-        raise TargetError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise TargetError(f"{path}: {error.strerror or error}; give the target YAML") from None
 
 
 def _compose(path: Path, text: str) -> yaml.Node | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import time
 from collections import deque
 from pathlib import Path
@@ -14,6 +15,10 @@ from vical_drivers.camera.statistics import FrameStatistics
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
+from vical_drivers.user_files import read_file, read_text
+
+_LISTING_LIMIT = 2**27  # bytes; a month of names at 1 Hz
+_IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
 
 class ImageFolder(Closing):
@@ -45,14 +50,17 @@ class ImageFolder(Closing):
 
     def _parse(self, listing: Path) -> list[tuple[int, Path]]:
         frames = []
-        with listing.open(encoding="utf-8", newline="") as file:
-            for number, row in enumerate(csv.reader(file), start=1):
-                if not row or row[0].lstrip().startswith("#"):
-                    continue
-                try:
-                    frames.append((int(row[0]), self._image_path(row[1].strip())))
-                except (ValueError, IndexError) as error:
-                    raise DeviceRefusedError(f"{listing}: line {number} is not 'stamp, file name'") from error
+        try:
+            rows = csv.reader(io.StringIO(read_text(listing, _LISTING_LIMIT)))
+        except UnicodeDecodeError:
+            raise DeviceRefusedError(f"{listing}: not a text file") from None
+        for number, row in enumerate(rows, start=1):
+            if not row or row[0].lstrip().startswith("#"):
+                continue
+            try:
+                frames.append((int(row[0]), self._image_path(row[1].strip())))
+            except (ValueError, IndexError) as error:
+                raise DeviceRefusedError(f"{listing}: line {number} is not 'stamp, file name'") from error
         return frames
 
     def _image_path(self, name: str) -> Path:
@@ -77,7 +85,7 @@ class ImageFolder(Closing):
             t_ns, path = self._frames.popleft()
             self._sequence += 1
             try:
-                data = np.fromfile(path, dtype=np.uint8)
+                data = np.frombuffer(read_file(path, _IMAGE_LIMIT), dtype=np.uint8)
                 image = self._decoder(data, colour=self._settings.encoding == "bgr8")
             except (OSError, ValueError):
                 self._statistics.count("unreadable_files")

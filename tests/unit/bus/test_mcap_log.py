@@ -187,7 +187,7 @@ def test_what_is_no_mcap_is_refused(tmp_path, content):
 def test_missing_file_and_folder_are_refused(tmp_path):
     with pytest.raises(LogError, match="No such file"):
         LogReader(tmp_path / "no.mcap")
-    with pytest.raises(LogError, match="Is a directory"):
+    with pytest.raises(LogError, match="is a folder, a file is needed"):
         LogReader(tmp_path)
     with pytest.raises(LogError, match="cannot create"):
         LogWriter(tmp_path / "no" / "a.mcap")
