@@ -86,6 +86,46 @@ def guidance_caption(guidance: Guidance) -> str:
     }[guidance.verb]
 
 
+_HEADLINES = {
+    "waiting": "Waiting for data.",
+    "initialising": "Looking for a first solution.",
+    "converging": "Getting sharper.",
+    "converged": "Converged.",
+    "degenerate": "The motion does not reveal everything yet.",
+    "inconsistent": "The data contradict the model: do not use these numbers.",
+}
+
+
+def headline(status: str, guidance: Guidance) -> str:
+    """Say in one short sentence where a calibration stands.
+
+    Args:
+        status: One of `result.Status`.
+        guidance: What to do next: a lens that was not seen everywhere is not called converged everywhere.
+    """
+    if status == "converged" and guidance.verb is Verb.SHOW:
+        return f"Converged, but the lens is not checked near the {_edges(guidance)}."
+    return _HEADLINES[status]
+
+
+def fault_headline(component: str) -> str:
+    """Say in one short sentence that a device or role does not work."""
+    return f"{component} does not work."
+
+
+def motion_caption(status: str, guidance: Guidance, advice: str) -> str:
+    """Say what the picture of the axes shows, or why it shows nothing.
+
+    Args:
+        status: One of `result.Status`.
+        guidance: What to do next.
+        advice: The same as text; with messages of version 0.1.0 there is nothing else.
+    """
+    if guidance or advice:
+        return guidance_caption(guidance)
+    return "nothing is missing" if status == "converged" else "turn and move freely"
+
+
 def _still(guidance: Guidance) -> str:
     if guidance.verb is Verb.TURN_TO_AND_FRO:
         return "without rotation the time shift hardly shows; turn the rig to and fro"

@@ -10,16 +10,20 @@ from typing import Any
 
 from vical_daemon import topics
 from vical_daemon.bus import Sample
+from vical_daemon.estimation.events import Event
+from vical_daemon.estimation.guidance import Guidance, Verb
+from vical_daemon.estimation.wording import event_document, fault_headline, headline, motion_caption
 from vical_daemon.messages import (
     CalibrationMessage,
     DiagnosticStatus,
+    Level,
     MessageError,
     decode_calibration,
     decode_diagnostics,
 )
-from vical_daemon.web import words
 
 HISTORY = 1500
+EVENTS = 8  # announcements that the page shows
 # One row of the history; lists of three are flattened in this order.
 COLUMNS = (
     "t_s", "px_mm", "py_mm", "pz_mm", "spx_mm", "spy_mm", "spz_mm", "qw", "qx", "qy", "qz",
@@ -39,12 +43,14 @@ class CameraState:
         rows: History, oldest first, thinned towards the past.
         fresh: Rows since the last tick.
         restarted: The estimator began anew since the last tick.
+        events: The last announcements, oldest first.
     """
 
     latest: CalibrationMessage
     rows: list[Row] = field(default_factory=list)
     fresh: list[Row] = field(default_factory=list)
     restarted: bool = False
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=EVENTS))
 
 
 class WebState:
@@ -111,7 +117,9 @@ class WebState:
         camera = self._cameras.setdefault(message.camera, CameraState(message))
         if message.estimate.duration_s < camera.latest.estimate.duration_s:
             camera.rows, camera.fresh, camera.restarted = [], [], True
+            camera.events.clear()
         camera.latest = message
+        camera.events.extend(message.estimate.events)
         row = history_row(message)
         if row is None or (camera.rows and camera.rows[-1][0] == row[0]):
             return
@@ -122,10 +130,12 @@ class WebState:
             camera.rows = camera.rows[:half:2] + camera.rows[half:]
 
     def _document(self, *, full: bool) -> dict[str, Any]:
+        fault = self._fault()
         cameras = {}
         for name, camera in sorted(self._cameras.items()):
             whole = full or camera.restarted
-            entry = summary(camera.latest)
+            entry = summary(camera.latest, fault is not None)
+            entry["events"] = [event_document(event) for event in camera.events]
             entry["rows" if whole else "fresh"] = camera.rows if whole else camera.fresh
             cameras[name] = entry
         devices = [
@@ -141,29 +151,56 @@ class WebState:
             for status in statuses
             if status.name != "clock"
         ]
-        document: dict[str, Any] = {"rig": self.rig, "cameras": cameras, "devices": devices}
+        document: dict[str, Any] = {
+            "rig": self.rig,
+            "cameras": cameras,
+            "devices": devices,
+            "fault": fault,
+        }
         if full:
             document["columns"] = COLUMNS
         return document
 
+    def _fault(self) -> dict[str, str] | None:
+        """The first component that does not work: until it does, no advice to the operator helps."""
+        for _, statuses in sorted(self._statuses.items()):
+            for status in statuses:
+                if status.level >= Level.ERROR:
+                    headline = fault_headline(status.name)
+                    return {"name": status.name, "headline": headline, "message": status.message}
+        return None
 
-def summary(message: CalibrationMessage) -> dict[str, Any]:
-    """Return what the page says about one camera at this moment."""
+
+def summary(message: CalibrationMessage, fault: bool = False) -> dict[str, Any]:
+    """Return what the page says about one camera at this moment.
+
+    Args:
+        message: The last one.
+        fault: A component does not work: then nothing is asked of the operator.
+    """
     estimate, camera = message.estimate, message.camera_estimate
     withheld = list(camera.unobservable) if camera else []
+    status, asked = str(estimate.status), Guidance() if fault else estimate.next_motion
+    moves = asked.verb is Verb.TURN_AND_MOVE
+    turns = asked.verb not in (Verb.NONE, Verb.SHOW)
     return {
-        "status": str(estimate.status),
-        "sentence": words.sentence(estimate),
-        "guidance": estimate.guidance,
+        "status": status,
+        "headline": headline(status, estimate.next_motion),
+        "reason": estimate.reason,
+        "guidance": "" if fault else estimate.guidance,
         "progress": finite(estimate.progress),
         "duration_s": finite(estimate.duration_s),
         "frames": estimate.frames,
         "imu_samples": estimate.imu_samples,
         "nis": finite(estimate.nis_per_dof),
         "rejected": finite(estimate.rejected_fraction),
-        "events": list(estimate.events),
         "withheld": withheld,
-        "motion": words.motion([estimate.guidance, *withheld]),
+        "motion": {
+            "rotate": list(asked.axes) if turns else [],
+            "translate": list(asked.axes) if moves else [],
+            "edges": list(asked.edges),
+            "caption": "" if fault else motion_caption(status, asked, estimate.guidance),
+        },
         "gravity": [finite(v) for v in estimate.gravity_world_mps2],
         "lens": None
         if camera is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +100,7 @@ class ImageFolder(Closing):
 
     def stats(self) -> SourceStats:
         """Counters since the folder was opened."""
-        return self._statistics.snapshot()
+        return replace(self._statistics.snapshot(), jitter_us=None)
 
     def close(self) -> None:
         """Forget the rest; may be called twice."""
