@@ -104,7 +104,7 @@ def headline(status: str, guidance: Guidance) -> str:
         guidance: What to do next: a lens that was not seen everywhere is not called converged everywhere.
     """
     if status == "converged" and guidance.verb is Verb.SHOW:
-        return f"Converged, but the lens is not checked near the {_edges(guidance)}."
+        return "Converged, except near the edges of the image."
     return _HEADLINES[status]
 
 

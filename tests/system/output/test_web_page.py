@@ -298,7 +298,7 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
         assert texts["motiontext"] == "turn about x and y" and texts["reason"] == reason
         assert "optical axis only" in texts["guidance"]
     elif scene == "edges":
-        assert texts["headline"].startswith("Converged, but") and texts["edges"] == 2
+        assert texts["headline"].startswith("Converged, except") and texts["edges"] == 2
         assert "show the target near" in texts["motiontext"]
     else:
         assert (texts["headline"], texts["motiontext"]) == ("Converged.", "nothing is missing")

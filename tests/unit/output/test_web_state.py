@@ -167,7 +167,7 @@ def test_nothing_is_missing_is_said_only_where_nothing_is(bus, state, web_feed):
     show = Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left", "right"))
     web_feed.publish_estimate(bus, web_feed.estimate(30.0, rng, Status.CONVERGED, motion=show))
     entry = state.tick()["cameras"]["cam0"]
-    assert entry["headline"] == "Converged, but the lens is not checked near the left and right edges."
+    assert entry["headline"] == "Converged, except near the edges of the image."
     assert "nothing" not in entry["motion"]["caption"] and "no corners" in entry["guidance"]
     web_feed.publish_estimate(bus, web_feed.estimate(30.2, rng, Status.CONVERGED))
     entry = state.tick()["cameras"]["cam0"]
