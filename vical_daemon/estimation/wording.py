@@ -54,6 +54,11 @@ def direction_sigma(weak: WeakDirection) -> str:
     return f"{direction_name(weak)}: +-{figure}"
 
 
+def direction_warning(weak: WeakDirection) -> str:
+    """Say which number is not to be used."""
+    return f"do not use: {direction_name(weak)}"
+
+
 def direction_line(weak: WeakDirection) -> str:
     """Name, and the motion that would reveal it."""
     return f"{direction_name(weak)}: {guidance_text(weak.guidance)}"

@@ -12,7 +12,13 @@ from vical_daemon import topics
 from vical_daemon.bus import Sample
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance, Verb
-from vical_daemon.estimation.wording import event_document, fault_headline, headline, motion_caption
+from vical_daemon.estimation.wording import (
+    direction_warning,
+    event_document,
+    fault_headline,
+    headline,
+    motion_caption,
+)
 from vical_daemon.messages import (
     CalibrationMessage,
     DiagnosticStatus,
@@ -179,7 +185,10 @@ def summary(message: CalibrationMessage, fault: bool = False) -> dict[str, Any]:
         fault: A component does not work: then nothing is asked of the operator.
     """
     estimate, camera = message.estimate, message.camera_estimate
-    withheld = list(camera.unobservable) if camera else []
+    # what to do stands in the guidance, once: a second advice beside it could name other axes
+    withheld = [direction_warning(weak) for weak in camera.withheld] if camera else []
+    if camera and not withheld:
+        withheld = list(camera.unobservable)  # of version 0.1.0
     status, asked = str(estimate.status), Guidance() if fault else estimate.next_motion
     moves = asked.verb is Verb.TURN_AND_MOVE
     turns = asked.verb not in (Verb.NONE, Verb.SHOW)

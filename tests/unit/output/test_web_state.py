@@ -9,7 +9,7 @@ import pytest
 from vical_daemon import topics
 from vical_daemon.bus import LocalBus, Sample
 from vical_daemon.estimation.events import Event, EventKind
-from vical_daemon.estimation.guidance import AXES, Guidance, Lack, Verb
+from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.wording import guidance_text
 from vical_daemon.messages import Level, decode_calibration, encode_calibration
@@ -192,6 +192,17 @@ def test_a_device_that_does_not_work_comes_before_advice(bus, state, web_feed):
     assert document["fault"]["message"] == "no data for 3.0 s"
     entry = document["cameras"]["cam0"]
     assert entry["guidance"] == entry["motion"]["caption"] == "" and entry["motion"]["rotate"] == []
+
+
+def test_withheld_directions_are_named_without_a_second_advice(bus, state, web_feed):
+    rng = np.random.default_rng(0)
+    sent = web_feed.estimate(20.0, rng, Status.DEGENERATE, withheld=["time shift: turn the rig"])
+    web_feed.publish_estimate(bus, sent)  # as of version 0.1.0
+    assert state.tick()["cameras"]["cam0"]["withheld"] == ["time shift: turn the rig"]
+    arm = WeakDirection(Block.LEVER_ARM, (0.0, 0.0, 1.0), 0.3, 5e-3, Guidance(Verb.TURN, ("x", "y")))
+    sent.cameras["cam0"].withheld.append(arm)
+    web_feed.publish_estimate(bus, sent)
+    assert state.tick()["cameras"]["cam0"]["withheld"] == ["do not use: lever arm along the optical axis"]
 
 
 def test_announcements_stay_on_the_page_for_a_while(bus, state, web_feed):
