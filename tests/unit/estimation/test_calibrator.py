@@ -1,5 +1,7 @@
 """The estimator as the roles see it, on simulated corners: truth, changes, bad input, repeatability."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -96,6 +98,17 @@ def test_a_lens_that_needs_one_term_more_is_told_once():
 def test_runs_are_bit_identical(run, done):
     again = calibrate(run).estimate()
     assert again.cameras["cam0"] == done.estimate().cameras["cam0"]
+
+
+def test_a_doubt_of_a_second_does_not_take_convergence_back(done):
+    judge = deepcopy(done.judge)
+    assert judge.estimate(done.filter).status == Status.CONVERGED
+    judge.in_doubt = "a doubt"
+    short = judge.estimate(done.filter)
+    assert (short.status, short.reason, short.progress) == (Status.CONVERGED, "", 1.0)
+    judge.saw_imu(judge._newest_ns + 3_000_000_000, np.zeros(3), np.zeros(3))
+    lasting = judge.estimate(done.filter)
+    assert (lasting.status, lasting.reason) == (Status.CONVERGING, "a doubt")
 
 
 def test_still_rig_never_converges_and_says_why():

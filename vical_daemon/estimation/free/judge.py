@@ -34,7 +34,6 @@ from vical_daemon.estimation.wording import cause_text, direction_line, directio
 
 _PATIENCE_S = 15.0
 _LOST = 3.0
-_HYSTERESIS = 2.0
 _ENOUGH_WINDOWS = 2
 _MOST_SIGMA_PX = 3.0
 _MOST_INERTIAL = 2.5
@@ -294,8 +293,7 @@ class FreeJudge:
         if not running and self._windows == 0:
             return Verdict(Status.INITIALISING, self._reason)
         pause = "" if running else f" (paused: {self._reason or cause_text(*self._quiet)})"
-        if self.status == Status.CONVERGED:
-            missing = [g for g in missing if g.excess > _HYSTERESIS]
+        missing = self._steady.counted(missing)
         if not missing:
             if self._windows < _ENOUGH_WINDOWS:
                 return Verdict(Status.CONVERGING, CONFIRMING + pause)

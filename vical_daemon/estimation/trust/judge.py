@@ -38,7 +38,6 @@ _PATIENCE_S = 15.0
 _LOST = 3.0  # a direction this far above its target after the patience is called unobservable
 _NIS_BAD = 4.0
 _HELD_BACK_BAD = 9.0
-_HYSTERESIS = 2.0
 _RECENT = 60
 
 
@@ -266,9 +265,8 @@ class Judge:
         if trouble:
             return Verdict(Status.INCONSISTENT, trouble)
         span = f.state.t_s - (self._started_s or 0.0)
-        lacking = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
-        if self.status == Status.CONVERGED:
-            lacking = [g for g in lacking if g.excess > _HYSTERESIS]
+        weak = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
+        lacking = self._steady.counted(weak)
         if not lacking:
             if self._partial:
                 return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)

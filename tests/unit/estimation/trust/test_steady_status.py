@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vical_daemon.estimation.guidance import Guidance, Verb
+from vical_daemon.estimation.guidance import Block, Guidance, Verb, WeakDirection
 from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.trust.steady_status import SteadyStatus, Verdict
 
@@ -33,6 +33,14 @@ def test_whatever_is_worse_shows_at_once(status):
     steady = SteadyStatus()
     steady.follow(CONVERGED, 0.0)
     assert steady.follow(Verdict(status, "why"), 0.1) == Verdict(status, "why")
+
+
+def test_a_sigma_may_grow_to_twice_its_limit_before_it_counts_again():
+    steady, nothing = SteadyStatus(), Guidance()
+    weak = [WeakDirection(Block.TIMESHIFT, (0.0, 0.0, 0.0), s, 1e-3, nothing) for s in (2.1e-3, 1.9e-3)]
+    assert steady.counted(weak) == weak
+    steady.follow(CONVERGED, 0.0)
+    assert steady.counted(weak) == weak[:1]
 
 
 def test_a_changed_rig_is_not_converged_for_another_moment():
