@@ -278,7 +278,7 @@ def _imu_noise(event: Event) -> str:
     than = "worse" if (event.value or 0.0) > 1.0 else "better"
     times = _of(event, 1.0, "times", ".1f")
     return (
-        f"the imu foretells images {than} than its noise densities say ({times}): "
+        f"the imu predicts images {than} than its noise densities say ({times}): "
         "measure them with `vical allan`"
     )
 
