@@ -12,6 +12,7 @@ from vical_mocks.rig import Bump, reference_rig
 
 from benchmarks import runner
 from benchmarks.feed import CalibratorSubject, Record, StartErrors, camera_prior, feed, imu_noise
+from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 AT_S = 60.0
@@ -59,9 +60,12 @@ def trial(size: tuple[float, float, float], lens_known: bool, seconds: float, se
     return judge(record)
 
 
+_STEPS = (EventKind.BUMPED, EventKind.TIMESHIFT_STEPPED)
+
+
 def judge(record: Record) -> runner.Result:
     """Delay of the announcement, time until the errors stay within 3 sigma, false alarms, lies."""
-    bumps = [t for t, text in record.events if text.startswith("bumped") or "the time shift stepped" in text]
+    bumps = [t for t, event in record.events if event.kind in _STEPS]
     after = [s for s in record.snapshots if s.t_s >= AT_S]
     worst = [(s.t_s, _worst(s.error, s.covariance)) for s in after]
     outside = [t for t, w in worst if w > 3.0]
@@ -78,7 +82,7 @@ def judge(record: Record) -> runner.Result:
     return {
         "announced_s": min((t - AT_S for t in bumps if t >= AT_S), default=None),
         "early": sum(t < AT_S for t in bumps),
-        "events": record.events,
+        "events": record.event_documents,
         "back_s": (outside[-1] - AT_S + 0.5) if outside else 0.0,
         "sigmas_at_10_s": next((w for t, w in worst if t >= AT_S + 10.0), None),
         "lies_s": lies,

@@ -72,7 +72,7 @@ def trial(
         if last is None
         else z_shown(limit.block("p_imu_cam", "r_imu_cam", "timeshift"), last),
         "sigma": None if last is None else np.sqrt(np.diag(last.covariance))[:7],
-        "events": record.events,
+        "events": record.event_documents,
     }
 
 

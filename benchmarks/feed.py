@@ -12,8 +12,10 @@ import numpy.typing as npt
 from vical_mocks.points import SimulatedFrame, SimulatedRun
 from vical_mocks.rotations import exp_so3, log_so3
 
+from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import CameraEstimate
+from vical_daemon.estimation.wording import event_document
 
 FloatArray = npt.NDArray[np.float64]
 CAMERA = "cam0"
@@ -45,12 +47,17 @@ class Record:
     """One trial: its snapshots, announcements and costs."""
 
     snapshots: list[Snapshot] = field(default_factory=list)
-    events: list[tuple[float, str]] = field(default_factory=list)
+    events: list[tuple[float, Event]] = field(default_factory=list)
     statuses: list[tuple[float, str, str]] = field(default_factory=list)  # (t_s, status, reason) at changes
     unobservable: list[str] = field(default_factory=list)
     guidance: str = ""
     cpu_s: float = 0.0
     frames: int = 0
+
+    @property
+    def event_documents(self) -> list[tuple[float, dict[str, Any]]]:
+        """The announcements as JSON, each with the time at which it came."""
+        return [(t_s, event_document(event)) for t_s, event in self.events]
 
     def started_s(self) -> float:
         """Time of the first answer, s; infinite when there was none."""

@@ -264,7 +264,7 @@ def summary(record: Record, dof: int, times_s: list[float]) -> runner.Result:
             "nees": [scores.nees(s.error, s.covariance, dof) for s in shots],
             "status": [s.status for s in shots],
         },
-        "events": record.events,
+        "events": record.event_documents,
         "statuses": record.statuses,
         "unobservable": record.unobservable,
         "guidance": record.guidance,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vical_daemon import topics
 from vical_daemon.bus import Sample
+from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.messages import MessageError, decode_calibration, decode_diagnostics
 from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
@@ -60,10 +61,10 @@ class Watcher:
                     return at_s, estimate
             return None
 
-    def events_since(self, t_s: float) -> list[str]:
+    def events_since(self, t_s: float) -> list[Event]:
         """Return what was announced after `t_s`."""
         with self._lock:
-            return [text for at_s, estimate in self._estimates if at_s > t_s for text in estimate.events]
+            return [event for at_s, estimate in self._estimates if at_s > t_s for event in estimate.events]
 
     def spoke_s(self, role: str) -> float:
         """When the last status of a role came; 0: never."""

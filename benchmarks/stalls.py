@@ -19,7 +19,9 @@ import numpy as np
 
 from benchmarks.stall_watcher import Watcher
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate
+from vical_daemon.estimation.wording import event_text
 from vical_daemon.vision.target import Checkerboard
 
 PROCESSES = {"acquire": "imu", "record": "record", "calibrate": "estimate", "web": "web"}
@@ -58,14 +60,14 @@ class Outcome:
     again_s: float | None = None
     z: float | None = None
     moved_mm: float | None = None
-    events: list[str] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
 
     @property
     def good(self) -> bool:
         """Whether it is as asked for: in time, the same numbers, and nothing taken for a bump."""
         in_time = self.again_s is not None and self.again_s <= WITHIN_S
         same = self.z is not None and self.z < 3.0  # of 7 numbers, by chance once in 50 deeds
-        return in_time and same and not any(text.startswith(("bumped", "changed")) for text in self.events)
+        return in_time and same and not any(event.changed for event in self.events)
 
 
 def main(argv: list[str]) -> int:
@@ -127,7 +129,12 @@ def _outcome(
         _wait(lambda: watcher.converged_since(time.monotonic() - 1.0) is not None, 120.0, "converged")
     before = watcher.last
     if before is None or before.status != "converged":
-        return Outcome(name, deed, 0.0, events=[f"not converged before: {before and before.reason}"])
+        return Outcome(
+            name,
+            deed,
+            0.0,
+            events=[Event(EventKind.OTHER, said=f"not converged before: {before and before.reason}")],
+        )
     pid = _child(parent, name)
     begin_s = time.monotonic()
     if deed == "stop":
@@ -194,7 +201,7 @@ def _table(outcomes: list[Outcome]) -> str:
         some = [o for o in outcomes if (o.process, o.deed) == key]
         good = sum(o.good for o in some)
         again = _worst([o.again_s for o in some])
-        events = sorted({text for o in some for text in o.events})
+        events = sorted({event_text(event) for o in some for event in o.events})
         cells = [
             *key, f"{good} of {len(some)}", _worst([o.outage_s for o in some]), again,
             _worst([o.z for o in some]), _worst([o.moved_mm for o in some]),

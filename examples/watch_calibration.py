@@ -34,7 +34,7 @@ def main(endpoint: str | None = None) -> int:
                 f"t_imu = t_cam + {known.timeshift_cam_imu_s:.6f} s (sigma {known.timeshift_sigma_s:.1e} s)"
             )
             for update in robot.updates():
-                print(update.camera, update.estimate.status, update.estimate.events)
+                print(update.camera, update.estimate.status, *update.announcements)
     except (BusError, client.ClientError) as error:
         print(error, file=sys.stderr)
         return 1

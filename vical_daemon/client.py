@@ -23,6 +23,7 @@ from vical_drivers.closing import Closing
 from vical_daemon import topics
 from vical_daemon.bus import Bus, Sample, Subscription
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
+from vical_daemon.estimation.wording import event_text
 from vical_daemon.messages import MessageError, decode_calibration
 from vical_daemon.topics import parse_key
 
@@ -60,6 +61,11 @@ class Update:
                 f"{self.camera} is {self.estimate.status}: {self.estimate.reason or 'no solution yet'}"
             )
         return known
+
+    @property
+    def announcements(self) -> list[str]:
+        """What was announced since the last estimate, as text; as data: `estimate.events`."""
+        return [event_text(event) for event in self.estimate.events]
 
     @property
     def converged(self) -> bool:

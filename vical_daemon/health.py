@@ -66,7 +66,6 @@ def device_status(
         "samples": str(stats.samples),
         "lost": str(stats.lost),
         "rate_hz": f"{stats.rate_hz:.3f}",
-        "jitter_us": f"{stats.jitter_us:.1f}",
         "clock_skew_ppm": f"{stats.clock_skew_ppm:.2f}",
         "checksum_errors": str(stats.checksum_errors),
         "resync_bytes": str(stats.resync_bytes),
@@ -76,6 +75,8 @@ def device_status(
         "queue_depth": str(outbox.waiting),
         "queue_dropped": str(outbox.dropped),
     }
+    if stats.jitter_us is not None:
+        values["jitter_us"] = f"{stats.jitter_us:.1f}"
     if info is not None:
         values |= {
             "model": info.model,

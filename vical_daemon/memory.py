@@ -1,4 +1,4 @@
-"""Remembers calibrations over restarts, by the serial numbers of the devices, and tells when one has changed.
+"""Remembers calibrations over restarts, by the serial numbers of the devices, and announces changes.
 
 Serial numbers come from the status of the acquiring roles, so the estimator needs no access to devices.
 """
@@ -13,13 +13,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from vical_daemon import notify, topics
 from vical_daemon.bus import Bus, Sample
 from vical_daemon.config import Config
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
+from vical_daemon.estimation.wording import event_text
 from vical_daemon.messages import MessageError, decode_diagnostics
 from vical_daemon.places import state_directory
 from vical_daemon.priors import camera_prior
@@ -53,7 +56,7 @@ class Memory:
         self._compared: set[str] = set()
         self._saved_s = -float("inf")
         self._status: Status | None = None
-        self._announced: list[str] = []
+        self._announced: list[Event] = []
         pattern = topics.STATUS.pattern
         self._keys = [pattern.format(rig=config.rig, name=role) for role in ("imu", "camera")]
         self._subscriptions = [bus.subscribe(key, self._listen) for key in self._keys]
@@ -89,9 +92,9 @@ class Memory:
         known = {name: self._serials[name] for name in names if name in self._serials}
         return known if len(known) == len(names) else {}
 
-    def announce(self, text: str) -> None:
+    def announce(self, event: Event) -> None:
         """Add an event to the next estimate."""
-        self._announced.append(text)
+        self._announced.append(event)
 
     def watch(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
         """Look at an estimate before it is published: save it when it is good, announce what changed.
@@ -107,11 +110,18 @@ class Memory:
                 notify.event("converged", f"{self._config.rig}: calibration converged", rig=self._config.rig)
             if time.monotonic() - self._saved_s > SAVE_EVERY_S:
                 self.save(estimate)
-        for text in events:
-            name = "bumped" if text.startswith(("bumped", "changed")) else "calibration"
-            notify.event(name, text, level="warning", rig=self._config.rig)
+        for event in events:
+            self._journal(event)
         self._status = estimate.status
         return replace(estimate, events=events) if events != estimate.events else estimate
+
+    def _journal(self, event: Event) -> None:
+        fields: dict[str, str | float] = {"kind": str(event.kind)}
+        fields |= {"camera": event.camera} if event.camera else {}
+        fields |= {"value": event.value} if event.value is not None else {}
+        fields |= {"sigma": event.sigma} if event.sigma is not None else {}
+        name = "bumped" if event.changed else "calibration"
+        notify.event(name, event_text(event), level="warning", rig=self._config.rig, **fields)
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
         """Store a converged estimate now (once a minute, and at the end)."""
@@ -132,15 +142,13 @@ class Memory:
         for subscription in self._subscriptions:
             subscription.close()
 
-    def _changes(self, estimate: CalibrationEstimate) -> list[str]:
-        texts = []
+    def _changes(self, estimate: CalibrationEstimate) -> list[Event]:
+        found: list[Event] = []
         for name, stored in self._before.items():
             if name in estimate.cameras and name not in self._compared:
                 self._compared.add(name)
-                text = difference(stored.known, estimate.cameras[name])
-                if text:
-                    texts.append(f"changed: {name} since the stored calibration: {text}")
-        return texts
+                found += differences(name, stored.known, estimate.cameras[name], estimate.duration_s)
+        return found
 
     def _listen(self, sample: Sample) -> None:
         try:
@@ -160,27 +168,41 @@ class Memory:
         return self._store.load(imu_serial, camera_serial) if imu_serial and camera_serial else None
 
 
-def difference(before: CameraEstimate, now: CameraEstimate) -> str:
-    """Say by how much a mounting differs from an earlier one, beyond both sigmas and what matters; or "".
+def differences(camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float) -> list[Event]:
+    """Return by how much a mounting differs from an earlier one, beyond both sigmas and what matters.
 
     Each component is compared with the sum of both variances; rotations as the angle about each axis.
+
+    Args:
+        camera: Name of the camera.
+        before: As stored.
+        now: As estimated.
+        t_s: Time of the comparison, s since the first inertial reading.
     """
     old, new = before.T_imu_cam, now.T_imu_cam
-    variance = np.diag(np.asarray(old.covariance)) + np.diag(np.asarray(new.covariance))
-    limit = SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+    covariance = np.asarray(old.covariance) + np.asarray(new.covariance)
+    limit = SIGMAS * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     move_m = np.subtract(new.p_m, old.p_m)
     R_old, R_new = (so3.matrix_from_quat(np.asarray(pose.q_wxyz)) for pose in (old, new))
     turn_rad = so3.log(R_old.T @ R_new)
     shift_s = now.timeshift_cam_imu_s - before.timeshift_cam_imu_s
-    texts = []
+    found: list[tuple[EventKind, float, float]] = []
     if np.any(np.abs(move_m) > np.maximum(limit[:3], IRRELEVANT_M)):
-        texts.append(f"moved by {1e3 * float(np.linalg.norm(move_m)):.1f} mm")
+        found.append((EventKind.CAMERA_MOVED, *_length(move_m, covariance[:3, :3])))
     if np.any(np.abs(turn_rad) > np.maximum(limit[3:], IRRELEVANT_RAD)):
-        texts.append(f"turned by {math.degrees(float(np.linalg.norm(turn_rad))):.2f} deg")
+        found.append((EventKind.CAMERA_TURNED, *_length(turn_rad, covariance[3:, 3:])))
     sigma_s = math.hypot(before.timeshift_sigma_s, now.timeshift_sigma_s)
     if abs(shift_s) > max(SIGMAS * sigma_s, IRRELEVANT_S):
-        texts.append(f"time shift by {1e3 * shift_s:+.2f} ms")
-    return ", ".join(texts)
+        found.append((EventKind.TIMESHIFT_CHANGED, shift_s, sigma_s))
+    why = Cause.STORED_DIFFERS
+    return [Event(kind, camera, value, sigma, t_s, why) for kind, value, sigma in found]
+
+
+def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Length of a vector, and its standard deviation."""
+    length = float(np.linalg.norm(vector))
+    along = vector / length
+    return length, math.sqrt(max(float(along @ covariance @ along), 0.0))
 
 
 def _merge(given: CameraPrior, stored: CameraPrior, fix: tuple[str, ...]) -> CameraPrior:

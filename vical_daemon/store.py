@@ -145,7 +145,7 @@ def read_stored(path: Path) -> StoredCalibration | None:
         _log.warning("%s cannot be read: %s", path, error.strerror)
         return None
     try:
-        stored = msgspec.json.decode(text, type=StoredCalibration)
+        stored = msgspec.convert(_without_news(msgspec.json.decode(text)), StoredCalibration)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         _log.warning("%s is no stored calibration and is not used: %s", path, error)
         return None
@@ -154,6 +154,14 @@ def read_stored(path: Path) -> StoredCalibration | None:
         _log.warning("%s is not used: %s", path, problem)
         return None
     return stored
+
+
+def _without_news(document: Any) -> Any:
+    """Leave out what was announced and advised then: files of version 0.1.0 hold it as text alone."""
+    estimate = document.get("estimate") if isinstance(document, dict) else None
+    if not isinstance(estimate, dict):
+        return document
+    return document | {"estimate": {k: v for k, v in estimate.items() if k not in ("events", "next_motion")}}
 
 
 def _problem(stored: StoredCalibration) -> str:

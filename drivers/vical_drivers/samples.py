@@ -83,7 +83,12 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class SourceStats:
-    """Counters of a source since it was opened; `extra` holds what only one kind has."""
+    """Counters of a source since it was opened; `extra` holds what only one kind has.
+
+    Attributes:
+        jitter_us: Spread of arrivals or stamps about an even grid, us; None: recorded data are played back,
+            whose times of arrival say nothing about a device.
+    """
 
     samples: int = 0
     lost: int = 0
@@ -92,7 +97,7 @@ class SourceStats:
     reconnects: int = 0
     rate_hz: float = 0.0
     clock_skew_ppm: float = 0.0
-    jitter_us: float = 0.0
+    jitter_us: float | None = 0.0
     extra: dict[str, float] = field(default_factory=dict)
 
 

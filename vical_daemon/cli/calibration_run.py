@@ -17,6 +17,7 @@ from vical_daemon.config import CalibrationConfig, CameraConfig, Config, ImuConf
 from vical_daemon.config_rules import NEEDS_TARGET
 from vical_daemon.estimate_role import EstimateRole
 from vical_daemon.estimation.camera_model import PLUMB_BOB
+from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.estimators import make_estimator
@@ -128,7 +129,7 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     bus = LocalBus()
     estimator = make_estimator(job.config, job.priors)
     keep = frames.extend if keep_frames else None
-    events: list[str] = []
+    events: list[Event] = []
 
     def listen(estimate: CalibrationEstimate) -> CalibrationEstimate:
         events.extend(estimate.events)

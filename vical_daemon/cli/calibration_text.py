@@ -25,7 +25,7 @@ def describe(result: dict[str, Any]) -> str:
                 lines.append(_row(f"{label} {axis}", row, None, "", 5))
         lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
     if result.get("events"):
-        lines += ["", *(f"  {event}" for event in result["events"])]
+        lines += ["", *(f"  {event['text']}" for event in result["events"])]
     if result.get("guidance"):
         lines += ["", f"  what would help: {result['guidance']}"]
     lines += [

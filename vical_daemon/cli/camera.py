@@ -191,9 +191,10 @@ def _stream(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"summary": summary}))
     else:
+        jitter = "" if stats.jitter_us is None else f", jitter {stats.jitter_us:.0f} us"
         print(
             f"{stats.samples} frames, {stats.lost} dropped, {stats.checksum_errors} corrupt, "
-            f"{stats.rate_hz:.3f} Hz, jitter {stats.jitter_us:.0f} us"
+            f"{stats.rate_hz:.3f} Hz{jitter}"
         )
     return 0
 

@@ -12,9 +12,9 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
+    from vical_daemon.estimation.guidance import WeakDirection
     from vical_daemon.estimation.observability import Motion, Observability, Setup
     from vical_daemon.estimation.observability_model import ModelRank
-    from vical_daemon.estimation.trust.missing_motion import Missing
 
 BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
 
@@ -64,12 +64,14 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print(document, missing)
     if missing:
-        print(f"vical: warning: {'; '.join(str(m) for m in missing)}", file=sys.stderr)
+        from vical_daemon.estimation.wording import direction_line
+
+        print(f"vical: warning: {'; '.join(direction_line(m) for m in missing)}", file=sys.stderr)
     return 0
 
 
-def _missing(result: Observability, motion: Motion, setup: Setup) -> list[Missing]:
-    """What is missing, in words, from the bound with next to no prior."""
+def _missing(result: Observability, motion: Motion, setup: Setup) -> list[WeakDirection]:
+    """What is missing, from the bound with next to no prior."""
     import numpy as np
 
     from vical_daemon.estimation.observability import covariance_of
@@ -86,9 +88,11 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[Missin
 
 
 def _document(
-    result: Observability, motion: Motion, missing: list[Missing], model: ModelRank, frames: int
+    result: Observability, motion: Motion, missing: list[WeakDirection], model: ModelRank, frames: int
 ) -> dict[str, Any]:
     import numpy as np
+
+    from vical_daemon.estimation.wording import axis_name, guidance_document, guidance_text
 
     def sigma(block: str) -> list[float | None]:
         return [float(v) if np.isfinite(v) else None for v in result.sigma[result.blocks[block]]]
@@ -106,11 +110,12 @@ def _document(
         "lost": [{"parts": dict(d.parts), "strength": d.strength} for d in result.lost],
         "missing": [
             {
-                "block": m.block,
-                "direction": m.direction,
-                "axis_cam": m.axis_cam.tolist(),
+                "block": str(m.block),
+                "direction": axis_name(m.axis_cam) if any(m.axis_cam) else "",
+                "axis_cam": list(m.axis_cam),
                 "sigma": m.sigma,
-                "advice": m.motion,
+                "advice": guidance_text(m.guidance),
+                "guidance": guidance_document(m.guidance),
             }
             for m in missing
         ],
@@ -121,7 +126,9 @@ def _document(
     }
 
 
-def _print(document: dict[str, Any], missing: list[Missing]) -> None:
+def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:
+    from vical_daemon.estimation.wording import direction_line
+
     print(
         f"{document['rank']} of {document['unknowns']} unknowns determined by {document['seconds']:.0f} s, "
         f"{document['frames']} frames (the model allows {document['model']['rank']} "
@@ -146,4 +153,4 @@ def _print(document: dict[str, Any], missing: list[Missing]) -> None:
         parts = ", ".join(f"{name} {share:.2f}" for name, share in lost["parts"].items())
         print(f"  lost direction: {parts}")
     for item in missing:
-        print(f"missing: {item}")
+        print(f"missing: {direction_line(item)}")

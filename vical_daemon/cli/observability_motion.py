@@ -67,7 +67,7 @@ def motion_of(args: argparse.Namespace, blocks: frozenset[str]) -> tuple[Motion,
 
 def _without_motion(poses: Orientations, result: TdIcpResult) -> TdIcpResult:
     """A rig that stands still has an observability too (a poor one); anything else is an error."""
-    if "no motion" not in result.reason or len(poses.t_cam_ns) < 12:
+    if not result.still or len(poses.t_cam_ns) < 12:
         raise CliError(f"the recording cannot be judged: {result.reason}")
     used = np.ones(len(poses.t_cam_ns), dtype=np.bool_)
     return TdIcpResult(

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.image_intake import (
@@ -35,7 +36,7 @@ from vical_daemon.estimation.start.starting import LATE_S, Starting
 from vical_daemon.estimation.state import ATTITUDE, POSITION, Layout, make_layout
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 from vical_daemon.estimation.trust import clock_drift, hypotheses, target_doubt
-from vical_daemon.estimation.trust.beyond_doubt import BeyondDoubt, size_told
+from vical_daemon.estimation.trust.beyond_doubt import BeyondDoubt
 from vical_daemon.estimation.trust.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.trust.held_back import HeldBack
 from vical_daemon.estimation.trust.judge import Judge
@@ -118,7 +119,7 @@ class Calibrator:
         for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
             self.judge.saw_imu(*reading)
         self.judge.imu_refused += self._imu.refused - refused
-        self.judge.events += self._imu.news()
+        self.judge.announce_all(self._imu.news())
 
     @property
     def _buffer(self) -> ImuBuffer | None:
@@ -135,7 +136,7 @@ class Calibrator:
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
         t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
-        self.judge.events += self._images.news()
+        self.judge.announce_all(self._images.news())
         if t_cam_s is None:
             self.judge.frames_ignored += 1
             return
@@ -198,7 +199,7 @@ class Calibrator:
                 self.judge.waiting(found.reason, found.motion_missing)
             return
         if self._size != 1.0:
-            self.judge.announce(size_told(self._size - 1.0), once=hypotheses.SIZE)
+            self.judge.announce(Event(EventKind.TARGET_SIZE, value=self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
         self.filter = found.filter
         self.filter.began_s, self.filter.stamp_sigma_s = found.filter.state.t_s, self._stamp_sigma_s
@@ -218,9 +219,7 @@ class Calibrator:
         self._states |= {"readout"}
         self.layout = self.judge.layout = self._lay_out()
         self._starting.go_on_with(self.layout, self.target)
-        self.judge.announce(
-            f"{camera}: a rolling shutter, by how the target is bent in motion: its readout is estimated, too"
-        )
+        self.judge.announce(Event(EventKind.ROLLING_SHUTTER, camera))
 
     def _resize(self, size: float) -> None:
         """The target is by far not as large as stated: go on with one that is; its size is asked for."""
@@ -323,7 +322,7 @@ class Calibrator:
         if ratio is not None:
             self.judge.held_back(ratio, f.consistency[frame.camera].scale)
         if not f.plausible():
-            self.watch.why = "the estimate left the range of what a rig can be"
+            self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
             self._restart(f)
             return [report]
         self._used_ns[frame.camera] = frame.t_cam_ns
@@ -332,11 +331,11 @@ class Calibrator:
         if self._unproven is not None and f.state.t_s > self._unproven[0]:
             self._announce_step(f, *self._unproven[1:])
             self._unproven = None
-        for block, told in self._beyond_doubt.look(f).items():
-            self.judge.announce(told, once=block)
+        for block, event in self._beyond_doubt.look(f).items():
+            self.judge.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
-        doubt = target_doubt.told(f.doubt)
-        if doubt:
+        doubt = target_doubt.announcement(f.doubt)
+        if doubt is not None:
             self.judge.announce(doubt, once=hypotheses.TARGET)
         return [report]
 
@@ -355,10 +354,10 @@ class Calibrator:
             return
         if action is Action.POSE:
             self._lose_motion()
-            self.judge.announce("pose lost and taken anew from the images")
+            self.judge.announce(Event(EventKind.POSE_LOST))
         elif action in (Action.SKEW, Action.WANDER):
             anew = action is Action.WANDER
-            self.judge.announce(clock_drift.let_drift(f, frame.camera, self.watch.why, anew=anew))
+            self.judge.announce(clock_drift.let_drift(f, frame.camera, anew=anew))
         elif action is Action.RESTART:
             self._restart(f)
 
@@ -377,8 +376,8 @@ class Calibrator:
         return True
 
     def _announce_step(self, f: CalibrationFilter, camera: str, before_s: float) -> None:
-        step_ms = 1e3 * (f.state.cameras[camera].timeshift_s - before_s)
-        self.judge.announce(f"{camera}: the time shift stepped by {step_ms:+.1f} ms; all else is kept")
+        step_s = f.state.cameras[camera].timeshift_s - before_s
+        self.judge.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
         """Take a time shift as found anew, all else as it is known; the step, s."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 
@@ -61,7 +62,7 @@ class ImageIntake:
 
     refused: int = 0
     _streams: dict[str, _Stream] = field(default_factory=dict)
-    _news: list[str] = field(default_factory=list)
+    _news: list[Event] = field(default_factory=list)
 
     def take(self, frame: PointsFrame, t_cam_s: float, newest_imu_s: float) -> float | None:
         """Look at one image.
@@ -110,15 +111,15 @@ class ImageIntake:
         stream.stepped_s.clear()
         stream.offset_s -= step_s
         stream.newest_s = np.nan
-        self._news.append(f"{camera}: its stamps stepped by about {step_s:+.1f} s against those of the IMU")
+        self._news.append(Event(EventKind.STAMPS_STEPPED, camera, step_s))
         return True
 
     def _measure(self, stream: _Stream, frame: PointsFrame, t_s: float) -> None:
         """Follow the usual interval; report a gap."""
         gap_s = t_s - stream.newest_s
         if gap_s > max(_REPORTED_S, _GAP_PERIODS * stream.usual_s):
-            what = "in which {} repeated one image" if stream.repeats else "without images from {}"
-            self._news.append(f"{gap_s:.1f} s {what.format(frame.camera)}")
+            kind = EventKind.IMAGE_REPEATED if stream.repeats else EventKind.IMAGE_GAP
+            self._news.append(Event(kind, frame.camera, gap_s))
         elif gap_s > 0.0:
             seen = stream.usual_s
             stream.usual_s = gap_s if np.isinf(seen) else seen + _FOLLOW * (gap_s - seen)
@@ -128,8 +129,8 @@ class ImageIntake:
         """Time shift by the stamps as they come now, minus the time shift by the axis without steps, s."""
         return self._streams[camera].offset_s if camera in self._streams else 0.0
 
-    def news(self) -> list[str]:
-        """Gaps and steps since the last call, in words."""
+    def news(self) -> list[Event]:
+        """Gaps and steps since the last call."""
         news, self._news = self._news, []
         return news
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.imu_buffer import GAP_S, ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.stamp_steps import StampSteps
@@ -53,7 +54,7 @@ class ImuIntake:
         self._held: tuple[float, Reading] | None = None
         self._last = np.full(6, np.nan)
         self._repeats = 0  # of the newest reading
-        self._news: list[str] = []
+        self._news: list[Event] = []
 
     @property
     def shift_s(self) -> float:
@@ -123,11 +124,11 @@ class ImuIntake:
         if held_s <= self._newest_s:
             back_s = self._newest_s + (t_s - held_s) - held_s
             self._set_back_s += back_s
-            self._news.append(f"the IMU's stamps went back by {back_s:.1f} s: its clock was set")
+            self._news.append(Event(EventKind.IMU_CLOCK_SET_BACK, value=back_s))
             held_s, t_s = held_s + back_s, t_s + back_s
         else:
-            what = "in which the IMU repeated one reading" if self._repeats else "without inertial data"
-            self._news.append(f"{held_s - self._newest_s:.1f} s {what}")
+            kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
+            self._news.append(Event(kind, value=held_s - self._newest_s))
         self._add(buffer, held_s, held)
         self.gap_end_s = buffer.newest_s
         self._add(buffer, t_s, reading)
@@ -137,7 +138,7 @@ class ImuIntake:
         self._newest_s = t_s
         buffer.append(self._steps.even(t_s), reading.gyro_rps, reading.specific_force_mps2)
 
-    def news(self) -> list[str]:
-        """What happened to the stream since the last call, in words."""
+    def news(self) -> list[Event]:
+        """What happened to the stream since the last call."""
         news, self._news = self._news + self._steps.news(), []
         return news

@@ -6,6 +6,10 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
+from vical_daemon.estimation.events import Event
+from vical_daemon.estimation.guidance import Guidance, WeakDirection
+from vical_daemon.estimation.wording import direction_document, event_document, guidance_document
+
 
 class Status(StrEnum):
     """Where a calibration stands."""
@@ -48,10 +52,11 @@ class CameraEstimate:
         distortion_sigma: Standard deviations.
         reprojection_rms_px: RMS of the residuals of accepted corners, px.
         corner_sigma_px: Measured corner noise per axis, px.
-        unobservable: Names of withheld directions, each with the motion that would reveal it.
+        unobservable: Names of withheld directions, each with the motion that would reveal it (text).
         readout_s: Rolling-shutter readout first to last row, s (0: global shutter).
         readout_sigma_s: Its standard deviation, s.
         resolution: width, height of the images, px; []: not known (it does not travel in the message).
+        withheld: The same as `unobservable`, as data; [] in logs of older versions.
     """
 
     T_imu_cam: PoseEstimate
@@ -68,6 +73,7 @@ class CameraEstimate:
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     resolution: list[int] = field(default_factory=list)
+    withheld: list[WeakDirection] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +112,7 @@ class CalibrationEstimate:
         status: Where the calibration stands.
         reason: Why, in words for a person; empty when converged.
         progress: 0 to 1.
-        guidance: What to do next, in words: a motion, or where to show the target; empty: nothing missing.
+        guidance: What to do next, as text; empty: nothing missing.
         duration_s: Seconds of data used.
         frames: Camera frames used.
         imu_samples: Inertial samples used.
@@ -115,7 +121,8 @@ class CalibrationEstimate:
         gravity_world_mps2: Acceleration of free fall in the world (target) frame, m/s^2; [] before.
         nis_per_dof: Mean normalised innovation squared per degree of freedom; 1 when consistent.
         rejected_fraction: Share of measurements that the gates refused.
-        events: Announcements since the last estimate, e.g. "bumped: ...".
+        events: Announcements since the last estimate.
+        next_motion: The same as `guidance`, as data; says nothing in logs of older versions.
     """
 
     t_ns: int
@@ -131,8 +138,14 @@ class CalibrationEstimate:
     gravity_world_mps2: list[float]
     nis_per_dof: float
     rejected_fraction: float
-    events: list[str] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    next_motion: Guidance = field(default_factory=Guidance)
 
     def to_json(self) -> dict[str, Any]:
         """Return the dictionary that COMMANDS promises (without trace, cpu_s and truth)."""
-        return asdict(self)
+        document = asdict(self)
+        document["events"] = [event_document(event) for event in self.events]
+        document["next_motion"] = guidance_document(self.next_motion)
+        for name, camera in self.cameras.items():
+            document["cameras"][name]["withheld"] = [direction_document(weak) for weak in camera.withheld]
+        return document

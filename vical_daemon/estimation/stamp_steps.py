@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vical_daemon.estimation.events import Event, EventKind
+
 _LEARN = 20  # intervals by which the usual one is known
 _LEAST_S = 1e-4  # smaller steps are like jitter
 _EVEN_S = 5e-5  # stamps that deviate by more from an even grid were not made by a device's clock
@@ -36,7 +38,7 @@ class StampSteps:
     _largest_s: float = 0.0
     _before_s: float = 0.0  # the total before a step that is not certain yet
     _since: int = 0
-    _news: list[str] = field(default_factory=list)
+    _news: list[Event] = field(default_factory=list)
 
     def even(self, t_s: float) -> float:
         """Put the stamp of the next reading, s, on the even axis."""
@@ -77,11 +79,9 @@ class StampSteps:
         if abs(step_s) < _LEAST_S:
             self.total_s = self._before_s
             return
-        self._news.append(
-            f"stamps of the imu moved by {1e3 * step_s:+.1f} ms (its clock was mapped anew): followed"
-        )
+        self._news.append(Event(EventKind.IMU_CLOCK_REMAPPED, value=step_s))
 
-    def news(self) -> list[str]:
-        """Steps that have become certain since the last call, in words."""
+    def news(self) -> list[Event]:
+        """Steps that have become certain since the last call."""
         news, self._news = self._news, []
         return news

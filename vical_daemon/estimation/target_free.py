@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.free.bundle import Bundle, Fit
 from vical_daemon.estimation.free.carry import DRIFT, FULL, LENS, SHIFT, Carry
@@ -96,7 +97,7 @@ class TargetFreeCalibrator:
         for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
             self.judge.saw_imu(reading.t_imu_ns, reading.gyro_rps)
         self.judge.imu_refused += self._imu.refused - refused
-        self.judge.events += self._imu.news()
+        self.judge.announce_all(self._imu.news())
 
     @property
     def _buffer(self) -> ImuBuffer | None:
@@ -109,7 +110,7 @@ class TargetFreeCalibrator:
             return
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
         t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
-        self.judge.events += self._images.news()
+        self.judge.announce_all(self._images.news())
         if t_cam_s is None or t_cam_s <= self._newest_s:
             self.judge.frames_ignored += 1
             return
@@ -156,7 +157,7 @@ class TargetFreeCalibrator:
         end_s = self._buffer.newest_s - window.shift_s - _LATE_S
         found = ready(self._pending, window.frames[-1][0], end_s)
         if found.hole_s:
-            self._lost(f"no usable images for {found.hole_s:.1f} s", keep=True)
+            self._lost(Cause.NO_IMAGES, float(found.hole_s), keep=True)
         return found
 
     def _trim(self) -> None:
@@ -211,21 +212,21 @@ class TargetFreeCalibrator:
         done = {id(f) for _, f in frames}
         self._pending = [x for x in self._pending if id(x[1]) not in done]
         if added < len(frames):
-            self._lost("inertial data have a gap", keep=True)
+            self._lost(Cause.INERTIAL_GAP, keep=True)
             return
         if len(window.frames) < 8:
             return
         bundle = Bundle(window, self.carry, *self._noise)
         fit = bundle.solve(self._buffer, 2 * _STEPS_GROW if _full(window) else _STEPS_GROW)
         if fit is None:
-            self._lost("too few features can be followed")
+            self._lost(Cause.TOO_FEW_FEATURES)
             return
         if not fit.settled:  # gross outliers among the new features; the next images may tell
             if _full(window):
-                self._lost("the features of the last seconds contradict each other")
+                self._lost(Cause.FEATURES_CONTRADICT)
             return
         if not self.judge.fits(fit):
-            self._lost(self.judge.misfit)
+            self._lost(*self.judge.misfit)
             return
         if self.starter.held is not None and has_turned(window.R, self.starter.held):
             self._start_whole()
@@ -242,7 +243,7 @@ class TargetFreeCalibrator:
         assert carry is not None
         if fit.parallax_deg < _MIN_PARALLAX_DEG:
             self.latest = carry if self._closed else None
-            self._lost("the camera stands still, or features are lost before they show depth")
+            self._lost(Cause.NO_PARALLAX)
             return
         if self._closed and not self.judge.agrees(fit, carry):
             self._disagreed(carry)
@@ -261,9 +262,8 @@ class TargetFreeCalibrator:
         if self._doubted is None:
             self._doubted = carry
             self.latest = carry
-            self._lost("the last seconds do not fit the calibration; looking again")
+            self._lost(Cause.WINDOW_CONTRADICTED)
             return
-        why = self.judge.disagreement
         self._doubted = None
         lens = carry.camera
         self.prior = replace(
@@ -276,7 +276,7 @@ class TargetFreeCalibrator:
         self.starter = Starter(self.options, self.prior)
         self.latest = None
         self._closed = 0
-        self.judge.changed(why)
+        self.judge.changed()
         self.window = self.carry = None
 
     def _start_whole(self) -> None:
@@ -284,11 +284,9 @@ class TargetFreeCalibrator:
         self.window = self.carry = self.latest = self._doubted = None
         self._closed = 0
         self.starter.again()
-        self.judge.lost(
-            "the rig turns about a second axis now: starting anew, with all of the lever arm", None
-        )
+        self.judge.lost(Cause.SECOND_AXIS, None, None)
 
-    def _lost(self, why: str, *, keep: bool = False) -> None:
+    def _lost(self, why: Cause, value: float | None = None, *, keep: bool = False) -> None:
         """Go back to waiting; the calibration stays as before this window, or as adjusted last (`keep`)."""
         window = self.window
         self.window = None
@@ -300,7 +298,7 @@ class TargetFreeCalibrator:
                 self.latest = self.carry if self._closed else None
         self.carry = None
         self.starter.again()
-        self.judge.lost(why, self.latest)
+        self.judge.lost(why, value, self.latest)
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

@@ -8,10 +8,13 @@ is blind, dark or unplugged; `converged` is the rig when all of them are. [docs/
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, ImuEstimate, Status, TracePoint
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
@@ -25,6 +28,9 @@ _ORDER = (
     Status.CONVERGING,
     Status.CONVERGED,
 )
+
+# About the imu, but estimated by each camera: the figures differ.
+_EACH_BY_ITSELF = {EventKind.IMU_INTRINSICS, EventKind.ACCEL_LAG}
 
 
 class TargetFreeRig:
@@ -107,7 +113,8 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
         gravity_world_mps2=next((e.gravity_world_mps2 for e in all_ if e.gravity_world_mps2), []),
         nis_per_dof=float(np.average([e.nis_per_dof for e in all_], weights=frames)),
         rejected_fraction=float(np.average([e.rejected_fraction for e in all_], weights=frames)),
-        events=[_named(name, text) for name, e in estimates.items() for text in e.events],
+        events=_events(estimates),
+        next_motion=next((e.next_motion for e in behind.values() if e.next_motion), Guidance()),
     )
 
 
@@ -115,12 +122,18 @@ def _best_known(imus: list[ImuEstimate]) -> ImuEstimate | None:
     return min(imus, key=lambda imu: sum(imu.gyro_bias_sigma_rps), default=None)
 
 
-def _named(camera: str, text: str) -> str:
-    """An announcement with the camera's name, behind the word that says what kind it is ("bumped: ...")."""
-    if text.startswith(f"{camera}: "):
-        return text
-    kind, colon, rest = text.partition(": ")
-    return f"{kind}: {camera}: {rest}" if colon else f"{camera}: {text}"
+def _events(estimates: dict[str, CalibrationEstimate]) -> list[Event]:
+    """All announcements; what concerns the imu is announced by each camera's part, and once is enough."""
+    found: list[Event] = []
+    for name, estimate in estimates.items():
+        for event in estimate.events:
+            alike = (replace(event, t_s=None) == replace(other, t_s=None) for other in found)
+            if not event.camera and any(alike):
+                continue
+            found.append(event)
+            if not event.camera and event.kind in _EACH_BY_ITSELF and len(estimates) > 1:
+                found[-1] = replace(event, camera=name)
+    return found
 
 
 def _in_order(reports: Iterable[list[FrameReport]]) -> list[FrameReport]:

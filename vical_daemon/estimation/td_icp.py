@@ -95,8 +95,8 @@ class _Data:
     index: npt.NDArray[np.intp]
     n_given: int
 
-    def refused(self, reason: str) -> TdIcpResult:
-        return TdIcpResult(REFUSED, reason, rejected=self.n_given)
+    def refused(self, reason: str, *, still: bool = False) -> TdIcpResult:
+        return TdIcpResult(REFUSED, reason, rejected=self.n_given, still=still)
 
     def mistake(self, shifts: tuple[float, float], start: Start | None) -> str:
         """The usual mistake that explains why the rotations do not fit; empty if none, or too few data."""
@@ -108,9 +108,9 @@ class _Data:
 def _register(data: _Data, shifts: tuple[float, float], options: TdIcpOptions) -> TdIcpResult:
     """Start, closest points, polish; or the reason why not."""
     t_cam, q = data.t_cam, data.q
-    reason = refuse_motion(data.t_imu, data.gyro, t_cam, q, options)
-    if reason:
-        return data.refused(reason)
+    refusal = refuse_motion(data.t_imu, data.gyro, t_cam, q, options)
+    if refusal.reason:
+        return data.refused(refusal.reason, still=refusal.still)
     start, bias = debiased_start(data.t_imu, data.gyro, t_cam, q, shifts)
     reason = refuse_start(start, t_cam, q, options)
     if start is None or reason:

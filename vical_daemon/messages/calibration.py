@@ -8,12 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
     ImuEstimate,
     PoseEstimate,
     Status,
+)
+from vical_daemon.estimation.wording import event_text
+from vical_daemon.messages.announcements import (
+    read_directions,
+    read_events,
+    read_guidance,
+    untyped_events,
+    write_directions,
+    write_events,
+    write_guidance,
 )
 from vical_daemon.messages.cdr import CdrReader, CdrWriter, MessageError
 from vical_daemon.messages.poses import read_pose, write_pose
@@ -51,7 +62,7 @@ def encode_calibration(estimate: CalibrationEstimate, camera: str) -> bytes:
     writer.string(str(estimate.status))
     writer.string(estimate.reason)
     writer.string(estimate.guidance)
-    writer.strings(estimate.events)
+    writer.strings([event_text(event) for event in estimate.events])
     writer.scalar("d", estimate.progress)
     writer.scalar("d", estimate.duration_s)
     writer.scalar("Q", estimate.frames)
@@ -60,12 +71,16 @@ def encode_calibration(estimate: CalibrationEstimate, camera: str) -> bytes:
     writer.scalar("d", estimate.rejected_fraction)
     writer.sequence(estimate.gravity_world_mps2)
     _write_imu(writer, estimate.imu)
-    _write_camera(writer, estimate.cameras.get(camera))
+    known = estimate.cameras.get(camera)
+    _write_camera(writer, known)
+    write_events(writer, estimate.events)
+    write_guidance(writer, estimate.next_motion)
+    write_directions(writer, [] if known is None else known.withheld)
     return writer.finish()
 
 
 def decode_calibration(data: bytes) -> CalibrationMessage:
-    """Read a vical_msgs/CalibrationEstimate.
+    """Read a vical_msgs/CalibrationEstimate, also one of version 0.1.0, which has events as text only.
 
     Raises:
         MessageError: These bytes are no such message.
@@ -75,12 +90,17 @@ def decode_calibration(data: bytes) -> CalibrationMessage:
     status = reader.string()
     if status not in set(Status):
         raise MessageError(f"calibration status {status!r} does not exist")
-    reason, guidance, events = reader.string(), reader.string(), reader.strings()
+    reason, guidance, texts = reader.string(), reader.string(), reader.strings()
     progress, duration_s = reader.scalar("d"), reader.scalar("d")
     frames, imu_samples = reader.scalar("Q"), reader.scalar("Q")
     nis_per_dof, rejected_fraction = reader.scalar("d"), reader.scalar("d")
     gravity = reader.sequence().tolist()
     imu, known = _read_imu(reader), _read_camera(reader)
+    events, next_motion = untyped_events(texts), Guidance()
+    if reader.remaining:
+        events, next_motion = read_events(reader, texts), read_guidance(reader)
+        withheld = read_directions(reader)
+        known = None if known is None else replace(known, withheld=withheld)
     estimate = CalibrationEstimate(
         t_ns=t_ns,
         status=Status(status),
@@ -96,6 +116,7 @@ def decode_calibration(data: bytes) -> CalibrationMessage:
         nis_per_dof=nis_per_dof,
         rejected_fraction=rejected_fraction,
         events=events,
+        next_motion=next_motion,
     )
     return CalibrationMessage(camera, estimate)
 

@@ -50,13 +50,41 @@ float64 reprojection_rms_px
 float64 corner_sigma_px
 string[] unobservable            # withheld directions, each with the motion that would reveal it
 """,
+    "vical_msgs/msg/Event": """\
+# One announcement as data; kinds, units and causes: docs/reference/events.md. Not a number: has none
+string kind
+string camera                    # empty: the rig, its imu or its target
+float64 t_s                      # since the first inertial reading
+float64 value                    # SI
+float64 sigma
+string cause
+float64 cause_value
+""",
+    "vical_msgs/msg/Guidance": """\
+# What to do next, as data; an empty verb: nothing is missing
+string verb                      # turn turn_faster turn_to_and_fro turn_and_move show
+string axes                      # of the camera, e.g. xy; x right, y down, z along the optical axis
+string lack                      # still slow one_axis steady_rate fast_changes edges
+float64[] turned_about           # axis about which it turned so far, in the camera frame; empty: several
+float64 rate_rps                 # how fast it turns
+string camera                    # whose image, for show
+string[] edges                   # left right top bottom, for show
+""",
+    "vical_msgs/msg/WeakDirection": """\
+# A direction that the motion did not reveal
+string block                     # lever_arm rotation timeshift
+float64[3] axis_cam              # in the camera frame, unit length; zeros for the time shift
+float64 sigma                    # m, rad or s
+float64 limit                    # above which sigma it counts as unknown
+vical_msgs/Guidance guidance     # the motion that would reveal it
+""",
     "vical_msgs/msg/CalibrationEstimate": """\
 # Everything the estimator says about one camera at one moment
 std_msgs/Header header           # stamp: newest data used; frame_id: camera
 string status                    # waiting initialising converging converged degenerate inconsistent
 string reason
 string guidance                  # what motion to make next
-string[] events
+string[] events                  # as text; as data: event_data
 float64 progress                 # 0 to 1
 float64 duration_s
 uint64 frames
@@ -66,6 +94,10 @@ float64 rejected_fraction
 float64[] gravity_world_mps2     # acceleration of free fall in the world frame
 vical_msgs/ImuCalibration imu
 vical_msgs/CameraCalibration camera
+# from here on absent in messages of version 0.1.0
+vical_msgs/Event[] event_data    # events, in the same order
+vical_msgs/Guidance next_motion  # guidance
+vical_msgs/WeakDirection[] withheld  # camera.unobservable, in the same order
 """,
 }
 

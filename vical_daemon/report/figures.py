@@ -61,7 +61,7 @@ def _style(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
 
 
 def _band(axes: Axes, t: FloatArray, value: FloatArray, sigma: FloatArray, colour: str, label: str) -> None:
-    axes.fill_between(t, value - 3 * sigma, value + 3 * sigma, color=colour, alpha=0.18, linewidth=0)
+    axes.fill_between(t, value - sigma, value + sigma, color=colour, alpha=0.18, linewidth=0)
     axes.plot(t, value, color=colour, linewidth=1.4, label=label)
 
 
@@ -71,7 +71,7 @@ def _limit(axes: Axes, t: FloatArray, values: FloatArray, sigmas: FloatArray, sh
     The first seconds are known to metres; shown whole, they would flatten everything after them.
     """
     late = t >= t[0] + share * (t[-1] - t[0])
-    low, high = values[late] - 3 * sigmas[late], values[late] + 3 * sigmas[late]
+    low, high = values[late] - sigmas[late], values[late] + sigmas[late]
     finite = np.isfinite(low) & np.isfinite(high)
     if finite.any():
         margin = 0.08 * (high[finite].max() - low[finite].min()) + 1e-12
@@ -79,7 +79,7 @@ def _limit(axes: Axes, t: FloatArray, values: FloatArray, sigmas: FloatArray, sh
 
 
 def convergence(trace: Sequence[dict[str, Any]]) -> Figure:
-    """Draw lever arm, rotation and time shift over the recording with bands of three sigma.
+    """Draw lever arm, rotation and time shift over the recording with bands of one sigma.
 
     Left: all of it. Right: its second half. Lever arm and rotation are shown relative to their final
     values, so that the three axes share one scale.

@@ -115,7 +115,12 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
         lines.append(
             f"{100 * rejected:.1f} % of the measurements were refused: blur, wrong ids or a wrong board?"
         )
-    lines += [str(event) for event in result.get("events") or []]
+    lines += [_text(event) for event in result.get("events") or []]
     if result.get("guidance"):
         lines.append(f"What would help: {result['guidance']}")
     return lines
+
+
+def _text(event: dict[str, Any] | str) -> str:
+    """Text of an event; results of version 0.1.0 have nothing else."""
+    return event if isinstance(event, str) else str(event["text"])

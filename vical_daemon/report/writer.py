@@ -160,7 +160,7 @@ def _camera_sections(
         drawn = [
             gallery.add(
                 f"{name}-convergence", figures.convergence(trace), "convergence",
-                "Bands are three sigma, as the filter stated them at that moment.",
+                "Bands are one sigma, as the filter stated them at that moment.",
             ),
             gallery.add(f"{name}-sigmas", figures.sigmas(trace), "standard deviations over time"),
         ]  # fmt: skip

@@ -12,8 +12,10 @@ from vical_daemon.bus import Bus, Subscription
 from vical_daemon.checkpoint import Checkpoint
 from vical_daemon.config import Config
 from vical_daemon.estimate_role import PUBLISH_S, EstimateRole
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.wording import event_text
 from vical_daemon.estimators import Estimator, input_keys, make_estimator, make_watch
 from vical_daemon.health import StatusSender
 from vical_daemon.inbox import Inbox
@@ -78,9 +80,9 @@ def _resumed(checkpoint: Checkpoint, memory: Memory) -> Estimator | None:
     if found is None:
         return None
     estimator, age_s = found
-    text = f"resumed from the state of {age_s:.1f} s ago: the process was restarted"
-    _log.info("%s", text)
-    memory.announce(text)
+    event = Event(EventKind.RESUMED, value=age_s)
+    _log.info("%s", event_text(event))
+    memory.announce(event)
     return estimator
 
 

@@ -27,6 +27,7 @@ WIDTH_LIMIT = 800  # wider images are thinned: the page is for looking, not for 
 QUALITY = 70
 PATIENCE_NS = 1_200_000_000  # an image without points is shown when nothing better came for so long
 RESTART_NS = 5_000_000_000
+SIDE_LIMIT = 10_000  # px: no stated size may make us take memory without end
 KEPT_BYTES = 24 * 2**20  # images that wait for their points: about a second of them
 _STAMP = struct.Struct("<4xiI")  # behind the four bytes that begin every CDR message
 _RING = np.array([(x, y) for x in range(-5, 6) for y in range(-5, 6) if 10 <= x * x + y * y <= 26])
@@ -40,13 +41,13 @@ class Sight:
 
     Attributes:
         stamp_ns: Stamp of all three, UNIX ns.
-        image: Image or compressed image message.
+        image: Image or compressed image message; None: only points arrive (a log without images).
         points: Points message of the same stamp; None: none came.
         predicted: Predicted points of the same stamp; None: none came.
     """
 
     stamp_ns: int
-    image: Sample
+    image: Sample | None
     points: Sample | None = None
     predicted: Sample | None = None
 
@@ -65,6 +66,7 @@ class CameraView:
         self._points: deque[Sample] = deque(maxlen=60)
         self._predicted: deque[Sample] = deque(maxlen=20)
         self._shown_ns = 0
+        self._since_ns = 0  # stamp of the newest image, or of the first points while there is none
 
     def take(self, sample: Sample) -> None:
         """Keep an image or a message with points."""
@@ -78,22 +80,33 @@ class CameraView:
                 if self._images and _stamp_ns(sample) < _stamp_ns(self._images[-1]) - RESTART_NS:
                     self._begin_anew()
                 self._images.append(sample)
+                self._since_ns = _stamp_ns(sample)
                 while len(self._images) > 2 and sum(len(s.payload) for s in self._images) > KEPT_BYTES:
                     self._images.popleft()
             else:
-                self._points.append(sample)
+                self._take_points(sample)
+
+    def _take_points(self, sample: Sample) -> None:
+        stamp_ns = _stamp_ns(sample)
+        last_ns = _stamp_ns(self._points[-1]) if self._points else 0
+        if stamp_ns < last_ns - RESTART_NS:
+            self._begin_anew()
+            last_ns = 0
+        if not self._since_ns or stamp_ns > last_ns + PATIENCE_NS:
+            self._since_ns = max(self._since_ns, stamp_ns)
+        self._points.append(sample)
 
     def _begin_anew(self) -> None:
         """The clock went back: a replay that began again."""
         for queue in (self._images, self._points, self._predicted):
             queue.clear()
-        self._shown_ns = 0
+        self._shown_ns = self._since_ns = 0
 
     def next(self) -> Sight | None:
         """Return what is to be shown next; None while there is nothing newer than the last one.
 
         The newest image that has both its points and a prediction; while nothing is predicted, one that
-        has its points; while nothing is detected, an image alone.
+        has its points; while nothing is detected, an image alone; while no images come, points alone.
         """
         with self._lock:
             images, predicted = list(self._images), {_stamp_ns(s): s for s in self._predicted}
@@ -109,14 +122,27 @@ class CameraView:
             chosen = found[0]
         elif fresh and newest_ns - self._shown_ns > PATIENCE_NS:
             chosen = (found or fresh)[0]
+        elif max(points, default=0) - self._since_ns > PATIENCE_NS:
+            return self._points_alone(points, predicted)
         else:
             return None
         self._shown_ns = chosen
         return Sight(chosen, stamps[chosen], points.get(chosen), predicted.get(chosen))
 
+    def _points_alone(self, points: dict[int, Sample], predicted: dict[int, Sample]) -> Sight | None:
+        """The newest points, if possible with a prediction; None where they have been shown."""
+        fresh = [stamp_ns for stamp_ns in sorted(points, reverse=True) if stamp_ns > self._shown_ns]
+        if not fresh:
+            return None
+        chosen = next((stamp_ns for stamp_ns in fresh if stamp_ns in predicted), fresh[0])
+        self._shown_ns = chosen
+        return Sight(chosen, None, points[chosen], predicted.get(chosen))
+
 
 def picture_event(sight: Sight) -> bytes | None:
     """Return a server-sent event with the picture and its points for the browser to draw; None: unreadable.
+
+    Where only points arrive, there is no picture in it.
 
     The points travel as numbers, in pixels of the full image, so that they stay sharp on a small picture.
     """
@@ -124,10 +150,11 @@ def picture_event(sight: Sight) -> bytes | None:
         pixels, points, predicted = _contents(sight)
     except MessageError:
         return None
-    from vical_daemon.vision.image_codec import encode_image
+    jpeg = b""
+    if sight.image is not None:
+        from vical_daemon.vision.image_codec import encode_image
 
-    small, _ = thinned(pixels)
-    jpeg = encode_image(small, "jpeg", quality=QUALITY)
+        jpeg = encode_image(thinned(pixels)[0], "jpeg", quality=QUALITY)
     document = {
         "stamp_s": round(sight.stamp_ns * 1e-9, 3),
         "size": [pixels.shape[1], pixels.shape[0]],
@@ -155,13 +182,28 @@ def drawn_jpeg(sight: Sight) -> bytes | None:
 
 
 def _contents(sight: Sight) -> tuple[npt.NDArray[Any], PointsMessage | None, PointsMessage | None]:
-    """Decode a sight.
+    """Decode a sight; the image is black where only points arrive.
 
     Raises:
         MessageError: One of its messages is not what it says.
     """
     read = [None if s is None else decode_points(s.payload) for s in (sight.points, sight.predicted)]
-    return _pixels(sight.image), read[0], read[1]
+    pixels = np.zeros(_size(read[0]), np.uint8) if sight.image is None else _pixels(sight.image)
+    return pixels, read[0], read[1]
+
+
+def _size(points: PointsMessage | None) -> tuple[int, int]:
+    """Height and width of the image in which points were found; of a smallest one where it is not stated."""
+    if points is None:
+        return 480, 640
+    width, height = points.image_size
+    if width and height:
+        return min(height, SIDE_LIMIT), min(width, SIDE_LIMIT)
+    far = (
+        np.nanmax(points.uv_px, axis=0, initial=1.0) + 2.0 if len(points.uv_px) else np.array([640.0, 480.0])
+    )
+    width, height = np.clip(np.nan_to_num(far), 2, SIDE_LIMIT).astype(int).tolist()
+    return height, width
 
 
 def _rows(points: PointsMessage | None) -> list[list[float]]:

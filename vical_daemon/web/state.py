@@ -12,6 +12,16 @@ from typing import Any
 
 from vical_daemon import topics
 from vical_daemon.bus import Sample
+from vical_daemon.estimation.events import Event
+from vical_daemon.estimation.guidance import Guidance, Verb
+from vical_daemon.estimation.wording import (
+    direction_warning,
+    event_document,
+    fault_headline,
+    headline,
+    motion_caption,
+    silence,
+)
 from vical_daemon.liveness import FRESH_S
 from vical_daemon.messages import (
     CalibrationMessage,
@@ -21,7 +31,6 @@ from vical_daemon.messages import (
     decode_calibration,
     decode_diagnostics,
 )
-from vical_daemon.web import words
 
 HISTORY = 1500
 """Rows kept of each camera: 1.6 MB, which five minutes of estimates at 5 Hz fill."""
@@ -29,6 +38,7 @@ SOURCES = 32
 """Cameras, and roles, that are shown at most: whoever invents names must not fill the memory."""
 STALE = "stale"
 """Stands for the status of a camera whose estimates have stopped."""
+EVENTS = 8  # announcements that the page shows
 # One row of the history; lists of three are flattened in this order.
 COLUMNS = (
     "t_s", "px_mm", "py_mm", "pz_mm", "spx_mm", "spy_mm", "spz_mm", "qw", "qx", "qy", "qz",
@@ -49,6 +59,7 @@ class CameraState:
         rows: History, oldest first, thinned towards the past.
         fresh: Rows since the last tick.
         restarted: The estimator began anew since the last tick.
+        events: The last announcements, oldest first.
     """
 
     latest: CalibrationMessage
@@ -56,6 +67,7 @@ class CameraState:
     rows: list[Row] = field(default_factory=list)
     fresh: list[Row] = field(default_factory=list)
     restarted: bool = False
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=EVENTS))
 
 
 class WebState:
@@ -139,7 +151,9 @@ class WebState:
         camera = self._cameras.setdefault(message.camera, CameraState(message, arrived_s))
         if message.estimate.duration_s < camera.latest.estimate.duration_s:
             camera.rows, camera.fresh, camera.restarted = [], [], True
+            camera.events.clear()
         camera.latest, camera.arrived_s = message, arrived_s
+        camera.events.extend(message.estimate.events)
         row = history_row(message)
         if row is None or (camera.rows and camera.rows[-1][0] == row[0]):
             return
@@ -150,10 +164,12 @@ class WebState:
             camera.rows = camera.rows[:half:2] + camera.rows[half:]
 
     def _document(self, *, full: bool) -> dict[str, Any]:
+        fault = self._fault()
         cameras, now_s = {}, self._clock()
         for name, camera in sorted(self._cameras.items()):
             whole = full or camera.restarted
-            entry = summary(camera.latest, now_s - camera.arrived_s)
+            entry = summary(camera.latest, now_s - camera.arrived_s, fault is not None)
+            entry["events"] = [event_document(event) for event in camera.events]
             entry["rows" if whole else "fresh"] = camera.rows if whole else camera.fresh
             cameras[name] = entry
         devices = [
@@ -169,10 +185,24 @@ class WebState:
             for status in statuses
             if status.name != "clock"
         ]
-        document: dict[str, Any] = {"rig": self.rig, "cameras": cameras, "devices": devices}
+        document: dict[str, Any] = {
+            "rig": self.rig,
+            "cameras": cameras,
+            "devices": devices,
+            "fault": fault,
+        }
         if full:
             document["columns"] = COLUMNS
         return document
+
+    def _fault(self) -> dict[str, str] | None:
+        """The first component that does not work, or is silent: until it works, no advice helps."""
+        for _, statuses in sorted(self.statuses.items()):
+            for status in statuses:
+                if status.level >= Level.ERROR:
+                    headline = fault_headline(status.name)
+                    return {"name": status.name, "headline": headline, "message": status.message}
+        return None
 
 
 def is_stale(age_s: float) -> bool:
@@ -197,32 +227,46 @@ def _admit(name: str, known: dict[str, Any]) -> None:
         raise MessageError(f"{name}: more than {SOURCES} sources")
 
 
-def summary(message: CalibrationMessage, age_s: float = 0.0) -> dict[str, Any]:
+def summary(message: CalibrationMessage, age_s: float = 0.0, fault: bool = False) -> dict[str, Any]:
     """Return what the page says about one camera at this moment.
 
     Args:
         message: The last message of the camera.
         age_s: How long ago it came, s.
+        fault: A component does not work: then nothing is asked of the operator.
     """
     estimate, camera = message.estimate, message.camera_estimate
-    withheld = list(camera.unobservable) if camera else []
+    # what to do stands in the guidance, once: a second advice beside it could name other axes
+    withheld = [direction_warning(weak) for weak in camera.withheld] if camera else []
+    if camera and not withheld:
+        withheld = list(camera.unobservable)  # of version 0.1.0
     stale = is_stale(age_s)
+    status, last_status = STALE if stale else str(estimate.status), str(estimate.status)
+    quiet = fault or stale
+    asked = Guidance() if quiet else estimate.next_motion
+    moves = asked.verb is Verb.TURN_AND_MOVE
+    turns = asked.verb not in (Verb.NONE, Verb.SHOW)
     return {
-        "status": STALE if stale else str(estimate.status),
-        "last_status": str(estimate.status),
+        "status": status,
+        "last_status": last_status,
         "stale": stale,
         "age_s": round(age_s, 1),
-        "sentence": words.silence(estimate, age_s) if stale else words.sentence(estimate),
-        "guidance": estimate.guidance,
+        "headline": silence(age_s) if stale else headline(status, estimate.next_motion),
+        "reason": f"The values are old; the last status was {last_status}." if stale else estimate.reason,
+        "guidance": "" if quiet else estimate.guidance,
         "progress": finite(estimate.progress),
         "duration_s": finite(estimate.duration_s),
         "frames": estimate.frames,
         "imu_samples": estimate.imu_samples,
         "nis": finite(estimate.nis_per_dof),
         "rejected": finite(estimate.rejected_fraction),
-        "events": list(estimate.events),
         "withheld": withheld,
-        "motion": words.motion([estimate.guidance, *withheld]),
+        "motion": {
+            "rotate": list(asked.axes) if turns else [],
+            "translate": list(asked.axes) if moves else [],
+            "edges": list(asked.edges),
+            "caption": "" if quiet else motion_caption(status, asked, estimate.guidance),
+        },
         "gravity": [finite(v) for v in estimate.gravity_world_mps2],
         "lens": None
         if camera is None

@@ -6,6 +6,7 @@ import csv
 import io
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +108,7 @@ class ImageFolder(Closing):
 
     def stats(self) -> SourceStats:
         """Counters since the folder was opened."""
-        return self._statistics.snapshot()
+        return replace(self._statistics.snapshot(), jitter_us=None)
 
     def close(self) -> None:
         """Forget the rest; may be called twice."""

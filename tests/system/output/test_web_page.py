@@ -14,7 +14,10 @@ import pytest
 
 from vical_daemon.bus import LocalBus
 from vical_daemon.config import Config, WebConfig
-from vical_daemon.messages import decode_string
+from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.guidance import Guidance, Lack, Verb
+from vical_daemon.estimation.result import Status
+from vical_daemon.messages import Level, decode_string
 from vical_daemon.roles import web
 from vical_daemon.wall_clock import private_clock
 
@@ -247,3 +250,76 @@ def test_commands_and_a_phone_in_a_browser(fed, browser, tmp_path):
     assert [(s.key, decode_string(s.payload)) for s in fed.commands] == [
         ("vical/rig0/command/record", "start")
     ]
+
+
+SCENES = {  # what the rig sends, and what must stand on the page
+    "converged": {},
+    "guided": {"motion": Guidance(Verb.TURN, ("x", "y"), Lack.ONE_AXIS, (0.0, 0.0, 1.0))},
+    "edges": {"motion": Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left", "top"))},
+    "fault": {"motion": Guidance(Verb.TURN, ("x", "y"))},
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(("width", "dark"), [(390, True), (390, False), (1400, False), (1400, True)])
+def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, width, dark):
+    keep, bus, rng = shots() or tmp_path, served.bus, np.random.default_rng(0)
+    status = Status.CONVERGED if scene in ("converged", "edges") else Status.CONVERGING
+    reason = "lever arm along the optical axis: +-12.0 mm" if status is Status.CONVERGING else ""
+    event = Event(EventKind.STAMP_JITTER, "cam0", 1.2e-3, t_s=12.0)
+    for k in range(1, 150):
+        events = [event] if k == 60 else []
+        sent = web_feed.estimate(0.2 * k, rng, status, reason=reason, events=events, **SCENES[scene])
+        web_feed.publish_estimate(bus, sent)
+    fault = (Level.ERROR, "no data for 3.0 s: is the cable plugged in?") if scene == "fault" else ()
+    web_feed.publish_status(bus, *fault)
+
+    async def script(page):
+        await page.open(served.address, width, 844 if width < 600 else 1250, dark=dark)
+        await page.wait("document.getElementById('link').textContent === 'live'")
+        await page.wait("document.querySelectorAll('#devices tbody tr').length > 1")
+        for number in range(1, 50):  # points alone, as from a log without images
+            web_feed.publish_points(bus, number)
+            await asyncio.sleep(0.02)
+        await page.wait("document.querySelector('#corners path.detected') !== null")
+        texts = {
+            name: await page.evaluate(f"document.getElementById('{name}').textContent")
+            for name in ("headline", "guidance", "motiontext", "reason", "news", "misfit", "facts")
+        }
+        texts["turned"] = await page.evaluate(
+            "[...document.querySelectorAll('.axis.rotate')].map((a) => a.id.slice(-1)).join('')"
+        )
+        texts["edges"] = await page.evaluate("document.querySelectorAll('.edge.wanted').length")
+        texts["wide"] = await page.evaluate(
+            "Math.max(document.documentElement.scrollWidth, ...[...document.querySelectorAll('.scroll')]"
+            ".map((box) => box.scrollWidth - box.clientWidth + innerWidth))"
+        )
+        texts["low"] = await page.evaluate(
+            "document.getElementById('headline').getBoundingClientRect().bottom"
+        )
+        await page.screenshot(keep / f"{scene}_{width}_{'dark' if dark else 'light'}.png")
+        if width < 600:
+            await page.evaluate("document.getElementById('devices').scrollIntoView()")
+            await page.screenshot(keep / f"{scene}_{width}_{'dark' if dark else 'light'}_devices.png")
+        return texts, page.errors
+
+    texts, errors = browser.drive(script, tmp_path / "profile")
+    assert errors == []
+    assert texts["wide"] <= width  # nothing to scroll sideways, tables neither
+    assert texts["low"] < 300
+    assert "no images arrive" in texts["misfit"] and "1 sigma" in texts["facts"]
+    assert "12 s: cam0: the stamps of the images jitter" in texts["news"]
+    if scene == "fault":
+        assert texts["headline"] == "imu/imu0 does not work."
+        assert texts["guidance"].startswith("no data for 3.0 s") and texts["turned"] == ""
+        assert texts["motiontext"] == ""
+    elif scene == "guided":
+        assert (texts["headline"], texts["turned"]) == ("Getting sharper.", "xy")
+        assert texts["motiontext"] == "turn about x and y" and texts["reason"] == reason
+        assert "optical axis only" in texts["guidance"]
+    elif scene == "edges":
+        assert texts["headline"].startswith("Converged, except") and texts["edges"] == 2
+        assert "show the target near" in texts["motiontext"]
+    else:
+        assert (texts["headline"], texts["motiontext"]) == ("Converged.", "nothing is missing")
+        assert texts["guidance"] == "" and texts["edges"] == 0

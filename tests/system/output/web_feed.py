@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vical_daemon import topics
+from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
@@ -11,6 +12,7 @@ from vical_daemon.estimation.result import (
     PoseEstimate,
     Status,
 )
+from vical_daemon.estimation.wording import guidance_text
 from vical_daemon.messages import (
     DiagnosticStatus,
     Level,
@@ -22,9 +24,10 @@ from vical_daemon.messages import (
 
 RIG, CAMERA = "rig0", "cam0"
 T0_NS = 1_700_000_000_000_000_000
+NOTHING = Guidance()
 
 
-def estimate(t_s, rng, status=None, guidance="", withheld=()):
+def estimate(t_s, rng, status=None, guidance="", withheld=(), motion=NOTHING, events=(), reason=""):
     """An estimate whose sigmas fall as 1/sqrt(t) and whose errors fit them."""
     shrink = 1.0 / np.sqrt(max(t_s, 0.2))
     sigma = np.array([4e-3, 4e-3, 6e-3, 3e-3, 3e-3, 1e-3]) * shrink
@@ -41,9 +44,12 @@ def estimate(t_s, rng, status=None, guidance="", withheld=()):
     )  # fmt: skip
     imu = ImuEstimate([0.002, -0.001, 0.004], [0.03, -0.02, 0.01], [1e-4 * shrink] * 3, [2e-2 * shrink] * 3)
     status = status or (Status.CONVERGED if t_s > 25 else Status.CONVERGING)
+    advice = guidance or guidance_text(motion)
     return CalibrationEstimate(
-        T0_NS + int(t_s * 1e9), status, "", min(t_s / 25, 1.0), guidance, t_s, int(20 * t_s), int(500 * t_s),
+        T0_NS + int(t_s * 1e9), status, reason, min(t_s / 25, 1.0), advice, t_s, int(20 * t_s),
+        int(500 * t_s),
         {CAMERA: camera}, imu, [0.1, 9.8, 0.2], 1.0 + 0.1 * rng.standard_normal(), 0.004,
+        list(events), motion,
     )  # fmt: skip
 
 
@@ -59,6 +65,13 @@ def publish_status(bus, level=Level.OK, message="500.0 Hz, 0 lost"):
     values = {"images": "600", "with_points": "590", "dropped": "3", "detection_ms": "11.2"}
     found = DiagnosticStatus(Level.OK, "detect/cam0", "98% of 600 images show points", "", values)
     bus.publish(topics.STATUS.key(RIG, "detect"), encode_diagnostics(T0_NS, "detect", [found, clock]))
+
+
+def publish_points(bus, number, size=(640, 480)):
+    """Corners alone, as from a log without images."""
+    grid = np.stack(np.meshgrid(np.arange(1, 9), np.arange(1, 7)), axis=-1).reshape(-1, 2) * 45.0
+    payload = encode_points(T0_NS + number * 50_000_000, CAMERA, np.arange(48), grid + 100.0, None, size)
+    bus.publish(topics.POINTS.key(RIG, CAMERA), payload)
 
 
 def publish_image(bus, number, *, with_points=True, with_prediction=True, width=640):

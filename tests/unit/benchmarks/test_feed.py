@@ -18,6 +18,7 @@ from benchmarks.feed import (
     feed,
     matrix_of_quaternion,
 )
+from vical_daemon.estimation.events import Event, EventKind
 
 
 class Listener:
@@ -89,7 +90,7 @@ def record_with(announced_s, errors):
         error[0] = e
         record.snapshots.append(Snapshot(t_s, "converged", error, np.eye(15)))
     if announced_s is not None:
-        record.events.append((announced_s, "bumped: the camera moved"))
+        record.events.append((announced_s, Event(EventKind.BUMPED)))
     return record
 
 

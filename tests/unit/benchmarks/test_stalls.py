@@ -10,8 +10,11 @@ import pytest
 from benchmarks.stall_watcher import Watcher
 from benchmarks.stalls import Outcome, change
 from vical_daemon.bus import Sample
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.messages import encode_calibration
+
+X = Event(EventKind.OTHER, said="x")
 
 
 def _estimate(p_m=(0.08, 0.02, -0.03), shift_s=0.01, frames=10, events=()) -> CalibrationEstimate:
@@ -50,19 +53,19 @@ def test_a_repeated_estimate_does_not_count_as_converged_again(tmp_path) -> None
     ((back_s, _),) = watcher._estimates
     watcher._on_estimate(Sample("k", encode_calibration(_estimate(frames=10), "cam0"), 1))
     assert watcher.converged_since(back_s) is None
-    watcher._on_estimate(Sample("k", encode_calibration(_estimate(frames=11, events=["x"]), "cam0"), 2))
+    watcher._on_estimate(Sample("k", encode_calibration(_estimate(frames=11, events=[X]), "cam0"), 2))
     found = watcher.converged_since(back_s)
-    assert found is not None and found[1].frames == 11 and watcher.events_since(back_s) == ["x"]
+    assert found is not None and found[1].frames == 11 and watcher.events_since(back_s) == [X]
 
 
 @pytest.mark.parametrize(
     ("outcome", "good"),
     [
-        (Outcome("web", "kill", 1.0, 0.1, 0.5, 0.1, ["resumed from the state of 1.8 s ago"]), True),
+        (Outcome("web", "kill", 1.0, 0.1, 0.5, 0.1, [Event(EventKind.RESUMED, value=1.8)]), True),
         (Outcome("web", "kill", 1.0, 5.1, 0.5, 0.1), False),
         (Outcome("web", "kill", 1.0, None, None, None), False),
         (Outcome("web", "kill", 1.0, 0.1, 4.0, 0.1), False),
-        (Outcome("web", "kill", 1.0, 0.1, 0.5, 0.1, ["bumped: it moved"]), False),
+        (Outcome("web", "kill", 1.0, 0.1, 0.5, 0.1, [Event(EventKind.BUMPED)]), False),
     ],
 )
 def test_what_is_as_asked_for(outcome: Outcome, good: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vical_daemon import messages as m
+from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.guidance import Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
@@ -17,6 +20,7 @@ from vical_daemon.estimation.result import (
     PoseEstimate,
     Status,
 )
+from vical_daemon.estimation.wording import event_text
 from vical_daemon.messages.poses import covariance_for_ros, rotation_matrix
 from vical_daemon.messages.schemas import DEFINITIONS, typestore
 from vical_daemon.topics import TOPICS
@@ -46,6 +50,14 @@ def serialised(message, type_name: str) -> bytes:
     return bytes(typestore().serialize_cdr(message, type_name))
 
 
+MOTION = Guidance(Verb.TURN_FASTER, ("x", "z"), Lack.ONE_AXIS, (0.0, 1.0, 0.0), 0.4)
+EVENTS = [
+    Event(EventKind.BUMPED, "cam0", t_s=3.5, cause=Cause.NO_IMAGES, cause_value=2.0),
+    Event(EventKind.CLOCK_DRIFT, "cam0", 2e-5, 1e-6, 4.0),
+    Event(EventKind.OTHER, t_s=5.0, said="größer"),
+]
+
+
 def an_estimate(rng: np.random.Generator, cameras=("cam0", "cam1")) -> CalibrationEstimate:
     def numbers(*shape):
         return rng.standard_normal(shape).tolist()
@@ -54,12 +66,13 @@ def an_estimate(rng: np.random.Generator, cameras=("cam0", "cam1")) -> Calibrati
         return CameraEstimate(
             PoseEstimate(numbers(3), numbers(4), numbers(6, 6)), 1e-3, 2e-5, numbers(4), numbers(4), "radtan",
             numbers(4), numbers(4), 0.21, 0.19, ["rotate about the optical axis"], 0.02, 1e-4,
+            withheld=[WeakDirection(Block.LEVER_ARM, (0.6, 0.0, 0.8), 0.1, 5e-3, MOTION)],
         )  # fmt: skip
 
     imu = ImuEstimate(numbers(3), numbers(3), numbers(3), numbers(3), numbers(3, 3), numbers(3, 3))
     return CalibrationEstimate(
         STAMP_NS, Status.CONVERGED, "", 1.0, "gedreht: 3°", 71.9, 1416, 14374,
-        {name: camera() for name in cameras}, imu, numbers(3), 1.02, 0.002, ["bumped: cam0"],
+        {name: camera() for name in cameras}, imu, numbers(3), 1.02, 0.002, EVENTS, MOTION,
     )  # fmt: skip
 
 
@@ -275,6 +288,30 @@ def test_calibration_round_trip_loses_nothing(rng_bus):
     assert m.merge_calibrations(decoded) == estimate
 
 
+def test_a_calibration_of_version_0_1_0_is_read_with_its_texts():
+    """The bytes were written by that version: events, guidance and withheld directions are text alone."""
+    old = bytes.fromhex((Path(__file__).parent / "data" / "calibration_estimate_0_1_0.hex").read_text())
+    message = m.decode_calibration(old)
+    assert message.estimate.status is Status.DEGENERATE
+    assert message.estimate.guidance == "turn the rig to and fro"
+    assert message.estimate.next_motion == Guidance()
+    said = ["bumped: images no longer fit the motion", "cam0: pose lost"]
+    assert message.estimate.events == [Event(EventKind.OTHER, said=text) for text in said]
+    known = message.camera_estimate
+    assert known is not None and known.withheld == []
+    assert known.unobservable == ["time shift: turn the rig to and fro"]
+
+
+def test_kinds_of_a_newer_version_are_read_as_text(rng_bus):
+    raw = m.encode_calibration(an_estimate(rng_bus, ("cam0",)), "cam0")
+    newer = raw.replace(b"clock_drift", b"clock_drips").replace(b"turn_faster", b"turn_faxter")
+    assert len(newer) == len(raw) != 0 and newer != raw
+    estimate = m.decode_calibration(newer).estimate
+    text = event_text(EVENTS[1])
+    assert estimate.events == [EVENTS[0], Event(EventKind.OTHER, t_s=4.0, said=text), EVENTS[2]]
+    assert estimate.next_motion == Guidance()
+
+
 def test_calibration_before_the_first_solution():
     empty = CalibrationEstimate(
         0, Status.WAITING, "no camera yet", 0.0, "move", 0.0, 0, 0, {}, None, [], 0.0, 0.0
@@ -334,9 +371,15 @@ GOOD = {
 def test_every_cut_is_refused(decode):
     good = GOOD[decode]
     decode(good)
-    for length in range(len(good)):
+    for length in set(range(len(good))) - {_END_OF_0_1_0.get(decode)}:
         with pytest.raises(m.MessageError):
             decode(good[:length])
+
+
+# A calibration that ends here is one of version 0.1.0, closed by the NUL of a string; what follows is aligned
+# and begins with the number of events.
+_EVENTS_AT = GOOD[m.decode_calibration].index(b"\x07\0\0\0bumped\0") - 4
+_END_OF_0_1_0 = {m.decode_calibration: len(GOOD[m.decode_calibration][:_EVENTS_AT].rstrip(b"\0")) + 1}
 
 
 @pytest.mark.parametrize("decode", GOOD, ids=lambda f: f.__name__)

@@ -52,6 +52,15 @@ def test_what_is_saved_is_loaded(store):
     assert [s.saved_ns for s in store.all()] == [99, 78]
 
 
+def test_a_file_of_version_0_1_0_with_events_as_text_is_loaded(store):
+    path = store.save("a", "b", "cam0", estimate(), 1)
+    document = json.loads(path.read_text())
+    del document["estimate"]["next_motion"], document["estimate"]["cameras"]["cam0"]["withheld"]
+    document["estimate"]["events"] = ["bumped: images no longer fit the motion"]
+    path.write_text(json.dumps(document))
+    assert store.load("a", "b").estimate == estimate()
+
+
 def test_prior_of_a_stored_calibration(store):
     store.save("a", "b", "cam0", estimate(), 1)
     prior = store.load("a", "b").prior((640, 480))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.cli import calibration_run, calibration_text, main
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimators import Estimator
 from vical_daemon.mcap_log import LogWriter
 from vical_daemon.priors import read_initial
@@ -106,7 +107,9 @@ def test_all_that_was_announced_on_the_way_is_told_at_the_end(
 
         def estimate(self):
             self.calls += 1
-            return replace(self._inner.estimate(), events=[f"event {self.calls}"])
+            return replace(
+                self._inner.estimate(), events=[Event(EventKind.OTHER, said=f"event {self.calls}")]
+            )
 
         def __getattr__(self, name: str):
             return getattr(self._inner, name)
@@ -121,7 +124,7 @@ def test_all_that_was_announced_on_the_way_is_told_at_the_end(
     outcome = calibration_run.run_job(job, lambda share, estimate: None)
     told = outcome.estimate.events
     assert len(told) > 2
-    assert told == [f"event {k + 1}" for k in range(len(told))]
+    assert [event.said for event in told] == [f"event {k + 1}" for k in range(len(told))]
     text = calibration_text.describe(calibration_run.document(job, outcome))
     assert all(event in text for event in told)
 

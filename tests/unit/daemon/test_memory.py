@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from vical_daemon import topics
 from vical_daemon.bus import LocalBus
 from vical_daemon.config import Config, loads
+from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.memory import Memory, difference
+from vical_daemon.estimation.wording import event_text
+from vical_daemon.memory import Memory, differences
 from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics
 from vical_daemon.wall_clock import private_clock
 
@@ -115,16 +118,40 @@ def test_a_changed_mounting_is_announced_once(config: Config) -> None:
     memory = _later(config)
     memory.priors()
     first = memory.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03), turn_deg=1.0)))
-    assert first.events == [
-        "changed: cam0 since the stored calibration: moved by 10.0 mm, turned by 1.00 deg"
+    assert [event_text(e) for e in first.events] == [
+        "changed: cam0: moved by 10.0 +- 0.1 mm since the stored calibration",
+        "changed: cam0: turned by 1.00 +- 0.01 deg since the stored calibration",
     ]
     assert memory.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03)))).events == []
 
 
+def _differences(before: CameraEstimate, now: CameraEstimate) -> list[tuple[EventKind, float]]:
+    found = differences("cam0", before, now, 30.0)
+    assert all(e.camera == "cam0" and e.t_s == 30.0 and e.cause is Cause.STORED_DIFFERS for e in found)
+    return [(e.kind, round(e.value or 0.0, 5)) for e in found]
+
+
 def test_what_lies_within_the_sigmas_or_does_not_matter_is_no_change() -> None:
-    assert difference(_camera(), _camera()) == ""
-    assert difference(_camera(), _camera(p_m=(0.081, 0.02, -0.03))) == ""  # 7 sigma, but 1 mm
-    assert difference(_camera(sigma=5e-3), _camera(p_m=(0.09, 0.02, -0.03), sigma=5e-3)) == ""  # 1.4 sigma
-    assert difference(_camera(), _camera(shift_s=0.0105)) == "time shift by +0.50 ms"
-    assert difference(_camera(turn_deg=0.05), _camera()) == ""
-    assert difference(_camera(turn_deg=0.5), _camera()) == "turned by 0.50 deg"
+    assert _differences(_camera(), _camera()) == []
+    assert _differences(_camera(), _camera(p_m=(0.081, 0.02, -0.03))) == []  # 7 sigma, but 1 mm
+    far = _camera(p_m=(0.09, 0.02, -0.03), sigma=5e-3)
+    assert _differences(_camera(sigma=5e-3), far) == []  # 1.4 sigma
+    assert _differences(_camera(), _camera(shift_s=0.0105)) == [(EventKind.TIMESHIFT_CHANGED, 5e-4)]
+    assert _differences(_camera(turn_deg=0.05), _camera()) == []
+    turned = [(EventKind.CAMERA_TURNED, round(math.radians(0.5), 5))]
+    assert _differences(_camera(turn_deg=0.5), _camera()) == turned
+
+
+def test_the_journal_gets_an_event_as_fields_and_its_name_from_its_kind(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[tuple[str, dict[str, object]]] = []
+    monkeypatch.setattr("vical_daemon.notify.event", lambda name, text, **more: written.append((name, more)))
+    memory = _later(config)
+    memory.announce(Event(EventKind.BUMPED, cause=Cause.IMAGES_REFUSED))
+    memory.announce(Event(EventKind.OTHER, said="bumped: only a text"))
+    memory.announce(Event(EventKind.STAMP_JITTER, "cam0", 1e-3))
+    memory.watch(_estimate(_camera(), Status.CONVERGING))
+    assert [name for name, _ in written] == ["bumped", "calibration", "calibration"]
+    assert written[2][1]["kind"] == "stamp_jitter"
+    assert (written[2][1]["camera"], written[2][1]["value"]) == ("cam0", 1e-3)

@@ -5,6 +5,7 @@ import pytest
 
 from vical_daemon.estimation.image_intake import ImageIntake
 from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.wording import event_text
 
 RNG = np.random.default_rng(1)
 IDS = np.arange(20)
@@ -31,7 +32,7 @@ def test_a_gap_is_reported_once():
     t[50:] += 2.0
     intake = ImageIntake()
     assert feed(intake, t, t) == list(t)
-    assert intake.news() == ["2.0 s without images from cam0"]
+    assert [event_text(e) for e in intake.news()] == ["cam0: 2.0 s without images"]
     assert intake.news() == []
 
 
@@ -49,7 +50,7 @@ def test_a_frozen_camera_is_a_gap():
     intake = ImageIntake()
     taken = feed(intake, t, t, frames)
     assert sum(x is None for x in taken) == 59
-    assert intake.news() == ["3.0 s in which cam0 repeated one image"]
+    assert [event_text(e) for e in intake.news()] == ["cam0: 3.0 s in which one image was repeated"]
 
 
 def test_images_without_points_are_not_repetitions():
@@ -66,7 +67,9 @@ def test_a_camera_clock_that_is_set_is_followed_by_the_order_of_arrival(step_s):
     taken = feed(intake, stamps, t + 0.02)
     assert sum(x is None for x in taken) == 4
     np.testing.assert_allclose([x for x in taken if x is not None], np.delete(t, np.r_[100:104]), atol=1e-9)
-    assert intake.news() == [f"cam0: its stamps stepped by about {step_s:+.1f} s against those of the IMU"]
+    assert [event_text(e) for e in intake.news()] == [
+        f"cam0: its stamps stepped by about {step_s:+.1f} s against those of the IMU"
+    ]
     assert intake.offset_s("cam0") == pytest.approx(-step_s)
 
 

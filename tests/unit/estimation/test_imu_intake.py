@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation.imu_intake import ImuIntake
+from vical_daemon.estimation.wording import event_text
 
 PERIOD_NS = 5_000_000
 RNG = np.random.default_rng(0)
@@ -32,7 +33,7 @@ def test_an_even_stream_enters_as_it_is():
 def test_a_gap_is_reported_once_with_its_length():
     intake, added = feed(np.concatenate([even(300), even(300, 300 * PERIOD_NS + 2_000_000_000)]))
     assert len(added) == 600
-    assert intake.news() == ["2.0 s without inertial data"]
+    assert [event_text(e) for e in intake.news()] == ["2.0 s without inertial data"]
     assert intake.gap_end_s == pytest.approx(300 * 0.005 + 2.0)
     assert intake.buffer.gap_within(1.0, 4.0)
     assert not intake.buffer.gap_within(0.2, 1.4)
@@ -52,7 +53,7 @@ def test_a_frozen_imu_is_a_gap():
     intake, added = feed(even(800), readings)
     assert len(added) == 600
     assert intake.repeated == 200
-    assert intake.news() == ["1.0 s in which the IMU repeated one reading"]
+    assert [event_text(e) for e in intake.news()] == ["1.0 s in which the IMU repeated one reading"]
 
 
 def test_one_wrong_stamp_is_left_out():
@@ -79,7 +80,9 @@ def test_a_clock_set_back_is_followed(back_s):
     later = even(300, 300 * PERIOD_NS - round(back_s * 1e9))
     intake, added = feed(np.concatenate([even(300), later]))
     assert len(added) == 600
-    assert intake.news() == [f"the IMU's stamps went back by {back_s:.1f} s: its clock was set"]
+    assert [event_text(e) for e in intake.news()] == [
+        f"the IMU's stamps went back by {back_s:.1f} s: its clock was set"
+    ]
     np.testing.assert_allclose(np.diff(intake.buffer.rows[:, 0]), 0.005, atol=1e-9)
     assert intake.shift_s == pytest.approx(-back_s, abs=1e-9)  # t_imu = t_cam + shift, by present stamps
 

@@ -4,16 +4,23 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation import so3
+from vical_daemon.estimation.guidance import Block, Lack, Verb
 from vical_daemon.estimation.measurements import ConvergenceTargets
 from vical_daemon.estimation.observability import Motion, Setup, gramian, lost_in_block, pose_sensitivities
 from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
 from vical_daemon.estimation.trust.missing_motion import (
     WIDE,
     RunningMotion,
-    axis_words,
-    guidance,
+    excitation_advice,
     missing_motion,
-    shortcoming,
+    weak_directions,
+)
+from vical_daemon.estimation.wording import (
+    axis_name,
+    direction_line,
+    direction_name,
+    direction_sigma,
+    guidance_text,
 )
 
 G = np.array([0.0, 6.0, 7.7])
@@ -199,7 +206,7 @@ def _scatter(*rates_cam):
 
 def test_guidance_names_the_optical_axis_and_another_rotation():
     found = missing_motion(_covariance(arm=(1e-3, 1e-3, 0.5)), R_IMU_CAM, _scatter((0, 0, 0.7)))
-    assert str(found[0]) == (
+    assert direction_line(found[0]) == (
         "lever arm along the optical axis: "
         "so far it turned about the optical axis only; rotate about another axis"
     )
@@ -212,24 +219,24 @@ def test_guidance_says_nothing_when_all_is_known():
 
 def test_guidance_for_standing_still_slow_and_steady_motion():
     still = missing_motion(_covariance((1, 1, 1), (1, 1, 1), 1.0), R_IMU_CAM, 1e-6 * np.eye(3))
-    assert len(still) == 7 and all("turn" in m.motion for m in still)
+    assert len(still) == 7 and all(m.guidance.lack is Lack.STILL for m in still)
     slow = missing_motion(_covariance(arm=(0.01, 1e-3, 1e-3)), R_IMU_CAM, 0.005 * np.eye(3))
-    assert "faster" in slow[0].motion and slow[0].direction == "the image's x axis"
+    assert slow[0].guidance.verb is Verb.TURN_FASTER and axis_name(slow[0].axis_cam) == "the image's x axis"
     steady = missing_motion(_covariance(shift=0.01), R_IMU_CAM, _scatter((0, 0.7, 0)), rate_change_rps2=0.01)
-    assert "to and fro" in str(steady[0]) and steady[0].block == "timeshift"
+    assert steady[0].guidance.verb is Verb.TURN_TO_AND_FRO and steady[0].block is Block.TIMESHIFT
     tilted = missing_motion(
         _covariance(rotation=(1e-3, 0.2, 1e-3)),
         R_IMU_CAM,
         _scatter((0, 0.7, 0)),
         limits=ConvergenceTargets(rotation_rad=0.01),
     )
-    assert "image's y axis" in str(tilted[0])
+    assert "image's y axis" in direction_line(tilted[0])
 
 
 def test_axes_in_words():
-    assert axis_words(np.array([0, 0, -2.0])) == "the optical axis"
-    assert "between" in axis_words(np.array([1.0, 1.0, 0.0]))
-    assert "oblique" in axis_words(np.array([1.0, 1.0, 1.0]))
+    assert axis_name(np.array([0, 0, -2.0])) == "the optical axis"
+    assert "between" in axis_name(np.array([1.0, 1.0, 0.0]))
+    assert "oblique" in axis_name(np.array([1.0, 1.0, 1.0]))
 
 
 def _turned(rates, dt=0.01):
@@ -257,30 +264,37 @@ def test_guidance_of_a_running_calibration_is_worst_first_and_speaks_of_the_moti
     t = np.arange(0, 20, 0.01)
     about_optical = _turned(np.outer(0.7 * np.sin(2 * t), R_IMU_CAM[:, 2]))
     covariance = _covariance(arm=(1e-3, 1e-3, 0.05), rotation=(0.02, 1e-3, 1e-3))[:6, :6]
-    found = guidance(covariance, R_IMU_CAM, 1e-4, about_optical, WIDE)
-    assert [g.name for g in found] == [
+    found = weak_directions(covariance, R_IMU_CAM, 1e-4, about_optical, WIDE)
+    assert [direction_name(g) for g in found] == [
         "lever arm along the optical axis",
         "rotation about the image's x axis",
     ]
-    assert found[0].excess == pytest.approx(10.0) and found[0].said.endswith("+-50.0 mm")
-    assert found[0].motion == "so far it turned about the optical axis only; rotate about another axis"
-    still = guidance(covariance, R_IMU_CAM, 1e-2, _turned(np.zeros((300, 3))), WIDE)
-    assert still[0].name == "time shift" and "turn the rig" in still[0].motion
-    assert guidance(_covariance()[:6, :6], R_IMU_CAM, 1e-4, about_optical, WIDE) == []
+    assert found[0].excess == pytest.approx(10.0) and direction_sigma(found[0]).endswith("+-50.0 mm")
+    assert (
+        guidance_text(found[0].guidance)
+        == "so far it turned about the optical axis only; rotate about another axis"
+    )
+    still = weak_directions(covariance, R_IMU_CAM, 1e-2, _turned(np.zeros((300, 3))), WIDE)
+    assert direction_name(still[0]) == "time shift" and "turn the rig" in guidance_text(still[0].guidance)
+    assert weak_directions(_covariance()[:6, :6], R_IMU_CAM, 1e-4, about_optical, WIDE) == []
 
 
 def test_a_rich_motion_is_told_which_turns_show_the_missing_direction():
     t = np.arange(0, 20, 0.01)
     rich = _turned(np.stack([np.sin(2 * t), np.cos(3 * t), np.sin(1.5 * t)], axis=1))
-    (arm,) = guidance(_covariance(arm=(1e-3, 1e-3, 0.2))[:6, :6], R_IMU_CAM, 1e-4, rich, WIDE)
-    assert arm.name == "lever arm along the optical axis"
-    assert arm.excess == pytest.approx(40.0) and "200.0 mm" in arm.said
-    assert arm.motion == "rotate about the image's x axis (nod) and about the image's y axis (shake)"
-    (turn,) = guidance(_covariance(rotation=(1e-3, 1e-3, 0.1))[:6, :6], R_IMU_CAM, 1e-4, rich, WIDE)
-    assert turn.name == "rotation about the optical axis" and "roll" not in turn.motion
-    late = guidance(_covariance(arm=(1e-3, 1e-3, 0.01))[:6, :6], R_IMU_CAM, 0.05, rich, WIDE)
-    assert [g.name for g in late] == ["time shift", "lever arm along the optical axis"]
-    assert "back and forth" in late[0].motion
+    (arm,) = weak_directions(_covariance(arm=(1e-3, 1e-3, 0.2))[:6, :6], R_IMU_CAM, 1e-4, rich, WIDE)
+    assert direction_name(arm) == "lever arm along the optical axis"
+    assert arm.excess == pytest.approx(40.0) and "200.0 mm" in direction_sigma(arm)
+    assert arm.guidance.axes == ("x", "y")
+    assert (
+        guidance_text(arm.guidance)
+        == "rotate about the image's x axis (nod) and about the image's y axis (shake)"
+    )
+    (turn,) = weak_directions(_covariance(rotation=(1e-3, 1e-3, 0.1))[:6, :6], R_IMU_CAM, 1e-4, rich, WIDE)
+    assert direction_name(turn) == "rotation about the optical axis" and "z" not in turn.guidance.axes
+    late = weak_directions(_covariance(arm=(1e-3, 1e-3, 0.01))[:6, :6], R_IMU_CAM, 0.05, rich, WIDE)
+    assert [direction_name(g) for g in late] == ["time shift", "lever arm along the optical axis"]
+    assert "back and forth" in guidance_text(late[0].guidance)
 
 
 @pytest.mark.parametrize(
@@ -296,9 +310,11 @@ def test_a_poor_motion_is_told_as_a_whole(rate, said):
     motion = RunningMotion()
     for k in range(1500):
         motion.add(0.01 * k, rate(0.01 * k))
-    words = shortcoming(motion, np.eye(3))
+    words = guidance_text(excitation_advice(motion, np.eye(3)))
     assert said in words
-    unnamed = shortcoming(motion, None)  # before the mounting is known no axis of the image can be named
+    unnamed = guidance_text(
+        excitation_advice(motion, None)
+    )  # before the mounting is known no axis of the image can be named
     assert bool(unnamed) == bool(words)
     assert "image" not in unnamed
     assert bool(words) == bool(said)

@@ -10,6 +10,7 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from benchmarks.feed import StartErrors, camera_prior, imu_noise, points_frame
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.target_free_rig import TargetFreeRig, together
@@ -130,5 +131,9 @@ def test_announcements_bear_the_name_of_their_camera():
             1, Status.CONVERGED, "", 1.0, "", 1.0, 5, 9, {}, None, [], 1.0, 0.0, list(events)
         )
 
-    both = together({"a": said("bumped: the lever arm"), "b2": said("went on", "b2: stamps jitter")})
-    assert both.events == ["bumped: a: the lever arm", "b2: went on", "b2: stamps jitter"]
+    gap, bump = Event(EventKind.IMU_GAP, value=2.0), Event(EventKind.BUMPED, "a")
+    lags = [Event(EventKind.ACCEL_LAG, value=v) for v in (1e-4, 2e-4)]
+    jitter = Event(EventKind.STAMP_JITTER, "b2", 1e-3)
+    both = together({"a": said(gap, bump, lags[0]), "b2": said(replace(gap, t_s=1.0), lags[1], jitter)})
+    named = [replace(lag, camera=name) for lag, name in zip(lags, ("a", "b2"), strict=True)]
+    assert both.events == [gap, bump, named[0], named[1], jitter]

@@ -8,6 +8,7 @@ from vical_mocks.rig import reference_rig
 
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from benchmarks.scores import nees
+from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 pytestmark = pytest.mark.timeout(400)
@@ -27,10 +28,9 @@ def calibrated(seed, size, *, seconds=12.0, lens_known=False, estimate=frozenset
 
 def told(record):
     """Announced size, percent; every announcement is about the size."""
-    (text,) = (text for _, text in record.events)
-    assert text.startswith("the target is ")
-    figure = float(text.removeprefix("the target is ").removeprefix("some ").split(" ")[0])
-    return figure if "larger than stated: measure it" in text else -figure
+    (event,) = (event for _, event in record.events)
+    assert event.kind is EventKind.TARGET_SIZE
+    return 100.0 * event.value
 
 
 @pytest.mark.parametrize(

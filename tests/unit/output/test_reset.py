@@ -43,7 +43,8 @@ def test_reset_forgets_everything(tmp_path):
     def feed():
         for _ in range(5):
             t_ns[0] += 4_000_000
-            payload = encode_imu(t_ns[0], "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
+            noise = 1e-4 * (t_ns[0] % 7)  # readings that repeat bit by bit are left out
+            payload = encode_imu(t_ns[0], "imu0", (noise, 0.0, 0.0), (0.0, 0.0, 9.8))
             bus.publish(topics.IMU.key("rig0", "imu0"), payload)
 
     command = topics.COMMAND.key("rig0", "estimate")

@@ -8,14 +8,16 @@ import pytest
 
 from vical_daemon import topics
 from vical_daemon.bus import LocalBus, Sample
+from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.result import CalibrationEstimate, Status
+from vical_daemon.estimation.wording import guidance_text
 from vical_daemon.liveness import FRESH_S
-from vical_daemon.messages import decode_calibration, encode_calibration, encode_diagnostics
+from vical_daemon.messages import Level, decode_calibration, encode_calibration, encode_diagnostics
 from vical_daemon.vision.image_codec import decode_image
-from vical_daemon.web import words
 from vical_daemon.web.images import CameraView, colour, draw, drawn_jpeg, picture_event, thinned
 from vical_daemon.web.metrics import metrics
-from vical_daemon.web.state import COLUMNS, HISTORY, SOURCES, WebState, history_row
+from vical_daemon.web.state import COLUMNS, EVENTS, HISTORY, SOURCES, WebState, history_row
 
 
 @pytest.fixture
@@ -99,7 +101,7 @@ def test_nothing_known_yet_is_fine(bus, state, web_feed):
     entry = state.tick()["cameras"]["cam0"]
     assert entry["lens"] is None
     assert entry["fresh"] == []
-    assert "no board seen yet" in entry["sentence"]
+    assert entry["reason"] == "no board seen yet"
     assert "vical_timeshift_seconds" not in metrics(state)
 
 
@@ -126,8 +128,8 @@ def test_a_source_that_falls_silent_is_stale_with_its_age(bus, web_feed):
         entry = document["cameras"]["cam0"]
         assert (entry["status"], entry["stale"], entry["age_s"]) == ("stale", True, FRESH_S + 7.0)
         assert entry["last_status"] == "converged"
-        assert "12 s" in entry["sentence"]
-        assert "Converged:" not in entry["sentence"]
+        assert "12 s" in entry["headline"]
+        assert "Converged" not in entry["headline"]
         for device in document["devices"]:
             assert device["level"] == 3
             assert device["message"].startswith("silent for 12 s")
@@ -172,28 +174,112 @@ def test_devices_and_metrics(bus, state, web_feed):
 
 
 @pytest.mark.parametrize(
-    ("texts", "rotate", "translate"),
+    ("asked", "rotate", "translate", "edges"),
     [
-        (["rotate about the optical axis"], ["z"], []),
-        (["turn about cam x and y"], ["x", "y"], []),
-        (["tilt the rig"], ["x", "y", "z"], []),
-        (["move along z; rotate about x"], ["x"], ["z"]),
-        (["move closer and further"], [], ["x", "y", "z"]),
-        ([""], [], []),
-        (["clean the lens"], [], []),
-        (["rotation about the optical axis (roll): +-0.2 deg"], [], []),
-        (["collecting the first seconds: move the rig, keep the target in view"], [], ["x", "y", "z"]),
-        (["turn the rig back and forth faster, changing direction"], ["x", "y", "z"], []),
-        (["rotate about the image's x axis (nod) and about the image's y axis (shake)"], ["x", "y"], []),
+        (Guidance(), [], [], []),
+        (Guidance(Verb.TURN, ("z",)), ["z"], [], []),
+        (Guidance(Verb.TURN, ("x", "y"), Lack.ONE_AXIS, (0.0, 0.0, 1.0)), ["x", "y"], [], []),
+        (Guidance(Verb.TURN_AND_MOVE, AXES), ["x", "y", "z"], ["x", "y", "z"], []),
+        (Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left",)), [], [], ["left"]),
     ],
 )
-def test_motion_is_read_from_the_words(texts, rotate, translate):
-    assert words.motion(texts) == {"rotate": rotate, "translate": translate}
+def test_the_picture_shows_what_the_guidance_asks_for(bus, state, web_feed, asked, rotate, translate, edges):
+    rng = np.random.default_rng(0)
+    web_feed.publish_estimate(bus, web_feed.estimate(9.0, rng, Status.CONVERGING, motion=asked))
+    entry = state.tick()["cameras"]["cam0"]
+    assert entry["guidance"] == guidance_text(asked)
+    motion = entry["motion"]
+    assert (motion["rotate"], motion["translate"], motion["edges"]) == (rotate, translate, edges)
+    named = {axis for axis in "xyz" if f" {axis}" in motion["caption"]} if rotate else set()
+    assert named == set(rotate)
 
 
-def test_every_status_has_a_sentence(web_feed):
+def test_every_status_has_a_short_headline_and_the_reason_below_it(bus, state, web_feed):
+    reason = "the motion does not show: lever arm along the optical axis: +-300.0 mm"
     for status in Status:
-        assert words.sentence(web_feed.estimate(1.0, np.random.default_rng(0), status)).endswith(".")
+        estimate = web_feed.estimate(1.0, np.random.default_rng(0), status, reason=reason)
+        web_feed.publish_estimate(bus, estimate)
+        entry = state.tick()["cameras"]["cam0"]
+        assert entry["headline"].endswith(".") and len(entry["headline"]) < 60
+        assert ":" not in entry["headline"] or status is Status.INCONSISTENT
+        assert entry["reason"] == reason
+
+
+def test_nothing_is_missing_is_said_only_where_nothing_is(bus, state, web_feed):
+    """Converged, nothing missing and unseen edges never stand side by side."""
+    rng = np.random.default_rng(0)
+    show = Guidance(Verb.SHOW, lack=Lack.EDGES, camera="cam0", edges=("left", "right"))
+    web_feed.publish_estimate(bus, web_feed.estimate(30.0, rng, Status.CONVERGED, motion=show))
+    entry = state.tick()["cameras"]["cam0"]
+    assert entry["headline"] == "Converged, except near the edges of the image."
+    assert "nothing" not in entry["motion"]["caption"] and "no corners" in entry["guidance"]
+    web_feed.publish_estimate(bus, web_feed.estimate(30.2, rng, Status.CONVERGED))
+    entry = state.tick()["cameras"]["cam0"]
+    assert (entry["headline"], entry["motion"]["caption"]) == ("Converged.", "nothing is missing")
+    # a message of version 0.1.0 has guidance as text alone
+    old = web_feed.estimate(30.4, rng, Status.CONVERGED, guidance="no corners yet near the left edge")
+    web_feed.publish_estimate(bus, old)
+    assert state.tick()["cameras"]["cam0"]["motion"]["caption"] == ""
+
+
+def test_a_device_that_does_not_work_comes_before_advice(bus, state, web_feed):
+    rng, asked = np.random.default_rng(0), Guidance(Verb.TURN, ("x",))
+    web_feed.publish_estimate(bus, web_feed.estimate(9.0, rng, Status.CONVERGING, motion=asked))
+    web_feed.publish_status(bus)
+    document = state.tick()
+    assert document["fault"] is None and document["cameras"]["cam0"]["guidance"]
+    web_feed.publish_status(bus, Level.WARN, "480 Hz instead of 500 Hz")
+    assert state.tick()["fault"] is None
+    web_feed.publish_status(bus, Level.ERROR, "no data for 3.0 s")
+    document = state.tick()
+    assert document["fault"]["headline"] == "imu/imu0 does not work."
+    assert document["fault"]["message"] == "no data for 3.0 s"
+    entry = document["cameras"]["cam0"]
+    assert entry["guidance"] == entry["motion"]["caption"] == "" and entry["motion"]["rotate"] == []
+
+
+def test_withheld_directions_are_named_without_a_second_advice(bus, state, web_feed):
+    rng = np.random.default_rng(0)
+    sent = web_feed.estimate(20.0, rng, Status.DEGENERATE, withheld=["time shift: turn the rig"])
+    web_feed.publish_estimate(bus, sent)  # as of version 0.1.0
+    assert state.tick()["cameras"]["cam0"]["withheld"] == ["time shift: turn the rig"]
+    arm = WeakDirection(Block.LEVER_ARM, (0.0, 0.0, 1.0), 0.3, 5e-3, Guidance(Verb.TURN, ("x", "y")))
+    sent.cameras["cam0"].withheld.append(arm)
+    web_feed.publish_estimate(bus, sent)
+    assert state.tick()["cameras"]["cam0"]["withheld"] == ["do not use: lever arm along the optical axis"]
+
+
+def test_announcements_stay_on_the_page_for_a_while(bus, state, web_feed):
+    rng = np.random.default_rng(0)
+    for k in range(EVENTS + 3):
+        event = Event(EventKind.POSE_LOST, "cam0", t_s=float(k))
+        web_feed.publish_estimate(bus, web_feed.estimate(1.0 + k, rng, events=[event]))
+        web_feed.publish_estimate(bus, web_feed.estimate(1.2 + k, rng))
+    shown = state.tick()["cameras"]["cam0"]["events"]
+    assert [event["t_s"] for event in shown] == [float(k) for k in range(3, EVENTS + 3)]
+    assert shown[0]["kind"] == "pose_lost" and shown[0]["text"].startswith("cam0: pose lost")
+    web_feed.publish_estimate(bus, web_feed.estimate(0.5, rng))  # begun anew
+    assert state.tick()["cameras"]["cam0"]["events"] == []
+
+
+@pytest.mark.parametrize("size", [(640, 480), (0, 0)])
+def test_where_only_points_arrive_they_are_shown(web_feed, size):
+    view, bus = CameraView("cam0"), LocalBus()
+    bus.subscribe("vical/**", view.take)
+    web_feed.publish_points(bus, 1, size)
+    assert view.next() is None  # the image may still come
+    for number in range(2, 40):
+        web_feed.publish_points(bus, number, size)
+    sight = view.next()
+    assert sight.image is None
+    document = json.loads(picture_event(sight).split(b"data: ")[1])
+    assert document["jpeg"] == "" and len(document["detected"]) == 48
+    assert all(u < document["size"][0] and v < document["size"][1] for _, u, v in document["detected"])
+    picture = decode_image(np.frombuffer(drawn_jpeg(sight), dtype=np.uint8), colour=True)
+    assert picture.shape[:2] == tuple(document["size"][::-1]) and picture.max() > 60
+    assert view.next() is None  # shown once
+    web_feed.publish_image(bus, 60)
+    assert view.next().image is not None  # images have come: they are shown
 
 
 def fill(view, web_feed, **options):

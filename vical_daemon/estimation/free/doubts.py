@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.free.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, Carry
 from vical_daemon.estimation.free.snapshot import Doubts
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.trust import hypotheses
-from vical_daemon.estimation.trust.beyond_doubt import KNOWN_OFF_SIGMA, imu_told, lag_told
+from vical_daemon.estimation.trust.beyond_doubt import KNOWN_OFF_SIGMA, known_off
 from vical_daemon.estimation.trust.clock_drift import (
-    CLOCKS_APART,
     CLOCKS_IN_DOUBT,
     SURE,
-    drift_told,
     evidence,
     probability,
     stamps_variance,
@@ -23,15 +22,8 @@ _SURELY_ROLLING = 5.0  # sigmas
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
 _WHERE = {hypotheses.IMU: np.arange(FULL)[IMU], hypotheses.LAG: np.arange(FULL)[LAG]}
 _SIGMA = {hypotheses.IMU: hypotheses.ENTRY_SIGMA, hypotheses.LAG: hypotheses.LAG_SIGMA_S}
-_TOLD = {hypotheses.IMU: imu_told, hypotheses.LAG: lag_told}
 
 Weights = dict[tuple[str, ...], float]
-
-
-def rolling_told(camera: str, readout_s: float, sigma_s: float) -> str:
-    """The announcement of a rolling shutter of which nothing was said."""
-    told = f"{1e3 * readout_s:.1f} +- {1e3 * sigma_s:.1f} ms"
-    return f"{camera}: a rolling shutter, by how features move: its readout takes {told}, and is allowed for"
 
 
 class FreeDoubts:
@@ -60,7 +52,7 @@ class FreeDoubts:
         self.stamp_sigma_s = 0.0
         self._began_s = np.inf
 
-    def watch(self, carry: Carry, factor: float, compared: bool) -> list[str]:
+    def watch(self, carry: Carry, factor: float, compared: bool) -> list[Event]:
         """Announce what has got beyond doubt.
 
         Args:
@@ -68,21 +60,22 @@ class FreeDoubts:
             factor: Measured variance over the stated one.
             compared: Windows could be compared; before, what looks like the imu may as well be the images.
         """
-        events = []
+        events: list[Event] = []
         if not self.drifting and probability(self._drift(carry, factor)) >= SURE:
             self.drifting = True
             sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
-            events.append(drift_told(self._camera, CLOCKS_APART, carry.camera.skew, sigma))
+            events.append(Event(EventKind.CLOCK_DRIFT, self._camera, float(carry.camera.skew), sigma))
         sigmas = np.sqrt(factor * np.diag(carry.calibration()))
         if not self.rolling:
             readout_s, sigma_s = carry.camera.readout_s, float(sigmas[READOUT])
             self.rolling = abs(readout_s) > max(_SURELY_ROLLING * sigma_s, _SHORTEST_S)
-            events += [rolling_told(self._camera, readout_s, sigma_s)] if self.rolling else []
+            if self.rolling:
+                events.append(Event(EventKind.ROLLING_SHUTTER, self._camera, float(readout_s), sigma_s))
         if compared:
             weights = self._weights(carry, factor)
             known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > hypotheses.SURE}
             news = [(name, _WHERE[name]) for name in sorted(known - self._off)]
-            events += [_TOLD[name](_numbers(carry)[at], sigmas[at]) for name, at in news]
+            events += [known_off(name, _numbers(carry)[at], sigmas[at]) for name, at in news]
             self._off |= known
         return events
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -23,18 +25,30 @@ _STRETCHED = 5e-3  # beyond this no delay makes sense
 RATE_SIGMAS = 6.0
 
 
+class Refusal(NamedTuple):
+    """Why the motion cannot be used.
+
+    Attributes:
+        reason: In words; empty: it can.
+        still: The rig stands still.
+    """
+
+    reason: str = ""
+    still: bool = False
+
+
 def refuse_motion(
     t_imu: FloatArray, gyro: FloatArray, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions
-) -> str:
-    """Say why the motion cannot be used, from the rotation rates alone; empty if it can."""
+) -> Refusal:
+    """Say why the motion cannot be used, from the rotation rates alone."""
     turns = camera_turns(t_cam, q)
     if len(turns.first) < 8:
-        return "the camera orientations are too far apart in time: at least 5 a second are needed"
+        return Refusal("the camera orientations are too far apart in time: at least 5 a second are needed")
     rate_cam = float(np.median(turns.angle / (t_cam[turns.second] - t_cam[turns.first])))
     reach = options.search_s + abs(options.timeshift_guess_s)
     near = (t_imu > t_cam[0] - reach) & (t_imu < t_cam[-1] + reach)
     if np.count_nonzero(near) < 2 * MIN_ORIENTATIONS:
-        return (
+        return Refusal(
             f"camera and imu do not overlap in time: the camera covers {t_cam[0]:.1f} to {t_cam[-1]:.1f} s, "
             f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?)"
         )
@@ -44,18 +58,21 @@ def refuse_motion(
     swing = float(np.median(change))
     ratio = rate_imu / max(rate_cam, 1e-9)
     if rate_cam < _MIN_RATE_RPS and swing < _MIN_RATE_RPS:
-        return (
+        return Refusal(
             f"no motion: the camera turns at {rate_cam / _DEG:.1f} deg/s (median); "
-            "turn the rig to and fro about all axes at 20 to 60 deg/s"
+            "turn the rig to and fro about all axes at 20 to 60 deg/s",
+            still=True,
         )
     if rate_cam < _MIN_RATE_RPS and swing > 5.0 * _MIN_RATE_RPS:
-        return "the imu turns but the camera does not: is the camera fixed to the imu, are its poses fresh?"
+        return Refusal(
+            "the imu turns but the camera does not: is the camera fixed to the imu, are its poses fresh?"
+        )
     if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
-        return (
+        return Refusal(
             f"it turns at one rate ({rate_imu / _DEG:.0f} deg/s) about one axis all the time: neither delay "
             "nor mounting about that axis show; turn to and fro, and about other axes"
         )
-    return _wrong_unit(ratio)
+    return Refusal(_wrong_unit(ratio))
 
 
 def at_one_rate(t_imu: FloatArray, gyro: FloatArray) -> bool:

@@ -69,6 +69,7 @@ class TdIcpResult:
         stamp_rate: By how much the delay grows with time in these data, s/s (1e-6: one microsecond a second);
             near zero where both clocks are sound. The shift above is that in the middle of the data.
         stamp_rate_sigma: Its standard deviation, s/s.
+        still: Refused because the rig stands still.
     """
 
     status: str
@@ -88,6 +89,7 @@ class TdIcpResult:
     used: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     stamp_rate: float = float("nan")
     stamp_rate_sigma: float = float("nan")
+    still: bool = False
 
     def to_json(self) -> dict[str, object]:
         """Return what `vical td-icp --json` prints."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.retract import retract
 from vical_daemon.estimation.trust.hypotheses import (
@@ -30,45 +31,26 @@ KNOWN_SIZE_SIGMA = 0.1
 """Of the size of a target that is known to be off, or where it is asked for, relative."""
 _EVERY_S = 1.0
 _MEASURED = 400  # images
+_KINDS = {
+    IMU: EventKind.IMU_INTRINSICS,
+    LAG: EventKind.ACCEL_LAG,
+    SIZE: EventKind.TARGET_SIZE,
+    TARGET: EventKind.TARGET_SHAPE,
+}
 
 
-def imu_told(entries: FloatArray, sigmas: FloatArray) -> str:
-    """The announcement for an IMU, with the entry that is off beyond all others."""
-    off, sigma = _surest(entries, sigmas)
-    return (
-        f"scale or alignment of the imu is off, by {100.0 * off:.2f} +- {100.0 * sigma:.2f} %: "
-        "allowed for from now on"
-    )
+def known_off(block: str, values: FloatArray, sigmas: FloatArray) -> Event:
+    """The announcement for a block of `hypotheses` that is off, with the entry that is most surely so.
 
-
-def size_told(off: float, sigma: float | None = None) -> str:
-    """The announcement for a target larger (off > 0) or smaller than stated; without a sigma: roughly."""
-    how = "larger" if off > 0 else "smaller"
-    figure = (
-        f"some {100 * abs(off):.0f} %" if sigma is None else f"{100 * abs(off):.2f} +- {100 * sigma:.2f} %"
-    )
-    return f"the target is {figure} {how} than stated: measure it; its size is estimated from now on"
-
-
-def target_told(shape_m: FloatArray, sigmas_m: FloatArray) -> str:
-    """The announcement for a target, with the mode that is off beyond all others."""
-    off, sigma = _surest(shape_m, sigmas_m)
-    return (
-        f"the target is not as stated, by {1e3 * off:.2f} +- {1e3 * sigma:.2f} mm at its edges: "
-        "its shape is estimated from now on"
-    )
-
-
-def lag_told(lag_s: FloatArray, sigma_s: FloatArray) -> str:
-    """The announcement for an accelerometer whose delay is not that of the gyro."""
-    late = "behind" if lag_s[0] > 0 else "ahead of"
-    size_ms, sigma_ms = 1e3 * abs(float(lag_s[0])), 1e3 * float(sigma_s[0])
-    return f"the accelerometer is {size_ms:.2f} +- {sigma_ms:.2f} ms {late} the gyro: allowed for from now on"
-
-
-def _surest(values: FloatArray, sigmas: FloatArray) -> tuple[float, float]:
+    Args:
+        block: Its name.
+        values: Its states; for `SIZE` relative, for `LAG` s, for `TARGET` m at the edges.
+        sigmas: Their standard deviations.
+    """
     surest = int(np.argmax(np.abs(values) / sigmas))
-    return abs(float(values[surest])), float(sigmas[surest])
+    value = float(values[surest])
+    signed = block in (SIZE, LAG)
+    return Event(_KINDS[block], value=value if signed else abs(value), sigma=float(sigmas[surest]))
 
 
 def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
@@ -86,12 +68,6 @@ def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
     f.state = retract(f.state, f.layout, dx)
 
 
-_TOLD = {
-    IMU: imu_told,
-    LAG: lag_told,
-    SIZE: lambda off, sigma: size_told(float(off[0]), float(sigma[0])),
-    TARGET: target_told,
-}
 _KNOWN_SIGMA = {IMU: KNOWN_OFF_SIGMA, SIZE: KNOWN_SIZE_SIGMA}
 
 
@@ -101,7 +77,7 @@ class BeyondDoubt:
 
     _next_s: float = -np.inf
 
-    def look(self, f: CalibrationFilter) -> dict[str, str]:
+    def look(self, f: CalibrationFilter) -> dict[str, Event]:
         """Return what is to be announced, by the name of the block."""
         if f.state.t_s < self._next_s:
             return {}
@@ -113,7 +89,7 @@ class BeyondDoubt:
         return {name: _off(f, name) for name in known}
 
 
-def _off(f: CalibrationFilter, name: str) -> str:
+def _off(f: CalibrationFilter, name: str) -> Event:
     """Let a block stand by itself; return the announcement."""
     f.off.add(name)
     if name in _KNOWN_SIGMA:
@@ -121,4 +97,4 @@ def _off(f: CalibrationFilter, name: str) -> str:
     if name == TARGET:  # what stretches said of the lens, they said with the target as stated
         f.agreement = {camera: LensAgreement(agreement.model) for camera, agreement in f.agreement.items()}
     block = blocks(f)[name]
-    return _TOLD[name](block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])
+    return known_off(name, block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])

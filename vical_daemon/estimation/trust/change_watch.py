@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.trust.clock_drift import CLOCKS_APART, as_if_alike, surely_apart
+from vical_daemon.estimation.trust.clock_drift import as_if_alike, surely_apart
 from vical_daemon.estimation.trust.drift_watch import DriftWatch
 
 _REFUSED_POSE = 10  # images in a row before the pose is taken anew
@@ -39,10 +40,10 @@ class ChangeWatch:
     """Follows the verdicts on the images of all cameras.
 
     Attributes:
-        why: Reason of the last action, in words.
+        why: Cause of the last restart.
     """
 
-    why: str = ""
+    why: Cause = Cause.NONE
     _refused: int = 0
     _closer: int = 0  # images until what has changed is decided; 0: nothing has
     _pose_taken_s: float = float("-inf")
@@ -76,7 +77,7 @@ class ChangeWatch:
         soon = t < self._pose_taken_s + _SOON_S
         if self._refused >= (_REFUSED_CHANGED if soon else _REFUSED_POSE):
             self._refused = 0
-            self.why = "images no longer fit the motion, even with the pose taken anew"
+            self.why = Cause.IMAGES_REFUSED
             if soon:
                 return Action.RESTART
             self._pose_taken_s = t
@@ -89,7 +90,7 @@ class ChangeWatch:
         if self._closer:
             self._closer -= 1
             if not self._closer:
-                self.why = "images have come to disagree with the motion: the camera moved"
+                self.why = Cause.IMAGES_DISAGREE
                 return Action.RESTART
         return self._look_for_drift(report.camera, f)
 
@@ -104,7 +105,6 @@ class ChangeWatch:
             return Action.NONE
         if surely_apart(f, camera):
             self._drift.pop(camera)
-            self.why = CLOCKS_APART
             return Action.SKEW
         alike = as_if_alike(f, camera)
         variance = float(alike.S[index] @ alike.S[index])
@@ -112,5 +112,4 @@ class ChangeWatch:
         if not watch.drifts(t_s, value, variance, f.consistency[camera].factor):
             return Action.NONE
         self._drift.pop(camera)
-        self.why = "the time shift moves: the clocks of camera and imu run at changing rates"
         return Action.WANDER

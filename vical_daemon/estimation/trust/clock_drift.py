@@ -15,12 +15,12 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.retract import retract
 
 SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s, one sigma; two poor crystals."""
-CLOCKS_APART = "the time shift drifts: the clocks of camera and imu run at different rates"
 CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
 SKEW_WALK = 1e-8
 """How such a drift wanders (temperature), s/s per sqrt(s)."""
@@ -28,11 +28,6 @@ _APART = 0.05  # share of rigs whose clocks do not run alike
 _LEAST_S = 1.0
 SURE = 0.99
 """Probability from which on a drift is announced."""
-
-
-def drift_told(camera: str, why: str, skew: float, sigma: float) -> str:
-    """Return the announcement of a drift, s/s, with its sigma."""
-    return f"{camera}: {why}, by {1e6 * skew:+.1f} +- {1e6 * sigma:.1f} us a second; it is now estimated too"
 
 
 def apart(f: CalibrationFilter, camera: str) -> float:
@@ -88,7 +83,7 @@ def surely_apart(f: CalibrationFilter, camera: str) -> bool:
     return apart(f, camera) > SURE
 
 
-def let_drift(f: CalibrationFilter, camera: str, why: str, *, anew: bool) -> str:
+def let_drift(f: CalibrationFilter, camera: str, *, anew: bool) -> Event:
     """From now on the clock of this camera drifts (`anew`: and not as it did before); the announcement."""
     where = f.layout.cameras[camera]
     assert where.timeshift is not None
@@ -98,7 +93,8 @@ def let_drift(f: CalibrationFilter, camera: str, why: str, *, anew: bool) -> str
     if anew:
         f.reopen(where.skew, SKEW_SIGMA)
         f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
-    return drift_told(camera, why, f.state.cameras[camera].skew, float(np.linalg.norm(f.S[where.skew])))
+    kind = EventKind.CLOCK_WANDER if anew else EventKind.CLOCK_DRIFT
+    return Event(kind, camera, float(f.state.cameras[camera].skew), float(np.linalg.norm(f.S[where.skew])))
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:

@@ -54,17 +54,19 @@ class HeldBack:
         return held.surprise(held.image(frame, t_cam_s, target[frame.ids]))
 
 
-def imu_noise_doubt(ratios: Sequence[float], scale: float) -> str:
-    """What held-back predictions say about the imu's noise densities, in words; empty: they agree.
+def imu_noise_error(ratios: Sequence[float], scale: float) -> float | None:
+    """What held-back predictions say about the imu's noise densities; None: they agree.
 
     Args:
         ratios: What `HeldBack.follow` returned of late.
         scale: `Consistency.scale` of the camera: with images that do not fit nothing can be said.
+
+    Returns:
+        Errors of the predictions over the expected ones (1: as expected), where they differ.
     """
     if len(ratios) < _ENOUGH or scale > _FITS:
-        return ""
+        return None
     mean = float(np.mean(np.minimum(ratios, _CLIP)))
     if _BETTER <= mean <= _WORSE:
-        return ""
-    than = "worse" if mean > _WORSE else "better"
-    return f"the imu foretells images {than} than its noise densities say ({np.sqrt(mean):.1f} times)"
+        return None
+    return float(np.sqrt(mean))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.camera_model import RADTAN
+from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
@@ -17,10 +20,17 @@ from vical_daemon.estimation.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.state import Layout
 from vical_daemon.estimation.trace import Trace
 from vical_daemon.estimation.trust import clock_drift, hypotheses
-from vical_daemon.estimation.trust.held_back import imu_noise_doubt
-from vical_daemon.estimation.trust.missing_motion import Missing, RunningMotion, guidance, shortcoming
+from vical_daemon.estimation.trust.held_back import imu_noise_error
+from vical_daemon.estimation.trust.missing_motion import (
+    ALL_WAYS,
+    RunningMotion,
+    excitation_advice,
+    weak_directions,
+)
 from vical_daemon.estimation.trust.picture_cover import Cover
-from vical_daemon.estimation.trust.stamp_jitter import jitter_told
+from vical_daemon.estimation.trust.stamp_jitter import ANNOUNCED_S
+from vical_daemon.estimation.trust.steady_status import CONFIRMING, SteadyStatus, Verdict
+from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
 
 _ENOUGH_FRAMES = 60
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
@@ -28,12 +38,7 @@ _PATIENCE_S = 15.0
 _LOST = 3.0  # a direction this far above its target after the patience is called unobservable
 _NIS_BAD = 4.0
 _HELD_BACK_BAD = 9.0
-_HYSTERESIS = 2.0
 _RECENT = 60
-_MOVE = "turn the rig about all three axes while moving it"
-
-
-_TERM_MISSING = "the lens of {} needs one term more than radtan has: give it distortion_model: plumb_bob"
 
 
 class Judge:
@@ -55,9 +60,9 @@ class Judge:
         self.frames_seen = 0
         self.frames_ignored = 0
         self.frames_refused = 0
-        self.events: list[str] = []
-        self.status = Status.WAITING
-        self.bumped = ""
+        self._events = EventLog()
+        self._steady = SteadyStatus()
+        self.bumped = Cause.NONE
         self.in_doubt = ""
         self._ever_converged = False
         self._start_reason = ""
@@ -71,7 +76,6 @@ class Judge:
         self._nis: deque[tuple[float, int]] = deque(maxlen=300)
         self._recent_used: deque[bool] = deque(maxlen=_RECENT)
         self._held_back: deque[float] = deque(maxlen=40)
-        self._told: set[str] = set()
         self._square: dict[str, deque[tuple[float, int]]] = {}
         self._trace: dict[str, Trace] = {}
         self._size: deque[float] = deque(maxlen=400)
@@ -84,6 +88,7 @@ class Judge:
             self._first_ns = t_ns
         self.imu_samples += 1
         self._newest_ns = t_ns
+        self._events.now_s = (t_ns - self._first_ns) * 1e-9
         self._motion.add((t_ns - self._first_ns) * 1e-9, gyro)
         if self.imu_samples % 16 == 1:
             self._size.append(float(np.sqrt(accel @ accel)))
@@ -106,25 +111,35 @@ class Judge:
         self._nis.clear()
         self._held_back.clear()
         if self.bumped:
-            self.events.append("started anew after the change")
-            self.bumped = ""
+            self.announce(Event(EventKind.STARTED_ANEW))
+            self.bumped = Cause.NONE
 
     def reopened(self, t_s: float) -> None:
         """Something that was known has to be found anew: patience begins again at `t_s`."""
         self._reopened_s = t_s
+        self._steady.reset(min(self.status, Status.CONVERGING, key=list(Status).index))
 
-    def announce(self, event: str, once: str = "") -> None:
+    def announce(self, event: Event, once: str = "") -> None:
         """Put an event into the next estimate; of those with the same `once` only the first."""
-        if once not in self._told:
-            self.events.append(event)
-            self._told |= {once} if once else set()
+        self._events.add(event, once)
 
-    def changed(self, why: str) -> None:
+    def announce_all(self, events: Iterable[Event]) -> None:
+        """Put events into the next estimate."""
+        for event in events:
+            self._events.add(event)
+
+    def changed(self, why: Cause) -> None:
         """The rig is not what it was: the calibration is being taken anew."""
         self.bumped = why
-        self.events.append(f"bumped: {why}" if self._ever_converged else f"started over: {why}")
+        kind = EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER
+        self.announce(Event(kind, cause=why))
         self._started_s = None
-        self.status = Status.INCONSISTENT
+        self._steady.reset(Status.INCONSISTENT)
+
+    @property
+    def status(self) -> Status:
+        """Where the calibration stands, as of the last estimate."""
+        return self._steady.status
 
     def held_back(self, ratio: float, scale: float) -> None:
         """Take in how well the imu alone foretold an image.
@@ -134,9 +149,9 @@ class Judge:
             scale: `Consistency.scale` of the camera.
         """
         self._held_back.append(ratio)
-        doubt = imu_noise_doubt(self._held_back, scale)
-        if doubt:
-            self.announce(f"{doubt}: measure them with `vical allan`", once="imu noise")
+        error = imu_noise_error(self._held_back, scale)
+        if error is not None:
+            self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
 
     def saw_frame(self, report: FrameReport, f: CalibrationFilter) -> None:
         """Take the verdict of one frame."""
@@ -153,12 +168,13 @@ class Judge:
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
-        told = jitter_told(report.camera, f.shared[report.camera].jitter_s)
-        if told:
-            self.announce(told, once=f"jitter {report.camera}")
+        jitter_s = f.shared[report.camera].jitter_s
+        if jitter_s >= ANNOUNCED_S:
+            event = Event(EventKind.STAMP_JITTER, report.camera, float(jitter_s))
+            self.announce(event, once=f"jitter {report.camera}")
         lens = f.agreement[report.camera]
         if lens.model == RADTAN and lens.moved.any():
-            self.announce(_TERM_MISSING.format(report.camera), once=f"lens {report.camera}")
+            self.announce(Event(EventKind.LENS_TERM_MISSING, report.camera), once=f"lens {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())
@@ -183,23 +199,24 @@ class Judge:
         shown = f or stale
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
-        self.status, reason, advice = self._decide(f, missing)
-        if advice and f is not None:
+        verdict = self._decide(f, missing)
+        if verdict.guidance and f is not None:
             first = next(iter(f.state.cameras.values()))
-            advice = shortcoming(self._motion, first.R_imu_cam, f.state.gyro_bias) or advice
+            advice = excitation_advice(self._motion, first.R_imu_cam, f.state.gyro_bias)
+            verdict = verdict._replace(guidance=advice or verdict.guidance)
+        _, reason, advice = self._steady.follow(verdict, self._now_s)
         if not advice and f is not None and self.status != Status.INCONSISTENT:
             advice = self._cover.advice()
         self._ever_converged |= self.status == Status.CONVERGED
         if f is not None and (self.status == Status.DEGENERATE or f.unshown is not None):
             cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
-        events, self.events = self.events, []
         return CalibrationEstimate(
             self._newest_ns,
             self.status,
             reason,
             self._progress(missing),
-            advice,
-            (self._newest_ns - self._first_ns) * 1e-9,
+            guidance_text(advice),
+            self._now_s,
             self.frames,
             self.imu_samples,
             cameras,
@@ -207,8 +224,13 @@ class Judge:
             [] if shown is None else shown.state.gravity.tolist(),
             self.nis_per_dof(),
             self._points[0] / max(self._points[1], 1),
-            events,
+            self._events.take(),
+            advice,
         )
+
+    @property
+    def _now_s(self) -> float:
+        return (self._newest_ns - self._first_ns) * 1e-9
 
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter as it is told: over all hypotheses about imu, target and clocks."""
@@ -221,64 +243,67 @@ class Judge:
         rms = float(np.sqrt(sum(s for s, _ in square) / count)) if count else 0.0
         return camera_estimate(f, name, rms)
 
-    def _missing(self, e: CameraEstimate, name: str, f: CalibrationFilter) -> list[Missing]:
+    def _missing(self, e: CameraEstimate, name: str, f: CalibrationFilter) -> list[WeakDirection]:
         where = self.layout.cameras[name]
         if where.position is None and where.timeshift is None:
             return []
         covariance, R = np.array(e.T_imu_cam.covariance), f.state.cameras[name].R_imu_cam
-        return guidance(
+        return weak_directions(
             covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, f.state.gyro_bias
         )
 
     @staticmethod
-    def _withheld(e: CameraEstimate, missing: list[Missing]) -> CameraEstimate:
-        return replace(e, unobservable=[str(m) for m in missing if m.excess > _LOST])
+    def _withheld(e: CameraEstimate, missing: list[WeakDirection]) -> CameraEstimate:
+        lost = [m for m in missing if m.excess > _LOST]
+        return replace(e, unobservable=[direction_line(m) for m in lost], withheld=lost)
 
-    def _decide(
-        self, f: CalibrationFilter | None, missing: dict[str, list[Missing]]
-    ) -> tuple[Status, str, str]:
-        """Status, reason and guidance."""
+    def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[WeakDirection]]) -> Verdict:
+        """Status, reason and guidance by the data up to now."""
         if f is None:
             return self._before_start()
         trouble = self._trouble()
         if trouble:
-            return Status.INCONSISTENT, trouble, ""
+            return Verdict(Status.INCONSISTENT, trouble)
         span = f.state.t_s - (self._started_s or 0.0)
-        lacking = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
-        if self.status == Status.CONVERGED:
-            lacking = [g for g in lacking if g.excess > _HYSTERESIS]
+        weak = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
+        lacking = self._steady.counted(weak)
         if not lacking:
             if self._partial:
-                return Status.DEGENERATE, self._partial, _MOVE
+                return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)
             if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
-                return Status.CONVERGING, "sigmas are small; waiting for more data to confirm them", ""
+                return Verdict(Status.CONVERGING, CONFIRMING)
             if self.in_doubt:
-                return Status.CONVERGING, self.in_doubt, ""
+                return Verdict(Status.CONVERGING, self.in_doubt)
             if not self._held_back_fine():
-                return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
-            return Status.CONVERGED, "", ""
+                return Verdict(
+                    Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet"
+                )
+            return Verdict(Status.CONVERGED)
         worst = lacking[0]
         patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > _PATIENCE_S
         if patient and worst.excess > _LOST:
-            names = "; ".join(g.said for g in lacking[:3])
-            return Status.DEGENERATE, f"the motion does not show: {names}", worst.motion
-        return Status.CONVERGING, f"{worst.said}", worst.motion
+            names = "; ".join(direction_sigma(g) for g in lacking[:3])
+            return Verdict(Status.DEGENERATE, f"the motion does not show: {names}", worst.guidance)
+        return Verdict(Status.CONVERGING, direction_sigma(worst), worst.guidance)
 
-    def _before_start(self) -> tuple[Status, str, str]:
+    def _before_start(self) -> Verdict:
         if self.bumped:
-            return Status.INCONSISTENT, f"{self.bumped}; calibrating anew: {self._start_reason}", ""
+            why = cause_text(self.bumped)
+            return Verdict(Status.INCONSISTENT, f"{why}; calibrating anew: {self._start_reason}")
         if not self.imu_samples:
-            return Status.WAITING, "no inertial data yet", ""
+            return Verdict(Status.WAITING, "no inertial data yet")
         unit = self._unit_trouble()
         if unit:
-            return Status.INCONSISTENT, unit, ""
+            return Verdict(Status.INCONSISTENT, unit)
         if self._first_frame_s is None:
-            return Status.WAITING, "the target has not been seen yet: show the whole board to the camera", ""
+            return Verdict(
+                Status.WAITING, "the target has not been seen yet: show the whole board to the camera"
+            )
         seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
         if self._motion_missing and seen_for > _PATIENCE_S:
-            advice = shortcoming(self._motion, None) or _MOVE
-            return Status.DEGENERATE, self._start_reason, advice
-        return Status.INITIALISING, self._start_reason or "collecting the first seconds", ""
+            advice = excitation_advice(self._motion, None) or ALL_WAYS
+            return Verdict(Status.DEGENERATE, self._start_reason, advice)
+        return Verdict(Status.INITIALISING, self._start_reason or "collecting the first seconds")
 
     def _unit_trouble(self) -> str:
         if len(self._size) < 20:
@@ -302,7 +327,7 @@ class Judge:
     def _held_back_fine(self) -> bool:
         return len(self._held_back) >= 2 and float(np.median(self._held_back)) < _HELD_BACK_BAD
 
-    def _progress(self, missing: dict[str, list[Missing]]) -> float:
+    def _progress(self, missing: dict[str, list[WeakDirection]]) -> float:
         if self.status == Status.CONVERGED:
             return 1.0
         if not missing:

@@ -1,9 +1,9 @@
-"""What motion is missing, in words: from the covariance of a calibration and from how the rig turned.
+"""What motion is missing: from the covariance of a calibration and from how the rig turned.
 
-A direction whose sigma is above its limit is named, in words that a person holding the rig understands (the
-optical axis, the image's x axis), together with the motion that would reveal it. Which motion that is follows
-from observability (docs/math/observability.md): the lever arm needs rotation about two axes, the mounting
-too, the delay needs a rate that changes. Live: feed `RunningMotion` with the gyro and ask `guidance`.
+A direction whose sigma is above its limit is given together with the motion that would reveal it. Which
+motion that is follows from observability (docs/math/observability.md): the lever arm needs rotation about
+two axes, the mounting too, the delay needs a rate that changes. Live: feed `RunningMotion` with the gyro and
+ask `weak_directions`. `wording` names directions and motions.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.measurements import ConvergenceTargets
 
 FloatArray = npt.NDArray[np.float64]
@@ -27,61 +28,14 @@ _ONE_AXIS = (
 )
 _BLOCK_S = 0.1
 _ALONG = 0.85  # cosine above which two directions are called the same
-_TURNS = ("the image's x axis (nod)", "the image's y axis (shake)", "the optical axis (roll)")
-_STEADY = "the rotation rate hardly changes; turn to and fro instead of steadily round"
-
-
-@dataclass(frozen=True)
-class Missing:
-    """One direction that is not known, and what would reveal it.
-
-    Attributes:
-        block: lever_arm, rotation or timeshift.
-        direction: In words, e.g. "the optical axis"; empty for the time shift.
-        axis_cam: The direction in the camera frame, unit length, shape (3,); zeros for the time shift.
-        sigma: Standard deviation along it, m, rad or s.
-        motion: The motion that would reveal it.
-        limit: Above which sigma it counts as unknown.
-    """
-
-    block: str
-    direction: str
-    axis_cam: FloatArray
-    sigma: float
-    motion: str
-    limit: float
-
-    @property
-    def name(self) -> str:
-        """What is not known, e.g. "lever arm along the optical axis"."""
-        return {
-            "lever_arm": f"lever arm along {self.direction}",
-            "rotation": f"rotation about {self.direction}",
-            "timeshift": "time shift",
-        }[self.block]
-
-    @property
-    def excess(self) -> float:
-        """Its sigma over the limit; above 1."""
-        return self.sigma / self.limit
-
-    @property
-    def said(self) -> str:
-        """Name and figure."""
-        figure = {
-            "lever_arm": f"{1e3 * self.sigma:.1f} mm",
-            "rotation": f"{self.sigma / _DEG:.2f} deg",
-            "timeshift": f"{1e3 * self.sigma:.2f} ms",
-        }[self.block]
-        return f"{self.name}: +-{figure}"
-
-    def __str__(self) -> str:
-        """One line for a person."""
-        return f"{self.name}: {self.motion}"
+_STEADY = 0.3  # change of the rate in a second over the rate, below which it turns steadily
+_NEAR = 0.5  # cosine above which turning about an axis is much the same as about a direction
+_GOOD_AXES: tuple[Axis, ...] = ("x", "y")  # any two will do; with these the target stays in view
+ALL_WAYS = Guidance(Verb.TURN_AND_MOVE, AXES)
 
 
 class RunningMotion:
-    """How the rig turned of late: what `guidance` needs to know of the gyro, kept for next to nothing.
+    """How the rig turned of late: what `weak_directions` needs to know of the gyro, kept for next to nothing.
 
     Rates are averaged over tenths of a second, so that the gyro's noise is not taken for acceleration.
 
@@ -132,15 +86,15 @@ class RunningMotion:
         return float(np.sqrt(self._change)) if self._changes else None
 
 
-def guidance(
+def weak_directions(
     pose_covariance: FloatArray,
     R_imu_cam: FloatArray,
     timeshift_sigma_s: float,
     motion: RunningMotion,
     limits: ConvergenceTargets,
     bias_rps: FloatArray | None = None,
-) -> list[Missing]:
-    """Name what is not known well enough, worst first, with the motion that would reveal it.
+) -> list[WeakDirection]:
+    """Find what is not known well enough, worst first, with the motion that would reveal it.
 
     Args:
         pose_covariance: Of T_imu_cam, order [p r], m and rad (rotation local), shape (6, 6).
@@ -151,7 +105,7 @@ def guidance(
         bias_rps: The gyro's bias, shape (3,).
 
     Returns:
-        The gaps; empty when everything is known well enough.
+        The directions; empty when everything is known well enough.
     """
     covariance = np.zeros((7, 7))
     covariance[:6, :6], covariance[6, 6] = pose_covariance, timeshift_sigma_s**2
@@ -160,10 +114,10 @@ def guidance(
     return sorted(found, key=lambda m: -m.excess)
 
 
-def shortcoming(
+def excitation_advice(
     motion: RunningMotion, R_imu_cam: FloatArray | None, bias_rps: FloatArray | None = None
-) -> str:
-    """What is wrong with the motion as a whole, and what to do; empty where it is rich enough.
+) -> Guidance:
+    """What is wrong with the motion as a whole, and what to do; nothing where it is rich enough.
 
     Args:
         motion: How the rig turned of late.
@@ -172,28 +126,14 @@ def shortcoming(
     """
     turning = _Turning.of(motion.scatter(bias_rps), np.eye(3) if R_imu_cam is None else R_imu_cam)
     if turning.rms_rps < _SLOW_RPS:
-        return turning._general()
+        return turning.too_little(_GOOD_AXES)
     if turning.one_axis:
-        about = "one axis" if R_imu_cam is None else axis_words(turning.axis_cam)
-        return f"so far it turned about {about} only; rotate about another axis too"
-    steady = motion.rate_change_rps2
-    if steady is not None and steady < 0.3 * turning.rms_rps:
-        return _STEADY
-    return ""
-
-
-def axis_words(axis_cam: FloatArray) -> str:
-    """Name a direction given in the camera frame (x right, y down, z forward)."""
-    axis = np.asarray(axis_cam, dtype=np.float64) / np.linalg.norm(axis_cam)
-    names = ("the image's x axis", "the image's y axis", "the optical axis")
-    i = int(np.argmax(np.abs(axis)))
-    if abs(axis[i]) > _ALONG:
-        return names[i]
-    j = int(np.argsort(np.abs(axis))[1])
-    if abs(axis[i]) ** 2 + abs(axis[j]) ** 2 > _ALONG**2 and abs(axis[j]) > 0.3:
-        short = ("x", "y", "optical")
-        return f"a line between the camera's {short[min(i, j)]} and {short[max(i, j)]} axes"
-    return "a line oblique to all axes of the camera"
+        if R_imu_cam is None:
+            return Guidance(Verb.TURN, _GOOD_AXES, Lack.ONE_AXIS)
+        return turning.about_another(Verb.TURN)
+    if turning.steady(motion.rate_change_rps2):
+        return Guidance(Verb.TURN_TO_AND_FRO, _GOOD_AXES, Lack.STEADY_RATE)
+    return Guidance()
 
 
 def missing_motion(
@@ -202,8 +142,8 @@ def missing_motion(
     rate_scatter: FloatArray,
     rate_change_rps2: float | None = None,
     limits: ConvergenceTargets = WIDE,
-) -> list[Missing]:
-    """Say which directions of a calibration are not known, and what motion would reveal them.
+) -> list[WeakDirection]:
+    """Find which directions of a calibration are not known, and what motion would reveal them.
 
     Args:
         covariance: Of [p_imu_cam (3, imu frame, m), R_imu_cam (3, local, rad), time shift (s)], shape (7, 7).
@@ -217,19 +157,24 @@ def missing_motion(
         The directions, worst first within each block; empty when all is known.
     """
     turning = _Turning.of(rate_scatter, R_imu_cam)
-    found: list[Missing] = []
+    found: list[WeakDirection] = []
     in_cam = R_imu_cam.T @ covariance[:3, :3] @ R_imu_cam
     for sigma, axis in _beyond(in_cam, limits.position_m):
-        advice = turning.advice_lever_arm(axis)
-        found.append(Missing("lever_arm", axis_words(axis), axis, sigma, advice, limits.position_m))
+        advice = turning.for_lever_arm(axis)
+        found.append(WeakDirection(Block.LEVER_ARM, _plain(axis), sigma, limits.position_m, advice))
     for sigma, axis in _beyond(covariance[3:6, 3:6], limits.rotation_rad):
-        advice = turning.advice_rotation(axis)
-        found.append(Missing("rotation", axis_words(axis), axis, sigma, advice, limits.rotation_rad))
+        advice = turning.for_rotation(axis)
+        found.append(WeakDirection(Block.ROTATION, _plain(axis), sigma, limits.rotation_rad, advice))
     sigma_t = float(np.sqrt(covariance[6, 6]))
     if sigma_t > limits.timeshift_s:
-        advice = turning.advice_timeshift(rate_change_rps2)
-        found.append(Missing("timeshift", "", np.zeros(3), sigma_t, advice, limits.timeshift_s))
+        advice = turning.for_timeshift(rate_change_rps2)
+        found.append(WeakDirection(Block.TIMESHIFT, (0.0, 0.0, 0.0), sigma_t, limits.timeshift_s, advice))
     return found
+
+
+def _plain(axis: FloatArray) -> tuple[float, float, float]:
+    x, y, z = (float(a) for a in axis)
+    return x, y, z
 
 
 def _beyond(block: FloatArray, limit: float) -> list[tuple[float, FloatArray]]:
@@ -254,35 +199,46 @@ class _Turning:
         one = bool(values[1] < _ONE_AXIS * values[2])
         return cls(rms, R_imu_cam.T @ vectors[:, 2], one)
 
-    def _general(self) -> str:
+    def too_little(self, axes: tuple[Axis, ...]) -> Guidance:
+        """What to do where it hardly turns, or slowly; nothing where it turns fast enough."""
         if self.rms_rps < _STILL_RPS:
-            return "the rig hardly turns; turn it to and fro about two axes at 20 to 60 deg/s"
+            return Guidance(Verb.TURN, axes, Lack.STILL, rate_rps=self.rms_rps)
         if self.rms_rps < _SLOW_RPS:
-            rate = f"{self.rms_rps / _DEG:.0f} deg/s"
-            return f"it turns at only {rate}; turn faster, 20 to 60 deg/s, about two axes"
-        return ""
+            return Guidance(Verb.TURN_FASTER, axes, Lack.SLOW, rate_rps=self.rms_rps)
+        return Guidance()
 
-    def _about_others(self, axis: FloatArray) -> str:
+    def about_another(self, verb: Verb) -> Guidance:
+        """Turn about another axis than so far."""
+        alike = np.abs(self.axis_cam)
+        axes = tuple(a for a, c in zip(AXES, alike, strict=True) if c < _NEAR) or (
+            AXES[int(np.argmin(alike))],
+        )
+        return Guidance(verb, axes, Lack.ONE_AXIS, _plain(self.axis_cam))
+
+    def steady(self, rate_change_rps2: float | None) -> bool:
+        """Whether the rate hardly changes."""
+        return rate_change_rps2 is not None and rate_change_rps2 < _STEADY * self.rms_rps
+
+    def _about_others(self, axis: FloatArray) -> Guidance:
         """Rotations across a direction: those that show what lies along it."""
         along = int(np.argmax(np.abs(axis)))
-        return " and ".join(f"about {_TURNS[i]}" for i in range(3) if i != along)
+        others = tuple(AXES[i] for i in range(3) if i != along)
+        return self.too_little(others) or Guidance(Verb.TURN, others)
 
-    def advice_lever_arm(self, axis: FloatArray) -> str:
+    def for_lever_arm(self, axis: FloatArray) -> Guidance:
         if self.one_axis and self.rms_rps >= _STILL_RPS:
-            about = axis_words(self.axis_cam)
-            if abs(float(axis @ self.axis_cam)) > _ALONG:
-                return f"so far it turned about {about} only; rotate about another axis"
-            return f"so far it turned about {about} only; rotate about another axis too, and faster"
-        return self._general() or f"rotate {self._about_others(axis)}"
+            along = abs(float(axis @ self.axis_cam)) > _ALONG
+            return self.about_another(Verb.TURN if along else Verb.TURN_FASTER)
+        return self._about_others(axis)
 
-    def advice_rotation(self, axis: FloatArray) -> str:
-        if self.one_axis and self.rms_rps >= _STILL_RPS and abs(float(axis @ self.axis_cam)) > 0.5:
-            return f"so far it turned about {axis_words(self.axis_cam)} only; rotate about another axis"
-        return self._general() or f"rotate {self._about_others(axis)}"
+    def for_rotation(self, axis: FloatArray) -> Guidance:
+        if self.one_axis and self.rms_rps >= _STILL_RPS and abs(float(axis @ self.axis_cam)) > _NEAR:
+            return self.about_another(Verb.TURN)
+        return self._about_others(axis)
 
-    def advice_timeshift(self, rate_change_rps2: float | None) -> str:
+    def for_timeshift(self, rate_change_rps2: float | None) -> Guidance:
         if self.rms_rps < _STILL_RPS:
-            return "without rotation the delay hardly shows; turn the rig to and fro"
-        if rate_change_rps2 is not None and rate_change_rps2 < 0.3 * self.rms_rps:
-            return _STEADY
-        return self._general() or "turn the rig back and forth faster, changing direction"
+            return Guidance(Verb.TURN_TO_AND_FRO, _GOOD_AXES, Lack.STILL, rate_rps=self.rms_rps)
+        if self.steady(rate_change_rps2):
+            return Guidance(Verb.TURN_TO_AND_FRO, _GOOD_AXES, Lack.STEADY_RATE)
+        return self.too_little(_GOOD_AXES) or Guidance(Verb.TURN_TO_AND_FRO, _GOOD_AXES, Lack.FAST_CHANGES)

@@ -13,7 +13,8 @@ import numpy as np
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.camera_model import EQUIDISTANT
 from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.guidance import Edge, Guidance, Lack, Verb
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 
 _ACROSS, _DOWN = 16, 12  # parts of the picture
 _LEAST = 5  # corners of a part that has been seen
@@ -35,15 +36,13 @@ class Cover:
         picture = self._pictures.setdefault(report.camera, PictureCover(camera.resolution))
         picture.add(report.uv_px[report.accepted])
 
-    def advice(self) -> str:
-        """What to show the cameras, in words, the first that lacks something; empty where none does."""
+    def advice(self) -> Guidance:
+        """What to show the cameras, the first that lacks something; nothing where none does."""
         for name, picture in self._pictures.items():
             edges = picture.unseen_edges()
             if edges:
-                names = " and ".join(filter(None, (", ".join(edges[:-1]), edges[-1])))
-                which = f"{names} {'edge' if len(edges) == 1 else 'edges'} of {name}'s picture"
-                return f"no corners yet near the {which}: show the target there, for the lens"
-        return ""
+                return Guidance(Verb.SHOW, lack=Lack.EDGES, camera=name, edges=edges)
+        return Guidance()
 
 
 class PictureCover:
@@ -64,10 +63,15 @@ class PictureCover:
         np.add.at(self._counts, (y, x), 1)
         self._most, self._least = max(self._most, len(uv_px)), min(self._least, len(uv_px))
 
-    def unseen_edges(self) -> list[str]:
+    def unseen_edges(self) -> tuple[Edge, ...]:
         """Edges along most of which no corners have been, though they could."""
         if self._least >= _PARTLY * self._most:
-            return []
+            return ()
         seen = self._counts >= _LEAST
-        edges = {"left": seen[:, 0], "right": seen[:, -1], "top": seen[0], "bottom": seen[-1]}
-        return [name for name, parts in edges.items() if parts.mean() < _SHARE]
+        edges: dict[Edge, BoolArray] = {
+            "left": seen[:, 0],
+            "right": seen[:, -1],
+            "top": seen[0],
+            "bottom": seen[-1],
+        }
+        return tuple(name for name, parts in edges.items() if parts.mean() < _SHARE)

@@ -1,6 +1,6 @@
-"""What late stamps are told as, and how a jitter is drawn from errors and their variances (without a board).
+"""From when on a jitter of stamps is announced, and how it is drawn from errors and their variances.
 
-With a board, `shared_errors` does it.
+The second is for use without a board; with one, `shared_errors` does it.
 """
 
 from __future__ import annotations
@@ -13,14 +13,8 @@ _SIGNIFICANT = 5.0  # standard deviations above what stamps without jitter would
 _CLIP = 36.0  # squared standard deviations: outliers are not jitter
 _FLOOR_S = 2e-5
 _ROUNDS = 8
-_TOLD_S = 3e-4  # what to do about it is often a setting of the camera's driver
-
-
-def jitter_told(camera: str, jitter_s: float) -> str:
-    """Announcement of a jitter; empty where it is too small to be worth a word."""
-    if jitter_s < _TOLD_S:
-        return ""
-    return f"{camera}: the stamps of the images jitter by {1e3 * jitter_s:.1f} ms; allowed for"
+ANNOUNCED_S = 3e-4
+"""From here on a jitter is announced, s: what to do about it is often a setting of the camera's driver."""
 
 
 def excess(square: FloatArray, usual: FloatArray) -> float:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.target_modes import TargetModes
 from vical_daemon.estimation.trust.stretches import Stretches
@@ -60,11 +61,10 @@ class TargetDoubt:
         self.off_m = told.values if z.max() > _BEYOND_DOUBT else None
 
 
-def told(doubts: dict[str, TargetDoubt]) -> str:
-    """What is to be announced, once: then the cameras' doubts are forgotten. Empty while there is nothing."""
-    off_mm = [1e3 * float(np.abs(d.off_m).max()) for d in doubts.values() if d.off_m is not None]
-    if not off_mm:
-        return ""
+def announcement(doubts: dict[str, TargetDoubt]) -> Event | None:
+    """What is to be announced, once: then the cameras' doubts are forgotten. None while there is nothing."""
+    off_m = [float(np.abs(d.off_m).max()) for d in doubts.values() if d.off_m is not None]
+    if not off_m:
+        return None
     doubts.clear()
-    seen = f"corners lie up to {max(off_mm):.1f} mm beside their stated places"
-    return f"{seen}, or the lens that is held is not this camera's"
+    return Event(EventKind.TARGET_OR_LENS, value=max(off_m))

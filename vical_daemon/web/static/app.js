@@ -2,7 +2,7 @@
 // Listens to /events and draws. Everything from the robot goes in as text, never as HTML.
 
 const $ = (id) => document.getElementById(id);
-const page = { columns: [], rows: {}, latest: {}, devices: [], views: [], control: false, camera: null, span: 0, heard: 0 };
+const page = { columns: [], rows: {}, latest: {}, devices: [], views: [], fault: null, control: false, camera: null, span: 0, heard: 0 };
 const SILENT_MS = 5000; // the robot speaks 2.5 times a second
 const AXES = ["x", "y", "z"];
 const COLOURS = ["--x", "--y", "--z"];
@@ -27,12 +27,12 @@ function setText(id, text) {
   if ($(id).textContent !== text) $(id).textContent = text;
 }
 
-// A value with the digits that three sigma leave meaningful.
+// A value with the digits that one sigma leaves meaningful: two digits of the sigma.
 function shown(value, sigma) {
   if (value === null || value === undefined) return ["–", ""];
   if (!sigma) return [String(value), ""];
-  const digits = Math.min(Math.max(1 - Math.floor(Math.log10(3 * sigma)), 0), 6);
-  return [value.toFixed(digits), `± ${(3 * sigma).toFixed(digits)}`];
+  const digits = Math.min(Math.max(1 - Math.floor(Math.log10(sigma)), 0), 6);
+  return [value.toFixed(digits), `± ${sigma.toFixed(digits)}`];
 }
 
 function fillValues(id, entries) {
@@ -127,25 +127,29 @@ function round(value, digits) {
 function drawWords() {
   const latest = page.latest[page.camera];
   const status = latest ? latest.status : "waiting"; // "stale" when the estimates have stopped
-  $("status").className = `pill ${status}`;
+  const fault = page.fault; // what does not work comes before any advice
+  $("status").className = `pill ${fault ? "fault" : status}`;
   document.querySelector("main").classList.toggle("stale", status === "stale");
-  setText("status", status === "stale" ? `stale, ${latest.age_s.toFixed(0)} s old` : latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
+  setText("status", fault ? "fault" : status === "stale" ? `stale, ${latest.age_s.toFixed(0)} s old` : latest && status === "converging" ? `${status} ${Math.round(100 * (latest.progress || 0))} %` : status);
   document.querySelector(".say").classList.toggle("converged", status === "converged");
-  setText("sentence", latest ? latest.sentence : "No estimate yet: is the calibrate process running?");
-  setText("guidance", latest && !latest.stale ? latest.guidance : "");
+  document.querySelector(".say").classList.toggle("fault", Boolean(fault));
+  const headline = latest ? latest.headline : "No estimate yet: is the calibrate process running?";
+  setText("headline", fault ? fault.headline : headline);
+  setText("guidance", fault ? fault.message : latest ? latest.guidance : "");
+  setText("reason", fault ? `Calibration: ${headline}` : latest ? latest.reason : "");
   $("bar").style.width = `${Math.round(100 * ((latest && latest.progress) || 0))}%`;
-  setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples · ± is 3 sigma` : "");
+  setText("facts", latest ? `${(latest.duration_s || 0).toFixed(0)} s of data · ${latest.frames} frames · ${latest.imu_samples} inertial samples · ± is 1 sigma` : "");
   const withheld = latest ? latest.withheld : [];
   $("withheld").replaceChildren(...withheld.map((line) => element("li", "", line)));
-  const motion = latest && !latest.stale ? latest.motion : { rotate: [], translate: [] };
+  const news = latest ? latest.events.slice().reverse() : [];
+  $("news").replaceChildren(...news.map((event) => element("li", "", event.t_s === null ? event.text : `${event.t_s.toFixed(0)} s: ${event.text}`)));
+  const motion = latest ? latest.motion : { rotate: [], translate: [], edges: [], caption: "" };
+  for (const edge of document.querySelectorAll(".edge")) edge.classList.toggle("wanted", motion.edges.some((name) => edge.classList.contains(name)));
   for (const axis of AXES) {
     $(`axis-${axis}`).classList.toggle("rotate", motion.rotate.includes(axis));
     $(`axis-${axis}`).classList.toggle("move", motion.translate.includes(axis));
   }
-  const asks = motion.rotate.length + motion.translate.length > 0;
-  setText("motiontext", asks ? [motion.rotate.length ? `turn about ${motion.rotate.join(", ")}` : "",
-    motion.translate.length ? `move along ${motion.translate.join(", ")}` : ""].filter(Boolean).join("; ")
-    : status === "stale" ? "" : status === "converged" ? "nothing is missing" : "turn and move freely, the board in view");
+  setText("motiontext", motion.caption);
   const lens = latest && latest.lens;
   setText("lens", lens ? lensText(lens) : "not known yet");
 }
@@ -168,8 +172,12 @@ function drawDevices() {
     const lost = d.values.lost !== undefined ? d.values.lost : d.values.dropped;
     const rate = d.values.rate_hz !== undefined ? Number(d.values.rate_hz).toFixed(1) : "";
     const jitter = d.values.jitter_us !== undefined ? Number(d.values.jitter_us).toFixed(0) : "";
-    line.append(first, element("td", "", d.name), element("td", "", d.message), element("td", "n", rate),
-      element("td", "n", lost === undefined ? "" : lost), element("td", "n", jitter));
+    const figures = [["rate, Hz", rate], ["lost", lost === undefined ? "" : lost], ["jitter, µs", jitter]].map(([label, text]) => {
+      const cell = element("td", "n", text);
+      cell.dataset.label = label; // shown instead of the heading where the page is narrow
+      return cell;
+    });
+    line.append(first, element("td", "name", d.name), element("td", "says", d.message), ...figures);
     return line;
   }));
 }
@@ -208,7 +216,8 @@ function watchSilence() {
   for (const latest of Object.values(page.latest)) {
     if (latest.heardAge === undefined) latest.heardAge = latest.age_s;
     Object.assign(latest, { status: "stale", stale: true, age_s: latest.heardAge + silent / 1000,
-      sentence: `The robot has not answered for ${(silent / 1000).toFixed(0)} s. The values below are old; the last status was ${latest.last_status}.` });
+      headline: `The robot has not answered for ${(silent / 1000).toFixed(0)} s.`, guidance: "",
+      reason: `The values are old; the last status was ${latest.last_status}.` });
   }
   drawWords();
 }
@@ -231,6 +240,7 @@ function take(message, full) {
     page.latest[name] = camera;
   }
   page.devices = message.devices;
+  page.fault = message.fault;
   draw();
 }
 

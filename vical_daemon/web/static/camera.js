@@ -27,17 +27,18 @@ class CameraScreen {
 
   async show(picture) {
     const image = new Image();
-    image.src = `data:image/jpeg;base64,${picture.jpeg}`;
-    try {
-      await image.decode();
-    } catch (error) {
-      return; // not a picture: the next one comes soon
+    if (picture.jpeg) {
+      image.src = `data:image/jpeg;base64,${picture.jpeg}`;
+      try {
+        await image.decode();
+      } catch (error) {
+        return; // not a picture: the next one comes soon
+      }
     }
     if (this.last && picture.number < this.last.number) return;
     const canvas = this.byId("picture"); // picture and corners change in one step, never one before the other
-    canvas.width = image.naturalWidth;
-    canvas.height = image.naturalHeight;
-    canvas.getContext("2d").drawImage(image, 0, 0);
+    [canvas.width, canvas.height] = picture.jpeg ? [image.naturalWidth, image.naturalHeight] : picture.size;
+    if (picture.jpeg) canvas.getContext("2d").drawImage(image, 0, 0); // else only points arrive
     this.last = picture;
     this.shownAt = performance.now();
     this.draw();
@@ -66,7 +67,7 @@ class CameraScreen {
     svg.replaceChildren(
       ...this.path("detected", detected, ring), ...this.path("predicted", predicted, cross),
     );
-    this.byId("misfit").textContent = this.misfit(detected, predicted);
+    this.byId("misfit").textContent = this.misfit(detected, predicted) + (this.last.jpeg ? "" : "; no images arrive");
   }
 
   path(kind, points, mark) {

@@ -1,5 +1,5 @@
 "use strict";
-// Lines with bands of three sigma on a canvas. A series: {t, v, s, colour} of equal lengths; s may be null.
+// Lines with bands of one sigma on a canvas. A series: {t, v, s, colour} of equal lengths; s may be null.
 
 function niceStep(range, count) {
   const raw = range / Math.max(count, 1);
@@ -35,7 +35,7 @@ class Chart {
     for (const { t, v, s } of this.series) {
       for (let i = 0; i < t.length; i++) {
         if (t[i] < from || v[i] === null) continue;
-        const band = s && s[i] !== null ? 3 * s[i] : 0;
+        const band = s && s[i] !== null ? s[i] : 0;
         low = Math.min(low, v[i] - band);
         high = Math.max(high, v[i] + band);
       }
@@ -117,8 +117,8 @@ class Chart {
     for (let i = 0; i < t.length; i++) if (t[i] >= t0 && v[i] !== null && s[i] !== null) use.push(i);
     if (use.length < 2) return;
     c.beginPath();
-    for (const i of use) c.lineTo(X(t[i]), Y(v[i] + 3 * s[i]));
-    for (const i of use.reverse()) c.lineTo(X(t[i]), Y(v[i] - 3 * s[i]));
+    for (const i of use) c.lineTo(X(t[i]), Y(v[i] + s[i]));
+    for (const i of use.reverse()) c.lineTo(X(t[i]), Y(v[i] - s[i]));
     c.closePath();
     c.globalAlpha = 0.18;
     c.fillStyle = colour;

@@ -4,7 +4,9 @@ import pytest
 from vical_mocks.points import simulate
 
 from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.wording import event_text
 
 
 def events_with(density_factor):
@@ -32,6 +34,6 @@ def events_with(density_factor):
 def test_wrong_noise_densities_are_told_once(factor, said):
     events, estimate = events_with(factor)
     assert estimate.nis_per_dof > 0.5
-    told = [e for e in events if "noise densities" in e]
+    told = [event_text(e) for e in events if e.kind is EventKind.IMU_NOISE]
     assert len(told) == (1 if said else 0)
     assert all(said in e and "vical allan" in e for e in told)

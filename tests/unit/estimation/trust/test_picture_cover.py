@@ -22,16 +22,16 @@ PARTLY_SEEN = np.full((8, 2), 300.0)  # a target that is partly in the picture
 @pytest.mark.parametrize(
     ("low", "high", "edges"),
     [
-        ((0, 0), (640, 480), []),
-        ((100, 0), (540, 480), ["left", "right"]),
-        ((0, 100), (640, 480), ["top"]),
-        ((100, 100), (540, 380), ["left", "right", "top", "bottom"]),
+        ((0, 0), (640, 480), ()),
+        ((100, 0), (540, 480), ("left", "right")),
+        ((0, 100), (640, 480), ("top",)),
+        ((100, 100), (540, 380), ("left", "right", "top", "bottom")),
     ],
 )
 def test_edges_without_corners_are_named(low, high, edges):
     cover = PictureCover((640, 480))
     cover.add(spread(low, high))
-    assert cover.unseen_edges() == []  # whole targets only: their corners may never come so far out
+    assert cover.unseen_edges() == ()  # whole targets only: their corners may never come so far out
     cover.add(PARTLY_SEEN)
     assert cover.unseen_edges() == edges
 
@@ -40,7 +40,7 @@ def test_a_few_strays_show_no_edge_and_corners_beyond_the_picture_do_no_harm():
     cover = PictureCover((640, 480))
     cover.add(spread((100, 100), (540, 380)))
     cover.add(np.array([[2.0, 240.0], [645.0, 240.0], [-3.0, -3.0]]))
-    assert cover.unseen_edges() == ["left", "right", "top", "bottom"]
+    assert cover.unseen_edges() == ("left", "right", "top", "bottom")
 
 
 @pytest.mark.parametrize(("model", "asked"), [("radtan", True), ("equidistant", False)])

@@ -1,0 +1,282 @@
+"""Events: what the estimators and the daemon announce, as data. `wording` turns them into text.
+
+`REFERENCE` is the one table of all kinds; docs/reference/events.md is made from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+
+class EventKind(StrEnum):
+    """What happened; see `REFERENCE` for meaning, unit of the value, and when it is announced."""
+
+    BUMPED = "bumped"
+    STARTED_OVER = "started_over"
+    STARTED_ANEW = "started_anew"
+    WENT_ON = "went_on"
+    RESUMED = "resumed"
+    CAMERA_MOVED = "camera_moved"
+    CAMERA_TURNED = "camera_turned"
+    TIMESHIFT_CHANGED = "timeshift_changed"
+    TIMESHIFT_STEPPED = "timeshift_stepped"
+    POSE_LOST = "pose_lost"
+    CLOCK_DRIFT = "clock_drift"
+    CLOCK_WANDER = "clock_wander"
+    STAMP_JITTER = "stamp_jitter"
+    STAMPS_STEPPED = "stamps_stepped"
+    IMU_CLOCK_SET_BACK = "imu_clock_set_back"
+    IMU_CLOCK_REMAPPED = "imu_clock_remapped"
+    IMU_GAP = "imu_gap"
+    IMU_REPEATED = "imu_repeated"
+    IMAGE_GAP = "image_gap"
+    IMAGE_REPEATED = "image_repeated"
+    IMU_NOISE = "imu_noise"
+    IMU_INTRINSICS = "imu_intrinsics"
+    ACCEL_LAG = "accel_lag"
+    TARGET_SIZE = "target_size"
+    TARGET_SHAPE = "target_shape"
+    TARGET_OR_LENS = "target_or_lens"
+    ROLLING_SHUTTER = "rolling_shutter"
+    LENS_TERM_MISSING = "lens_term_missing"
+    OTHER = "other"
+
+
+class Cause(StrEnum):
+    """Why a calibration or a window was given up, or what it was compared with; see `wording.cause_text`.
+
+    Figures (`Event.cause_value`): of `NO_IMAGES` s, of `FEATURES_MISS` px, of `INERTIAL_MISFIT` times the
+    noise, of `SCENE_MOVES` the share of the features.
+    """
+
+    NONE = ""
+    STORED_DIFFERS = "stored_differs"
+    IMAGES_REFUSED = "images_refused"
+    IMAGES_DISAGREE = "images_disagree"
+    ESTIMATE_IMPLAUSIBLE = "estimate_implausible"
+    CALIBRATION_CONTRADICTED = "calibration_contradicted"
+    WINDOW_CONTRADICTED = "window_contradicted"
+    NO_IMAGES = "no_images"
+    INERTIAL_GAP = "inertial_gap"
+    TOO_FEW_FEATURES = "too_few_features"
+    FEATURES_CONTRADICT = "features_contradict"
+    FEATURES_MISS = "features_miss"
+    INERTIAL_MISFIT = "inertial_misfit"
+    SCENE_MOVES = "scene_moves"
+    NO_PARALLAX = "no_parallax"
+    SECOND_AXIS = "second_axis"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One announcement.
+
+    Attributes:
+        kind: What happened.
+        camera: Name of the camera that it concerns; empty: the rig, its IMU or its target.
+        value: Its figure, in the SI unit that `REFERENCE` gives; None: it has none.
+        sigma: Standard deviation of the value, same unit; None: not known.
+        t_s: When, in seconds since the first inertial reading; None: not known.
+        cause: Why; for `BUMPED`, `STARTED_OVER` and `WENT_ON`.
+        cause_value: Figure of the cause, see `Cause`; None: it has none.
+        said: Text of an event of kind `OTHER`, from a log written before events were typed or after a kind
+            was added that is not known here.
+    """
+
+    kind: EventKind
+    camera: str = ""
+    value: float | None = None
+    sigma: float | None = None
+    t_s: float | None = None
+    cause: Cause = Cause.NONE
+    cause_value: float | None = None
+    said: str = ""
+
+    @property
+    def changed(self) -> bool:
+        """Whether it says that the rig is not what it was."""
+        return self.kind in _CHANGES
+
+
+_CHANGES = frozenset(
+    {
+        EventKind.BUMPED,
+        EventKind.CAMERA_MOVED,
+        EventKind.CAMERA_TURNED,
+        EventKind.TIMESHIFT_CHANGED,
+    }
+)
+
+
+class EventLog:
+    """Collects the events of one estimator until they are asked for.
+
+    Attributes:
+        now_s: Time of events that come now, s since the first inertial reading.
+    """
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self._waiting: list[Event] = []
+        self._announced: set[str] = set()
+
+    def add(self, event: Event, once: str = "") -> None:
+        """Take an event; of those with the same `once` only the first."""
+        if once in self._announced:
+            return
+        self._waiting.append(replace(event, t_s=self.now_s) if event.t_s is None else event)
+        if once:
+            self._announced.add(once)
+
+    def take(self) -> list[Event]:
+        """Return the events since the last call."""
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+
+class About(NamedTuple):
+    """One row of the reference.
+
+    Attributes:
+        meaning: What it says.
+        unit: Of value and sigma; empty: it has none.
+        when: When it is announced.
+    """
+
+    meaning: str
+    unit: str
+    when: str
+
+
+REFERENCE: dict[EventKind, About] = {
+    EventKind.BUMPED: About(
+        "The rig is no longer what was calibrated; calibration starts anew.",
+        "",
+        "After the first convergence, when images stop fitting the motion although pose and time shift were "
+        "found anew.",
+    ),
+    EventKind.STARTED_OVER: About(
+        "As `bumped`, but there was no converged calibration yet.", "", "Before the first convergence."
+    ),
+    EventKind.STARTED_ANEW: About(
+        "There is a calibration again.", "", "At the first solution after `bumped` or `started_over`."
+    ),
+    EventKind.WENT_ON: About(
+        "Target-free: images are used again; the calibration was kept.", "", "When a pause ends."
+    ),
+    EventKind.RESUMED: About(
+        "The estimator went on from its saved state. Value: age of that state.", "s", "After a crash."
+    ),
+    EventKind.CAMERA_MOVED: About(
+        "The lever arm differs. Value: distance.",
+        "m",
+        "Once per start, at convergence, if a component differs from the stored calibration by more than 4 "
+        "joint sigma and 2 mm; target-free also with `bumped`.",
+    ),
+    EventKind.CAMERA_TURNED: About(
+        "The mounting rotation differs. Value: angle.",
+        "rad",
+        "As `camera_moved`: 4 joint sigma and 0.1 deg.",
+    ),
+    EventKind.TIMESHIFT_CHANGED: About(
+        "The time shift differs. Value: new minus stored.",
+        "s",
+        "As `camera_moved`: 4 joint sigma and 0.2 ms.",
+    ),
+    EventKind.TIMESHIFT_STEPPED: About(
+        "The time shift jumped; everything else is kept. Value: new minus old.",
+        "s",
+        "When images have agreed with the new time shift for 3 s.",
+    ),
+    EventKind.POSE_LOST: About(
+        "The pose was lost and is taken from the images again; the calibration is kept.",
+        "",
+        "After 10 images in a row that do not fit.",
+    ),
+    EventKind.CLOCK_DRIFT: About(
+        "The clocks of camera and IMU run at different rates; the drift is estimated from now "
+        "on. Value: drift.",
+        "s/s",
+        "Once per camera, at a probability above 99 %.",
+    ),
+    EventKind.CLOCK_WANDER: About(
+        "The rate between the clocks of camera and IMU changes. Value: present drift.",
+        "s/s",
+        "Once per camera, when the time shift leaves where earlier estimates put it, by 6 sigma.",
+    ),
+    EventKind.STAMP_JITTER: About(
+        "The stamps of the images jitter; allowed for. Value: standard deviation.",
+        "s",
+        "Once per camera, from 0.3 ms.",
+    ),
+    EventKind.STAMPS_STEPPED: About(
+        "A camera's clock was set. Value: step against the IMU's stamps.",
+        "s",
+        "When 5 images in a row show a step of more than 1.5 s.",
+    ),
+    EventKind.IMU_CLOCK_SET_BACK: About("The IMU's clock was set back. Value: by how much.", "s", "At once."),
+    EventKind.IMU_CLOCK_REMAPPED: About(
+        "The driver mapped the IMU's clock anew; the time shift follows. Value: step.",
+        "s",
+        "When 4 even readings have followed the step.",
+    ),
+    EventKind.IMU_GAP: About(
+        "Inertial readings were missing. Value: for how long.", "s", "When they resume."
+    ),
+    EventKind.IMU_REPEATED: About(
+        "The IMU repeated one reading bit by bit. Value: for how long.", "s", "When new readings come."
+    ),
+    EventKind.IMAGE_GAP: About(
+        "Images were missing. Value: for how long.",
+        "s",
+        "When they resume, from 0.5 s and 4 image intervals.",
+    ),
+    EventKind.IMAGE_REPEATED: About(
+        "A camera repeated one image. Value: for how long.", "s", "As `image_gap`."
+    ),
+    EventKind.IMU_NOISE: About(
+        "The IMU's noise densities in the config are wrong. Value: error of predictions over the expected "
+        "one.",
+        "1",
+        "Once, after 20 predicted images, outside of 0.74 to 1.22.",
+    ),
+    EventKind.IMU_INTRINSICS: About(
+        "Scale or alignment of the IMU is off; allowed for. Value: the most certain entry.",
+        "1",
+        "Once, at a probability above 99 %.",
+    ),
+    EventKind.ACCEL_LAG: About(
+        "The accelerometer lags (+) or leads (-) the gyro; allowed for. Value: by how much.",
+        "s",
+        "Once, at a probability above 99 %.",
+    ),
+    EventKind.TARGET_SIZE: About(
+        "The target is larger (+) or smaller (-) than stated; its size is estimated. Value: relative.",
+        "1",
+        "Once: during initialisation if it is far off, else at a probability above 99 %.",
+    ),
+    EventKind.TARGET_SHAPE: About(
+        "The target is not flat or not as stated; its shape is estimated. Value: the most certain mode, "
+        "at the edges.",
+        "m",
+        "Once, at a probability above 99 %.",
+    ),
+    EventKind.TARGET_OR_LENS: About(
+        "With the lens fixed: target file or lens is wrong. Value: largest distance of a corner from its "
+        "stated place.",
+        "m",
+        "Once, at 5 sigma.",
+    ),
+    EventKind.ROLLING_SHUTTER: About(
+        "A rolling shutter that the config does not mention; its readout is estimated. Value: readout, where "
+        "already known.",
+        "s",
+        "Once per camera.",
+    ),
+    EventKind.LENS_TERM_MISSING: About(
+        "The lens needs one more distortion term than radtan has: use `plumb_bob`.", "", "Once per camera."
+    ),
+    EventKind.OTHER: About("Text from a log or program of another version.", "", "Never by this version."),
+}

@@ -1,0 +1,395 @@
+"""The one place where events, guidance and weak directions become English text.
+
+For terminal, page, report, journal, and the text fields of messages and JSON. Nothing reads these texts back:
+whoever needs the facts takes them from the data (`events`, `guidance`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, Verb, WeakDirection
+
+_ALONG = 0.85
+"""Cosine above which a direction is called by the name of an axis: within 32 deg."""
+_BESIDE = 0.3
+"""Least share of a second axis in a direction that is called a line between two."""
+_AXIS_NAMES = dict(zip(AXES, ("the image's x axis", "the image's y axis", "the optical axis"), strict=True))
+_TURNS = {"x": "the image's x axis (nod)", "y": "the image's y axis (shake)", "z": "the optical axis (roll)"}
+
+
+# ---------------------------------------------------------------------------------------------- directions
+def axis_name(axis_cam: Sequence[float]) -> str:
+    """Name a direction given in the camera frame (x right, y down, z forward); any length but zero."""
+    length = math.sqrt(sum(a * a for a in axis_cam))
+    size = [abs(a) / length for a in axis_cam]
+    order = sorted(range(3), key=lambda i: -size[i])
+    if size[order[0]] > _ALONG:
+        return _AXIS_NAMES[AXES[order[0]]]
+    if size[order[0]] ** 2 + size[order[1]] ** 2 > _ALONG**2 and size[order[1]] > _BESIDE:
+        first, second = (("x", "y", "optical")[i] for i in sorted(order[:2]))
+        return f"a line between the camera's {first} and {second} axes"
+    return "a line oblique to all axes of the camera"
+
+
+def direction_name(weak: WeakDirection) -> str:
+    """Say what is not known, e.g. "lever arm along the optical axis"."""
+    if weak.block is Block.TIMESHIFT:
+        return "time shift"
+    if weak.block is Block.LEVER_ARM:
+        return f"lever arm along {axis_name(weak.axis_cam)}"
+    return f"rotation about {axis_name(weak.axis_cam)}"
+
+
+def direction_sigma(weak: WeakDirection) -> str:
+    """Name and figure (one sigma)."""
+    figure = {
+        Block.LEVER_ARM: f"{1e3 * weak.sigma:.1f} mm",
+        Block.ROTATION: f"{math.degrees(weak.sigma):.2f} deg",
+        Block.TIMESHIFT: f"{1e3 * weak.sigma:.2f} ms",
+    }[weak.block]
+    return f"{direction_name(weak)}: +-{figure}"
+
+
+def direction_warning(weak: WeakDirection) -> str:
+    """Say which number is not to be used."""
+    return f"do not use: {direction_name(weak)}"
+
+
+def direction_line(weak: WeakDirection) -> str:
+    """Name, and the motion that would reveal it."""
+    return f"{direction_name(weak)}: {guidance_text(weak.guidance)}"
+
+
+# ------------------------------------------------------------------------------------------------ guidance
+def guidance_text(guidance: Guidance) -> str:
+    """Say what to do next; empty where nothing is missing."""
+    if not guidance:
+        return ""
+    said = _LACKS.get(guidance.lack)
+    if said is not None:
+        return said(guidance)
+    if guidance.verb is Verb.TURN_AND_MOVE:
+        return "turn the rig about all three axes while moving it to and fro"
+    return "rotate " + " and ".join(f"about {_TURNS[axis]}" for axis in guidance.axes)
+
+
+def guidance_caption(guidance: Guidance) -> str:
+    """Say what the picture of the axes shows, in a few words; empty where nothing is missing."""
+    if guidance.verb is Verb.SHOW:
+        return f"show the target near the {_edges(guidance)} of the image"
+    axes = _listed(guidance.axes)
+    return {
+        Verb.NONE: "",
+        Verb.TURN: f"turn about {axes}",
+        Verb.TURN_FASTER: f"turn faster, about {axes}",
+        Verb.TURN_TO_AND_FRO: f"turn to and fro, about {axes}",
+        Verb.TURN_AND_MOVE: f"turn about {axes} and move to and fro",
+    }[guidance.verb]
+
+
+_HEADLINES = {
+    "waiting": "Waiting for data.",
+    "initialising": "Looking for a first solution.",
+    "converging": "Getting sharper.",
+    "converged": "Converged.",
+    "degenerate": "The motion does not reveal everything yet.",
+    "inconsistent": "The data contradict the model: do not use these numbers.",
+}
+
+
+def headline(status: str, guidance: Guidance) -> str:
+    """Say in one short sentence where a calibration stands.
+
+    Args:
+        status: One of `result.Status`.
+        guidance: What to do next: a lens that was not seen everywhere is not called converged everywhere.
+    """
+    if status == "converged" and guidance.verb is Verb.SHOW:
+        return "Converged, except near the edges of the image."
+    return _HEADLINES[status]
+
+
+def fault_headline(component: str) -> str:
+    """Say in one short sentence that a device or role does not work."""
+    return f"{component} does not work."
+
+
+def silence(age_s: float) -> str:
+    """Say in one short sentence that estimates have stopped.
+
+    Args:
+        age_s: How long ago the last one came, s.
+    """
+    return f"No estimate for {age_s:.0f} s: is the calibrate process running?"
+
+
+def motion_caption(status: str, guidance: Guidance, advice: str) -> str:
+    """Say what the picture of the axes shows, or why it shows nothing.
+
+    Args:
+        status: One of `result.Status`.
+        guidance: What to do next.
+        advice: The same as text; with messages of version 0.1.0 there is nothing else.
+    """
+    if guidance or advice:
+        return guidance_caption(guidance)
+    return "nothing is missing" if status == "converged" else "turn and move freely"
+
+
+def _still(guidance: Guidance) -> str:
+    if guidance.verb is Verb.TURN_TO_AND_FRO:
+        return "without rotation the time shift hardly shows; turn the rig to and fro"
+    return "the rig hardly turns; turn it to and fro about two axes at 20 to 60 deg/s"
+
+
+def _slow(guidance: Guidance) -> str:
+    rate = "slowly" if guidance.rate_rps is None else f"at only {math.degrees(guidance.rate_rps):.0f} deg/s"
+    return f"it turns {rate}; turn faster, 20 to 60 deg/s, about two axes"
+
+
+def _one_axis(guidance: Guidance) -> str:
+    faster = ", and faster" if guidance.verb is Verb.TURN_FASTER else ""
+    about = axis_name(guidance.turned_about) if guidance.turned_about else "one axis"
+    return f"so far it turned about {about} only; rotate about another axis{faster}"
+
+
+def _unseen_edges(guidance: Guidance) -> str:
+    return (
+        f"no corners yet near the {_edges(guidance)} of {guidance.camera}'s picture: "
+        "show the target there, for the lens"
+    )
+
+
+def _edges(guidance: Guidance) -> str:
+    return f"{_listed(guidance.edges)} {'edge' if len(guidance.edges) == 1 else 'edges'}"
+
+
+_LACKS: dict[Lack, Callable[[Guidance], str]] = {
+    Lack.STILL: _still,
+    Lack.SLOW: _slow,
+    Lack.ONE_AXIS: _one_axis,
+    Lack.STEADY_RATE: lambda _: "the rotation rate hardly changes; turn to and fro instead of steadily round",
+    Lack.FAST_CHANGES: lambda _: "turn the rig back and forth faster, changing direction",
+    Lack.EDGES: _unseen_edges,
+}
+
+
+# -------------------------------------------------------------------------------------------------- events
+def event_text(event: Event) -> str:
+    """Return the announcement as one line, with the name of the camera that it concerns."""
+    label, says = _EVENTS[event.kind]
+    named = f"{event.camera}: " if event.camera else ""
+    return f"{label}{named}{says(event)}"
+
+
+def event_document(event: Event) -> dict[str, Any]:
+    """Return the event as any JSON of ours has it."""
+    document: dict[str, Any] = {
+        "kind": str(event.kind),
+        "camera": event.camera,
+        "t_s": event.t_s,
+        "value": event.value,
+        "sigma": event.sigma,
+        "text": event_text(event),
+    }
+    if event.cause:
+        document |= {"cause": str(event.cause), "cause_value": event.cause_value}
+    return document
+
+
+def guidance_document(guidance: Guidance) -> dict[str, Any]:
+    """Return guidance as any JSON of ours has it."""
+    return {
+        "verb": str(guidance.verb),
+        "axes": list(guidance.axes),
+        "lack": str(guidance.lack),
+        "turned_about": list(guidance.turned_about),
+        "rate_rps": guidance.rate_rps,
+        "camera": guidance.camera,
+        "edges": list(guidance.edges),
+        "text": guidance_text(guidance),
+    }
+
+
+def direction_document(weak: WeakDirection) -> dict[str, Any]:
+    """Return a weak direction as any JSON of ours has it."""
+    return {
+        "block": str(weak.block),
+        "axis_cam": list(weak.axis_cam),
+        "sigma": weak.sigma,
+        "limit": weak.limit,
+        "guidance": guidance_document(weak.guidance),
+        "text": direction_line(weak),
+    }
+
+
+def cause_text(cause: Cause, value: float | None = None) -> str:
+    """Say why a calibration or a window was given up."""
+    return _CAUSES[cause](math.nan if value is None else value)
+
+
+_CAUSES: dict[Cause, Callable[[float], str]] = {
+    Cause.NONE: lambda _: "",
+    Cause.STORED_DIFFERS: lambda _: "since the stored calibration",
+    Cause.IMAGES_REFUSED: lambda _: "images no longer fit the motion, even with the pose taken anew",
+    Cause.IMAGES_DISAGREE: lambda _: "images have come to disagree with the motion: the camera moved",
+    Cause.ESTIMATE_IMPLAUSIBLE: lambda _: "the estimate left the range of what a rig can be",
+    Cause.CALIBRATION_CONTRADICTED: lambda _: (
+        "the last seconds move the calibration by more than the sigmas allow"
+    ),
+    Cause.WINDOW_CONTRADICTED: lambda _: "the last seconds do not fit the calibration; looking again",
+    Cause.NO_IMAGES: lambda v: f"no usable images for {v:.1f} s",
+    Cause.INERTIAL_GAP: lambda _: "inertial data have a gap",
+    Cause.TOO_FEW_FEATURES: lambda _: "too few features can be followed",
+    Cause.FEATURES_CONTRADICT: lambda _: "the features of the last seconds contradict each other",
+    Cause.FEATURES_MISS: lambda v: f"features miss their places by {v:.1f} px",
+    Cause.INERTIAL_MISFIT: lambda v: f"inertial data and images disagree ({v:.1f} times their noise)",
+    Cause.SCENE_MOVES: lambda v: f"{v:.0%} of the features do not move with the scene",
+    Cause.NO_PARALLAX: lambda _: "the camera stands still, or features are lost before they show depth",
+    Cause.SECOND_AXIS: lambda _: (
+        "the rig turns about a second axis now: starting anew, with all of the lever arm"
+    ),
+}
+
+
+def _of(event: Event, factor: float, unit: str, form: str) -> str:
+    """Value and, where known, sigma, each times `factor`."""
+    value = format(factor * (math.nan if event.value is None else event.value), form)
+    if event.sigma is None:
+        return f"{value} {unit}"
+    return f"{value} +- {format(factor * event.sigma, form.replace('+', ''))} {unit}"
+
+
+def _size(event: Event, factor: float, unit: str, form: str) -> str:
+    """The same without the sign."""
+    value = format(factor * abs(math.nan if event.value is None else event.value), form)
+    return f"{value} {unit}" if event.sigma is None else f"{value} +- {factor * event.sigma:{form}} {unit}"
+
+
+def _target_size(event: Event) -> str:
+    how = "larger" if (event.value or 0.0) > 0 else "smaller"
+    figure = (
+        f"some {_size(event, 100.0, '%', '.0f')}" if event.sigma is None else _size(event, 100.0, "%", ".2f")
+    )
+    return f"the target is {figure} {how} than stated: measure it; its size is estimated from now on"
+
+
+def _accel_lag(event: Event) -> str:
+    late = "behind" if (event.value or 0.0) > 0 else "ahead of"
+    return f"the accelerometer is {_size(event, 1e3, 'ms', '.2f')} {late} the gyro: allowed for from now on"
+
+
+def _imu_noise(event: Event) -> str:
+    than = "worse" if (event.value or 0.0) > 1.0 else "better"
+    times = _of(event, 1.0, "times", ".1f")
+    return (
+        f"the imu predicts images {than} than its noise densities say ({times}): "
+        "measure them with `vical allan`"
+    )
+
+
+def _rolling(event: Event) -> str:
+    if event.value is None:
+        return "a rolling shutter, by how the target is bent in motion: its readout is estimated, too"
+    readout = _of(event, 1e3, "ms", ".1f")
+    return f"a rolling shutter, by how features move: its readout takes {readout}, and is allowed for"
+
+
+def _drift(why: str) -> Callable[[Event], str]:
+    return lambda e: f"{why}, by {_of(e, 1e6, 'us a second', '+.1f')}; it is now estimated too"
+
+
+def _difference(what: str, factor: float, unit: str, form: str) -> Callable[[Event], str]:
+    return lambda e: f"{what} {_of(e, factor, unit, form)} {cause_text(e.cause)}".rstrip()
+
+
+_EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
+    EventKind.BUMPED: ("bumped: ", lambda e: cause_text(e.cause, e.cause_value)),
+    EventKind.STARTED_OVER: ("started over: ", lambda e: cause_text(e.cause, e.cause_value)),
+    EventKind.STARTED_ANEW: ("", lambda _: "started anew after the change"),
+    EventKind.WENT_ON: ("", lambda e: f"went on after: {cause_text(e.cause, e.cause_value)}"),
+    EventKind.RESUMED: (
+        "",
+        lambda e: f"resumed from the state of {_of(e, 1.0, 's', '.1f')} ago: the process was restarted",
+    ),
+    EventKind.CAMERA_MOVED: ("changed: ", _difference("moved by", 1e3, "mm", ".1f")),
+    EventKind.CAMERA_TURNED: ("changed: ", _difference("turned by", 180.0 / math.pi, "deg", ".2f")),
+    EventKind.TIMESHIFT_CHANGED: ("changed: ", _difference("time shift by", 1e3, "ms", "+.2f")),
+    EventKind.TIMESHIFT_STEPPED: (
+        "",
+        lambda e: f"the time shift stepped by {_of(e, 1e3, 'ms', '+.1f')}; all else is kept",
+    ),
+    EventKind.POSE_LOST: ("", lambda _: "pose lost and taken anew from the images"),
+    EventKind.CLOCK_DRIFT: (
+        "",
+        _drift("the time shift drifts: the clocks of camera and imu run at different rates"),
+    ),
+    EventKind.CLOCK_WANDER: (
+        "",
+        _drift("the time shift moves: the clocks of camera and imu run at changing rates"),
+    ),
+    EventKind.STAMP_JITTER: (
+        "",
+        lambda e: f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}; allowed for",
+    ),
+    EventKind.STAMPS_STEPPED: (
+        "",
+        lambda e: f"its stamps stepped by about {_of(e, 1.0, 's', '+.1f')} against those of the IMU",
+    ),
+    EventKind.IMU_CLOCK_SET_BACK: (
+        "",
+        lambda e: f"the IMU's stamps went back by {_of(e, 1.0, 's', '.1f')}: its clock was set",
+    ),
+    EventKind.IMU_CLOCK_REMAPPED: (
+        "",
+        lambda e: (
+            f"stamps of the imu moved by {_of(e, 1e3, 'ms', '+.1f')} (its clock was mapped anew): followed"
+        ),
+    ),
+    EventKind.IMU_GAP: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} without inertial data"),
+    EventKind.IMU_REPEATED: (
+        "",
+        lambda e: f"{_of(e, 1.0, 's', '.1f')} in which the IMU repeated one reading",
+    ),
+    EventKind.IMAGE_GAP: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} without images"),
+    EventKind.IMAGE_REPEATED: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} in which one image was repeated"),
+    EventKind.IMU_NOISE: ("", _imu_noise),
+    EventKind.IMU_INTRINSICS: (
+        "",
+        lambda e: (
+            f"scale or alignment of the imu is off, by {_of(e, 100.0, '%', '.2f')}: allowed for from now on"
+        ),
+    ),
+    EventKind.ACCEL_LAG: ("", _accel_lag),
+    EventKind.TARGET_SIZE: ("", _target_size),
+    EventKind.TARGET_SHAPE: (
+        "",
+        lambda e: (
+            f"the target is not as stated, by {_of(e, 1e3, 'mm', '.2f')} at its edges: "
+            "its shape is estimated from now on"
+        ),
+    ),
+    EventKind.TARGET_OR_LENS: (
+        "",
+        lambda e: (
+            f"corners are up to {_of(e, 1e3, 'mm', '.1f')} from where the target file puts them: wrong "
+            "target file, bent board, or the fixed lens is not this camera's"
+        ),
+    ),
+    EventKind.ROLLING_SHUTTER: ("", _rolling),
+    EventKind.LENS_TERM_MISSING: (
+        "",
+        lambda _: "the lens needs one term more than radtan has: give it distortion_model: plumb_bob",
+    ),
+    EventKind.OTHER: ("", lambda e: e.said),
+}
+
+
+def _listed(words: Iterable[Axis | str]) -> str:
+    """Join words with commas and "and"."""
+    *most, last = list(words) or [""]
+    return " and ".join(filter(None, (", ".join(most), last)))
