@@ -2,8 +2,9 @@
 
 A Point Grey camera writes the cycle time at which its shutter closed into each image; the bus clock is
 read together with CLOCK_MONOTONIC at each frame and fitted (`cycle_clock`), and half the exposure is
-taken off. Any other camera is dated by the first packet of its frame. libdc1394 itself reports no lost
-frames; they are found by the embedded frame counter, or by gaps in the stamps.
+taken off. Any other camera is dated by the first packet of its frame. libdc1394 itself reports neither lost
+frames nor lost packets: the first are found by the embedded frame counter, or by gaps in the stamps, the
+others as `iidc_whole` says.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 import logging
 import select
 import time
+from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +27,9 @@ from vical_drivers.camera.hotplug import wait_for_camera
 from vical_drivers.camera.iidc_dating import FrameDating
 from vical_drivers.camera.iidc_device import IidcDevice, frame_bytes, list_devices, pixel_format
 from vical_drivers.camera.iidc_modes import IidcMode, set_mode
+from vical_drivers.camera.iidc_whole import Wholeness, judge
 from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.v4l2_stamp import RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
@@ -35,6 +40,19 @@ list_iidc_cameras = list_devices
 
 MIN_SILENCE_S = 1.0
 SILENT_PERIODS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """A frame out of the ring, dated and numbered, not yet decoded."""
+
+    data: Bytes
+    depth_bits: int
+    info: EmbeddedInfo
+    raw: RawStamp
+    sequence: int
+    missing_before: int
+    t_arrival_ns: int
 
 
 class IidcCamera(Closing):
@@ -79,6 +97,8 @@ class IidcCamera(Closing):
         self._decode: FrameDecoder | None = None
         self._dating = FrameDating(self._settings.stamp, self._mode.rate_hz, self._frames.statistics)
         self._shutter_raw: int | None = None
+        self._held: _Taken | None = None  # the next frame decides whether it is whole
+        self._ready: deque[Frame] = deque()
         self._t_alive_ns = time.monotonic_ns()
 
     def _apply(self, device: IidcDevice) -> None:
@@ -195,6 +215,8 @@ class IidcCamera(Closing):
 
     def _next(self, timeout_s: float) -> Frame | None:
         device, bus = self._need()
+        if self._ready:
+            return self._ready.popleft()
         poller = select.poll()
         poller.register(self._fd, select.POLLIN)
         events = dict(poller.poll(min(timeout_s, MIN_SILENCE_S) * 1e3)).get(self._fd, 0)
@@ -209,15 +231,41 @@ class IidcCamera(Closing):
         self._t_alive_ns = t_arrival_ns
         frame: abi.VideoFrame = held.contents
         data = frame_bytes(frame)
-        t_packet_ns = t_arrival_ns - (t_real_ns - frame.timestamp_us * 1000)
+        age_ns = t_real_ns - frame.timestamp_us * 1000  # since its first packet
         image_format = pixel_format(self._mode.coding, frame)
-        depth_bits = frame.data_depth
+        depth_bits, image_bytes, packet_bytes = frame.data_depth, frame.image_bytes, frame.packet_size
         device.enqueue(held)
         self._dating.clock.add(*bus.read())
         if self._decode is None or self._decode.pixel_format != image_format:
             self._decode = self._make_decoder(device, image_format)
         info = parse_embedded(data[:64].tobytes(), self._frame_info)
-        return self._finish(device, data, depth_bits, info, t_packet_ns, t_arrival_ns)
+        raw = self._dating.raw_stamp(info, t_arrival_ns - age_ns, t_arrival_ns)
+        missing = self._dating.missing(info, raw.t_raw_ns)
+        taken = _Taken(
+            data[:image_bytes], depth_bits, info, raw, self._dating.sequence, missing, t_arrival_ns
+        )
+        verdict = judge(data, packet_bytes, info, self._frame_info, age_ns, self._mode.rate_hz)
+        self._sort(device, taken, verdict)
+        return self._ready.popleft() if self._ready else None
+
+    def _sort(self, device: IidcDevice, taken: _Taken, verdict: Wholeness) -> None:
+        """Deliver what is whole, in order, and drop what is not."""
+        held, self._held = self._held, None
+        if held is not None:
+            if taken.missing_before:  # a shifted image looks the same, and nothing else could tell them apart
+                self._drop_image(held, "doubtful_images")
+            else:
+                self._deliver(device, held)
+        if verdict is Wholeness.WHOLE:
+            self._deliver(device, taken)
+        elif verdict is Wholeness.SHIFTED:
+            self._drop_image(taken, "shifted_images")
+        else:
+            self._held = taken
+
+    def _drop_image(self, taken: _Taken, reason: str) -> None:
+        self._frames.spoilt(reason)
+        self._frames.lost(taken.missing_before + 1)
 
     def _check_silence(self, device: IidcDevice) -> None:
         """A camera that was unplugged for a moment keeps its node, but has forgotten to send."""
@@ -233,23 +281,15 @@ class IidcCamera(Closing):
         except ValueError as error:
             raise DeviceRefusedError(f"{device.name}: {error}") from error
 
-    def _finish(
-        self,
-        device: IidcDevice,
-        data: Bytes,
-        depth_bits: int,
-        info: EmbeddedInfo,
-        t_packet_ns: int,
-        t_arrival_ns: int,
-    ) -> Frame | None:
-        raw = self._dating.raw_stamp(info, t_packet_ns, t_arrival_ns)
-        self._update_exposure(device, info)
-        self._frames.lost(self._dating.missing(info, raw.t_raw_ns))
-        image = self._image(data, depth_bits)
+    def _deliver(self, device: IidcDevice, taken: _Taken) -> None:
+        self._update_exposure(device, taken.info)
+        self._frames.lost(taken.missing_before)
+        image = self._image(taken.data, taken.depth_bits)
         if image is None:
             self._frames.lost()
-            return None
-        return self._frames.frame(image, raw, sequence=self._dating.sequence, t_arrival_ns=t_arrival_ns)
+            return
+        frame = self._frames.frame(image, taken.raw, sequence=taken.sequence, t_arrival_ns=taken.t_arrival_ns)
+        self._ready.append(frame)
 
     def _update_exposure(self, device: IidcDevice, info: EmbeddedInfo) -> None:
         """Read the shutter in seconds again whenever the image says that its raw value changed."""

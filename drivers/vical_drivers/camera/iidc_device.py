@@ -204,8 +204,8 @@ class IidcDevice:
 
 
 def frame_bytes(frame: abi.VideoFrame) -> npt.NDArray[np.uint8]:
-    """Return a copy of the frame's image bytes."""
-    source = (ctypes.c_uint8 * frame.image_bytes).from_address(frame.image)
+    """Return a copy of all bytes that came for a frame: `image_bytes` of the image, then padding."""
+    source = (ctypes.c_uint8 * frame.total_bytes).from_address(frame.image)
     return np.frombuffer(source, dtype=np.uint8).copy()
 
 
