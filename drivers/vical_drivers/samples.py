@@ -53,7 +53,8 @@ class Frame:
         exposure_ns: Exposure time where known, ns.
         readout_ns: First to last row where known (0 for a global shutter), ns.
         t_sigma_ns: One-sigma uncertainty of the stamp, ns.
-        dropped_before: Frames known to be missing just before this one.
+        dropped_before: Frames known to be missing just before this one, or found only now to be missing
+            before the last one.
     """
 
     t_exposure_mid_ns: int

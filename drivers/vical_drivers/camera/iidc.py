@@ -135,7 +135,7 @@ class IidcCamera(Closing):
         except DriverError as error:
             wait_for_camera(timeout_s, ("firewire",))
             raise DeviceLostError(f"iidc:{self._guid:016x}: the camera is not back yet ({error})") from error
-        self._frames.statistics.restart()
+        self._frames.reopened()
         _log.info("camera back guid=%016x", self._guid)
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ What happens when something goes wrong:
 | unplugged, also during a dequeue | `DeviceLostError`; the next `read` waits for it and opens it anew |
 | empty buffer, buffer flagged as damaged, JPEG or image cut off | counted, skipped, the frame is lost |
 | jump in the sequence numbers | `Frame.dropped_before`, counted |
+| jump in the stamps alone (lost inside the camera) | the same, one frame later; counted apart as well |
 | format or size refused | `DeviceRefusedError` with what is on offer |
 | a second process on the camera | `DeviceBusyError` naming the first one |
 | no permission | `DevicePermissionError` naming the group |
@@ -30,7 +31,7 @@ from vical_drivers.camera.v4l2_controls import Controls
 from vical_drivers.camera.v4l2_exposure import read_exposure_ns, set_exposure
 from vical_drivers.camera.v4l2_node import DequeuedBuffer
 from vical_drivers.camera.v4l2_session import V4l2Session
-from vical_drivers.camera.v4l2_stamp import RawStamp, kernel_stamp
+from vical_drivers.camera.v4l2_stamp import RawStamp, kernel_stamp, to_monotonic_ns
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceLostError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
@@ -100,7 +101,7 @@ class V4l2Camera(Closing):
         except DriverError as error:
             self._wait(timeout_s)  # udev may not have set the permissions yet
             raise DeviceLostError(f"{entry.path}: the camera is not back yet ({error})") from error
-        self._frames.statistics.restart()
+        self._frames.reopened()
         _log.info("camera back path=%s", entry.path)
 
     def close(self) -> None:
@@ -226,7 +227,8 @@ class V4l2Camera(Closing):
     def _frame(self, session: V4l2Session, buffer: DequeuedBuffer) -> Frame | None:
         # Both clocks at once, and before anything takes time: a stamp of the wall clock is moved by the pair.
         t_arrival_ns, t_realtime_ns = self._kernel.monotonic_ns(), self._kernel.realtime_ns()
-        self._frames.lost(self._sequence.missing_before(buffer.sequence))
+        t_stamp_ns = to_monotonic_ns(buffer.t_ns, t_arrival_ns, t_realtime_ns) or t_arrival_ns
+        self._frames.numbered(t_stamp_ns, self._sequence.missing_before(buffer.sequence))
         image = self._image(session, buffer)
         if image is None:
             self._frames.lost()

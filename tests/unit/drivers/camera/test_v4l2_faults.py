@@ -73,6 +73,25 @@ def test_a_jump_of_the_sequence_is_a_loss(open_fake) -> None:
     assert source.stats().rate_hz == pytest.approx(30.0, rel=1e-6)
 
 
+def test_frames_that_never_leave_the_camera_are_found_by_the_stamps(open_fake) -> None:
+    kept = dict.fromkeys([*range(20, 33), 50, 70, 72], "kept") | {40: "lost", 90: "lost", 91: "kept"}
+    camera = FakeCamera(faults=kept)
+    source = open_fake(camera)
+    frames = [source.read(1.0) for _ in range(100)]
+    assert [(k, f.dropped_before) for k, f in enumerate(frames) if f.dropped_before] == [
+        (21, 13),  # 13 at once, and the sequence goes on by one; known when the old pace is back
+        (27, 1),  # one that the driver counted: it does not count twice
+        (37, 1),
+        (57, 2),  # two with one frame in between
+        (73, 1),  # the driver's count, at once
+        (74, 1),  # beside it
+    ]
+    stats = source.stats()
+    assert (stats.lost, stats.extra["lost_in_camera"]) == (19, 17)
+    assert stats.rate_hz == pytest.approx(30.0, rel=1e-3)
+    assert stats.jitter_us < 4000.0  # the losses are no jitter, but for the frame between two of them
+
+
 def test_a_slow_reader_loses_frames_and_knows_how_many(open_fake, kernel) -> None:
     camera = FakeCamera()
     source = open_fake(camera, buffers=4)
