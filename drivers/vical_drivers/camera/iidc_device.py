@@ -82,7 +82,7 @@ class IidcDevice:
         if code == abi.SUCCESS:
             return
         if firewire.find_node(self.guid) is None:
-            raise DeviceLostError(f"{self.name}: the camera went away (cannot {doing})")
+            raise DeviceLostError(f"{self.name}: the camera went away; check its cable")
         raise DeviceRefusedError(f"{self.name}: cannot {doing} (libdc1394 error {code})")
 
     def number(self, function: str, *arguments: object, doing: str) -> int:
@@ -223,7 +223,7 @@ def _choose(found: list[int], guid: int | None) -> int:
     if guid in found and guid is not None:
         return guid
     if not found:
-        firewire.find_node(guid or 0)  # raises where permission is the reason
+        firewire.find_node(guid)  # raises where permission is the reason
     there = ", ".join(f"iidc:{g:016x}" for g in found) or "none"
     asked = "one camera" if guid is None else f"iidc:{guid:016x}"
     raise DeviceNotFoundError(f"{asked} was asked for; on the bus: {there}")

@@ -221,7 +221,7 @@ class V4l2Camera(Closing):
         return None
 
     def _take_event(self, session: V4l2Session) -> None:
-        session.node.request(abi.VIDIOC_DQEVENT, abi.Event(), "tell what changed")
+        session.node.request(abi.VIDIOC_DQEVENT, abi.Event(), "report changes")
         self._frames.stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
 
     def _frame(self, session: V4l2Session, buffer: DequeuedBuffer) -> Frame | None:

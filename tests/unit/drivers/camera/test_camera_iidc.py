@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from vical_drivers import errors
-from vical_drivers.camera import iidc_abi
+from vical_drivers.camera import firewire, iidc_abi
 from vical_drivers.camera.cycle_clock import WRAP_NS, CycleClock, cycle_time_ns, image_cycle_time_ns
 from vical_drivers.camera.embedded import parse_embedded
 from vical_drivers.camera.firewire import IOC_GET_CYCLE_TIMER2, BusClock
@@ -99,6 +99,47 @@ def test_a_second_process_is_kept_off_the_camera(tmp_path: Path) -> None:
     first.close()
     first.close()
     BusClock(str(node)).close()
+
+
+CAMERA, ADAPTER = 0x00B09D0100A1B2C3, 0x0012345678ABCDEF
+
+
+def closed_bus(tmp_path: Path, monkeypatch, units: dict[str, tuple[int, str]]) -> tuple[Path, Path]:
+    """Nodes that nobody may open, and what sysfs tells everybody of them."""
+    dev, sysfs = tmp_path / "dev", tmp_path / "sys"
+    dev.mkdir()
+    for name, (guid, text) in units.items():
+        (dev / name).touch()
+        facts = sysfs / "bus/firewire/devices" / name
+        facts.mkdir(parents=True)
+        (facts / "guid").write_text(f"{guid:#018x}\n")
+        if text:
+            (facts / "units").write_text(text + "\n")
+
+    def refuse(*_: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(firewire.os, "open", refuse)
+    return dev, sysfs
+
+
+@pytest.mark.parametrize("units", ["", "0x00609e:0x010483"], ids=["no units", "a disk"])
+def test_a_closed_node_that_is_no_camera_is_no_matter_of_permission(tmp_path, monkeypatch, units) -> None:
+    dev, sysfs = closed_bus(tmp_path, monkeypatch, {"fw0": (ADAPTER, units)})
+    assert firewire.find_node(None, dev, sysfs) is None
+    assert firewire.find_node(CAMERA, dev, sysfs) is None
+
+
+def test_a_closed_camera_is_named_and_nothing_else(tmp_path, monkeypatch) -> None:
+    there = {"fw0": (ADAPTER, ""), "fw1": (CAMERA, "0x00a02d:0x000102")}
+    dev, sysfs = closed_bus(tmp_path, monkeypatch, there)
+    for asked in (CAMERA, None):
+        with pytest.raises(errors.DevicePermissionError, match="group 'video'") as told:
+            firewire.find_node(asked, dev, sysfs)
+        assert "fw1" in str(told.value) and "fw0" not in str(told.value)
+    (sysfs / "bus/firewire/devices/fw1/guid").unlink()  # no sysfs: it may be the camera
+    with pytest.raises(errors.DevicePermissionError):
+        firewire.find_node(CAMERA, dev, sysfs)
 
 
 @pytest.mark.system

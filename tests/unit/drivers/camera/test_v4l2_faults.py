@@ -13,7 +13,7 @@ from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.v4l2 import V4l2Camera
 from vical_mocks.v4l2_camera import CID_EXPOSURE_AUTO, FakeCamera
 
-REQBUFS, STREAMON = 8, 18
+REQBUFS, STREAMON, DQEVENT = 8, 18, 89
 
 
 def read_on(source: V4l2Camera) -> None:
@@ -39,6 +39,20 @@ def test_unplug_is_told_and_the_camera_comes_back_under_another_number(open_fake
     assert frame.exposure_ns == 4_000_000
     assert frame.dropped_before == 0
     assert source.stats().reconnects == 1
+
+
+@pytest.mark.parametrize("code", [errno.ENODEV, errno.EIO])
+def test_an_unplug_is_called_an_unplug_whatever_was_asked_then(open_fake, kernel, code: int) -> None:
+    camera = FakeCamera()
+    source = open_fake(camera, exposure_s=0.004)
+    source.read(1.0)
+    kernel._plugged[str(kernel.dev / "video0")].events.append(CID_EXPOSURE_AUTO)
+    camera.request_errno[DQEVENT] = code
+    with pytest.raises(errors.DeviceLostError) as told:
+        read_on(source)
+    said = {errno.ENODEV: "the camera went away", errno.EIO: "the camera fails to report changes"}[code]
+    assert str(told.value).startswith(f"{kernel.dev}/video0: {said}")
+    assert "check its cable" in str(told.value)
 
 
 def test_another_camera_in_the_same_place_is_not_taken_for_the_lost_one(open_fake, kernel) -> None:
