@@ -130,6 +130,7 @@ class ImuSource(Source, Protocol):
         Raises:
             DeviceLostError: The device went away; `read` may be called again after a pause, and the
                 source tries to come back by itself.
+            DeviceReplacedError: Another device came back in its place; this source is closed.
         """
         ...
 
