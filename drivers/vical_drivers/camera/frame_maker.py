@@ -6,7 +6,7 @@ from vical_drivers.camera.formats import Image
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import StampGaps
 from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp
+from vical_drivers.camera.v4l2.kernel_stamp import ExposureStamper, RawStamp
 from vical_drivers.samples import Frame
 
 

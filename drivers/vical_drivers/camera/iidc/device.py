@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vical_drivers.camera import embedded, firewire
-from vical_drivers.camera import iidc_abi as abi
 from vical_drivers.camera.formats import FORMATS, Layout, PixelFormat
+from vical_drivers.camera.iidc import abi, embedded, firewire
 from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo
 

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from vical_drivers import errors
-from vical_drivers.camera import firewire, iidc_abi
-from vical_drivers.camera.cycle_clock import WRAP_NS, CycleClock, cycle_time_ns, image_cycle_time_ns
-from vical_drivers.camera.embedded import parse_embedded
-from vical_drivers.camera.firewire import IOC_GET_CYCLE_TIMER2, BusClock
-from vical_drivers.camera.iidc_whole import Wholeness, judge
+from vical_drivers.camera.iidc import abi as iidc_abi
+from vical_drivers.camera.iidc import firewire
+from vical_drivers.camera.iidc.cycle_clock import WRAP_NS, CycleClock, cycle_time_ns, image_cycle_time_ns
+from vical_drivers.camera.iidc.embedded import parse_embedded
+from vical_drivers.camera.iidc.firewire import IOC_GET_CYCLE_TIMER2, BusClock
+from vical_drivers.camera.iidc.whole import Wholeness, judge
 from vical_mocks import firewire_rig
 
 HERE = Path(__file__).parent
@@ -164,7 +165,10 @@ def test_the_grabber_over_the_real_libdc1394(tmp_path: Path) -> None:
         "-o",
         f"cache_dir={tmp_path / 'cache'}",
     ]
-    files = [str(HERE / "iidc_under_shim.py"), f"{HERE / 'test_frame_source_contract.py'}::TestFrameSource"]
+    files = [
+        str(HERE / "iidc_under_shim.py"),
+        f"{HERE.parent / 'test_frame_source_contract.py'}::TestFrameSource",
+    ]
     output = ""
     for extra in ([], ["--last-failed"]):
         done = subprocess.run(

@@ -10,7 +10,7 @@ import pytest
 from vical_drivers import errors
 from vical_drivers.camera import check_camera
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.v4l2.camera import V4l2Camera
 from vical_mocks.v4l2_camera import CID_EXPOSURE_AUTO, FakeCamera
 
 REQBUFS, STREAMON, DQEVENT = 8, 18, 89

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vical_drivers.camera import v4l2_abi as abi
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import Anchor, ExposureStamp, exposure_middle
-from vical_drivers.camera.v4l2_node import DequeuedBuffer
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.node import DequeuedBuffer
 
 PLAUSIBLE_NS = 10_000_000_000
 """A stamp further than this from a clock's now is not of that clock."""

@@ -4,7 +4,7 @@ A Point Grey camera writes the cycle time at which its shutter closed into each 
 read together with CLOCK_MONOTONIC at each frame and fitted (`cycle_clock`), and half the exposure is
 taken off. Any other camera is dated by the first packet of its frame. libdc1394 itself reports neither lost
 frames nor lost packets: the first are found by the embedded frame counter, or by gaps in the stamps, the
-others as `iidc_whole` says.
+others as `whole` says.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Any
 
 import numpy as np
 
-from vical_drivers.camera import iidc_abi as abi
-from vical_drivers.camera.embedded import EmbeddedInfo, parse_embedded
-from vical_drivers.camera.firewire import BusClock, find_node
 from vical_drivers.camera.formats import Bytes, CorruptImageError, FrameDecoder, Image
 from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
-from vical_drivers.camera.iidc_dating import FrameDating
-from vical_drivers.camera.iidc_device import IidcDevice, frame_bytes, list_devices, pixel_format
-from vical_drivers.camera.iidc_modes import IidcMode, set_mode
-from vical_drivers.camera.iidc_whole import Wholeness, judge
+from vical_drivers.camera.iidc import abi
+from vical_drivers.camera.iidc.dating import FrameDating
+from vical_drivers.camera.iidc.device import IidcDevice, frame_bytes, list_devices, pixel_format
+from vical_drivers.camera.iidc.embedded import EmbeddedInfo, parse_embedded
+from vical_drivers.camera.iidc.firewire import BusClock, find_node
+from vical_drivers.camera.iidc.modes import IidcMode, set_mode
+from vical_drivers.camera.iidc.whole import Wholeness, judge
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.v4l2_stamp import RawStamp
+from vical_drivers.camera.v4l2.kernel_stamp import RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats

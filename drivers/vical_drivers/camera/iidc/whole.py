@@ -18,8 +18,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from vical_drivers.camera.cycle_clock import WRAP_NS, image_cycle_time_ns
-from vical_drivers.camera.embedded import FRAME_COUNTER, EmbeddedInfo, parse_embedded, position
+from vical_drivers.camera.iidc.cycle_clock import WRAP_NS, image_cycle_time_ns
+from vical_drivers.camera.iidc.embedded import FRAME_COUNTER, EmbeddedInfo, parse_embedded, position
 
 EARLIEST_NEXT = 0.97
 """In periods after an image's first packet: the next image begins no earlier. Cameras keep their rate to

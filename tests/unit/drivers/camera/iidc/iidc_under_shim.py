@@ -1,4 +1,4 @@
-"""The FireWire grabber over the real libdc1394 and the preloaded fake bus; run by test_camera_iidc.py."""
+"""The FireWire grabber over the real libdc1394 and the preloaded fake bus; run by test_iidc.py."""
 
 from __future__ import annotations
 

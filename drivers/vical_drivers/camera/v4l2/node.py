@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.kernel import Kernel, Mapping
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.kernel import Kernel, Mapping
 from vical_drivers.errors import (
     DeviceBusyError,
     DeviceLostError,
