@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from vical_drivers.camera.exposure_stamper import ExposureStamper
 from vical_drivers.camera.formats import Image
+from vical_drivers.camera.losses import StampGaps
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.stamps import StampGaps
+from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.v4l2.kernel_stamp import ExposureStamper, RawStamp
 from vical_drivers.samples import Frame
 
 

@@ -17,9 +17,9 @@ import numpy as np
 from vical_drivers.camera.aravis.process import OPEN_TIMEOUT_S, GrabberProcess
 from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Layout, PixelFormat
 from vical_drivers.camera.frame_maker import FrameMaker
+from vical_drivers.camera.losses import SequenceCounter
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.stamps import Anchor, SequenceCounter
-from vical_drivers.camera.v4l2.kernel_stamp import SIGMA_NS, RawStamp
+from vical_drivers.camera.stamps import SIGMA_NS, Anchor, RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.envelope import LowerEnvelope
 from vical_drivers.errors import (

@@ -29,7 +29,7 @@ from vical_drivers.camera.iidc.firewire import BusClock, find_node
 from vical_drivers.camera.iidc.modes import IidcMode, set_mode
 from vical_drivers.camera.iidc.whole import Wholeness, judge
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.v4l2.kernel_stamp import RawStamp
+from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats

@@ -22,14 +22,15 @@ from collections.abc import Callable
 from vical_drivers.camera.formats import CorruptImageError, Image
 from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
+from vical_drivers.camera.losses import SequenceCounter
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.stamps import SequenceCounter
+from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.camera.v4l2 import abi
 from vical_drivers.camera.v4l2.controls import Controls
 from vical_drivers.camera.v4l2.discovery import find_again, find_node
 from vical_drivers.camera.v4l2.exposure import read_exposure_ns, set_exposure
 from vical_drivers.camera.v4l2.kernel import Kernel, LinuxKernel
-from vical_drivers.camera.v4l2.kernel_stamp import RawStamp, kernel_stamp, to_monotonic_ns
+from vical_drivers.camera.v4l2.kernel_stamp import kernel_stamp, to_monotonic_ns
 from vical_drivers.camera.v4l2.node import DequeuedBuffer
 from vical_drivers.camera.v4l2.session import V4l2Session
 from vical_drivers.closing import Closing

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vical_drivers.camera.stamps import Anchor, SequenceCounter, Shutter, StampGaps, exposure_middle
+from vical_drivers.camera.losses import SequenceCounter, StampGaps
+from vical_drivers.camera.stamps import Anchor, Shutter, exposure_middle
 from vical_drivers.camera.v4l2 import abi
 from vical_mocks.v4l2_camera import CID_EXPOSURE_ABSOLUTE, CID_EXPOSURE_AUTO, FakeCamera
 
