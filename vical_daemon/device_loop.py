@@ -214,7 +214,7 @@ class DeviceLoop(Generic[T]):
         info = source.info
         _log.info("%s: open: %s %s serial %s", self.name, info.kind, info.model, info.serial_number)
         known = self._health.info
-        if known is not None and known.serial_number != info.serial_number:
+        if known is not None and known.serial_number and info.serial_number not in ("", known.serial_number):
             text = (
                 f"{self.name} is another device now: {info.model} serial {info.serial_number}, "
                 f"not {known.model} serial {known.serial_number}"

@@ -43,8 +43,8 @@ class NodeEntry:
 
     @property
     def identity(self) -> str:
-        """What keys a stored calibration: the serial number, else the port."""
-        return self.serial_number or f"port-{self.port}"
+        """What keys a stored calibration: the serial number, else the port and what is plugged in there."""
+        return self.serial_number or f"port-{self.port} {self.name}"
 
 
 def list_nodes(kernel: Kernel) -> list[NodeEntry]:

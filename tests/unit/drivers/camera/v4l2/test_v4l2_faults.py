@@ -11,6 +11,7 @@ from vical_drivers import errors
 from vical_drivers.camera import check_camera
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.v4l2.camera import V4l2Camera
+from vical_drivers.camera.v4l2.discovery import NodeEntry
 from vical_mocks.v4l2_camera import CID_EXPOSURE_AUTO, FakeCamera
 
 REQBUFS, STREAMON, DQEVENT = 8, 18, 89
@@ -64,6 +65,15 @@ def test_another_camera_in_the_same_place_is_not_taken_for_the_lost_one(open_fak
     kernel.plug(FakeCamera(serial_number="OTHER"), number=0)
     with pytest.raises(errors.DeviceLostError, match="still away"):
         source.read(0.1)
+
+
+def test_without_serial_numbers_another_camera_in_the_port_has_another_identity() -> None:
+    def identity(name: str, port: str, serial_number: str = "") -> str:
+        return NodeEntry("/dev/video0", name, 0, serial_number, port).identity
+
+    assert identity("One", "1-1") != identity("Two", "1-1")
+    assert identity("One", "1-1") != identity("One", "1-2")
+    assert identity("One", "1-1", "SN") == identity("One", "1-2", "SN") == "SN"
 
 
 @pytest.mark.parametrize(
