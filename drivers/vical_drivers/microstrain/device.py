@@ -6,6 +6,7 @@ import contextlib
 import logging
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from vical_drivers.closing import Closing
 from vical_drivers.envelope import EnvelopeOptions
@@ -21,7 +22,7 @@ SILENCE_S = 2.0
 """A stream that is silent for this long counts as lost."""
 _ABSENT_S = 0.1
 """A host that is away for longer than this between two reads has not listened: no silence of the device."""
-_BACKOFF_S = (0.05, 0.1, 0.25)
+_BACKOFF_S = (0.1, 0.25)
 """Pauses between attempts to come back: an attempt on a port that is not there costs a system call, one on a
 silent port half a second."""
 
@@ -205,7 +206,8 @@ class MicrostrainImu(Closing):
             raise
         except DriverError as error:
             pause_s = _BACKOFF_S[min(self._attempts, len(_BACKOFF_S) - 1)]
-            self._attempts += 1
+            # a port that is not there was not asked: it will be asked first where the device was
+            self._attempts = self._attempts + 1 if Path(self._path).exists() else 0
             self._next_attempt_ns = time.monotonic_ns() + round(pause_s * 1e9)
             _log.debug("imu=%s reconnect=failed reason=%s", self._path, error)
 

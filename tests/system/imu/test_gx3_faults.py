@@ -92,10 +92,10 @@ def test_after_an_outage_it_is_soon_back(emulate, protocol, outage):
 
 def test_attempts_to_come_back_follow_each_other_closely_and_look_everywhere(emulate, monkeypatch):
     emulator = emulate()
-    with open_imu(emulator.port_name, rate_hz=100.0, **FAST) as imu:
+    with open_imu(emulator.port_name, rate_hz=100.0, **FAST, silence_s=0.3) as imu:
         collect(imu, 5)
-        emulator.unplug()
-        with pytest.raises(DeviceLostError):
+        emulator.power_off()
+        with pytest.raises(DriverError, match="silent"):
             collect(imu, 10_000)
         tried, pauses = [], []
 
@@ -112,7 +112,15 @@ def test_attempts_to_come_back_follow_each_other_closely_and_look_everywhere(emu
         monkeypatch.setattr(device.time, "sleep", sleep)
         for _ in range(16):
             imu.read(10.0)
+        of_a_silent_port = tried[:]
+        emulator.unplug()
+        imu.read(10.0)  # from now on the port is not there
+        tried.clear()
+        for _ in range(4):
+            imu.read(10.0)
         monkeypatch.undo()
+    assert tried == [("single-byte", (115_200,))] * 4  # so that it is asked so when it is there again
+    tried = of_a_silent_port
     assert tried[::2] == [("single-byte", (115_200,))] * 8  # as it was
     assert {bauds for _, bauds in tried[1::2]} == {(baud,) for baud in PROBE_BAUDS}
     assert {protocol for protocol, _ in tried[1::2]} == {"auto"}
