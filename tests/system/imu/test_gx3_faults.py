@@ -69,7 +69,7 @@ def test_unplug_and_replug_many_times(emulate):
 @pytest.mark.parametrize("protocol", ["single-byte", "mip"])
 @pytest.mark.parametrize("outage", ["unplugged", "without power"])
 def test_after_an_outage_it_is_soon_back(emulate, protocol, outage):
-    # measured on an idle machine: 1.3 to 2.5 s, of which the clock mapping warms up for 1 s
+    # measured: 1.2 to 2.5 s, of which the clock mapping warms up for 1 s
     emulator = emulate(protocol=protocol, link="uart")
     with open_imu(emulator.port_name, rate_hz=100.0) as imu:
         collect(imu, 5)
