@@ -98,7 +98,7 @@ class IidcCamera(Closing):
         self._dating = FrameDating(self._settings.stamp, self._mode.rate_hz, self._frames.statistics)
         self._shutter_raw: int | None = None
         self._held: _Taken | None = None  # the next frame decides whether it is whole
-        self._ready: deque[Frame] = deque()
+        self._judged: deque[tuple[_Taken, str]] = deque()  # in order; with what is wrong, "" for a whole one
         self._t_alive_ns = time.monotonic_ns()
 
     def _apply(self, device: IidcDevice) -> None:
@@ -215,8 +215,9 @@ class IidcCamera(Closing):
 
     def _next(self, timeout_s: float) -> Frame | None:
         device, bus = self._need()
-        if self._ready:
-            return self._ready.popleft()
+        frame_made = self._first_judged(device)
+        if frame_made is not None:
+            return frame_made
         poller = select.poll()
         poller.register(self._fd, select.POLLIN)
         events = dict(poller.poll(min(timeout_s, MIN_SILENCE_S) * 1e3)).get(self._fd, 0)
@@ -245,27 +246,33 @@ class IidcCamera(Closing):
             data[:image_bytes], depth_bits, info, raw, self._dating.sequence, missing, t_arrival_ns
         )
         verdict = judge(data, packet_bytes, info, self._frame_info, age_ns, self._mode.rate_hz)
-        self._sort(device, taken, verdict)
-        return self._ready.popleft() if self._ready else None
+        self._sort(taken, verdict)
+        return self._first_judged(device)
 
-    def _sort(self, device: IidcDevice, taken: _Taken, verdict: Wholeness) -> None:
-        """Deliver what is whole, in order, and drop what is not."""
+    def _sort(self, taken: _Taken, verdict: Wholeness) -> None:
+        """Judge the frame that was held by the one that follows it, and that one by itself."""
         held, self._held = self._held, None
         if held is not None:
-            if taken.missing_before:  # a shifted image looks the same, and nothing else could tell them apart
-                self._drop_image(held, "doubtful_images")
-            else:
-                self._deliver(device, held)
-        if verdict is Wholeness.WHOLE:
-            self._deliver(device, taken)
-        elif verdict is Wholeness.SHIFTED:
-            self._drop_image(taken, "shifted_images")
-        else:
+            # before a gap a shifted image and one that was only fetched late look the same
+            self._judged.append((held, "doubtful_images" if taken.missing_before else ""))
+        if verdict is Wholeness.OPEN:
             self._held = taken
+        else:
+            self._judged.append((taken, "shifted_images" if verdict is Wholeness.SHIFTED else ""))
 
-    def _drop_image(self, taken: _Taken, reason: str) -> None:
-        self._frames.spoilt(reason)
-        self._frames.lost(taken.missing_before + 1)
+    def _first_judged(self, device: IidcDevice) -> Frame | None:
+        """Make the next good frame of what was judged; what is not good is counted on the way."""
+        while self._judged:
+            taken, fault = self._judged.popleft()
+            self._frames.lost(taken.missing_before)
+            if fault:
+                self._frames.spoilt(fault)
+                self._frames.lost()
+                continue
+            frame = self._make(device, taken)
+            if frame is not None:
+                return frame
+        return None
 
     def _check_silence(self, device: IidcDevice) -> None:
         """A camera that was unplugged for a moment keeps its node, but has forgotten to send."""
@@ -281,15 +288,13 @@ class IidcCamera(Closing):
         except ValueError as error:
             raise DeviceRefusedError(f"{device.name}: {error}") from error
 
-    def _deliver(self, device: IidcDevice, taken: _Taken) -> None:
+    def _make(self, device: IidcDevice, taken: _Taken) -> Frame | None:
         self._update_exposure(device, taken.info)
-        self._frames.lost(taken.missing_before)
         image = self._image(taken.data, taken.depth_bits)
         if image is None:
             self._frames.lost()
-            return
-        frame = self._frames.frame(image, taken.raw, sequence=taken.sequence, t_arrival_ns=taken.t_arrival_ns)
-        self._ready.append(frame)
+            return None
+        return self._frames.frame(image, taken.raw, sequence=taken.sequence, t_arrival_ns=taken.t_arrival_ns)
 
     def _update_exposure(self, device: IidcDevice, info: EmbeddedInfo) -> None:
         """Read the shutter in seconds again whenever the image says that its raw value changed."""
