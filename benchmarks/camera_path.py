@@ -74,7 +74,7 @@ def _run(size: tuple[int, int], rate_hz: float, seconds: float, *, load: bool) -
 def _acquire(folder: str, stop: Any, ready: Any, answers: Any, size: tuple[int, int], rate_hz: float) -> None:
     """The process `acquire`: hosts the bus, runs the camera role on a fake kernel in real time."""
     from vical_drivers.camera import CameraSettings
-    from vical_drivers.camera.v4l2 import V4l2Camera
+    from vical_drivers.camera.v4l2.camera import V4l2Camera
     from vical_mocks.v4l2_camera import FakeCamera
     from vical_mocks.v4l2_kernel import FakeKernel, RealClock
 

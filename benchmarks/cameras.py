@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from vical_drivers.camera import CameraSettings
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.v4l2.camera import V4l2Camera
 from vical_mocks import firewire_rig
 from vical_mocks.v4l2_camera import FakeCamera, UvcClockModel
 from vical_mocks.v4l2_kernel import FakeKernel, RealClock
@@ -22,7 +22,7 @@ from vical_mocks.v4l2_kernel import FakeKernel, RealClock
 from vical_daemon.vision.image_codec import decode_image, encode_image
 
 ROOT = Path(__file__).resolve().parent.parent
-SHIM = ROOT / "tests/unit/drivers/camera/fake_firewire.c"
+SHIM = ROOT / "tests/unit/drivers/camera/iidc/fake_firewire.c"
 
 
 def main(argv: list[str]) -> int:

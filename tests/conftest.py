@@ -13,7 +13,7 @@ LONGEST_FIRST = (
     "test_euroc.py",
     "test_calibrator.py",
     "test_calibration_statistics.py",
-    "test_camera_iidc.py",
+    "test_iidc.py",
     "test_calibrate.py",
     "test_demo_command.py",
     "test_run_processes.py",

@@ -114,7 +114,10 @@ def run_lines(
     rig: str, role: str, lines: Sequence[Line[Any]], bus: Bus, stop: threading.Event, clock: WallClock
 ) -> None:
     """Publish the status of the devices until `stop`, then end their threads."""
-    StatusSender(rig, role, bus, clock).run_until(stop, lambda: [line.status() for line in lines])
+    sender = StatusSender(rig, role, bus, clock)
+    sender.run_until(
+        stop, lambda: [line.status() for line in lines], lambda: sum(line.loop.openings for line in lines)
+    )
     for line in lines:
         line.loop.join(JOIN_S)
         line.outbox.close()

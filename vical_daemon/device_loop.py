@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, Self, TypeVar
 
-from vical_drivers.errors import DriverError
+from vical_drivers.errors import DeviceReplacedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, FrameSource, SourceStats
 
 from vical_daemon import notify
@@ -96,7 +96,8 @@ class DeviceLoop(Generic[T]):
     """One thread per device: blocking read, hand over, and recovery without a restart.
 
     A source that was opened comes back by itself (that is its contract); the loop opens it when it was not
-    there at the start, and once more from scratch when it stays silent for very long.
+    there at the start, and once more from scratch when it stays silent for very long, or when another device
+    came back in its place.
 
     Args:
         name: For logs and the thread, e.g. ``imu/imu0``.
@@ -119,7 +120,7 @@ class DeviceLoop(Generic[T]):
         flush: Callable[[], None] | None = None,
         read_timeout_s: float = 0.2,
         silence_s: float = 20.0,
-        longest_pause_s: float = 5.0,
+        longest_pause_s: float = 1.0,
     ) -> None:
         self.name = name
         self._open_source, self._deliver, self._stop = open_source, deliver, stop
@@ -142,6 +143,11 @@ class DeviceLoop(Generic[T]):
         """Wait for the end of the thread (after `stop`); False if it is stuck."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
+
+    @property
+    def openings(self) -> int:
+        """How often the device was opened."""
+        return self._health.openings
 
     def health(self) -> DeviceHealth:
         """Return how the device is now."""
@@ -192,7 +198,8 @@ class DeviceLoop(Generic[T]):
             try:
                 items = source.read(self._read_timeout_s)
             except Exception as error:  # in whatever thread this is
-                self._broken = not isinstance(error, DriverError)  # the source cannot tell what is left of it
+                # the source cannot tell what is left of it, or has closed itself
+                self._broken = isinstance(error, DeviceReplacedError) or not isinstance(error, DriverError)
                 self._failed(error)
                 items = []
             self._t_loop_s = time.monotonic()
@@ -206,6 +213,15 @@ class DeviceLoop(Generic[T]):
     def _opened(self, source: Source[T]) -> None:
         info = source.info
         _log.info("%s: open: %s %s serial %s", self.name, info.kind, info.model, info.serial_number)
+        known = self._health.info
+        if known is not None and known.serial_number and info.serial_number not in ("", known.serial_number):
+            text = (
+                f"{self.name} is another device now: {info.model} serial {info.serial_number}, "
+                f"not {known.model} serial {known.serial_number}"
+            )
+            _log.warning("%s", text)
+            serials = {"serial": info.serial_number, "serial_before": known.serial_number}
+            notify.event("device_replaced", text, level="warning", device=self.name, **serials)
         openings = self._health.openings + 1
         self._health = replace(self._health, state="silent", problem="", info=info, openings=openings)
         self._source = source

@@ -44,11 +44,24 @@ class StatusSender:
         payload = encode_diagnostics(self._clock.now_ns(), self._role, [*statuses(), clock])
         self._bus.publish(self._key, payload)
 
-    def run_until(self, stop: threading.Event, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
-        """Publish once a second until `stop`, for a role whose work is done by device threads."""
+    def run_until(
+        self,
+        stop: threading.Event,
+        statuses: Callable[[], list[DiagnosticStatus]],
+        openings: Callable[[], int] = lambda: 0,
+    ) -> None:
+        """Publish once a second until `stop`, for a role whose work is done by device threads.
+
+        Args:
+            stop: Ends it.
+            statuses: Makes what is published.
+            openings: How often devices were opened: it may be another device now, which is told at once.
+        """
+        opened = 0
         while not stop.is_set():
-            self.tick(statuses)
-            stop.wait(STATUS_PERIOD_S / 5)
+            before, opened = opened, openings()
+            self.tick(statuses, force=opened != before)
+            stop.wait(STATUS_PERIOD_S / 10)
 
 
 def device_status(

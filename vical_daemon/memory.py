@@ -1,6 +1,8 @@
 """Remembers calibrations over restarts, by the serial numbers of the devices, and announces changes.
 
-Serial numbers come from the status of the acquiring roles, so the estimator needs no access to devices.
+Serial numbers come from the status of the acquiring roles, so the estimator needs no access to devices. What
+is estimated belongs to the devices that were there when the estimator began. When one of them is replaced,
+nothing more is saved until `begin_again`: else the calibration of one device would be filed under another.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy.typing as npt
 from vical_daemon import notify, topics
 from vical_daemon.bus import Bus, Sample
 from vical_daemon.config import Config
+from vical_daemon.device_serials import DeviceSerials
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.measurements import CameraPrior
@@ -50,7 +53,7 @@ class Memory:
         folder = Path(config.store.directory) if config.store.directory else state_directory() / "calibration"
         self._config, self._bus, self._clock = config, bus, clock
         self._store = CalibrationStore(folder)
-        self._serials: dict[str, str] = {}
+        self._serials = DeviceSerials()
         self._complete = threading.Event()
         self._before: dict[str, StoredCalibration] = {}
         self._compared: set[str] = set()
@@ -80,17 +83,36 @@ class Memory:
         return known
 
     @property
+    def replaced(self) -> bool:
+        """Whether a device of this calibration was replaced by another one since the estimator began."""
+        return bool(self._serials.replaced)
+
+    def begin_again(self) -> dict[str, CameraPrior]:
+        """Turn to the devices that are there now; return what is known about each camera with them."""
+        for line in self._serials.adopt():
+            said = f"{line}: the calibration begins anew"
+            _log.warning("%s", said)
+            self.announce(Event(EventKind.DEVICE_REPLACED, said=said))
+        self._before.clear()
+        self._compared.clear()
+        self._status, self._saved_s = None, -float("inf")
+        return self.priors()
+
+    @property
     def stored(self) -> list[str]:
         """Cameras for which a calibration of these devices is stored."""
         return list(self._before)
 
     @property
     def devices(self) -> dict[str, str]:
-        """Serial numbers of the devices of this calibration by component; empty while one is unknown."""
-        names = [f"imu/{self._config.calibration_imu}"]
-        names += [f"camera/{name}" for name in self._config.calibration_cameras]
-        known = {name: self._serials[name] for name in names if name in self._serials}
-        return known if len(known) == len(names) else {}
+        """Serial numbers of the devices of this calibration by component; empty while one is not certain."""
+        names = self._components()
+        known = {name: serial for name, serial in self._serials.known.items() if name in names}
+        return known if len(known) == len(names) and not self._serials.in_doubt else {}
+
+    def _components(self) -> list[str]:
+        cameras = [f"camera/{name}" for name in self._config.calibration_cameras]
+        return [f"imu/{self._config.calibration_imu}", *cameras]
 
     def announce(self, event: Event) -> None:
         """Add an event to the next estimate."""
@@ -125,7 +147,7 @@ class Memory:
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
         """Store a converged estimate now (once a minute, and at the end)."""
-        if estimate is None or estimate.status is not Status.CONVERGED:
+        if estimate is None or estimate.status is not Status.CONVERGED or self._serials.in_doubt:
             return
         self._saved_s = time.monotonic()
         for name in estimate.cameras:
@@ -155,13 +177,15 @@ class Memory:
             statuses = decode_diagnostics(sample.payload).statuses
         except MessageError:
             return
-        self._serials.update({s.name: s.hardware_id for s in statuses if s.hardware_id})
+        for status in statuses:
+            if status.name in self._components():
+                self._serials.note(status)
         if all(all(self._pair(name)) for name in self._config.calibration_cameras):
             self._complete.set()
 
     def _pair(self, camera: str) -> tuple[str, str]:
-        imu = self._serials.get(f"imu/{self._config.calibration_imu}", "")
-        return imu, self._serials.get(f"camera/{camera}", "")
+        known = self._serials.known
+        return known.get(f"imu/{self._config.calibration_imu}", ""), known.get(f"camera/{camera}", "")
 
     def _load(self, camera: str) -> StoredCalibration | None:
         imu_serial, camera_serial = self._pair(camera)

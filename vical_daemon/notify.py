@@ -40,7 +40,7 @@ def event(name: str, message: str, *, level: str = "notice", **fields: str | flo
     """Write an event that `journalctl VICAL_EVENT=name` finds.
 
     Args:
-        name: converged, bumped, device_lost, device_back, ...
+        name: converged, bumped, device_lost, device_back, device_replaced, ...
         message: One line for a person.
         level: error, warning, notice or info.
         **fields: Further fields; ``camera="cam0"`` becomes ``VICAL_CAMERA=cam0``.

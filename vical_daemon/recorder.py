@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from vical_drivers.user_files import read_file
 
 from vical_daemon.config import Config
+from vical_daemon.device_serials import DeviceSerials
 from vical_daemon.mcap_log import Attachment, LogError, LogFolder, LogSession
 from vical_daemon.messages import (
     DiagnosticStatus,
@@ -43,7 +44,7 @@ class Recorder:
         self._problem = ""
         self._retry_ns = 0
         self._command_key = COMMAND.key(config.rig, "record")
-        self._serials: dict[str, str] = {}
+        self._serials = DeviceSerials()
         self._calibrations: dict[str, bytes] = {}
         self._latched: dict[str, bytes] = {}
         self._mending: threading.Thread | None = None
@@ -107,12 +108,17 @@ class Recorder:
             self._wanted = False
             self.close()
         elif word == "split" and self._session is not None:
+            self._split()
+        else:
+            _log.warning("command %r is not known: start, stop or split", word[:40])
+
+    def _split(self) -> None:
+        """Go on in a new file."""
+        if self._session is not None:
             try:
                 self._session.rotate(self._clock.now_ns())
             except LogError as error:
                 self._fail(str(error))
-        else:
-            _log.warning("command %r is not known: start, stop or split", word[:40])
 
     def _note_serials(self, payload: bytes) -> None:
         try:
@@ -120,8 +126,10 @@ class Recorder:
         except MessageError:
             return
         for status in message.statuses:
-            if status.hardware_id and len(self._serials) < 64:
-                self._serials[status.name] = status.hardware_id
+            self._serials.note(status)
+        if self._serials.replaced:
+            self._serials.adopt()
+            self._split()  # a file names the devices that it is of
 
     def tick(self) -> None:
         """Do what time demands: flush, rotate, quota, reserve, and begin again after a failure."""
@@ -208,7 +216,7 @@ class Recorder:
         except PackageNotFoundError:
             program = "unknown"
         about = {"version": program, "rig": self._config.rig, **self._clock.status_values()}
-        return {"vical": about, "devices": dict(self._serials)}
+        return {"vical": about, "devices": dict(self._serials.known)}
 
     def _attachments(self) -> list[Attachment]:
         items = []

@@ -24,6 +24,10 @@ class DeviceLostError(DriverError):
     """The device was there and went away (unplugged, powered off)."""
 
 
+class DeviceReplacedError(DriverError):
+    """Another device answers where a known one was; the source has closed itself: open it anew."""
+
+
 class DeviceTimeoutError(DriverError, TimeoutError):
     """The device is open but stays silent."""
 

@@ -53,7 +53,8 @@ class Frame:
         exposure_ns: Exposure time where known, ns.
         readout_ns: First to last row where known (0 for a global shutter), ns.
         t_sigma_ns: One-sigma uncertainty of the stamp, ns.
-        dropped_before: Frames known to be missing just before this one.
+        dropped_before: Frames known to be missing just before this one, or found only now to be missing
+            before the last one.
     """
 
     t_exposure_mid_ns: int
@@ -134,6 +135,7 @@ class ImuSource(Source, Protocol):
         Raises:
             DeviceLostError: The device went away; `read` may be called again after a pause, and the
                 source tries to come back by itself.
+            DeviceReplacedError: Another device came back in its place; this source is closed.
         """
         ...
 

@@ -30,13 +30,19 @@ class Truth(ctypes.Structure):
 
 
 class Rig(ctypes.Structure):
-    """What is shared: commands to the bus first, then what it did."""
+    """What is shared: commands to the bus first, then what it did.
+
+    `lose_frames`: so many whole frames are lost. `lose_packets`: so many packets are lost from number
+    `lose_at` of a frame on; the kernel then moves the rest of the frame up, and takes the beginning of the
+    next frame for its end.
+    """
 
     _fields_ = (
         ("magic", ctypes.c_uint32),
         ("unplugged", ctypes.c_uint32),
         ("lose_frames", ctypes.c_uint32),
-        ("mix_frames", ctypes.c_uint32),
+        ("lose_packets", ctypes.c_uint32),
+        ("lose_at", ctypes.c_uint32),
         ("bus_resets", ctypes.c_uint32),
         ("no_embedding", ctypes.c_uint32),
         ("no_bandwidth", ctypes.c_uint32),

@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import errno
 import fcntl
+import math
 import os
 import select
 import signal
@@ -56,6 +57,7 @@ class Gx3Emulator:
             UART does; None: for every link but "usb" and "direct".
         faults: Damage to the bytes towards the host.
         stall_every_s: Mean time between stalls of the link; 0 for none.
+        boot_s: Time after a replug in which it hears and says nothing.
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class Gx3Emulator:
         baud_matters: bool | None = None,
         faults: ByteFaults | None = None,
         stall_every_s: float = 0.0,
+        boot_s: float = 0.0,
     ) -> None:
         self._motion = motion
         self._clock = SkewedClock(time.monotonic(), clock_skew_ppm, clock_wander_ppm)
@@ -95,6 +98,7 @@ class Gx3Emulator:
         self._thread: threading.Thread | None = None
         self._master = self._slave = -1
         self._plugged_before = False
+        self._boot_s, self._dark_until_s = boot_s, -math.inf
         self._wake_r, self._wake_w = os.pipe()
         self.plug()
 
@@ -113,12 +117,13 @@ class Gx3Emulator:
             self._openers = Openers(self._slave)
             if replugged:
                 self.device.power_up(time.monotonic())
-            self._link = FaultyLink(
-                make_link(self._link_kind, self._rng, self.device.baud),
-                self._faults,
-                stall_every_s=self._stall_every_s,
-            )
+                self._dark_until_s = time.monotonic() + self._boot_s
+            self._link = self._new_link()
         self._wake()
+
+    def _new_link(self) -> FaultyLink:
+        link = make_link(self._link_kind, self._rng, self.device.baud)
+        return FaultyLink(link, self._faults, stall_every_s=self._stall_every_s)
 
     def unplug(self) -> None:
         """Pull the cable: the terminal disappears under whoever has it open."""
@@ -131,6 +136,19 @@ class Gx3Emulator:
             os.close(self._master)
             self._master = self._slave = -1
 
+    def power_off(self) -> None:
+        """Take the supply away; the port stays, as that of a converter on USB does."""
+        with self._lock:
+            self._dark_until_s = math.inf
+
+    def power_on(self, boot_s: float = 0.0) -> None:
+        """Give the supply back; the device powers up and hears nothing for `boot_s`."""
+        with self._lock:
+            self._dark_until_s = time.monotonic() + boot_s
+            self.device.power_up(self._dark_until_s)
+            self._link = self._new_link()
+        self._wake()
+
     def toggle_cable(self) -> None:
         """Unplug where it is plugged in, plug in where it is not."""
         # A thread of its own: a signal may come while the lock is held.
@@ -142,7 +160,7 @@ class Gx3Emulator:
         with self._lock:
             self._faults = faults
             if self._master >= 0:
-                self._link = FaultyLink(make_link(self._link_kind, self._rng, self.device.baud), faults)
+                self._link = self._new_link()
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
@@ -191,6 +209,10 @@ class Gx3Emulator:
         if self._master < 0:
             return _IDLE_S
         now_s = time.monotonic()
+        if now_s < self._dark_until_s:
+            with contextlib.suppress(OSError):  # whatever the host says is lost
+                os.read(self._master, 4096)
+            return min(self._dark_until_s - now_s, _IDLE_S)
         if self._openers.closed_by_all():
             self._forget_host()
         self._take_input(now_s)

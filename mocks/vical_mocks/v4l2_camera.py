@@ -108,7 +108,8 @@ class FakeCamera:
         formats: Four-character code -> {(width, height): rates}.
         stamps: What the driver stamps: "soe", "eof" or "first-packet".
         flags: Time-stamp flags of its buffers; None: MONOTONIC with the anchor of `stamps`.
-        faults: Frame number -> "empty", "flagged", "short", "lost" or "unplug".
+        faults: Frame number -> "empty", "flagged", "short", "lost" (the driver counts it), "kept" (it never
+            leaves the camera, and the driver does not know of it) or "unplug".
         stamp_offset_ns: Added to the stamps (another clock).
         static: Pictures do not change but for their number: costs no time, for benchmarks.
     """

@@ -235,13 +235,17 @@ class FakeKernel(Requests):
         if fault == "unplug":
             self.unplug(camera)
             return
+        if fault == "kept":
+            plugged.kept += 1
+            return
+        sequence = truth.number - plugged.kept
         index = next((i for i, b in enumerate(video.buffers) if b.queued), None)
         if index is not None and fault != "lost":
             buffer = video.buffers[index]
             used = 0 if fault == "empty" else camera.fill(truth.number, buffer.memory)
             buffer.used = used // 2 if fault == "short" else used
             buffer.flags = camera.time_flags() | (0x40 if fault == "flagged" else 0)
-            buffer.t_ns, buffer.sequence, buffer.queued = truth.t_stamp_ns, truth.number, False
+            buffer.t_ns, buffer.sequence, buffer.queued = truth.t_stamp_ns, sequence, False
             video.done.append(index)
         meta = plugged.queues.get(META)
         if meta is not None and meta.streaming:
@@ -250,5 +254,5 @@ class FakeKernel(Requests):
                 data = camera.metadata(truth)
                 buffer = meta.buffers[index]
                 buffer.memory[: len(data)] = np.frombuffer(data, dtype=np.uint8)
-                buffer.used, buffer.sequence, buffer.queued = len(data), truth.number, False
+                buffer.used, buffer.sequence, buffer.queued = len(data), sequence, False
                 meta.done.append(index)

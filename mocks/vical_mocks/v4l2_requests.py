@@ -80,6 +80,7 @@ class PluggedCamera:
     gone: bool = False
     t_on_ns: int = 0
     next_frame: int = 0
+    kept: int = 0  # frames that never left the camera
     pending: FrameTruth | None = None
     queues: dict[int, Queue] = field(default_factory=dict)  # by buffer type
     events: deque[int] = field(default_factory=deque)
@@ -223,7 +224,7 @@ class Requests(ABC):
         held.plugged.queues[held.kind].streaming = True
         if held.kind == VIDEO:
             held.plugged.t_on_ns = self.clock.now_ns + 1_000_000
-            held.plugged.next_frame, held.plugged.pending = 0, None
+            held.plugged.next_frame, held.plugged.kept, held.plugged.pending = 0, 0, None
             held.plugged.camera.truth.clear()
 
     def _streamoff(self, held: OpenNode, _data: bytearray) -> None:

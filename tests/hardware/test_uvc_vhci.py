@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from vical_drivers import errors
 from vical_drivers.camera import CameraSettings, list_cameras
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.v4l2.camera import V4l2Camera
 from vical_mocks import usb_camera
 
 pytestmark = [pytest.mark.hardware, pytest.mark.root, pytest.mark.timeout(300)]  # root plugs the camera in

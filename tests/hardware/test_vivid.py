@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from vical_drivers import errors
 from vical_drivers.camera import CameraSettings, check_camera, list_cameras
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.v4l2.camera import V4l2Camera
 
 pytestmark = [pytest.mark.hardware, pytest.mark.timeout(300)]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from vical_drivers.camera import CameraSettings
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.v4l2.camera import V4l2Camera
 from vical_drivers.samples import FrameSource
 from vical_mocks.v4l2_camera import FakeCamera, UvcClockModel
 from vical_mocks.v4l2_kernel import FakeKernel, RealClock

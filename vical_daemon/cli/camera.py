@@ -256,7 +256,7 @@ def _snapshot(args: argparse.Namespace) -> int:
 
 
 def _controls(args: argparse.Namespace) -> int:
-    from vical_drivers.camera.v4l2 import V4l2Camera
+    from vical_drivers.camera.v4l2.camera import V4l2Camera
 
     with _open(args) as source:
         if not isinstance(source, V4l2Camera):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+import threading
+import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,6 +15,9 @@ from vical_drivers.errors import DriverError
 from vical_drivers.samples import DeviceInfo
 
 from vical_daemon.cli.options import add_json
+
+LIMIT_S = 12.0
+"""For all ports together: 4 s where nothing answers, and a slow device's answers to seven questions."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """List serial ports with what answers there, then cameras."""
-    ports = [_port(path, probe=not args.no_probe) for path in [*args.port, *serial_ports()]]
+    paths = _different([*args.port, *serial_ports()])
+    ports = [_unknown(path) for path in paths] if args.no_probe else probe_all(paths)
     cameras, problem = _cameras()
     if args.json:
         print(json.dumps({"imus": ports, "cameras": [_camera(c) for c in cameras], "problem": problem}))
@@ -46,6 +53,31 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _different(paths: list[str]) -> list[str]:
+    """Leave out second names of a port: asked at once under both, it would seem to be in use."""
+    found = {os.path.realpath(path): path for path in reversed(paths)}
+    return [path for path in dict.fromkeys(paths) if found[os.path.realpath(path)] == path]
+
+
+def probe_all(paths: list[str]) -> list[dict[str, object]]:
+    """Ask all ports at once; one that is not done within `LIMIT_S` is given up, and the rest are listed."""
+    if paths:
+        print(f"asking {', '.join(paths)} ...", file=sys.stderr)
+    found: dict[str, dict[str, object]] = {}
+
+    def probe(path: str) -> None:
+        found[path] = _probe(path)
+
+    threads = [threading.Thread(target=probe, args=(path,), name=path, daemon=True) for path in paths]
+    end_s = time.monotonic() + LIMIT_S
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(max(0.0, end_s - time.monotonic()))
+    slow = f"not done within {LIMIT_S:g} s; is something else on this port? Try: vical imu info PORT"
+    return [found.get(path, {**_unknown(path), "problem": f"{path}: {slow}"}) for path in paths]
+
+
 def serial_ports() -> list[str]:
     """Serial ports of this machine, by their stable names where udev made them."""
     from serial.tools import list_ports
@@ -57,11 +89,11 @@ def serial_ports() -> list[str]:
     return [stable.get(port.device, port.device) for port in sorted(list_ports.comports())]
 
 
-def _port(path: str, *, probe: bool) -> dict[str, object]:
-    found: dict[str, object] = {"port": path, "found": False}
-    if not probe:
-        return found
-    print(f"asking {path} ...", file=sys.stderr)
+def _unknown(path: str) -> dict[str, object]:
+    return {"port": path, "found": False}
+
+
+def _probe(path: str) -> dict[str, object]:
     from vical_drivers.microstrain.probe import connect
 
     try:
@@ -72,9 +104,11 @@ def _port(path: str, *, probe: bool) -> dict[str, object]:
             session.stop()
             port.close()
     except DriverError as error:
-        return {**found, "problem": str(error)}
+        return {**_unknown(path), "problem": str(error)}
+    except Exception as error:  # of a library: the other ports are listed all the same
+        return {**_unknown(path), "problem": f"{path}: {type(error).__name__}: {error}"}
     return {
-        **found,
+        "port": path,
         "found": True,
         "protocol": info.protocol,
         "model": info.model,

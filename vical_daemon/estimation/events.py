@@ -41,6 +41,8 @@ class EventKind(StrEnum):
     TARGET_OR_LENS = "target_or_lens"
     ROLLING_SHUTTER = "rolling_shutter"
     LENS_TERM_MISSING = "lens_term_missing"
+    DEVICE_REPLACED = "device_replaced"
+    ESTIMATOR_RESTARTED = "estimator_restarted"
     OTHER = "other"
 
 
@@ -81,8 +83,8 @@ class Event:
         t_s: When, in seconds since the first inertial reading; None: not known.
         cause: Why; for `BUMPED`, `STARTED_OVER` and `WENT_ON`.
         cause_value: Figure of the cause, see `Cause`; None: it has none.
-        said: Text of an event of kind `OTHER`, from a log written before events were typed or after a kind
-            was added that is not known here.
+        said: Text of the kinds in `SAID`. Those of kind `OTHER` come from a log written before events were
+            typed, or after a kind was added that is not known here.
     """
 
     kind: EventKind
@@ -100,6 +102,8 @@ class Event:
         return self.kind in _CHANGES
 
 
+SAID = frozenset({EventKind.OTHER, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED})
+"""Kinds whose details (serial numbers, a line of code) are text only."""
 _CHANGES = frozenset(
     {
         EventKind.BUMPED,
@@ -277,6 +281,16 @@ REFERENCE: dict[EventKind, About] = {
     ),
     EventKind.LENS_TERM_MISSING: About(
         "The lens needs one more distortion term than radtan has: use `plumb_bob`.", "", "Once per camera."
+    ),
+    EventKind.DEVICE_REPLACED: About(
+        "A device was replaced by another one; the calibration begins anew. The text has the serial numbers.",
+        "",
+        "When its status has named another serial number three times in a row.",
+    ),
+    EventKind.ESTIMATOR_RESTARTED: About(
+        "The estimator failed and was started afresh. The text says why.",
+        "",
+        "When it raises an error, or uses no images for 15 s.",
     ),
     EventKind.OTHER: About("Text from a log or program of another version.", "", "Never by this version."),
 }

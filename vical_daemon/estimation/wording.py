@@ -385,6 +385,8 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         "",
         lambda _: "the lens needs one term more than radtan has: give it distortion_model: plumb_bob",
     ),
+    EventKind.DEVICE_REPLACED: ("", lambda e: e.said),
+    EventKind.ESTIMATOR_RESTARTED: ("", lambda e: e.said),
     EventKind.OTHER: ("", lambda e: e.said),
 }
 

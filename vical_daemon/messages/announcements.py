@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import TypeVar
 
-from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.events import SAID, Cause, Event, EventKind
 from vical_daemon.estimation.guidance import AXES, Block, Edge, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.messages.cdr import CdrReader, CdrWriter
 
@@ -40,11 +40,12 @@ def read_events(reader: CdrReader, texts: Sequence[str]) -> list[Event]:
         t_s, value, sigma = (_read_number(reader) for _ in range(3))
         cause, cause_value = reader.string(), _read_number(reader)
         known, why = _known(EventKind, kind), _known(Cause, cause)
-        if known is None or why is None or known is EventKind.OTHER:
-            text = texts[i] if i < len(texts) else ""
-            found.append(Event(EventKind.OTHER, t_s=t_s, said=text))
+        if known is None or why is None:
+            known = EventKind.OTHER
+        if known in SAID:
+            found.append(Event(known, t_s=t_s, said=texts[i] if i < len(texts) else ""))
         else:
-            found.append(Event(known, camera, value, sigma, t_s, why, cause_value))
+            found.append(Event(known, camera, value, sigma, t_s, why or Cause.NONE, cause_value))
     return found
 
 

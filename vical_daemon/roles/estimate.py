@@ -56,6 +56,10 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
             _log.info("calibration reset by command")
             checkpoint.forget()
             role.reset(make_estimator(config, priors), make_watch(config))
+        if memory.replaced:
+            checkpoint.forget()
+            priors = memory.begin_again()
+            role.reset(_started(config, priors, memory), make_watch(config))
         while True:  # a bounded number at a time, so that publications stay on time when data pile up
             for sample in inbox.take(256):
                 role.take(sample)

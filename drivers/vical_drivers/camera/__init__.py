@@ -4,9 +4,9 @@ A camera is named by a URI:
 
 | URI | source |
 |---|---|
-| ``/dev/video0``, ``/dev/v4l/by-id/...``, ``v4l2:PATH``, ``v4l2:SERIAL`` | `v4l2.V4l2Camera` |
-| ``iidc:GUID`` (``iidc:`` alone: the only one there is) | `iidc.IidcCamera` |
-| ``aravis:ID`` | `aravis.AravisCamera` |
+| ``/dev/video0``, ``/dev/v4l/by-id/...``, ``v4l2:PATH``, ``v4l2:SERIAL`` | `v4l2.camera.V4l2Camera` |
+| ``iidc:GUID`` (``iidc:`` alone: the only one there is) | `iidc.camera.IidcCamera` |
+| ``aravis:ID`` | `aravis.camera.AravisCamera` |
 | ``folder:PATH`` | `folder.ImageFolder`, an ASL folder with ``data.csv`` |
 """
 

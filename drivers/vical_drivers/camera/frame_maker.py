@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from vical_drivers.camera.exposure_stamper import ExposureStamper
 from vical_drivers.camera.formats import Image
+from vical_drivers.camera.losses import StampGaps
 from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.v4l2_stamp import ExposureStamper, RawStamp
 from vical_drivers.samples import Frame
 
 
@@ -25,6 +27,26 @@ class FrameMaker:
         self.stamper = ExposureStamper(settings)
         self.statistics = FrameStatistics()
         self._lost = 0
+        self._gaps = StampGaps()
+
+    def reopened(self) -> None:
+        """The camera came back: its numbers, stamps and rate start afresh."""
+        self.statistics.restart()
+        self._gaps.restart()
+
+    def numbered(self, t_raw_ns: int, missing_before: int) -> None:
+        """Take note of a frame that came, good or not: what is missing before it by number, and by stamp.
+
+        Args:
+            t_raw_ns: When it was stamped, on a clock that nobody sets, ns.
+            missing_before: Frames that the source's own numbers skip.
+        """
+        self.lost(missing_before)
+        unnumbered = self._gaps.found(t_raw_ns, missing_before)
+        if unnumbered:
+            self.lost(unnumbered)
+            self.statistics.lost_before_last(unnumbered)
+            self.statistics.count("lost_in_camera", unnumbered)
 
     def lost(self, frames: int = 1) -> None:
         """Frames that never came, or came spoilt; `Frame.dropped_before` of the next good one."""

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from vical_drivers.camera.formats import ImageDecoder
-from vical_drivers.camera.kernel import Kernel, LinuxKernel
 from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.v4l2.kernel import Kernel, LinuxKernel
 from vical_drivers.errors import DeviceNotFoundError, DriverError, MissingLibraryError
 from vical_drivers.samples import DeviceInfo, FrameSource
 
@@ -92,19 +92,19 @@ def open_camera(
 
 
 def _open_v4l2(name: str, settings: CameraSettings, kernel: Kernel | None) -> FrameSource:
-    from vical_drivers.camera.v4l2 import V4l2Camera
+    from vical_drivers.camera.v4l2.camera import V4l2Camera
 
     return V4l2Camera(name, settings, kernel=kernel)
 
 
 def _open_iidc(name: str, settings: CameraSettings, _kernel: Kernel | None) -> FrameSource:
-    from vical_drivers.camera.iidc import IidcCamera
+    from vical_drivers.camera.iidc.camera import IidcCamera
 
     return IidcCamera(name, settings)
 
 
 def _open_aravis(name: str, settings: CameraSettings, _kernel: Kernel | None) -> FrameSource:
-    from vical_drivers.camera.aravis import AravisCamera
+    from vical_drivers.camera.aravis.camera import AravisCamera
 
     return AravisCamera(name, settings)
 
@@ -123,7 +123,7 @@ def list_cameras(*, kernel: Kernel | None = None, schemes: tuple[str, ...] = SCH
 
     A kind whose library is missing is skipped; where there is a FireWire bus, the log says what to install.
     """
-    from vical_drivers.camera.discovery import list_v4l2_cameras
+    from vical_drivers.camera.v4l2.discovery import list_v4l2_cameras
 
     found = list_v4l2_cameras(kernel or LinuxKernel()) if "v4l2" in schemes else []
     for scheme in ("iidc", "aravis"):
@@ -140,10 +140,10 @@ def list_cameras(*, kernel: Kernel | None = None, schemes: tuple[str, ...] = SCH
 
 def _list_by_library(scheme: str) -> list[DeviceInfo]:
     if scheme == "iidc":
-        from vical_drivers.camera.iidc import list_iidc_cameras
+        from vical_drivers.camera.iidc.camera import list_iidc_cameras
 
         return list_iidc_cameras()
-    from vical_drivers.camera.aravis import list_aravis_cameras
+    from vical_drivers.camera.aravis.camera import list_aravis_cameras
 
     return list_aravis_cameras()
 

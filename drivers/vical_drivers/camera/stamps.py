@@ -30,6 +30,33 @@ class Anchor(Enum):
     ARRIVAL = "arrival"
 
 
+SIGMA_NS = {
+    Anchor.START_OF_EXPOSURE: 50_000,
+    Anchor.END_OF_FRAME: 50_000,
+    Anchor.SHUTTER_CLOSED: 50_000,
+    Anchor.FIRST_PACKET: 2_000_000,
+    Anchor.ARRIVAL: 5_000_000,
+}
+"""One sigma of a raw stamp by its anchor: interrupt latency; USB scheduling; process scheduling."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawStamp:
+    """A driver's stamp, understood.
+
+    Attributes:
+        t_raw_ns: CLOCK_MONOTONIC, ns.
+        anchor: The instant it marks.
+        origin: Name for the stamp rule where it is not the anchor's; None: the anchor's.
+        t_sigma_ns: One sigma, ns.
+    """
+
+    t_raw_ns: int
+    anchor: Anchor
+    origin: str | None
+    t_sigma_ns: int
+
+
 @dataclass(frozen=True, slots=True)
 class Shutter:
     """How the sensor exposes.
@@ -99,34 +126,3 @@ def exposure_middle(
     if anchor is Anchor.FIRST_PACKET and rolling:
         return ExposureStamp(t_raw_ns - half + readout // 2, name + "-exposure/2+readout/2")
     return ExposureStamp(t_raw_ns - half, name + "-exposure/2")
-
-
-class SequenceCounter:
-    """Counts the frames that a source's own numbers say are missing.
-
-    Args:
-        bits: Width of the number.
-        skips_zero: The number goes from its highest value to 1 (GigE Vision's 16-bit frame id).
-    """
-
-    def __init__(self, bits: int = 32, *, skips_zero: bool = False) -> None:
-        self._modulus = 1 << bits
-        self._skips_zero = skips_zero
-        self._last: int | None = None
-
-    def restart(self) -> None:
-        """Forget the last number: the source was opened anew."""
-        self._last = None
-
-    def missing_before(self, number: int) -> int:
-        """Take the next number and return how many were skipped; 0 at the start or after a restart.
-
-        A step back by more than half the range is a source that began to count anew, not a loss.
-        """
-        last, self._last = self._last, number
-        if last is None:
-            return 0
-        step = (number - last) % self._modulus
-        if self._skips_zero and number < last:
-            step -= 1
-        return step - 1 if 1 <= step < self._modulus // 2 else 0

@@ -31,9 +31,15 @@ class FrameStatistics:
         self._number += 1 + lost_before
         self._recent.append((self._number, t_ns))
 
-    def count(self, name: str) -> None:
+    def lost_before_last(self, frames: int) -> None:
+        """Frames turn out to be missing before the latest one; whoever counts them as lost calls `add`."""
+        if self._recent:
+            number, t_ns = self._recent.pop()
+            self._recent.append((number + frames, t_ns))
+
+    def count(self, name: str, times: int = 1) -> None:
         """Count an event of one kind of source."""
-        self.extra[name] = self.extra.get(name, 0.0) + 1.0
+        self.extra[name] = self.extra.get(name, 0.0) + times
 
     def restart(self) -> None:
         """The source was opened anew: rate and jitter start afresh."""

@@ -6,11 +6,13 @@ import contextlib
 import logging
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from vical_drivers.closing import Closing
 from vical_drivers.envelope import EnvelopeOptions
-from vical_drivers.errors import DeviceLostError, DeviceTimeoutError, DriverError
-from vical_drivers.microstrain.probe import PROTOCOLS, connect
+from vical_drivers.errors import DeviceLostError, DeviceReplacedError, DeviceTimeoutError, DriverError
+from vical_drivers.microstrain.port import SerialPort
+from vical_drivers.microstrain.probe import PROBE_BAUDS, PROTOCOLS, connect
 from vical_drivers.microstrain.session import ImuSettings, Session
 from vical_drivers.microstrain.stamping import WARM_UP_S, SampleStamper
 from vical_drivers.samples import DeviceInfo, ImuSample, SourceStats
@@ -20,7 +22,9 @@ SILENCE_S = 2.0
 """A stream that is silent for this long counts as lost."""
 _ABSENT_S = 0.1
 """A host that is away for longer than this between two reads has not listened: no silence of the device."""
-_BACKOFF_S = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+_BACKOFF_S = (0.1, 0.25)
+"""Pauses between attempts to come back: an attempt on a port that is not there costs a system call, one on a
+silent port half a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +94,8 @@ class MicrostrainImu(Closing):
         self._closed = False
         self._silent_s = self._last_read_s = 0.0
         self._next_attempt_ns = 0
+        self._known: DeviceInfo | None = None
+        self._likely_bauds: list[int] = []
         self._open()
 
     @property
@@ -99,22 +105,20 @@ class MicrostrainImu(Closing):
 
     def _open(self) -> None:
         o = self._options
-        session, port = connect(
-            self._path,
-            o.protocol,
-            o.link,
-            self._settings.baud,
-            patient=self._stamper is None or not self._stamper.samples,
-        )
+        session, port = self._connect()
         self._close_port.callback(port.close)
         try:
-            self._info = session.identify()
+            info = session.identify()
+            self._expect(info)
+            found_baud = port.baud
             self.applied = session.configure(self._settings)
             session.start()
         except BaseException:
             session.stop()
             self._close_port.close()
             raise
+        self._known = self._info = info
+        self._likely_bauds = list(dict.fromkeys((found_baud, port.baud, PROBE_BAUDS[0])))
         self._session = session
         if self._stamper is None:
             self._stamper = SampleStamper(self.applied, port.wire_byte_ns, o.warm_up_s, o.clock)
@@ -123,6 +127,32 @@ class MicrostrainImu(Closing):
         self._silent_s, self._last_read_s = 0.0, time.monotonic()
         self._attempts = 0
         _log.info("imu=%s model=%s serial=%s", self._path, self._info.model, self._info.serial_number)
+
+    def _connect(self) -> tuple[Session, SerialPort]:
+        """Find the device; one that is known is looked for where it was."""
+        o, known = self._options, self._known
+        if known is None:
+            return connect(self._path, o.protocol, o.link, self._settings.baud)
+        if self._attempts % 2 == 0:
+            return connect(self._path, known.protocol, o.link, bauds=self._likely_bauds, patient=False)
+        # in between at one other baud, in any protocol: during a whole search, 4 s, it may come back
+        other = PROBE_BAUDS[self._attempts // 2 % len(PROBE_BAUDS)]
+        return connect(self._path, o.protocol, o.link, bauds=[other], patient=False)
+
+    def _expect(self, info: DeviceInfo) -> None:
+        """Refuse to go on with another device: clock, counters and calibration are not its own."""
+        known = self._known
+        if known is None or (info.serial_number, info.model) == (known.serial_number, known.model):
+            return
+        if known.serial_number and not info.serial_number:
+            raise DeviceTimeoutError(f"{self._path}: the device does not tell its serial number")
+        if info.serial_number == known.serial_number:
+            return
+        self._closed = True
+        raise DeviceReplacedError(
+            f"{self._path}: another device came back: {info.model} serial {info.serial_number}, "
+            f"not {known.model} serial {known.serial_number}"
+        )
 
     def read(self, timeout_s: float) -> list[ImuSample]:
         """See `ImuSource.read`."""
@@ -172,9 +202,12 @@ class MicrostrainImu(Closing):
         try:
             self._open()
             self._reconnects += 1
+        except DeviceReplacedError:
+            raise
         except DriverError as error:
             pause_s = _BACKOFF_S[min(self._attempts, len(_BACKOFF_S) - 1)]
-            self._attempts += 1
+            # a port that is not there was not asked: it will be asked first where the device was
+            self._attempts = self._attempts + 1 if Path(self._path).exists() else 0
             self._next_attempt_ns = time.monotonic_ns() + round(pause_s * 1e9)
             _log.debug("imu=%s reconnect=failed reason=%s", self._path, error)
 

@@ -35,6 +35,7 @@ BITS_PER_BYTE = 10
 """Start, eight data, stop."""
 _CHUNK = 4096  # more than a terminal holds; larger ones cost the allocator more than the read
 _WRITE_TIMEOUT_S = 1.0
+_slow_ports: set[str] = set()
 _CHUNKS_KEPT = 512  # a record waits for its end for 261 bytes at most
 
 
@@ -152,7 +153,8 @@ class SerialPort:
             # Pseudo terminals, CDC-ACM and some adapters refuse; they need it least.
             _log.debug("port=%s low_latency=refused reason=%s", self._name, error)
         timer_ms = latency_timer_ms(self._name)
-        if timer_ms is not None and timer_ms > 1:
+        if timer_ms is not None and timer_ms > 1 and self._name not in _slow_ports:
+            _slow_ports.add(self._name)  # said once, not at each attempt to come back
             _log.warning(
                 "port=%s latency_timer=%dms samples come late and in bunches; "
                 "`vical install-service` has the udev rule that sets 1 ms",

@@ -308,6 +308,29 @@ def test_calibration_and_serials_are_in_the_log(make, tmp_path):
     assert [a.name for a in reader.attachments] == ["calibration.json"]
 
 
+def test_a_replaced_device_begins_a_new_file(make, tmp_path):
+    recorder = make()
+
+    def status(serial):
+        payload = m.encode_diagnostics(
+            1, "imu", [m.DiagnosticStatus(m.Level.OK, "imu/imu0", hardware_id=serial)]
+        )
+        sample = Sample(topics.STATUS.key("rig0", "imu"), payload, 0)
+        recorder.write(arrival(sample, private_clock()))
+
+    status("A")
+    recorder.tick()
+    for serial in ("A", "B", "A", "B", "B"):  # a damaged message is no other device
+        status(serial)
+    assert len(LogFolder(tmp_path / "log").segments()) == 0  # all in the open one
+    status("B")
+    recorder.close()
+    readers = [LogReader(path) for path in LogFolder(tmp_path / "log").segments()]
+    for reader in readers:
+        list(reader.messages())
+    assert [dict(r.metadata)["devices"] for r in readers] == [{"imu/imu0": "A"}, {"imu/imu0": "B"}]
+
+
 def test_passwords_stay_out_of_logs(tmp_path):
     path = tmp_path / "vical.yaml"
     path.write_text(

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import cv2
 import pytest
-from vical_drivers.camera import opening, v4l2
+from vical_drivers.camera import opening
+from vical_drivers.camera.v4l2 import camera as v4l2
 from vical_mocks.v4l2_camera import FakeCamera, UvcClockModel
 from vical_mocks.v4l2_kernel import FakeKernel
 

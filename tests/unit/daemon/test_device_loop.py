@@ -8,27 +8,30 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from vical_drivers.errors import DeviceLostError, DeviceNotFoundError
+from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceReplacedError
 from vical_drivers.samples import DeviceInfo, SourceStats
 
+from vical_daemon import notify
 from vical_daemon.bus import LocalBus
 from vical_daemon.device_loop import DeviceLoop
 from vical_daemon.direct_outbox import DirectOutbox, StandIn
-from vical_daemon.health import STUCK_S, _judge, device_status
+from vical_daemon.health import STUCK_S, StatusSender, _judge, device_status
 from vical_daemon.messages import Level
 from vical_daemon.outbox import Outbox
+from vical_daemon.wall_clock import private_clock
 
 
 class ScriptedSource:
     """Plays a list of batches; an exception in it is raised."""
 
-    def __init__(self, script: list[Any]) -> None:
+    def __init__(self, script: list[Any], serial_number: str = "S1") -> None:
         self.script = script
+        self.serial_number = serial_number
         self.closed = False
 
     @property
     def info(self) -> DeviceInfo:
-        return DeviceInfo("imu", "scripted", "S1")
+        return DeviceInfo("imu", "scripted", self.serial_number)
 
     def read(self, timeout_s: float) -> list[int]:
         if not self.script:
@@ -94,6 +97,45 @@ def test_a_lost_device_is_reported_and_comes_back_by_itself(stop) -> None:
     source.script.append([2])
     _wait_for(lambda: got == [1, 2] and loop.health().state == "streaming")
     assert loop.health().openings == 1
+
+
+def test_another_device_is_opened_from_scratch_and_told_in_the_journal(stop, monkeypatch) -> None:
+    told: list[tuple[str, str]] = []
+    monkeypatch.setattr(notify, "event", lambda name, text, **_: told.append((name, text)))
+    lost = DeviceLostError("unplugged")
+    sources = [
+        ScriptedSource([[1], lost, DeviceReplacedError("another device came back")], serial_number="S1"),
+        ScriptedSource([[2], lost, [3]], serial_number="S2"),
+    ]
+    waiting = sources[:]
+    got: list[int] = []
+    loop = _loop(lambda: waiting.pop(0), got, stop)
+    _wait_for(lambda: got == [1, 2, 3])
+    assert sources[0].closed and not sources[1].closed and loop.openings == 2
+    info = loop.health().info
+    assert info is not None and info.serial_number == "S2"
+    replaced = [text for name, text in told if name == "device_replaced"]
+    assert replaced == ["imu/imu0 is another device now: scripted serial S2, not scripted serial S1"]
+
+
+def test_a_device_that_is_opened_is_told_at_once(stop) -> None:
+    """Not with the next status: samples of another device must not run ahead of its serial number."""
+    sent, openings = [], iter([0, 1, 1, 1, 2])
+
+    def count() -> int:
+        try:
+            return next(openings)
+        except StopIteration:
+            stop.set()
+            return 2
+
+    class CountingBus(LocalBus):
+        def publish(self, key: str, payload: bytes) -> None:
+            sent.append(key)
+
+    sender = StatusSender("rig0", "imu", CountingBus(), private_clock())
+    sender.run_until(stop, list, count)
+    assert len(sent) >= 3  # the first, and one for each opening
 
 
 def test_a_silent_device_is_opened_again(stop) -> None:

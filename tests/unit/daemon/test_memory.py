@@ -113,6 +113,45 @@ def test_serials_may_come_late_but_not_never(config: Config) -> None:
     assert memory.priors()["cam0"].T_imu_cam is not None
 
 
+def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config: Config) -> None:
+    _remember(config, _camera(p_m=(0.5, 0.0, 0.0)), camera_serial="C2")  # known from another day
+    bus = LocalBus()
+    memory = Memory(config, bus, private_clock())
+    _announce(bus, "C1")
+    assert memory.priors()["cam0"].T_imu_cam is None
+    memory.watch(_estimate(_camera()))
+    of_c1 = memory.devices
+    for times in range(3):  # another camera in the same place
+        assert not memory.replaced, times
+        _announce(bus, "C2")
+        assert memory.devices == {}  # in doubt: no state is kept
+        memory.save(_estimate(_camera(p_m=(0.2, 0.2, 0.2))))
+    assert memory.replaced
+    memory.save(_estimate(_camera(p_m=(0.3, 0.3, 0.3))))  # of the old one: under no name
+    prior = memory.begin_again()["cam0"]
+    assert prior.T_imu_cam is not None
+    np.testing.assert_array_equal(prior.T_imu_cam[1], [0.5, 0.0, 0.0])
+    assert memory.stored == ["cam0"] and not memory.replaced
+    assert memory.devices == {**of_c1, "camera/cam0": "C2"}
+    told = memory.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
+    assert told[0] == "camera/cam0 is another device now (serial C2, not C1): the calibration begins anew"
+    memory.close(None)
+    for serial, p_m in (("C1", [0.08, 0.02, -0.03]), ("C2", [0.6, 0.0, 0.0])):
+        prior = _later(config, serial).priors()["cam0"]
+        assert prior.T_imu_cam is not None
+        np.testing.assert_array_equal(prior.T_imu_cam[1], p_m)
+
+
+def test_one_damaged_status_replaces_no_device(config: Config) -> None:
+    bus = LocalBus()
+    memory = Memory(config, bus, private_clock())
+    for serial in ("C1", "C9", "C8", "C1", "C9", "C9", "C1", "C8"):
+        _announce(bus, serial)
+        assert not memory.replaced
+    _announce(bus, "C1")
+    assert memory.devices["camera/cam0"] == "C1"
+
+
 def test_a_changed_mounting_is_announced_once(config: Config) -> None:
     _remember(config, _camera())
     memory = _later(config)

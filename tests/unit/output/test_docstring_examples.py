@@ -17,7 +17,7 @@ MODULES = sorted(
 
 
 def test_examples_are_found():
-    assert {"vical_daemon.cli.info", "vical_drivers.camera.v4l2_abi"} <= set(MODULES)
+    assert {"vical_daemon.cli.info", "vical_drivers.camera.v4l2.abi"} <= set(MODULES)
 
 
 @pytest.mark.parametrize("module", MODULES)

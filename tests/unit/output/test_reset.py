@@ -1,17 +1,57 @@
-"""`reset`, as the page sends it, makes the estimate role begin anew; other words do nothing."""
+"""`reset`, as the page sends it, makes the estimate role begin anew, and so does another device."""
 
+import contextlib
 import threading
 import time
 
+import pytest
+
 from vical_daemon import topics
 from vical_daemon.bus import LocalBus
-from vical_daemon.config import CameraConfig, Config, ImuConfig
-from vical_daemon.messages import decode_calibration, encode_imu, encode_string
+from vical_daemon.config import CameraConfig, Config, ImuConfig, StoreConfig
+from vical_daemon.estimation.wording import event_text
+from vical_daemon.messages import (
+    DiagnosticStatus,
+    Level,
+    decode_calibration,
+    encode_diagnostics,
+    encode_imu,
+    encode_string,
+)
 from vical_daemon.roles import estimate
 from vical_daemon.wall_clock import private_clock
 
 
-def test_reset_forgets_everything(tmp_path):
+class Run:
+    """A running estimate role, and what it publishes."""
+
+    def __init__(self, bus: LocalBus) -> None:
+        self.bus, self.counts, self.events = bus, [], []
+        self._t_ns = 10**18
+        bus.subscribe(topics.CALIBRATION.key("rig0", "cam0"), self._take)
+
+    def _take(self, sample) -> None:
+        estimate = decode_calibration(sample.payload).estimate
+        self.counts.append(estimate.imu_samples)
+        self.events += [event_text(event) for event in estimate.events]
+
+    def feed(self) -> None:
+        for _ in range(5):
+            self._t_ns += 4_000_000
+            noise = 1e-3 * (self._t_ns // 4_000_000 % 7)  # a sensor that repeats itself counts as frozen
+            payload = encode_imu(self._t_ns, "imu0", (noise, 0.0, 0.0), (0.0, noise, 9.8))
+            self.bus.publish(topics.IMU.key("rig0", "imu0"), payload)
+
+    def until(self, true) -> None:
+        end = time.monotonic() + 60
+        while not true():
+            assert time.monotonic() < end
+            self.feed()
+            time.sleep(0.02)
+
+
+@pytest.fixture
+def running(tmp_path):
     board = tmp_path / "board.yaml"
     board.write_text(
         "{target_type: checkerboard, targetCols: 8, targetRows: 6, "
@@ -21,41 +61,44 @@ def test_reset_forgets_everything(tmp_path):
         imus={"imu0": ImuConfig(port="none")},
         cameras={"cam0": CameraConfig(uri="none")},
         target=str(board),
+        store=StoreConfig(directory=str(tmp_path / "store")),
     )
-    bus, stop, counts = LocalBus(), threading.Event(), []
-    bus.subscribe(
-        topics.CALIBRATION.key("rig0", "cam0"),
-        lambda sample: counts.append(decode_calibration(sample.payload).estimate.imu_samples),
-    )
+    bus, stop = LocalBus(), threading.Event()
+    run = Run(bus)
     options = {"clock": private_clock()}
     thread = threading.Thread(target=estimate.run, args=(config, bus, stop), kwargs=options)
     thread.start()
+    with contextlib.ExitStack() as stack:
+        stack.callback(thread.join, 60)
+        stack.callback(stop.set)
+        yield run
 
-    def wait_until(true):
-        end = time.monotonic() + 60
-        while not true():
-            assert time.monotonic() < end
-            feed()
-            time.sleep(0.02)
 
-    t_ns = [10**18]
-
-    def feed():
-        for _ in range(5):
-            t_ns[0] += 4_000_000
-            noise = 1e-4 * (t_ns[0] % 7)  # readings that repeat bit by bit are left out
-            payload = encode_imu(t_ns[0], "imu0", (noise, 0.0, 0.0), (0.0, 0.0, 9.8))
-            bus.publish(topics.IMU.key("rig0", "imu0"), payload)
-
+def test_reset_forgets_everything(running):
     command = topics.COMMAND.key("rig0", "estimate")
-    try:
-        wait_until(lambda: counts and counts[-1] > 100)
-        bus.publish(command, encode_string("dance"))
-        bus.publish(command, b"")
-        before = counts[-1]
-        wait_until(lambda: counts[-1] > before)
-        bus.publish(command, encode_string("reset"))
-        wait_until(lambda: counts[-1] < before)
-    finally:
-        stop.set()
-        thread.join(60)
+    running.until(lambda: running.counts and running.counts[-1] > 100)
+    running.bus.publish(command, encode_string("dance"))
+    running.bus.publish(command, b"")
+    before = running.counts[-1]
+    running.until(lambda: running.counts[-1] > before)
+    running.bus.publish(command, encode_string("reset"))
+    running.until(lambda: running.counts[-1] < before)
+
+
+def test_another_device_begins_anew_and_is_told(running):
+    def status(serial: str) -> None:
+        payload = encode_diagnostics(1, "imu", [DiagnosticStatus(Level.OK, "imu/imu0", "", serial)])
+        running.bus.publish(topics.STATUS.key("rig0", "imu"), payload)
+
+    status("I1")
+    running.until(lambda: running.counts and running.counts[-1] > 100)
+    before = running.counts[-1]
+    status("I2")
+    running.until(lambda: running.counts[-1] > before)  # once may be a damaged message
+    before = running.counts[-1]
+    status("I2")
+    status("I2")
+    running.until(lambda: running.counts[-1] < before)
+    running.until(lambda: running.events)
+    text = "imu/imu0 is another device now (serial I2, not I1): the calibration begins anew"
+    assert running.events == [text]

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.v4l2.camera import V4l2Camera
 from vical_mocks.v4l2_camera import FakeCamera
 from vical_mocks.v4l2_kernel import FakeKernel
 

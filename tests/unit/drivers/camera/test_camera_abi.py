@@ -8,8 +8,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from vical_drivers.camera import iidc_abi
-from vical_drivers.camera import v4l2_abi as abi
+from vical_drivers.camera.iidc import abi as iidc_abi
+from vical_drivers.camera.v4l2 import abi
 from vical_mocks import firewire_rig
 
 HEADER = Path("/usr/include/linux/videodev2.h")

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from vical_drivers.camera import CameraSettings, open_camera
-from vical_drivers.camera.aravis import AravisCamera, list_aravis_cameras
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.aravis.camera import AravisCamera, list_aravis_cameras
+from vical_drivers.camera.v4l2.camera import V4l2Camera
 from vical_drivers.errors import DeviceLostError, MissingLibraryError
 from vical_drivers.samples import DeviceInfo, Frame, FrameSource, SourceStats
 from vical_mocks import firewire_rig
@@ -123,7 +123,7 @@ MAKERS: dict[str, Callable[[Path], Stand]] = {
     maker.__name__: maker
     for maker in (v4l2_grey, v4l2_yuyv_borrowed, v4l2_mjpg, uvc, folder_replay, simulated, aravis)
 }
-if firewire_rig.ENVIRONMENT in os.environ:  # the process that test_camera_iidc.py starts
+if firewire_rig.ENVIRONMENT in os.environ:  # the process that test_iidc.py starts
     MAKERS["iidc"] = iidc
 
 

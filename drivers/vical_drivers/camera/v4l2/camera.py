@@ -7,6 +7,7 @@ What happens when something goes wrong:
 | unplugged, also during a dequeue | `DeviceLostError`; the next `read` waits for it and opens it anew |
 | empty buffer, buffer flagged as damaged, JPEG or image cut off | counted, skipped, the frame is lost |
 | jump in the sequence numbers | `Frame.dropped_before`, counted |
+| jump in the stamps alone (lost inside the camera) | the same, one frame later; counted apart as well |
 | format or size refused | `DeviceRefusedError` with what is on offer |
 | a second process on the camera | `DeviceBusyError` naming the first one |
 | no permission | `DevicePermissionError` naming the group |
@@ -18,19 +19,20 @@ import logging
 import select
 from collections.abc import Callable
 
-from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.discovery import find_again, find_node
 from vical_drivers.camera.formats import CorruptImageError, Image
 from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
-from vical_drivers.camera.kernel import Kernel, LinuxKernel
+from vical_drivers.camera.losses import SequenceCounter
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.stamps import SequenceCounter
-from vical_drivers.camera.v4l2_controls import Controls
-from vical_drivers.camera.v4l2_exposure import read_exposure_ns, set_exposure
-from vical_drivers.camera.v4l2_node import DequeuedBuffer
-from vical_drivers.camera.v4l2_session import V4l2Session
-from vical_drivers.camera.v4l2_stamp import RawStamp, kernel_stamp
+from vical_drivers.camera.stamps import RawStamp
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.controls import Controls
+from vical_drivers.camera.v4l2.discovery import find_again, find_node
+from vical_drivers.camera.v4l2.exposure import read_exposure_ns, set_exposure
+from vical_drivers.camera.v4l2.kernel import Kernel, LinuxKernel
+from vical_drivers.camera.v4l2.kernel_stamp import kernel_stamp, to_monotonic_ns
+from vical_drivers.camera.v4l2.node import DequeuedBuffer
+from vical_drivers.camera.v4l2.session import V4l2Session
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceLostError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
@@ -100,7 +102,7 @@ class V4l2Camera(Closing):
         except DriverError as error:
             self._wait(timeout_s)  # udev may not have set the permissions yet
             raise DeviceLostError(f"{entry.path}: the camera is not back yet ({error})") from error
-        self._frames.statistics.restart()
+        self._frames.reopened()
         _log.info("camera back path=%s", entry.path)
 
     def close(self) -> None:
@@ -220,13 +222,14 @@ class V4l2Camera(Closing):
         return None
 
     def _take_event(self, session: V4l2Session) -> None:
-        session.node.request(abi.VIDIOC_DQEVENT, abi.Event(), "tell what changed")
+        session.node.request(abi.VIDIOC_DQEVENT, abi.Event(), "report changes")
         self._frames.stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
 
     def _frame(self, session: V4l2Session, buffer: DequeuedBuffer) -> Frame | None:
         # Both clocks at once, and before anything takes time: a stamp of the wall clock is moved by the pair.
         t_arrival_ns, t_realtime_ns = self._kernel.monotonic_ns(), self._kernel.realtime_ns()
-        self._frames.lost(self._sequence.missing_before(buffer.sequence))
+        t_stamp_ns = to_monotonic_ns(buffer.t_ns, t_arrival_ns, t_realtime_ns) or t_arrival_ns
+        self._frames.numbered(t_stamp_ns, self._sequence.missing_before(buffer.sequence))
         image = self._image(session, buffer)
         if image is None:
             self._frames.lost()

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vical_drivers.camera import embedded, firewire
-from vical_drivers.camera import iidc_abi as abi
 from vical_drivers.camera.formats import FORMATS, Layout, PixelFormat
+from vical_drivers.camera.iidc import abi, embedded, firewire
 from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo
 
@@ -82,7 +81,7 @@ class IidcDevice:
         if code == abi.SUCCESS:
             return
         if firewire.find_node(self.guid) is None:
-            raise DeviceLostError(f"{self.name}: the camera went away (cannot {doing})")
+            raise DeviceLostError(f"{self.name}: the camera went away; check its cable")
         raise DeviceRefusedError(f"{self.name}: cannot {doing} (libdc1394 error {code})")
 
     def number(self, function: str, *arguments: object, doing: str) -> int:
@@ -204,8 +203,8 @@ class IidcDevice:
 
 
 def frame_bytes(frame: abi.VideoFrame) -> npt.NDArray[np.uint8]:
-    """Return a copy of the frame's image bytes."""
-    source = (ctypes.c_uint8 * frame.image_bytes).from_address(frame.image)
+    """Return a copy of all bytes that came for a frame: `image_bytes` of the image, then padding."""
+    source = (ctypes.c_uint8 * frame.total_bytes).from_address(frame.image)
     return np.frombuffer(source, dtype=np.uint8).copy()
 
 
@@ -223,7 +222,7 @@ def _choose(found: list[int], guid: int | None) -> int:
     if guid in found and guid is not None:
         return guid
     if not found:
-        firewire.find_node(guid or 0)  # raises where permission is the reason
+        firewire.find_node(guid)  # raises where permission is the reason
     there = ", ".join(f"iidc:{g:016x}" for g in found) or "none"
     asked = "one camera" if guid is None else f"iidc:{guid:016x}"
     raise DeviceNotFoundError(f"{asked} was asked for; on the bus: {there}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vical_drivers.camera.formats import FORMATS, Layout, PixelFormat
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.v4l2_node import ObtainedFormat, VideoNode
+from vical_drivers.camera.v4l2.node import ObtainedFormat, VideoNode
 from vical_drivers.errors import DeviceRefusedError
 
 RATE_TOLERANCE = 0.01

@@ -9,11 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.discovery import NodeEntry, metadata_node
-from vical_drivers.camera.kernel import Kernel
-from vical_drivers.camera.stamps import Anchor
-from vical_drivers.camera.uvc import (
+from vical_drivers.camera.stamps import Anchor, RawStamp
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.discovery import NodeEntry, metadata_node
+from vical_drivers.camera.v4l2.kernel import Kernel
+from vical_drivers.camera.v4l2.kernel_stamp import to_monotonic_ns
+from vical_drivers.camera.v4l2.node import DequeuedBuffer, VideoNode
+from vical_drivers.camera.v4l2.uvc import (
     ClockHealth,
     PayloadHeader,
     UvcClock,
@@ -22,8 +24,6 @@ from vical_drivers.camera.uvc import (
     parse_metadata,
     plausible_capture,
 )
-from vical_drivers.camera.v4l2_node import DequeuedBuffer, VideoNode
-from vical_drivers.camera.v4l2_stamp import RawStamp, to_monotonic_ns
 from vical_drivers.errors import DriverError
 
 _log = logging.getLogger(__name__)

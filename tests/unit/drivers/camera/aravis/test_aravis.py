@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from vical_drivers import errors
 from vical_drivers.camera import CameraSettings
-from vical_drivers.camera.aravis import AravisCamera, list_aravis_cameras
-from vical_drivers.camera.aravis_process import system_python
+from vical_drivers.camera.aravis.camera import AravisCamera, list_aravis_cameras
+from vical_drivers.camera.aravis.process import system_python
 
 pytestmark = pytest.mark.system
 FAKE = ("Fake",)

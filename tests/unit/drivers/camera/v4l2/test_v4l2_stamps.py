@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
-from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.stamps import Anchor, SequenceCounter, Shutter, exposure_middle
+from vical_drivers.camera.losses import SequenceCounter, StampGaps
+from vical_drivers.camera.stamps import Anchor, Shutter, exposure_middle
+from vical_drivers.camera.v4l2 import abi
 from vical_mocks.v4l2_camera import CID_EXPOSURE_ABSOLUTE, CID_EXPOSURE_AUTO, FakeCamera
 
 READOUT_S = 0.008
@@ -145,3 +147,43 @@ def test_sequence_counter_knows_gaps_wraps_and_restarts() -> None:
     assert [counter.missing_before(n) for n in numbers] == [0, 0, 2, 0, 0, 1, 0]
     gige = SequenceCounter(16, skips_zero=True)
     assert [gige.missing_before(n) for n in (65534, 65535, 1, 2, 4)] == [0, 0, 0, 0, 1]
+
+
+PERIOD_NS = 33_366_700  # 29.97 Hz
+
+
+def losses_found(stamps_ns: np.ndarray, missing: dict[int, int] | None = None) -> int:
+    gaps = StampGaps()
+    return sum(gaps.found(int(t), (missing or {}).get(k, 0)) for k, t in enumerate(stamps_ns))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("jitter_ns", [0, 3_000_000])
+def test_every_frame_lost_inside_a_camera_is_counted(seed: int, jitter_ns: int) -> None:
+    rng = np.random.default_rng(seed)
+    all_of_them = np.arange(3000) * PERIOD_NS + rng.normal(0.0, jitter_ns, 3000)
+    kept = np.ones(3000, dtype=bool)
+    for start in rng.choice(np.arange(40, 2900, 40), 30, replace=False):
+        kept[start : start + rng.integers(1, 14)] = False
+    assert losses_found(all_of_them[kept]) == 3000 - kept.sum()
+
+
+def test_late_stamps_and_another_pace_are_no_losses() -> None:
+    even = np.arange(600) * PERIOD_NS
+    late = even.copy()
+    late[100::50] += 25_000_000  # three quarters of a period, caught up by the next frame
+    assert losses_found(late) == 0
+    bunched = even.copy()
+    bunched[200:206] = bunched[206]  # six stamps at once
+    assert losses_found(bunched) == 0
+    darker = np.concatenate([even, even[-1] + 2 * PERIOD_NS * np.arange(1, 300)])  # half the rate in the dark
+    assert losses_found(darker) == 0
+    slowly = np.cumsum(PERIOD_NS * np.linspace(1.0, 2.0, 600))
+    assert losses_found(slowly) == 0
+    assert losses_found(np.cumsum(np.random.default_rng(3).exponential(PERIOD_NS, 40))) >= 0  # a trigger
+
+
+def test_what_the_numbers_tell_is_not_counted_twice() -> None:
+    stamps = np.delete(np.arange(200) * PERIOD_NS, [50, 51, 52, 80])
+    assert losses_found(stamps, {50: 3, 77: 1}) == 0
+    assert losses_found(stamps, {50: 1}) == 3

@@ -10,10 +10,11 @@ import pytest
 from vical_drivers import errors
 from vical_drivers.camera import check_camera
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.v4l2 import V4l2Camera
+from vical_drivers.camera.v4l2.camera import V4l2Camera
+from vical_drivers.camera.v4l2.discovery import NodeEntry
 from vical_mocks.v4l2_camera import CID_EXPOSURE_AUTO, FakeCamera
 
-REQBUFS, STREAMON = 8, 18
+REQBUFS, STREAMON, DQEVENT = 8, 18, 89
 
 
 def read_on(source: V4l2Camera) -> None:
@@ -41,6 +42,20 @@ def test_unplug_is_told_and_the_camera_comes_back_under_another_number(open_fake
     assert source.stats().reconnects == 1
 
 
+@pytest.mark.parametrize("code", [errno.ENODEV, errno.EIO])
+def test_an_unplug_is_called_an_unplug_whatever_was_asked_then(open_fake, kernel, code: int) -> None:
+    camera = FakeCamera()
+    source = open_fake(camera, exposure_s=0.004)
+    source.read(1.0)
+    kernel._plugged[str(kernel.dev / "video0")].events.append(CID_EXPOSURE_AUTO)
+    camera.request_errno[DQEVENT] = code
+    with pytest.raises(errors.DeviceLostError) as told:
+        read_on(source)
+    said = {errno.ENODEV: "the camera went away", errno.EIO: "the camera fails to report changes"}[code]
+    assert str(told.value).startswith(f"{kernel.dev}/video0: {said}")
+    assert "check its cable" in str(told.value)
+
+
 def test_another_camera_in_the_same_place_is_not_taken_for_the_lost_one(open_fake, kernel) -> None:
     camera = FakeCamera(faults={1: "unplug"})
     source = open_fake(camera)
@@ -50,6 +65,15 @@ def test_another_camera_in_the_same_place_is_not_taken_for_the_lost_one(open_fak
     kernel.plug(FakeCamera(serial_number="OTHER"), number=0)
     with pytest.raises(errors.DeviceLostError, match="still away"):
         source.read(0.1)
+
+
+def test_without_serial_numbers_another_camera_in_the_port_has_another_identity() -> None:
+    def identity(name: str, port: str, serial_number: str = "") -> str:
+        return NodeEntry("/dev/video0", name, 0, serial_number, port).identity
+
+    assert identity("One", "1-1") != identity("Two", "1-1")
+    assert identity("One", "1-1") != identity("One", "1-2")
+    assert identity("One", "1-1", "SN") == identity("One", "1-2", "SN") == "SN"
 
 
 @pytest.mark.parametrize(
@@ -71,6 +95,25 @@ def test_a_jump_of_the_sequence_is_a_loss(open_fake) -> None:
     assert [f.dropped_before for f in frames] == [0, 0, 0, 2, 0]
     assert source.stats().lost == 2
     assert source.stats().rate_hz == pytest.approx(30.0, rel=1e-6)
+
+
+def test_frames_that_never_leave_the_camera_are_found_by_the_stamps(open_fake) -> None:
+    kept = dict.fromkeys([*range(20, 33), 50, 70, 72], "kept") | {40: "lost", 90: "lost", 91: "kept"}
+    camera = FakeCamera(faults=kept)
+    source = open_fake(camera)
+    frames = [source.read(1.0) for _ in range(100)]
+    assert [(k, f.dropped_before) for k, f in enumerate(frames) if f.dropped_before] == [
+        (21, 13),  # 13 at once, and the sequence goes on by one; known when the old pace is back
+        (27, 1),  # one that the driver counted: it does not count twice
+        (37, 1),
+        (57, 2),  # two with one frame in between
+        (73, 1),  # the driver's count, at once
+        (74, 1),  # beside it
+    ]
+    stats = source.stats()
+    assert (stats.lost, stats.extra["lost_in_camera"]) == (19, 17)
+    assert stats.rate_hz == pytest.approx(30.0, rel=1e-3)
+    assert stats.jitter_us < 4000.0  # the losses are no jitter, but for the frame between two of them
 
 
 def test_a_slow_reader_loses_frames_and_knows_how_many(open_fake, kernel) -> None:

@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from vical_drivers.camera.uvc import UvcClock, clock_frequency_hz, parse_metadata
+from vical_drivers.camera.v4l2.uvc import UvcClock, clock_frequency_hz, parse_metadata
 from vical_mocks.v4l2_camera import FakeCamera, UvcClockModel
 
 SIZES = {"YUYV": {(64, 48): (30.0,)}}

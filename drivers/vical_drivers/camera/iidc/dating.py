@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from vical_drivers.camera.cycle_clock import CycleClock, image_cycle_time_ns
-from vical_drivers.camera.embedded import EmbeddedInfo
-from vical_drivers.camera.stamps import Anchor, SequenceCounter
+from vical_drivers.camera.iidc.cycle_clock import CycleClock, image_cycle_time_ns
+from vical_drivers.camera.iidc.embedded import EmbeddedInfo
+from vical_drivers.camera.losses import SequenceCounter
+from vical_drivers.camera.stamps import SIGMA_NS, Anchor, RawStamp
 from vical_drivers.camera.statistics import FrameStatistics
-from vical_drivers.camera.v4l2_stamp import SIGMA_NS, RawStamp
 
 OLDEST_NS = 2_000_000_000
 """No frame waits longer in the ring."""

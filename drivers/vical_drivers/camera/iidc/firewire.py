@@ -55,20 +55,31 @@ def _opened(path: str) -> Iterator[int]:
         os.close(fd)
 
 
-def find_node(guid: int) -> str | None:
-    """Return the node of a device by its GUID; None while it is not on the bus.
+def find_node(guid: int | None, dev: Path = Path("/dev"), sysfs: Path = Path("/sys")) -> str | None:
+    """Return the node of a device; None while it is not on the bus.
+
+    Sysfs shows to everybody what is on the bus. So a closed node is no obstacle when it is another device's,
+    e.g. that of the computer's own adapter, which stays root's.
+
+    Args:
+        guid: Of the device; None: any camera will do, the first that may be opened.
+        dev: Where the nodes are.
+        sysfs: Where sysfs is mounted.
 
     Raises:
-        DevicePermissionError: It is not among the nodes that this user may open, and some are closed.
+        DevicePermissionError: This user may not open its node.
     """
     closed = []
-    for path in nodes():
+    for path in nodes(dev):
+        facts = sysfs / "bus/firewire/devices" / Path(path).name
         try:
             with _opened(path) as fd:
-                if read_guid(fd) == guid:
+                if read_guid(fd) == guid or (guid is None and _is_camera(facts)):
                     return path
         except PermissionError:
-            closed.append(path)
+            known = _read(facts / "guid")
+            if not known or (int(known, 16) == guid if guid is not None else _is_camera(facts)):
+                closed.append(path)
         except OSError:
             continue
     if closed:
@@ -77,6 +88,18 @@ def find_node(guid: int) -> str | None:
             "sudo usermod -aG video $USER, then log in again"
         )
     return None
+
+
+def _is_camera(facts: Path) -> bool:
+    """Tell by sysfs whether a node has a camera unit: of the 1394 Trade Association, or of Point Grey."""
+    return any(unit.startswith(("0x00a02d:", "0x00b09d:")) for unit in _read(facts / "units").split())
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii").strip()
+    except OSError:  # no such file, or no sysfs
+        return ""
 
 
 class BusClock:

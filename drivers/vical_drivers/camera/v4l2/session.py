@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 
-from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.discovery import NodeEntry
 from vical_drivers.camera.formats import FORMATS, FrameDecoder
-from vical_drivers.camera.kernel import Kernel
-from vical_drivers.camera.negotiate import negotiate
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.uvc_stream import UvcMetadata, hwtimestamps
-from vical_drivers.camera.v4l2_controls import Controls
-from vical_drivers.camera.v4l2_exposure import apply_settings, read_exposure_ns
-from vical_drivers.camera.v4l2_node import NodeIdentity, ObtainedFormat, VideoNode
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.controls import Controls
+from vical_drivers.camera.v4l2.discovery import NodeEntry
+from vical_drivers.camera.v4l2.exposure import apply_settings, read_exposure_ns
+from vical_drivers.camera.v4l2.kernel import Kernel
+from vical_drivers.camera.v4l2.negotiate import negotiate
+from vical_drivers.camera.v4l2.node import NodeIdentity, ObtainedFormat, VideoNode
+from vical_drivers.camera.v4l2.uvc_stream import UvcMetadata, hwtimestamps
 from vical_drivers.errors import DeviceRefusedError, DriverError
 
 _log = logging.getLogger(__name__)

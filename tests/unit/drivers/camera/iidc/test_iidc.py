@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from vical_drivers import errors
-from vical_drivers.camera import iidc_abi
-from vical_drivers.camera.cycle_clock import WRAP_NS, CycleClock, cycle_time_ns, image_cycle_time_ns
-from vical_drivers.camera.embedded import parse_embedded
-from vical_drivers.camera.firewire import IOC_GET_CYCLE_TIMER2, BusClock
+from vical_drivers.camera.iidc import abi as iidc_abi
+from vical_drivers.camera.iidc import firewire
+from vical_drivers.camera.iidc.cycle_clock import WRAP_NS, CycleClock, cycle_time_ns, image_cycle_time_ns
+from vical_drivers.camera.iidc.embedded import parse_embedded
+from vical_drivers.camera.iidc.firewire import IOC_GET_CYCLE_TIMER2, BusClock
+from vical_drivers.camera.iidc.whole import Wholeness, judge
 from vical_mocks import firewire_rig
 
 HERE = Path(__file__).parent
@@ -100,6 +102,47 @@ def test_a_second_process_is_kept_off_the_camera(tmp_path: Path) -> None:
     BusClock(str(node)).close()
 
 
+CAMERA, ADAPTER = 0x00B09D0100A1B2C3, 0x0012345678ABCDEF
+
+
+def closed_bus(tmp_path: Path, monkeypatch, units: dict[str, tuple[int, str]]) -> tuple[Path, Path]:
+    """Nodes that nobody may open, and what sysfs tells everybody of them."""
+    dev, sysfs = tmp_path / "dev", tmp_path / "sys"
+    dev.mkdir()
+    for name, (guid, text) in units.items():
+        (dev / name).touch()
+        facts = sysfs / "bus/firewire/devices" / name
+        facts.mkdir(parents=True)
+        (facts / "guid").write_text(f"{guid:#018x}\n")
+        if text:
+            (facts / "units").write_text(text + "\n")
+
+    def refuse(*_: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(firewire.os, "open", refuse)
+    return dev, sysfs
+
+
+@pytest.mark.parametrize("units", ["", "0x00609e:0x010483"], ids=["no units", "a disk"])
+def test_a_closed_node_that_is_no_camera_is_no_matter_of_permission(tmp_path, monkeypatch, units) -> None:
+    dev, sysfs = closed_bus(tmp_path, monkeypatch, {"fw0": (ADAPTER, units)})
+    assert firewire.find_node(None, dev, sysfs) is None
+    assert firewire.find_node(CAMERA, dev, sysfs) is None
+
+
+def test_a_closed_camera_is_named_and_nothing_else(tmp_path, monkeypatch) -> None:
+    there = {"fw0": (ADAPTER, ""), "fw1": (CAMERA, "0x00a02d:0x000102")}
+    dev, sysfs = closed_bus(tmp_path, monkeypatch, there)
+    for asked in (CAMERA, None):
+        with pytest.raises(errors.DevicePermissionError, match="group 'video'") as told:
+            firewire.find_node(asked, dev, sysfs)
+        assert "fw1" in str(told.value) and "fw0" not in str(told.value)
+    (sysfs / "bus/firewire/devices/fw1/guid").unlink()  # no sysfs: it may be the camera
+    with pytest.raises(errors.DevicePermissionError):
+        firewire.find_node(CAMERA, dev, sysfs)
+
+
 @pytest.mark.system
 @pytest.mark.timeout(400)
 def test_the_grabber_over_the_real_libdc1394(tmp_path: Path) -> None:
@@ -122,7 +165,10 @@ def test_the_grabber_over_the_real_libdc1394(tmp_path: Path) -> None:
         "-o",
         f"cache_dir={tmp_path / 'cache'}",
     ]
-    files = [str(HERE / "iidc_under_shim.py"), f"{HERE / 'test_frame_source_contract.py'}::TestFrameSource"]
+    files = [
+        str(HERE / "iidc_under_shim.py"),
+        f"{HERE.parent / 'test_frame_source_contract.py'}::TestFrameSource",
+    ]
     output = ""
     for extra in ([], ["--last-failed"]):
         done = subprocess.run(
@@ -138,3 +184,51 @@ def test_the_grabber_over_the_real_libdc1394(tmp_path: Path) -> None:
         if done.returncode == 0:
             return
     pytest.fail(output)
+
+
+PACKET, PACKETS, RATE_HZ = 640, 120, 30.0
+ITEMS = 0x80000045
+COUNTER = 4
+
+
+def header_of(counter: int, t_ns: int) -> bytes:
+    quadlets = (register_of(t_ns) & ~0xF | counter & 0xF, 0x82000320, counter)
+    return b"".join(word.to_bytes(4, "big") for word in quadlets)
+
+
+def image_of(counter: int, level: int = 0) -> bytearray:
+    image = bytearray([level]) * (PACKET * PACKETS)
+    image[:12] = header_of(counter, 10**9 + counter * 33_333_333)
+    return image
+
+
+def verdict_on(image: bytearray, age_ns: int, items: int = ITEMS) -> Wholeness:
+    data = np.frombuffer(bytes(image), dtype=np.uint8)
+    return judge(data, PACKET, parse_embedded(bytes(image[:64]), items), items, age_ns, RATE_HZ)
+
+
+@pytest.mark.parametrize("lost", [1, 2, 50, 119])
+def test_the_header_of_the_next_image_tells_a_lost_packet(lost: int) -> None:
+    shifted = image_of(COUNTER)[: -lost * PACKET] + image_of(COUNTER + 1)[: lost * PACKET]
+    assert verdict_on(shifted, age_ns=34_000_000) is Wholeness.SHIFTED
+    assert verdict_on(shifted, age_ns=16_000_000) is Wholeness.SHIFTED
+    # without the counter only the time is left
+    assert verdict_on(shifted, age_ns=34_000_000, items=0x80000001) is Wholeness.OPEN
+
+
+def test_an_image_that_was_complete_in_time_is_whole() -> None:
+    assert verdict_on(image_of(COUNTER), age_ns=30_000_000) is Wholeness.WHOLE
+    assert verdict_on(image_of(COUNTER), age_ns=33_000_000) is Wholeness.OPEN
+    assert verdict_on(image_of(COUNTER), age_ns=-5_000_000) is Wholeness.OPEN  # the wall clock was set
+    data = np.zeros(100, dtype=np.uint8)
+    assert judge(data, 0, parse_embedded(b"", 0), 0, 1_000, 0.0) is Wholeness.OPEN  # rate unknown
+
+
+def test_pixels_that_read_like_the_next_counter_are_no_header() -> None:
+    dark = image_of(COUNTER)
+    for packet in range(1, PACKETS):  # a counter of 5 is three black pixels and one nearly black
+        dark[packet * PACKET + 8 : packet * PACKET + 12] = (COUNTER + 1).to_bytes(4, "big")
+    assert verdict_on(dark, age_ns=16_000_000) is Wholeness.WHOLE
+    off_the_boundary = image_of(COUNTER)
+    off_the_boundary[7 * PACKET + 3 : 7 * PACKET + 15] = header_of(COUNTER + 1, 2 * 10**9)
+    assert verdict_on(off_the_boundary, age_ns=16_000_000) is Wholeness.WHOLE

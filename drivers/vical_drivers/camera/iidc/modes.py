@@ -6,8 +6,8 @@ import math
 from ctypes import byref, c_uint32
 from dataclasses import dataclass
 
-from vical_drivers.camera import iidc_abi as abi
-from vical_drivers.camera.iidc_device import IidcDevice
+from vical_drivers.camera.iidc import abi
+from vical_drivers.camera.iidc.device import IidcDevice
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.errors import DeviceRefusedError
 

@@ -24,7 +24,7 @@ from vical_drivers.errors import (
 )
 
 PACKAGES = "gir1.2-aravis-0.8 python3-gi"
-_GRABBER = Path(__file__).with_name("aravis_grabber.py")
+_GRABBER = Path(__file__).with_name("grabber.py")
 _HEADER = struct.Struct("<4sII")
 _MAGIC = b"VGRB"
 OPEN_TIMEOUT_S = 15.0

@@ -2,8 +2,8 @@
  *
  * Plays /dev/fw0 (the local node) and /dev/fw1 (a Point Grey Flea-like camera) at the interface of
  * <linux/firewire-cdev.h>, so that the real libdc1394 runs above it: configuration ROM, registers,
- * isochronous ring, bus reset, cycle timer with a rate error, embedded image stamps, lost packets and
- * frames, unplug. Everything is in real time. A test talks to it through a shared file (struct rig),
+ * isochronous ring packet by packet, bus reset, cycle timer with a rate error, embedded image stamps, lost
+ * packets and frames, unplug. Everything is in real time. A test talks to it through a shared file (struct rig),
  * named by VICAL_FAKE_FIREWIRE; the same layout is in vical_mocks/firewire_rig.py.
  *
  * An open node is one end of a socket pair: poll and read are the real ones.
@@ -31,12 +31,15 @@
 #define TRUTHS 4096
 #define QUEUE 64
 #define NODES 2
+#define PACKETS 4096                 /* of one frame, at most */
+#define CYCLE_NS 125000LL
 #define NS 1000000000LL
 
 struct truth { int64_t t_open_ns, t_close_ns; uint32_t counter, raw_shutter; };
 
 struct rig {                     /* see vical_mocks/firewire_rig.py */
-    uint32_t magic, unplugged, lose_frames, mix_frames, bus_resets, no_embedding, no_bandwidth, stopped;
+    uint32_t magic, unplugged, lose_frames, lose_packets, lose_at, bus_resets, no_embedding, no_bandwidth;
+    uint32_t stopped;
     double ppm;
     int64_t cycle_offset_ns;
     uint32_t frames, opens, closes, sent;
@@ -50,6 +53,8 @@ struct client {
     uint64_t reset_closure, iso_closure, resource_closure;
     void *memory; size_t memory_bytes;
     struct buffer queue[QUEUE]; unsigned head, tail;
+    uint32_t filled;                                                  /* packets in the buffer at `head` */
+    uint32_t headers[2 * PACKETS];
 };
 
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
@@ -238,33 +243,45 @@ static void bus_reset(void)
 
 /* ---- the camera -------------------------------------------------------------------------------------- */
 
-static void expose(struct client *c, uint32_t counter, int64_t t_open, int64_t t_close, uint32_t raw)
+/* One packet, as the kernel's isochronous context takes it in: a buffer waits for the packet that begins a
+ * frame (its sy bit), then packet after packet goes into its slots. It knows nothing of frames: after a lost
+ * packet the rest moves up, and the first packet of the next frame fills the last slot. That frame is then
+ * past its beginning, and the next buffer waits for the one after it. */
+static void receive(struct client *c, const uint8_t *data, uint32_t bytes, int sync, int64_t t_bus_ns)
 {
-    struct truth *t = &rig->truth[rig->frames % TRUTHS];
-    *t = (struct truth){t_open, t_close, counter, raw};
-    rig->frames++;
-    if (rig->lose_frames) { rig->lose_frames--; return; }
-    if (c->head == c->tail) return;                                   /* the ring is full: lost */
-    struct buffer *b = &c->queue[c->head++ % QUEUE];
-    memset(b->data, (int)(counter & 0x7F), b->bytes);
-    if (rig->mix_frames) memset(b->data + b->bytes / 2, (int)((counter + 1) & 0x7F), b->bytes / 2);
-    uint32_t info = REG(0x12F8), *head = (uint32_t *)(void *)b->data;
-    for (int item = 0; item < 10; item++)
-        if (info >> item & 1)
-            *head++ = htonl(item == 0 ? (cycle_register(bus_ns(t_close)) & ~0xFu) | (counter & 0xF)
-                          : item == 2 ? 0x82000000 | raw : item == 6 ? counter : 0);
-    int64_t first = bus_ns(t_close + 1000000);                        /* first packet 1 ms later */
-    size_t bytes = sizeof(struct fw_cdev_event_iso_interrupt) + 8 * b->packets;
-    struct fw_cdev_event_iso_interrupt *e = calloc(1, bytes);
+    if (c->head == c->tail || (!c->filled && !sync)) return;
+    struct buffer *b = &c->queue[c->head % QUEUE];
+    uint32_t slot = b->bytes / b->packets;
+    memcpy(b->data + c->filled * slot, data, bytes < slot ? bytes : slot);
+    c->headers[2 * c->filled] = htonl(bytes << 16 | 1 << 14 | 3 << 8 | 0xA << 4 | (uint32_t)sync);
+    c->headers[2 * c->filled + 1] = htonl(cycle_register(t_bus_ns) >> 12 & 0xFFFF);
+    if (++c->filled < b->packets) return;
+    size_t length = 8 * b->packets;
+    struct fw_cdev_event_iso_interrupt *e = calloc(1, sizeof *e + length);
     e->closure = c->iso_closure;
     e->type = FW_CDEV_EVENT_ISO_INTERRUPT;
-    e->header_length = 8 * b->packets;
-    for (uint32_t i = 0; i < b->packets; i++)
-        e->header[2 * i + 1] = htonl(cycle_register(first + i * 125000LL) >> 12 & 0xFFFF);
-    e->cycle = ntohl(e->header[2 * b->packets - 1]) & 0xFFFF;
-    post(c, e, bytes);
+    e->header_length = (uint32_t)length;
+    memcpy(e->header, c->headers, length);
+    e->cycle = ntohl(c->headers[2 * b->packets - 1]) & 0xFFFF;
+    post(c, e, sizeof *e + length);
     free(e);
+    c->head++;
+    c->filled = 0;
     rig->sent++;
+}
+
+/* A picture whose row r shows counter + r everywhere, so that a row in the wrong place shows. */
+static void draw(uint8_t *image, uint32_t width, uint32_t bytes, uint32_t counter, int64_t t_close, uint32_t raw)
+{
+    for (uint32_t at = 0; at < bytes; at++) image[at] = (uint8_t)((counter + at / width) & 0x7F);
+    uint32_t info = REG(0x12F8);
+    for (int item = 0; item < 10; item++)
+        if (info >> item & 1) {
+            uint32_t word = htonl(item == 0 ? (cycle_register(bus_ns(t_close)) & ~0xFu) | (counter & 0xF)
+                                : item == 2 ? 0x82000000 | raw : item == 6 ? counter : 0);
+            memcpy(image, &word, 4);
+            image += 4;
+        }
 }
 
 static void sleep_until(int64_t t_ns)
@@ -273,33 +290,58 @@ static void sleep_until(int64_t t_ns)
     while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) == EINTR) { }
 }
 
+static int listens(const struct client *c)
+{
+    return c->used && c->streaming && !rig->unplugged && !rig->stopped && REG(0x614) & 0x80000000;
+}
+
+/* What the host's controller does in a while: unplugging and bus resets, and power lost. */
+static void look_around(void)
+{
+    if (seen_resets != rig->bus_resets) { seen_resets = rig->bus_resets; bus_reset(); }
+    for (unsigned i = 0; i < 64; i++)
+        if (rig->unplugged && clients[i].used) shutdown(clients[i].peer, SHUT_RDWR);
+    if (rig->unplugged) reset_registers();                            /* no power: everything forgotten */
+}
+
 static void *run_camera(void *unused)
 {
+    static uint8_t image[PACKETS * 4096];
     int64_t t_close = now_ns(CLOCK_MONOTONIC);
-    uint32_t counter = 1000, mixed = 0;
+    uint32_t losing = 0;
     (void)unused;
-    for (;;) {
+    for (uint32_t counter = 1000;; counter++) {
         pthread_mutex_lock(&lock);
         uint32_t packet = 1, bytes = frame_bytes(&packet);
-        int64_t period = (int64_t)(1e9 / frame_rate()), wire = 125000LL * (bytes / (packet ? packet : 1));
-        uint32_t raw = REG(0x81C) & 0xFFF;
+        uint32_t packets = packet ? (bytes + packet - 1) / packet : 1;
+        int64_t period = (int64_t)(1e9 / frame_rate());
+        int64_t apart = packets * CYCLE_NS < period ? CYCLE_NS : period / packets;
+        uint32_t raw = REG(0x81C) & 0xFFF, sent = 0;
+        uint32_t width = REG(0x608) >> 29 == 7 ? REG(0xA0C) >> 16 : REG(0x608) >> 29 == 2 ? 1280 : 640;
         pthread_mutex_unlock(&lock);
         t_close += period;
-        int64_t t_ready = t_close + 1000000 + (wire < period ? wire : period) + 50000;
-        sleep_until(t_ready);
-        pthread_mutex_lock(&lock);
-        if (seen_resets != rig->bus_resets) { seen_resets = rig->bus_resets; bus_reset(); }
-        for (unsigned i = 0; i < 64; i++) {
-            struct client *c = &clients[i];
-            if (rig->unplugged && c->used) shutdown(c->peer, SHUT_RDWR);
-            if (!c->used || !c->streaming || rig->unplugged || rig->stopped) continue;
-            if (REG(0x614) & 0x80000000 && !mixed) expose(c, counter, t_close - raw * 10000LL, t_close, raw);
+        int64_t t_first = t_close + 1000000;                          /* first packet 1 ms later */
+        while (sent < packets) {                                      /* in bunches, as interrupts come */
+            uint32_t end = sent + 16 < packets ? sent + 16 : packets;
+            sleep_until(t_first + end * apart);
+            pthread_mutex_lock(&lock);
+            look_around();
+            int heard = 0;
+            for (unsigned i = 0; i < 64; i++) heard |= listens(&clients[i]);
+            if (!sent) draw(image, width, packets * packet, counter, t_close, raw);
+            if (!sent && heard)
+                rig->truth[rig->frames++ % TRUTHS] = (struct truth){t_close - raw * 10000LL, t_close, counter, raw};
+            for (; sent < end && heard; sent++) {
+                if (!sent && rig->lose_frames) { rig->lose_frames--; losing = packets; }
+                if (rig->lose_packets && sent == rig->lose_at) { losing = rig->lose_packets; rig->lose_packets = 0; }
+                if (losing && losing--) continue;
+                for (unsigned i = 0; i < 64; i++)
+                    if (listens(&clients[i]))
+                        receive(&clients[i], image + sent * packet, packet, !sent, bus_ns(t_first + sent * apart));
+            }
+            sent = end;
+            pthread_mutex_unlock(&lock);
         }
-        counter++;
-        mixed = mixed ? 0 : rig->mix_frames;
-        if (rig->mix_frames && mixed) rig->mix_frames--;
-        if (rig->unplugged) reset_registers();                        /* no power: everything forgotten */
-        pthread_mutex_unlock(&lock);
     }
     return NULL;
 }
@@ -340,7 +382,7 @@ static int queue_iso(struct client *c, struct fw_cdev_queue_iso *q)
         b.packets += (p[i].control >> 24) / 8;
     }
     if (b.data < (uint8_t *)c->memory || b.data + b.bytes > (uint8_t *)c->memory + c->memory_bytes
-        || c->tail - c->head >= QUEUE) { errno = EINVAL; return -1; }
+        || !b.packets || b.packets > PACKETS || c->tail - c->head >= QUEUE) { errno = EINVAL; return -1; }
     c->queue[c->tail++ % QUEUE] = b;
     return 0;
 }
@@ -396,7 +438,7 @@ static int handle(struct client *c, unsigned long request, void *argument)
         c->streaming = 1;
         if (!camera_running) camera_running = !pthread_create(&camera_thread, NULL, run_camera, NULL);
         return 0;
-    case FW_CDEV_IOC_STOP_ISO: c->streaming = 0; return 0;
+    case FW_CDEV_IOC_STOP_ISO: c->streaming = 0; c->filled = 0; return 0;
     case FW_CDEV_IOC_ALLOCATE_ISO_RESOURCE: return iso_resource(c, argument, FW_CDEV_EVENT_ISO_RESOURCE_ALLOCATED);
     case FW_CDEV_IOC_DEALLOCATE_ISO_RESOURCE: return iso_resource(c, argument, FW_CDEV_EVENT_ISO_RESOURCE_DEALLOCATED);
     case FW_CDEV_IOC_GET_CYCLE_TIMER: {

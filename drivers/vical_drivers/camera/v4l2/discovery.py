@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from vical_drivers.camera import v4l2_abi as abi
 from vical_drivers.camera.formats import FORMATS
-from vical_drivers.camera.kernel import Kernel
-from vical_drivers.camera.v4l2_node import VideoNode
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.kernel import Kernel
+from vical_drivers.camera.v4l2.node import VideoNode
 from vical_drivers.errors import DeviceNotFoundError, DriverError
 from vical_drivers.samples import DeviceInfo
 
@@ -43,8 +43,8 @@ class NodeEntry:
 
     @property
     def identity(self) -> str:
-        """What keys a stored calibration: the serial number, else the port."""
-        return self.serial_number or f"port-{self.port}"
+        """What keys a stored calibration: the serial number, else the port and what is plugged in there."""
+        return self.serial_number or f"port-{self.port} {self.name}"
 
 
 def list_nodes(kernel: Kernel) -> list[NodeEntry]:

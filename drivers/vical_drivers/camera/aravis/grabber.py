@@ -2,7 +2,7 @@
 
 Aravis has no package on PyPI: its bindings belong to the distribution's Python (gir1.2-aravis-0.8,
 python3-gi), which is not the one of a virtual environment. So this file runs in a process of its own,
-imports nothing of vical, and speaks a small protocol that `aravis.py` reads:
+imports nothing of vical, and speaks a small protocol that `camera.py` reads:
 
     b"VGRB" | u32 length of JSON | u32 length of data | JSON | data      (little endian)
 

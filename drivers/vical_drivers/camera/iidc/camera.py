@@ -2,8 +2,9 @@
 
 A Point Grey camera writes the cycle time at which its shutter closed into each image; the bus clock is
 read together with CLOCK_MONOTONIC at each frame and fitted (`cycle_clock`), and half the exposure is
-taken off. Any other camera is dated by the first packet of its frame. libdc1394 itself reports no lost
-frames; they are found by the embedded frame counter, or by gaps in the stamps.
+taken off. Any other camera is dated by the first packet of its frame. libdc1394 itself reports neither lost
+frames nor lost packets: the first are found by the embedded frame counter, or by gaps in the stamps, the
+others as `whole` says.
 """
 
 from __future__ import annotations
@@ -11,20 +12,24 @@ from __future__ import annotations
 import logging
 import select
 import time
+from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vical_drivers.camera import iidc_abi as abi
-from vical_drivers.camera.embedded import EmbeddedInfo, parse_embedded
-from vical_drivers.camera.firewire import BusClock, find_node
 from vical_drivers.camera.formats import Bytes, CorruptImageError, FrameDecoder, Image
 from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
-from vical_drivers.camera.iidc_dating import FrameDating
-from vical_drivers.camera.iidc_device import IidcDevice, frame_bytes, list_devices, pixel_format
-from vical_drivers.camera.iidc_modes import IidcMode, set_mode
+from vical_drivers.camera.iidc import abi
+from vical_drivers.camera.iidc.dating import FrameDating
+from vical_drivers.camera.iidc.device import IidcDevice, frame_bytes, list_devices, pixel_format
+from vical_drivers.camera.iidc.embedded import EmbeddedInfo, parse_embedded
+from vical_drivers.camera.iidc.firewire import BusClock, find_node
+from vical_drivers.camera.iidc.modes import IidcMode, set_mode
+from vical_drivers.camera.iidc.whole import Wholeness, judge
 from vical_drivers.camera.settings import CameraSettings
+from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
@@ -35,6 +40,19 @@ list_iidc_cameras = list_devices
 
 MIN_SILENCE_S = 1.0
 SILENT_PERIODS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """A frame out of the ring, dated and numbered, not yet decoded."""
+
+    data: Bytes
+    depth_bits: int
+    info: EmbeddedInfo
+    raw: RawStamp
+    sequence: int
+    missing_before: int
+    t_arrival_ns: int
 
 
 class IidcCamera(Closing):
@@ -79,6 +97,8 @@ class IidcCamera(Closing):
         self._decode: FrameDecoder | None = None
         self._dating = FrameDating(self._settings.stamp, self._mode.rate_hz, self._frames.statistics)
         self._shutter_raw: int | None = None
+        self._held: _Taken | None = None  # the next frame decides whether it is whole
+        self._judged: deque[tuple[_Taken, str]] = deque()  # in order; with what is wrong, "" for a whole one
         self._t_alive_ns = time.monotonic_ns()
 
     def _apply(self, device: IidcDevice) -> None:
@@ -115,7 +135,7 @@ class IidcCamera(Closing):
         except DriverError as error:
             wait_for_camera(timeout_s, ("firewire",))
             raise DeviceLostError(f"iidc:{self._guid:016x}: the camera is not back yet ({error})") from error
-        self._frames.statistics.restart()
+        self._frames.reopened()
         _log.info("camera back guid=%016x", self._guid)
 
     def close(self) -> None:
@@ -195,6 +215,9 @@ class IidcCamera(Closing):
 
     def _next(self, timeout_s: float) -> Frame | None:
         device, bus = self._need()
+        frame_made = self._first_judged(device)
+        if frame_made is not None:
+            return frame_made
         poller = select.poll()
         poller.register(self._fd, select.POLLIN)
         events = dict(poller.poll(min(timeout_s, MIN_SILENCE_S) * 1e3)).get(self._fd, 0)
@@ -209,15 +232,47 @@ class IidcCamera(Closing):
         self._t_alive_ns = t_arrival_ns
         frame: abi.VideoFrame = held.contents
         data = frame_bytes(frame)
-        t_packet_ns = t_arrival_ns - (t_real_ns - frame.timestamp_us * 1000)
+        age_ns = t_real_ns - frame.timestamp_us * 1000  # since its first packet
         image_format = pixel_format(self._mode.coding, frame)
-        depth_bits = frame.data_depth
+        depth_bits, image_bytes, packet_bytes = frame.data_depth, frame.image_bytes, frame.packet_size
         device.enqueue(held)
         self._dating.clock.add(*bus.read())
         if self._decode is None or self._decode.pixel_format != image_format:
             self._decode = self._make_decoder(device, image_format)
         info = parse_embedded(data[:64].tobytes(), self._frame_info)
-        return self._finish(device, data, depth_bits, info, t_packet_ns, t_arrival_ns)
+        raw = self._dating.raw_stamp(info, t_arrival_ns - age_ns, t_arrival_ns)
+        missing = self._dating.missing(info, raw.t_raw_ns)
+        taken = _Taken(
+            data[:image_bytes], depth_bits, info, raw, self._dating.sequence, missing, t_arrival_ns
+        )
+        verdict = judge(data, packet_bytes, info, self._frame_info, age_ns, self._mode.rate_hz)
+        self._sort(taken, verdict)
+        return self._first_judged(device)
+
+    def _sort(self, taken: _Taken, verdict: Wholeness) -> None:
+        """Judge the frame that was held by the one that follows it, and that one by itself."""
+        held, self._held = self._held, None
+        if held is not None:
+            # before a gap a shifted image and one that was only fetched late look the same
+            self._judged.append((held, "doubtful_images" if taken.missing_before else ""))
+        if verdict is Wholeness.OPEN:
+            self._held = taken
+        else:
+            self._judged.append((taken, "shifted_images" if verdict is Wholeness.SHIFTED else ""))
+
+    def _first_judged(self, device: IidcDevice) -> Frame | None:
+        """Make the next good frame of what was judged; what is not good is counted on the way."""
+        while self._judged:
+            taken, fault = self._judged.popleft()
+            self._frames.lost(taken.missing_before)
+            if fault:
+                self._frames.spoilt(fault)
+                self._frames.lost()
+                continue
+            frame = self._make(device, taken)
+            if frame is not None:
+                return frame
+        return None
 
     def _check_silence(self, device: IidcDevice) -> None:
         """A camera that was unplugged for a moment keeps its node, but has forgotten to send."""
@@ -233,23 +288,13 @@ class IidcCamera(Closing):
         except ValueError as error:
             raise DeviceRefusedError(f"{device.name}: {error}") from error
 
-    def _finish(
-        self,
-        device: IidcDevice,
-        data: Bytes,
-        depth_bits: int,
-        info: EmbeddedInfo,
-        t_packet_ns: int,
-        t_arrival_ns: int,
-    ) -> Frame | None:
-        raw = self._dating.raw_stamp(info, t_packet_ns, t_arrival_ns)
-        self._update_exposure(device, info)
-        self._frames.lost(self._dating.missing(info, raw.t_raw_ns))
-        image = self._image(data, depth_bits)
+    def _make(self, device: IidcDevice, taken: _Taken) -> Frame | None:
+        self._update_exposure(device, taken.info)
+        image = self._image(taken.data, taken.depth_bits)
         if image is None:
             self._frames.lost()
             return None
-        return self._frames.frame(image, raw, sequence=self._dating.sequence, t_arrival_ns=t_arrival_ns)
+        return self._frames.frame(image, taken.raw, sequence=taken.sequence, t_arrival_ns=taken.t_arrival_ns)
 
     def _update_exposure(self, device: IidcDevice, info: EmbeddedInfo) -> None:
         """Read the shutter in seconds again whenever the image says that its raw value changed."""

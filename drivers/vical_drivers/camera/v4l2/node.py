@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.kernel import Kernel, Mapping
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.kernel import Kernel, Mapping
 from vical_drivers.errors import (
     DeviceBusyError,
     DeviceLostError,
@@ -21,7 +21,8 @@ from vical_drivers.errors import (
     DriverError,
 )
 
-_LOST = frozenset({errno.ENODEV, errno.EIO, errno.ENXIO, errno.ESHUTDOWN, errno.EPIPE})
+_GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN})
+_FAILING = frozenset({errno.EIO, errno.EPIPE})
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +89,12 @@ def translate(error: OSError, path: str, doing: str) -> DriverError:
         return DeviceBusyError(
             f"{path}: another process streams from it{_holders(path)}; stop that one first"
         )
-    if code in _LOST:
-        return DeviceLostError(f"{path}: the camera went away ({doing}: {os.strerror(code or 0)})")
+    if code in _GONE:  # whatever was asked of it then
+        return DeviceLostError(f"{path}: the camera went away; check its cable")
+    if code in _FAILING:
+        return DeviceLostError(
+            f"{path}: the camera fails to {doing} ({os.strerror(code or 0)}); check its cable"
+        )
     if code == errno.ENOTTY:
         return DeviceRefusedError(f"{path}: not a V4L2 device, or it cannot {doing}")
     if code == errno.ENOSPC:

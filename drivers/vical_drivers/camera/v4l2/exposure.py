@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import logging
 
-from vical_drivers.camera import v4l2_abi as abi
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.v4l2_controls import Control, Controls
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.controls import Control, Controls
 from vical_drivers.errors import DeviceRefusedError
 
 _log = logging.getLogger(__name__)

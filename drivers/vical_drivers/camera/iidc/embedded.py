@@ -30,6 +30,13 @@ class EmbeddedInfo:
     frame_counter: int | None
 
 
+def position(frame_info: int, item: int) -> int | None:
+    """Return where an item stands in the image, bytes from its beginning; None where it is off."""
+    if not frame_info >> item & 1:
+        return None
+    return 4 * (frame_info & ((1 << item) - 1)).bit_count()
+
+
 def parse_embedded(head: bytes, frame_info: int) -> EmbeddedInfo:
     """Read the embedded data.
 
@@ -38,11 +45,10 @@ def parse_embedded(head: bytes, frame_info: int) -> EmbeddedInfo:
         frame_info: Register value as the camera reads it back: which items are on.
     """
     values: dict[int, int] = {}
-    at = 0
     for item in range(_ITEMS):
-        if frame_info >> item & 1 and at + 4 <= len(head):
+        at = position(frame_info, item)
+        if at is not None and at + 4 <= len(head):
             values[item] = struct.unpack_from(">I", head, at)[0]
-            at += 4
     shutter = values.get(SHUTTER)
     return EmbeddedInfo(
         cycle_time=values.get(TIMESTAMP),

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from vical_drivers.camera.aravis_process import OPEN_TIMEOUT_S, GrabberProcess
+from vical_drivers.camera.aravis.process import OPEN_TIMEOUT_S, GrabberProcess
 from vical_drivers.camera.formats import FORMATS, CorruptImageError, FrameDecoder, Layout, PixelFormat
 from vical_drivers.camera.frame_maker import FrameMaker
+from vical_drivers.camera.losses import SequenceCounter
 from vical_drivers.camera.settings import CameraSettings
-from vical_drivers.camera.stamps import Anchor, SequenceCounter
-from vical_drivers.camera.v4l2_stamp import SIGMA_NS, RawStamp
+from vical_drivers.camera.stamps import SIGMA_NS, Anchor, RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.envelope import LowerEnvelope
 from vical_drivers.errors import (
@@ -169,7 +169,7 @@ class AravisCamera(Closing):
             self._open()  # searching the network takes its time: no further wait is needed
         except DriverError as error:
             raise DeviceLostError(f"{self._info.details['uri']}: not back yet ({error})") from error
-        self._frames.statistics.restart()
+        self._frames.reopened()
 
     def _next(self, timeout_s: float) -> Frame | None:
         assert self._grabber is not None
@@ -183,7 +183,7 @@ class AravisCamera(Closing):
             return None
         missing = self._counter.missing_before(fields["frame_id"])
         self._sequence += missing + 1
-        self._frames.lost(missing)
+        self._frames.numbered(fields["first_packet_ns"], missing)
         if not fields["whole"]:
             self._frames.statistics.count(f"buffers_{fields['status'].replace('-', '_')}")
             self._frames.lost()

@@ -9,9 +9,9 @@ import os
 import re
 from dataclasses import dataclass, field
 
-from vical_drivers.camera import v4l2_abi as abi
-from vical_drivers.camera.kernel import Kernel
-from vical_drivers.camera.v4l2_node import VideoNode, translate
+from vical_drivers.camera.v4l2 import abi
+from vical_drivers.camera.v4l2.kernel import Kernel
+from vical_drivers.camera.v4l2.node import VideoNode, translate
 from vical_drivers.errors import DeviceRefusedError
 
 _log = logging.getLogger(__name__)
