@@ -12,6 +12,7 @@ from vical_daemon.messages.calibration import (
     merge_calibrations,
 )
 from vical_daemon.messages.cdr import MessageError
+from vical_daemon.messages.decoders import check_message
 from vical_daemon.messages.diagnostics import (
     DIAGNOSTICS_TYPE,
     STRING_TYPE,
@@ -75,6 +76,7 @@ __all__ = [
     "PointsMessage",
     "PoseMessage",
     "Transform",
+    "check_message",
     "decode_calibration",
     "decode_camera_info",
     "decode_compressed_image",

@@ -81,6 +81,7 @@ def decode_calibration(data: bytes) -> CalibrationMessage:
     nis_per_dof, rejected_fraction = reader.scalar("d"), reader.scalar("d")
     gravity = reader.sequence().tolist()
     imu, known = _read_imu(reader), _read_camera(reader)
+    reader.end()
     estimate = CalibrationEstimate(
         t_ns=t_ns,
         status=Status(status),
