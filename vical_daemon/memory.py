@@ -48,6 +48,7 @@ class Memory:
         self._config, self._bus, self._clock = config, bus, clock
         self._store = CalibrationStore(folder)
         self._serials: dict[str, str] = {}
+        self._components = {*(f"imu/{n}" for n in config.imus), *(f"camera/{n}" for n in config.cameras)}
         self._complete = threading.Event()
         self._before: dict[str, StoredCalibration] = {}
         self._compared: set[str] = set()
@@ -58,15 +59,18 @@ class Memory:
         self._keys = [pattern.format(rig=config.rig, name=role) for role in ("imu", "camera")]
         self._subscriptions = [bus.subscribe(key, self._listen) for key in self._keys]
 
-    def priors(self) -> dict[str, CameraPrior]:
+    def priors(self, wait_s: float = SERIALS_WITHIN_S) -> dict[str, CameraPrior]:
         """Return what is known about each camera: what was stored for these devices, else the config.
 
-        Waits a moment for the serial numbers. What the config gives for a held parameter stays.
+        What the config gives for a held parameter stays.
+
+        Args:
+            wait_s: How long to wait for the serial numbers.
         """
         for key in self._keys:
             for sample in self._bus.latest(key):
                 self._listen(sample)
-        self._complete.wait(SERIALS_WITHIN_S)
+        self._complete.wait(wait_s)
         known: dict[str, CameraPrior] = {}
         for name in self._config.calibration_cameras:
             known[name] = given = camera_prior(self._config, name)
@@ -89,8 +93,9 @@ class Memory:
         known = {name: self._serials[name] for name in names if name in self._serials}
         return known if len(known) == len(names) else {}
 
-    def announce(self, text: str) -> None:
-        """Add an event to the next estimate."""
+    def announce(self, text: str, name: str = "calibration") -> None:
+        """Write an event into the journal now and into the next estimate; `name`: as the journal has it."""
+        notify.event(name, text, level="warning", rig=self._config.rig)
         self._announced.append(text)
 
     def watch(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
@@ -99,8 +104,7 @@ class Memory:
         Returns:
             The estimate, with an event added where the calibration differs from the stored one.
         """
-        events = [*self._announced, *estimate.events]
-        self._announced.clear()
+        events = list(estimate.events)
         if estimate.status is Status.CONVERGED:
             events += self._changes(estimate)
             if self._status is not Status.CONVERGED:
@@ -111,6 +115,8 @@ class Memory:
             name = "bumped" if text.startswith(("bumped", "changed")) else "calibration"
             notify.event(name, text, level="warning", rig=self._config.rig)
         self._status = estimate.status
+        events = [*self._announced, *events]
+        self._announced.clear()
         return replace(estimate, events=events) if events != estimate.events else estimate
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
@@ -147,7 +153,9 @@ class Memory:
             statuses = decode_diagnostics(sample.payload).statuses
         except MessageError:
             return
-        self._serials.update({s.name: s.hardware_id for s in statuses if s.hardware_id})
+        for s in statuses:
+            if s.hardware_id and s.name in self._components:
+                self._serials[s.name] = s.hardware_id
         if all(all(self._pair(name)) for name in self._config.calibration_cameras):
             self._complete.set()
 

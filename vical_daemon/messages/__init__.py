@@ -2,8 +2,17 @@
 
 The bytes on the bus are the bytes in the log. `encode_*` builds a message, `decode_*` reads one into a
 small frozen dataclass in our own names and units, and raises only `MessageError` whatever the bytes.
+`admit_*` does so, too, and refuses what no device measures: roles work with those.
 """
 
+from vical_daemon.messages.admission import (
+    ImplausibleError,
+    admit_calibration,
+    admit_image,
+    admit_imu,
+    admit_points,
+    admit_stamp_sigma_s,
+)
 from vical_daemon.messages.calibration import (
     CALIBRATION_TYPE,
     CalibrationMessage,
@@ -70,12 +79,18 @@ __all__ = [
     "DiagnosticStatus",
     "DiagnosticsMessage",
     "ImageMessage",
+    "ImplausibleError",
     "ImuMessage",
     "Level",
     "MessageError",
     "PointsMessage",
     "PoseMessage",
     "Transform",
+    "admit_calibration",
+    "admit_image",
+    "admit_imu",
+    "admit_points",
+    "admit_stamp_sigma_s",
     "check_message",
     "decode_calibration",
     "decode_camera_info",

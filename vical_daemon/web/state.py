@@ -14,11 +14,12 @@ from vical_daemon.messages import (
     CalibrationMessage,
     DiagnosticStatus,
     MessageError,
-    decode_calibration,
+    admit_calibration,
     decode_diagnostics,
 )
 from vical_daemon.web import words
 
+NAMES = 64  # devices and roles that a page can show
 HISTORY = 1500
 # One row of the history; lists of three are flattened in this order.
 COLUMNS = (
@@ -61,6 +62,7 @@ class WebState:
         self._cameras: dict[str, CameraState] = {}
         self._statuses: dict[str, tuple[DiagnosticStatus, ...]] = {}
         self._stamps_ns: dict[str, int] = {}
+        self._names: set[str] = set()
         self.malformed = 0
 
     def take(self, sample: Sample) -> None:
@@ -98,14 +100,21 @@ class WebState:
 
     def _digest(self, sample: Sample) -> None:
         parsed = topics.parse_key(sample.key)
-        if parsed is None:
+        if parsed is None or not self._room(parsed.name):
             return
         if parsed.topic is topics.CALIBRATION:
-            self._calibration(decode_calibration(sample.payload))
+            message = admit_calibration(sample.payload)
+            if message.camera == parsed.name:
+                self._calibration(message)
         elif parsed.topic is topics.STATUS:
-            message = decode_diagnostics(sample.payload)
-            self._statuses[parsed.name] = message.statuses
-            self._stamps_ns[parsed.name] = message.stamp_ns
+            status = decode_diagnostics(sample.payload)
+            self._statuses[parsed.name] = status.statuses
+            self._stamps_ns[parsed.name] = status.stamp_ns
+
+    def _room(self, name: str) -> bool:
+        """Whether to listen to this device or role: whoever invents names must not fill memory and page."""
+        self._names.add(name) if len(self._names) < NAMES else None
+        return name in self._names
 
     def _calibration(self, message: CalibrationMessage) -> None:
         camera = self._cameras.setdefault(message.camera, CameraState(message))

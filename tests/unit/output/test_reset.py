@@ -43,7 +43,8 @@ def test_reset_forgets_everything(tmp_path):
     def feed():
         for _ in range(5):
             t_ns[0] += 4_000_000
-            payload = encode_imu(t_ns[0], "imu0", (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
+            wiggle = 1e-3 * (t_ns[0] // 4_000_000 % 7)  # an IMU that repeats itself bit by bit has hung
+            payload = encode_imu(t_ns[0], "imu0", (wiggle, 0.0, 0.0), (0.0, 0.0, 9.8))
             bus.publish(topics.IMU.key("rig0", "imu0"), payload)
 
     command = topics.COMMAND.key("rig0", "estimate")
