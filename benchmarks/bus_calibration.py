@@ -174,7 +174,7 @@ def calibrating(junk: int, seed: int = 11) -> tuple[list[tuple[str, str]], bool]
     if seen.last is None or "cam0" not in seen.last.cameras:
         return [("calibration", f"none: {seen.last}")], False
     away = away_sigmas(calm, seen.last)
-    first, last = (np.mean([mb for _, mb in part], axis=0) for part in _thirds(seen.memory_mb))
+    first, last = (np.mean([mb for _, mb in part], axis=0) for part in _later_thirds(seen.memory_mb))
     estimate, record = seen.statuses["estimate"], seen.statuses["record"]
     grown = {role: f"{a:.0f} -> {b:.0f}" for role, a, b in zip(_ROLES, first, last, strict=True)}
     rows = [
@@ -190,7 +190,7 @@ def calibrating(junk: int, seed: int = 11) -> tuple[list[tuple[str, str]], bool]
         ("record: messages, malformed, dropped, lost on the bus", _values(
             record, "messages", "malformed", "dropped", "lost_on_bus")),
         ("longest silence of a role's status", f"{max(seen.silent_s.values()):.1f} s"),
-        ("memory MB, while junk comes, first -> last third", ", ".join(f"{r} {g}" for r, g in grown.items())),
+        ("memory MB, second -> last third of that time", ", ".join(f"{r} {g}" for r, g in grown.items())),
         ("logs that open in mcap-ros2, rosbags, rosbags-convert", f"{len(logs) - len(bad)} of {len(logs)}"),
     ]  # fmt: skip
     held = seen.last.status is Status.CONVERGED and away < 1.0 and not bad and bool(logs)
@@ -254,9 +254,9 @@ def _start(role: str, folder: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, env=environment)
 
 
-def _thirds(rows: list[Any]) -> tuple[list[Any], list[Any]]:
+def _later_thirds(rows: list[Any]) -> tuple[list[Any], list[Any]]:
     third = max(len(rows) // 3, 1)
-    return rows[:third], rows[-third:]
+    return rows[third : 2 * third], rows[-third:]
 
 
 def _values(values: dict[str, str], *names: str) -> str:

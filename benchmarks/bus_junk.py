@@ -183,11 +183,14 @@ class Junk:
 
 def unopened(log: Path, scratch: Path) -> list[str]:
     """Read a log with mcap-ros2, rosbags and rosbags-convert; what failed, [] if nothing did."""
-    from mcap_ros2.reader import read_ros2_messages
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
     from rosbags.highlevel import AnyReader
 
     def with_mcap_ros2() -> int:
-        return sum(1 for _ in read_ros2_messages(log))
+        with log.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            return sum(1 for _ in reader.iter_decoded_messages())
 
     def with_rosbags() -> int:
         with AnyReader([log]) as reader:

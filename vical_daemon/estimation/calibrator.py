@@ -129,7 +129,8 @@ class Calibrator:
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image; those of unknown cameras or off the board are only counted."""
         ok = usable_points(frame) & (frame.ids < len(self.target))
-        if frame.camera not in self.priors or self._buffer is None:
+        nonsense = len(ok) > 0 and not ok.any()  # its stamp is worth no more than its points
+        if frame.camera not in self.priors or self._buffer is None or nonsense:
             self.judge.frames_ignored += 1
             return
         if not ok.all():

@@ -107,7 +107,9 @@ class TargetFreeCalibrator:
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
-        if frame.camera != self.camera or self._buffer is None:
+        count, frame = len(frame.ids), cleaned(frame)
+        nonsense = count > 0 and not len(frame.ids)  # its stamp is worth no more than its tracks
+        if frame.camera != self.camera or self._buffer is None or nonsense:
             self.judge.frames_ignored += 1
             return
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
@@ -119,7 +121,6 @@ class TargetFreeCalibrator:
         self._newest_s = t_cam_s
         if not self._thinning.takes(t_cam_s):
             return
-        frame = cleaned(frame)
         self.judge.saw_points(t_cam_s, len(frame.ids))
         if len(frame.ids) >= 4:
             self._pending.append((t_cam_s, frame))
