@@ -32,6 +32,8 @@ __all__ = ["EstimateRole", "run"]
 
 _log = logging.getLogger(__name__)
 INBOX = 20_000  # 20 s at 1000 Hz: what arrives while the estimator starts
+_WELL_S = 1.0  # images wait that long now and then
+_OURS = "vical_daemon/"  # in the path of our code
 
 
 def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | None = None) -> None:
@@ -91,7 +93,7 @@ class _Keeper:
     @property
     def well(self) -> bool:
         """Whether what arrives is being worked on."""
-        return self._stuck_s == 0.0
+        return self._stuck_s < _WELL_S
 
     def work(self, samples: Iterable[Sample], now_s: float) -> list[Message]:
         """Take what has arrived; what is to be published."""
@@ -140,10 +142,11 @@ class _Keeper:
 
 
 def _told(error: Exception) -> str:
-    """One line on an exception: what, and where."""
+    """One line on an exception: what, and where in our code."""
     _log.debug("the estimator raised", exc_info=error)
     frames = traceback.extract_tb(error.__traceback__)
-    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    ours = [frame for frame in frames if _OURS in frame.filename] or frames
+    where = f" ({Path(ours[-1].filename).name}, line {ours[-1].lineno})" if ours else ""
     return " ".join(f"{type(error).__name__}: {error}".split())[:200] + where
 
 

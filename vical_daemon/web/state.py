@@ -113,7 +113,8 @@ class WebState:
 
     def _room(self, name: str) -> bool:
         """Whether to listen to this device or role: whoever invents names must not fill memory and page."""
-        self._names.add(name) if len(self._names) < NAMES else None
+        if len(self._names) < NAMES:
+            self._names.add(name)
         return name in self._names
 
     def _calibration(self, message: CalibrationMessage) -> None:
