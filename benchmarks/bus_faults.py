@@ -4,7 +4,9 @@
 
 This process hosts the bus and publishes 1000 Hz inertial data and 30 Hz images of 360 kB, as `acquire`
 does. A good subscriber in a process of its own counts what arrives and how late. Beside them, one fault
-at a time.
+at a time. Last, a calibration runs in processes of its own beside junk on all keys (`bus_calibration`):
+
+    python -m benchmarks bus_faults --only calibration
 """
 
 from __future__ import annotations
@@ -23,11 +25,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.bus_calibration import calibrating
 from vical_daemon import messages as m
 from vical_daemon import topics
 
 IMU, IMAGE = topics.IMU.key("rig0", "imu0"), topics.IMAGE.key("rig0", "cam0")
 JUNK = 1_000_000
+CALIBRATION_JUNK = 100_000
 _CONTEXT = mp.get_context("spawn")
 
 
@@ -36,7 +40,8 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="bus_faults")
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--junk", type=int, default=JUNK)
-    parser.add_argument("--only", nargs="+", help="names of faults")
+    parser.add_argument("--calibration-junk", type=int, default=CALIBRATION_JUNK, help="messages beside it")
+    parser.add_argument("--only", nargs="+", help="names of faults, restart, or calibration")
     args = parser.parse_args(argv)
     faults: dict[str, Callable[[Path, float], list[Any]]] = {
         "none": lambda _, __: [],
@@ -47,20 +52,38 @@ def main(argv: list[str]) -> int:
             _start(publish_junk, socket, args.junk)
         ],
     }
+    chosen = [name for name in (*faults, "restart", "calibration") if _wanted(name, args.only)]
+    lost = _scenarios({name: fault for name, fault in faults.items() if name in chosen}, args.seconds)
+    if "restart" in chosen:
+        print()
+        router_restart()
+    held = True
+    if "calibration" in chosen:
+        rows, held = calibrating(args.calibration_junk)
+        print("\n| figure | value |\n|---|---|")
+        for what, value in rows:
+            print(f"| {what} | {value} |")
+    return int(lost > 0 or not held)
+
+
+def _wanted(name: str, words: list[str] | None) -> bool:
+    return not words or any(word in name for word in words)
+
+
+def _scenarios(faults: dict[str, Callable[[Path, float], list[Any]]], seconds: float) -> int:
+    """One row for each fault; inertial samples lost beside all of them."""
+    if not faults:
+        return 0
     print("| beside | imu sent | lost | junk refused | publish p50 / p99 / max ms | age p50 / p99 / max ms "
           "| images sent / got | RSS host MB |\n|---|---|---|---|---|---|---|---|")  # fmt: skip
     lost = 0
     for name, fault in faults.items():
-        if args.only and not any(word in name for word in args.only):
-            continue
-        row = scenario(fault, args.seconds)
+        row = scenario(fault, seconds)
         lost += row["lost"] if name != "none" else 0
         print(f"| {name} | {row['sent']} | {row['lost']} | {row['refused']} | {_three(row['publish_ms'])} "
               f"| {_three(row['age_ms'])} | {row['images_sent']} / {row['images']} | {row['rss_mb']:.0f} |",
               flush=True)  # fmt: skip
-    print()
-    router_restart()
-    return int(lost > 0)
+    return lost
 
 
 def scenario(fault: Callable[[Path, float], list[Any]], seconds: float) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from vical_daemon import topics
 from vical_daemon.bus import Bus, Sample, Subscription
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.wording import event_text
-from vical_daemon.messages import MessageError, decode_calibration
+from vical_daemon.messages import MessageError, admit_calibration
 from vical_daemon.topics import parse_key
 
 _DEPTH = 256
@@ -267,7 +267,7 @@ def _read(sample: Sample) -> Update | None:
     if parsed is None or parsed.topic is not topics.CALIBRATION:
         return None
     try:
-        message = decode_calibration(sample.payload)
+        message = admit_calibration(sample.payload)
     except MessageError:
         return None
     return Update(parsed.rig, message.camera, message.estimate)

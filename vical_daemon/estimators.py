@@ -30,6 +30,11 @@ class Estimator(Protocol):
         """Take the points of one image."""
         ...
 
+    @property
+    def waiting(self) -> int:
+        """Images taken that have neither been used nor refused yet."""
+        ...
+
     def process(self) -> Sequence[Any]:
         """Do what can be done with what has arrived."""
         ...

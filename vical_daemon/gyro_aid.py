@@ -12,7 +12,7 @@ from vical_daemon.config import Config
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CameraEstimate, Status
-from vical_daemon.messages import MessageError, decode_calibration, decode_imu
+from vical_daemon.messages import MessageError, admit_calibration, admit_imu
 from vical_daemon.vision.flow_prediction import FlowCamera, FlowPredictor
 
 ENOUGH_HZ = 200.0  # the mean rate between two images does not need more
@@ -51,7 +51,7 @@ class GyroAid:
     def take_calibration(self, sample: Sample) -> None:
         """Believe a calibration that is on its way or converged; anything else changes nothing."""
         try:
-            message = decode_calibration(sample.payload)
+            message = admit_calibration(sample.payload)
         except MessageError:
             return
         known = message.camera_estimate
@@ -62,7 +62,7 @@ class GyroAid:
         """Hand what has come to the predictor."""
         while self._samples:
             try:
-                imu = decode_imu(self._samples.popleft())
+                imu = admit_imu(self._samples.popleft())
             except MessageError:
                 continue
             self.predictor.add_imu(imu.stamp_ns, imu.gyro_rps)

@@ -40,6 +40,12 @@ SIGMAS = 4.0
 IRRELEVANT_M, IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 
 
+_JOURNAL_NAMES = {
+    EventKind.DEVICE_REPLACED: "calibration_restarted",
+    EventKind.ESTIMATOR_RESTARTED: "estimator_restarted",
+}
+
+
 class Memory:
     """The store as one running estimator uses it.
 
@@ -64,15 +70,18 @@ class Memory:
         self._keys = [pattern.format(rig=config.rig, name=role) for role in ("imu", "camera")]
         self._subscriptions = [bus.subscribe(key, self._listen) for key in self._keys]
 
-    def priors(self) -> dict[str, CameraPrior]:
+    def priors(self, wait_s: float = SERIALS_WITHIN_S) -> dict[str, CameraPrior]:
         """Return what is known about each camera: what was stored for these devices, else the config.
 
-        Waits a moment for the serial numbers. What the config gives for a held parameter stays.
+        What the config gives for a held parameter stays.
+
+        Args:
+            wait_s: How long to wait for the serial numbers.
         """
         for key in self._keys:
             for sample in self._bus.latest(key):
                 self._listen(sample)
-        self._complete.wait(SERIALS_WITHIN_S)
+        self._complete.wait(wait_s)
         known: dict[str, CameraPrior] = {}
         for name in self._config.calibration_cameras:
             known[name] = given = camera_prior(self._config, name)
@@ -115,7 +124,8 @@ class Memory:
         return [f"imu/{self._config.calibration_imu}", *cameras]
 
     def announce(self, event: Event) -> None:
-        """Add an event to the next estimate."""
+        """Write an event into the journal now and into the next estimate."""
+        self._journal(event)
         self._announced.append(event)
 
     def watch(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
@@ -124,8 +134,7 @@ class Memory:
         Returns:
             The estimate, with an event added where the calibration differs from the stored one.
         """
-        events = [*self._announced, *estimate.events]
-        self._announced.clear()
+        events = list(estimate.events)
         if estimate.status is Status.CONVERGED:
             events += self._changes(estimate)
             if self._status is not Status.CONVERGED:
@@ -135,6 +144,8 @@ class Memory:
         for event in events:
             self._journal(event)
         self._status = estimate.status
+        events = [*self._announced, *events]
+        self._announced.clear()
         return replace(estimate, events=events) if events != estimate.events else estimate
 
     def _journal(self, event: Event) -> None:
@@ -142,7 +153,7 @@ class Memory:
         fields |= {"camera": event.camera} if event.camera else {}
         fields |= {"value": event.value} if event.value is not None else {}
         fields |= {"sigma": event.sigma} if event.sigma is not None else {}
-        name = "bumped" if event.changed else "calibration"
+        name = "bumped" if event.changed else _JOURNAL_NAMES.get(event.kind, "calibration")
         notify.event(name, event_text(event), level="warning", rig=self._config.rig, **fields)
 
     def save(self, estimate: CalibrationEstimate | None) -> None:

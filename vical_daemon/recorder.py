@@ -16,6 +16,7 @@ from vical_daemon.messages import (
     DiagnosticStatus,
     Level,
     MessageError,
+    check_message,
     decode_calibration,
     decode_diagnostics,
     decode_string,
@@ -24,13 +25,15 @@ from vical_daemon.messages import (
 from vical_daemon.record_images import ImageCompressor
 from vical_daemon.record_queue import Arrival, RecordQueue
 from vical_daemon.strict_yaml import MAX_BYTES
-from vical_daemon.topics import CALIBRATION, COMMAND, STATUS, Topic
+from vical_daemon.topics import CALIBRATION, COMMAND, STATUS, Topic, parse_key
 from vical_daemon.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
 _RETRY_NS = 5_000_000_000
 _MENDING_S = 5.0
 _KEYS = 512
+_WORDS = 32  # lines in the log about messages and commands that cannot be understood
+_ROLES = ("imu", "camera", "detect", "estimate", "record", "web", "")  # "": tf_static, which has no name
 
 
 class Recorder:
@@ -49,8 +52,11 @@ class Recorder:
         self._latched: dict[str, bytes] = {}
         self._mending: threading.Thread | None = None
         self._keys: set[str] = set()
+        self._names = {*config.imus, *config.cameras, *_ROLES}
+        self._told: set[str] = set()  # kinds of which a message did not decode
         self.messages = 0
         self.refused = 0
+        self.malformed = 0
 
     @property
     def recording(self) -> bool:
@@ -62,8 +68,8 @@ class Recorder:
         return topic.recorded and (self._config.record.images or topic.kind not in ("image", "compressed"))
 
     def write(self, item: Arrival) -> None:
-        """Take one arrival: learn from it, obey it, record it."""
-        if not self._admit(item.key):
+        """Take one arrival: learn from it, obey it, record it; what does not decode is only counted."""
+        if not (self._decodes(item) and self._admit(item)):
             return
         self._learn(item)
         if self._session is None:
@@ -75,15 +81,38 @@ class Recorder:
         except LogError as error:
             self._fail(str(error))
 
-    def _admit(self, key: str) -> bool:
+    def _decodes(self, item: Arrival) -> bool:
+        """Whether a message is what its key says: one that is not closes the whole file to some readers."""
+        try:
+            check_message(item.topic.type_name, item.payload)
+        except MessageError as error:
+            self.malformed += 1
+            if item.topic.kind not in self._told:
+                self._told.add(item.topic.kind)
+                _log.warning(
+                    "%s: not recorded, no %s: %s; more of this kind are only counted",
+                    item.key[:100],
+                    item.topic.type_name,
+                    " ".join(str(error).split()),
+                )
+            return False
+        return True
+
+    def _admit(self, item: Arrival) -> bool:
         """Refuse keys beyond any sane number: whoever invents names must not fill memory and log."""
-        if key in self._keys:
+        key = item.key
+        if key in self._keys or self._of_the_rig(item):
             return True
         if len(self._keys) >= _KEYS:
             self.refused += 1
             return False
         self._keys.add(key)
         return True
+
+    def _of_the_rig(self, item: Arrival) -> bool:
+        """Whether a key belongs to a device or role of the config: there is always room for those."""
+        parsed = parse_key(item.key)
+        return parsed is not None and parsed.name in self._names
 
     def _learn(self, item: Arrival) -> None:
         if item.key == self._command_key:
@@ -96,10 +125,7 @@ class Recorder:
             self._latched[item.key] = item.payload
 
     def _obey(self, payload: bytes) -> None:
-        try:
-            word = decode_string(payload).strip()
-        except MessageError:
-            return
+        word = decode_string(payload).strip()
         if word == "start":
             self._wanted, self._retry_ns = True, 0
             self.tick()
@@ -109,7 +135,8 @@ class Recorder:
             self.close()
         elif word == "split" and self._session is not None:
             self._split()
-        else:
+        elif len(self._told) < _WORDS and word[:40] not in self._told:
+            self._told.add(word[:40])
             _log.warning("command %r is not known: start, stop or split", word[:40])
 
     def _split(self) -> None:
@@ -121,11 +148,7 @@ class Recorder:
                 self._fail(str(error))
 
     def _note_serials(self, payload: bytes) -> None:
-        try:
-            message = decode_diagnostics(payload)
-        except MessageError:
-            return
-        for status in message.statuses:
+        for status in decode_diagnostics(payload).statuses:
             self._serials.note(status)
         if self._serials.replaced:
             self._serials.adopt()
@@ -223,12 +246,7 @@ class Recorder:
         for name, path in (("config.yaml", self._config.path), ("target.yaml", self._config.target_path)):
             if path is not None and path.is_file():
                 items.append(Attachment(name, "text/yaml", _without_secrets(read_file(path, MAX_BYTES))))
-        estimates = []
-        for payload in self._calibrations.values():
-            try:
-                estimates.append(decode_calibration(payload))
-            except MessageError:
-                continue
+        estimates = [decode_calibration(payload) for payload in self._calibrations.values()]
         if estimates:
             text = json.dumps(merge_calibrations(estimates).to_json(), indent=1)
             items.append(Attachment("calibration.json", "application/json", text.encode()))
@@ -246,6 +264,7 @@ class Recorder:
             "dropped": str(sum(queue.dropped.values())),
             "lost_on_bus": str(lost),
             "refused": str(self.refused),
+            "malformed": str(self.malformed),
             "images_not_compressed": str(self._images.failures),
             "files_deleted": str(self._folder.deleted),
         }

@@ -19,18 +19,17 @@ class StampOrder(Generic[T]):
         lag_s: An item is released when one with a stamp so much later has arrived.
         max_items: When more wait, the earliest are released before their time (a stream with a far
             future stamp must not fill memory).
-        max_lead_s: A stamp so far ahead of all others is not believed and refused.
+
+    Stamps are believed here: `stamp_gate` sees to it that they go on from those before.
     """
 
-    def __init__(self, lag_s: float, max_items: int = 20_000, max_lead_s: float = 3600.0) -> None:
+    def __init__(self, lag_s: float, max_items: int = 20_000) -> None:
         self._lag_ns = round(lag_s * 1e9)
-        self._max_lead_ns = round(max_lead_s * 1e9)
         self._max_items = max_items
         self._heap: list[tuple[int, int, T]] = []
         self._arrivals = 0
         self._newest_ns: int | None = None
         self._released_ns: int | None = None
-        self.refused = 0
         self.late = 0
 
     def __len__(self) -> int:
@@ -47,12 +46,7 @@ class StampOrder(Generic[T]):
         It is not dropped: a stream that is delayed as a whole (a busy machine) is still in order by itself,
         and the estimator waits with an image until inertial data bracket it.
         """
-        if self._newest_ns is None:
-            self._newest_ns = stamp_ns
-        elif stamp_ns - self._newest_ns > self._max_lead_ns:
-            self.refused += 1
-            return
-        elif stamp_ns > self._newest_ns:
+        if self._newest_ns is None or stamp_ns > self._newest_ns:
             self._newest_ns = stamp_ns
         if self._released_ns is not None and stamp_ns < self._released_ns:
             self.late += 1

@@ -122,7 +122,10 @@ TOPICS: tuple[Topic, ...] = (
 BY_KIND: dict[str, Topic] = {topic.kind: topic for topic in TOPICS}
 
 _PATTERNS = tuple(
-    (re.compile(topic.pattern.format(rig="(?P<rig>[^/]+)", name="(?P<name>[^/]+)")), topic)
+    (
+        re.compile(topic.pattern.format(rig=f"(?P<rig>{_NAME.pattern})", name=f"(?P<name>{_NAME.pattern})")),
+        topic,
+    )
     for topic in TOPICS
 )
 
@@ -145,7 +148,7 @@ def check_name(name: str) -> str:
 
 @lru_cache(maxsize=1024)
 def parse_key(key: str) -> ParsedKey | None:
-    """Tell what a key of ours says; None for a key that is not in the table.
+    """Tell what a key of ours says; None for a key that is not in the table, or with a name that cannot be.
 
     >>> parsed = parse_key("vical/rig0/imu/imu0")
     >>> parsed.rig, parsed.topic.kind, parsed.name

@@ -23,13 +23,13 @@ from vical_daemon.estimation.image_intake import (
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import (
-    BoolArray,
     CalibrationOptions,
     CameraPrior,
     FloatArray,
     PointsFrame,
 )
 from vical_daemon.estimation.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.plausible import stamp_sigma_problem, usable_points
 from vical_daemon.estimation.recent_past import RecentPast
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
 from vical_daemon.estimation.start.starting import LATE_S, Starting
@@ -108,7 +108,9 @@ class Calibrator:
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
-        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        """Take how well the imu's driver knows its device's clock now, one sigma, s; nonsense is ignored."""
+        if stamp_sigma_problem(sigma_s):
+            return
         self._stamp_sigma_s = sigma_s
         if self.filter is not None:
             self.filter.stamp_sigma_s = sigma_s
@@ -127,8 +129,9 @@ class Calibrator:
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image; those of unknown cameras or off the board are only counted."""
-        ok = self._known(frame)
-        if frame.camera not in self.priors or self._buffer is None:
+        ok = usable_points(frame) & (frame.ids < len(self.target))
+        nonsense = len(ok) > 0 and not ok.any()  # its stamp is worth no more than its points
+        if frame.camera not in self.priors or self._buffer is None or nonsense:
             self.judge.frames_ignored += 1
             return
         if not ok.all():
@@ -153,11 +156,10 @@ class Calibrator:
             self._seek_shift.add(camera)
             self.watch.shift_reopened()
 
-    def _known(self, frame: PointsFrame) -> BoolArray:
-        """Which points of a frame can be used at all."""
-        return np.asarray(
-            np.isfinite(frame.uv_px).all(axis=1) & (frame.ids >= 0) & (frame.ids < len(self.target))
-        )
+    @property
+    def waiting(self) -> int:
+        """Images that wait for inertial data."""
+        return len(self._pending)
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:

@@ -21,6 +21,9 @@ class FrameQueue:
         self._queues: dict[str, deque[tuple[float, PointsFrame]]] = {n: deque() for n in cameras}
         self.dropped = 0
 
+    def __len__(self) -> int:
+        return sum(map(len, self._queues.values()))
+
     def push(self, t_cam_s: float, frame: PointsFrame) -> None:
         """Append an image; stamps of one camera that go backwards are dropped and counted."""
         queue = self._queues[frame.camera]

@@ -10,9 +10,11 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.imu_buffer import GAP_S, ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 from vical_daemon.estimation.stamp_steps import StampSteps
 
 _LEARN = 20  # readings by which the usual interval is known
+_MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
 _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
@@ -37,7 +39,7 @@ class ImuIntake:
     Attributes:
         buffer: The readings, s since the first stamp; None before the first one.
         base_ns: First stamp, ns.
-        refused: Readings left out: out of order, not finite, or with a wrong stamp.
+        refused: Readings left out: out of order, no possible values, or with a wrong stamp.
         repeated: Readings left out because they repeat the one before, bit by bit.
         gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
     """
@@ -76,7 +78,7 @@ class ImuIntake:
         """
         reading = Reading(t_imu_ns, np.array(gyro_rps, np.float64), np.array(specific_force_mps2, np.float64))
         six = np.concatenate([reading.gyro_rps, reading.specific_force_mps2])
-        if not np.isfinite(six.sum()):
+        if not (np.abs(six) <= _MOST).all():  # NaN is not, either
             self.refused += 1
             return []
         if (six == self._last).all():

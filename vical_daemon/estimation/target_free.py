@@ -33,6 +33,7 @@ from vical_daemon.estimation.image_intake import (
 from vical_daemon.estimation.imu_buffer import ImuBuffer
 from vical_daemon.estimation.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.plausible import stamp_sigma_problem
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.unshown_axes import has_turned
 
@@ -88,7 +89,9 @@ class TargetFreeCalibrator:
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
-        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        """Take how well the imu's driver knows its device's clock now, one sigma, s; nonsense is ignored."""
+        if stamp_sigma_problem(sigma_s):
+            return
         self.judge.doubts.stamp_sigma_s = sigma_s
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
@@ -105,7 +108,9 @@ class TargetFreeCalibrator:
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
-        if frame.camera != self.camera or self._buffer is None:
+        count, frame = len(frame.ids), cleaned(frame)
+        nonsense = count > 0 and not len(frame.ids)  # its stamp is worth no more than its tracks
+        if frame.camera != self.camera or self._buffer is None or nonsense:
             self.judge.frames_ignored += 1
             return
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
@@ -117,10 +122,14 @@ class TargetFreeCalibrator:
         self._newest_s = t_cam_s
         if not self._thinning.takes(t_cam_s):
             return
-        frame = cleaned(frame)
         self.judge.saw_points(t_cam_s, len(frame.ids))
         if len(frame.ids) >= 4:
             self._pending.append((t_cam_s, frame))
+
+    @property
+    def waiting(self) -> int:
+        """Images that wait for inertial data; before there is a window, all are tried again and again."""
+        return 0 if self.window is None else len(self._pending)
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:

@@ -68,6 +68,11 @@ class TargetFreeRig:
         else:
             part.add_points(frame)
 
+    @property
+    def waiting(self) -> int:
+        """Images that wait for inertial data."""
+        return sum(part.waiting for part in self.parts.values())
+
     def process(self) -> list[FrameReport]:
         """Do what can be done with what has arrived; reports on the images of windows that are complete."""
         return _in_order(part.process() for part in self.parts.values())

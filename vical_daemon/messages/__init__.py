@@ -2,8 +2,17 @@
 
 The bytes on the bus are the bytes in the log. `encode_*` builds a message, `decode_*` reads one into a
 small frozen dataclass in our own names and units, and raises only `MessageError` whatever the bytes.
+`admit_*` does so, too, and refuses what no device measures: roles work with those.
 """
 
+from vical_daemon.messages.admission import (
+    ImplausibleError,
+    admit_calibration,
+    admit_image,
+    admit_imu,
+    admit_points,
+    admit_stamp_sigma_s,
+)
 from vical_daemon.messages.calibration import (
     CALIBRATION_TYPE,
     CalibrationMessage,
@@ -12,6 +21,7 @@ from vical_daemon.messages.calibration import (
     merge_calibrations,
 )
 from vical_daemon.messages.cdr import MessageError
+from vical_daemon.messages.decoders import check_message
 from vical_daemon.messages.diagnostics import (
     DIAGNOSTICS_TYPE,
     STRING_TYPE,
@@ -69,12 +79,19 @@ __all__ = [
     "DiagnosticStatus",
     "DiagnosticsMessage",
     "ImageMessage",
+    "ImplausibleError",
     "ImuMessage",
     "Level",
     "MessageError",
     "PointsMessage",
     "PoseMessage",
     "Transform",
+    "admit_calibration",
+    "admit_image",
+    "admit_imu",
+    "admit_points",
+    "admit_stamp_sigma_s",
+    "check_message",
     "decode_calibration",
     "decode_camera_info",
     "decode_compressed_image",

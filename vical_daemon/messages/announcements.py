@@ -41,11 +41,11 @@ def read_events(reader: CdrReader, texts: Sequence[str]) -> list[Event]:
         cause, cause_value = reader.string(), _read_number(reader)
         known, why = _known(EventKind, kind), _known(Cause, cause)
         if known is None or why is None:
-            known = EventKind.OTHER
+            known, why = EventKind.OTHER, Cause.NONE
         if known in SAID:
             found.append(Event(known, t_s=t_s, said=texts[i] if i < len(texts) else ""))
         else:
-            found.append(Event(known, camera, value, sigma, t_s, why or Cause.NONE, cause_value))
+            found.append(Event(known, camera, value, sigma, t_s, why, cause_value))
     return found
 
 

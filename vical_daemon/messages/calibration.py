@@ -26,7 +26,7 @@ from vical_daemon.messages.announcements import (
     write_events,
     write_guidance,
 )
-from vical_daemon.messages.cdr import CdrReader, CdrWriter, MessageError
+from vical_daemon.messages.cdr import PADDING, CdrReader, CdrWriter, MessageError
 from vical_daemon.messages.poses import read_pose, write_pose
 
 CALIBRATION_TYPE = "vical_msgs/msg/CalibrationEstimate"
@@ -97,10 +97,11 @@ def decode_calibration(data: bytes) -> CalibrationMessage:
     gravity = reader.sequence().tolist()
     imu, known = _read_imu(reader), _read_camera(reader)
     events, next_motion = untyped_events(texts), Guidance()
-    if reader.remaining:
+    if reader.remaining > PADDING:
         events, next_motion = read_events(reader, texts), read_guidance(reader)
         withheld = read_directions(reader)
         known = None if known is None else replace(known, withheld=withheld)
+    reader.end()
     estimate = CalibrationEstimate(
         t_ns=t_ns,
         status=Status(status),

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+PADDING = 3  # bytes at most: CDR fills a message up to a multiple of 4
 _U32 = struct.Struct("<I")
 _STAMP = struct.Struct("<iI")
 _NS_PER_S = 1_000_000_000
@@ -144,7 +145,7 @@ class CdrReader:
         length = _U32.unpack_from(self._data, self.skip(4, 4))[0]
         begin = self.skip(length, 1)
         raw = self._data[begin : begin + length]
-        if length and raw[-1]:
+        if not length or raw[-1]:
             raise MessageError("string without its closing NUL")
         try:
             return str(raw[:-1], "utf-8")
@@ -178,3 +179,8 @@ class CdrReader:
         length = self.count(1)
         begin = self.skip(length, 1)
         return memoryview(self._data)[begin : begin + length]
+
+    def end(self) -> None:
+        """Demand that the message ends here; other readers, rosbags among them, do so too."""
+        if self.remaining > PADDING:
+            raise MessageError(f"message goes on for {self.remaining} bytes behind its last field")

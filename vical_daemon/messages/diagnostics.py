@@ -74,6 +74,7 @@ def decode_diagnostics(data: bytes) -> DiagnosticsMessage:
     reader = CdrReader(data)
     stamp_ns, role = reader.header()
     statuses = tuple(_decode_status(reader) for _ in range(reader.count(17)))
+    reader.end()
     return DiagnosticsMessage(stamp_ns, role, statuses)
 
 
@@ -99,4 +100,7 @@ def decode_string(data: bytes) -> str:
     Raises:
         MessageError: These bytes are no such message.
     """
-    return CdrReader(data).string()
+    reader = CdrReader(data)
+    text = reader.string()
+    reader.end()
+    return text

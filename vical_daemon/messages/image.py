@@ -142,6 +142,7 @@ def decode_image(data: bytes) -> ImageMessage:
     height, width = reader.scalar("I"), reader.scalar("I")
     encoding, big_endian, step = reader.string(), bool(reader.scalar("B")), reader.scalar("I")
     pixels = reader.blob()
+    reader.end()
     if not height or not width or len(pixels) != height * step:
         raise MessageError(
             f"image of {width} x {height} with rows of {step} bytes but {len(pixels)} bytes of data"
@@ -166,7 +167,9 @@ def decode_compressed_image(data: bytes) -> CompressedImageMessage:
     """
     reader = CdrReader(data)
     stamp_ns, frame_id = reader.header()
-    return CompressedImageMessage(stamp_ns, frame_id, reader.string(), reader.blob())
+    message = CompressedImageMessage(stamp_ns, frame_id, reader.string(), reader.blob())
+    reader.end()
+    return message
 
 
 def encode_camera_info(
@@ -220,6 +223,7 @@ def decode_camera_info(data: bytes) -> CameraInfoMessage:
     k = reader.fixed(9)
     reader.skip(9 * 8 + 12 * 8, 8)  # rectification and projection
     reader.skip(6 * 4 + 1, 4)  # binning and region of interest
+    reader.end()
     intrinsics = (float(k[0]), float(k[4]), float(k[2]), float(k[5]))
     model = _MODEL_FROM_ROS.get(model, model)
     if model == "plumb_bob" and not any(distortion[4:]):

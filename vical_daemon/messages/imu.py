@@ -88,6 +88,7 @@ def decode_imu(data: bytes) -> ImuMessage:
     reader = CdrReader(data)
     stamp_ns, frame_id = reader.header()
     values = _BODY.unpack_from(data, reader.skip(_BODY.size, 8))
+    reader.end()
     if not math.isfinite(sum(values)):
         raise MessageError("Imu message with a value that is not finite")
     return ImuMessage(stamp_ns, frame_id, values[:3], values[3:])

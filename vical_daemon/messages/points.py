@@ -82,6 +82,7 @@ def decode_points(data: bytes) -> PointsMessage:
     stamp_ns, camera = reader.header()
     image_size = (reader.scalar("I"), reader.scalar("I"))
     ids, uv, sigma = reader.sequence("<i8"), reader.sequence(), reader.sequence()
+    reader.end()
     n = len(ids)
     if len(uv) != 2 * n or len(sigma) not in (0, n):
         raise MessageError(f"{n} ids, {len(uv)} coordinates and {len(sigma)} sigmas do not fit together")

@@ -81,7 +81,9 @@ def decode_pose(data: bytes) -> PoseMessage:
     reader = CdrReader(data)
     stamp_ns, frame_id = reader.header()
     p_m, q_wxyz = read_pose(reader)
-    return PoseMessage(stamp_ns, frame_id, p_m, q_wxyz, reader.fixed(36).reshape(6, 6))
+    covariance = reader.fixed(36).reshape(6, 6)
+    reader.end()
+    return PoseMessage(stamp_ns, frame_id, p_m, q_wxyz, covariance)
 
 
 def encode_transforms(transforms: list[Transform]) -> bytes:
@@ -107,6 +109,7 @@ def decode_transforms(data: bytes) -> list[Transform]:
         stamp_ns, frame_id = reader.header()
         child = reader.string()
         transforms.append(Transform(stamp_ns, frame_id, child, *read_pose(reader)))
+    reader.end()
     return transforms
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from vical_daemon import topics
+from vical_daemon import notify, topics
 from vical_daemon.bus import Bus, Sample, Subscription
 from vical_daemon.config import Config
 from vical_daemon.detectors import Detect, make_detector
@@ -19,8 +21,8 @@ from vical_daemon.messages import (
     DiagnosticStatus,
     Level,
     MessageError,
+    admit_image,
     decode_compressed_image,
-    decode_image,
     encode_points,
 )
 from vical_daemon.places import make_private, runtime_directory
@@ -31,6 +33,11 @@ from vical_daemon.wall_clock import WallClock, shared_clock
 QUEUE_DEPTH = 2
 _NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 JOIN_S = 3.0
+STUCK_S = 20.0
+"""At one image for so long, s: a detection takes 0.1 s; on a slow card OpenCV takes some to load."""
+_SET_BACK_NS = 2e9  # further behind the last image than any queue can bring it
+_NEW_SIZE = 3  # images in a row
+_log = logging.getLogger(__name__)
 
 
 class DetectRole:
@@ -56,10 +63,15 @@ class DetectRole:
         self.aid: GyroAid | None = None
         if free and config.imus:
             self.aid = GyroAid(config, camera, prior or camera_prior(config, camera))
-        self._detect = detector or make_detector(config, self.aid.predictor if self.aid else None)
+        predictor = self.aid.predictor if self.aid else None
+        self._make: Callable[[], Detect] = lambda: detector or make_detector(config, predictor)
+        self._detect = self._make()
+        self._size: tuple[int, int] | None = None  # of the images of this camera: height, width
+        self._other: tuple[tuple[int, int], int] = ((0, 0), 0)  # another size, and how often in a row
+        self._problem = ""
         self._period_ns = 1e9 / config.calibration.detect_rate_hz
         self._next_ns = 0.0
-        self._images = self._found = self._malformed = self._skipped = 0
+        self._images = self._found = self._malformed = self._skipped = self._failures = 0
         self._busy_s = 0.0
 
     def points(self, sample: Sample) -> list[Message]:
@@ -67,17 +79,23 @@ class DetectRole:
         begin_s = time.perf_counter()
         try:
             stamp_ns, image = _decode(sample)
-            if stamp_ns < self._next_ns - 0.5 * self._period_ns:
-                self._skipped += 1
-                return []
-            self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
-            if self.aid is not None:
-                self.aid.prepare()
-            found = self._detect(image, stamp_ns)
         except (MessageError, ValueError):
             self._malformed += 1
             return []
+        if not self._of_usual_size(image.shape[:2]):
+            self._malformed += 1
+            return []
+        if not self._due(stamp_ns):
+            self._skipped += 1
+            return []
         self._images += 1
+        try:
+            if self.aid is not None:
+                self.aid.prepare()
+            found = self._detect(image, stamp_ns)
+        except Exception as error:  # OpenCV raises on pictures that nobody has thought of
+            self._failed(error)
+            return []
         height, width = image.shape[:2]
         points: tuple[Any, Any, Any] = (_NO_IDS, _NO_POINTS, None)
         if found is not None:
@@ -87,8 +105,45 @@ class DetectRole:
         self._busy_s += time.perf_counter() - begin_s
         return [(self.key, payload)]
 
-    def status(self, dropped: int = 0) -> DiagnosticStatus:
-        """Return how it goes; `dropped`: images that came while it was busy."""
+    def _of_usual_size(self, size: tuple[int, int]) -> bool:
+        """Whether an image is as large as those before; a camera with a new setting is believed soon."""
+        if self._size is None or size == self._size:
+            self._size, self._other = size, ((0, 0), 0)
+            return True
+        self._other = (size, self._other[1] + 1 if size == self._other[0] else 1)
+        if self._other[1] < _NEW_SIZE:
+            return False
+        self._size = size
+        return True
+
+    def _due(self, stamp_ns: int) -> bool:
+        """Whether an image comes so late after the last one as `detect_rate_hz` asks for."""
+        ahead_ns = self._next_ns - stamp_ns
+        if 0.5 * self._period_ns < ahead_ns < _SET_BACK_NS:
+            return False
+        if ahead_ns >= _SET_BACK_NS:  # the clock was set back, or the image before was nonsense
+            self._next_ns = stamp_ns
+        self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
+        return True
+
+    def _failed(self, error: Exception) -> None:
+        """Go on with a fresh detector; each problem is said once."""
+        self._failures += 1
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        if text != self._problem:
+            self._problem = text
+            _log.error("%s: the detector failed and starts again: %s", self.camera, text)
+            told = f"{self.camera}: the detector failed and starts again: {text}"
+            notify.event("detector_restarted", told, level="warning", camera=self.camera)
+        self._detect = self._make()
+
+    def status(self, dropped: int = 0, busy_s: float = 0.0) -> DiagnosticStatus:
+        """Return how it goes.
+
+        Args:
+            dropped: Images that came while it was busy.
+            busy_s: For how long it has been at the present image.
+        """
         share = self._found / self._images if self._images else 0.0
         values = {
             "images": str(self._images),
@@ -96,8 +151,12 @@ class DetectRole:
             "skipped": str(self._skipped),
             "dropped": str(dropped),
             "malformed": str(self._malformed),
+            "failures": str(self._failures),
             "detection_ms": f"{1e3 * self._busy_s / self._images if self._images else 0.0:.2f}",
         }
+        if busy_s > STUCK_S:
+            text = f"stuck: at one image for {busy_s:.0f} s"
+            return DiagnosticStatus(Level.STALE, f"detect/{self.camera}", text, "", values)
         message = f"{share:.0%} of {self._images} images show points"
         level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK
         return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)
@@ -121,7 +180,7 @@ def _decode(sample: Sample) -> tuple[int, Any]:
 
         message = decode_compressed_image(sample.payload)
         return message.stamp_ns, image_codec.decode_image(np.frombuffer(message.data, np.uint8))
-    image = decode_image(sample.payload)
+    image = admit_image(sample.payload)
     return image.stamp_ns, image.pixels()
 
 
@@ -148,6 +207,7 @@ class _Worker:
 
     def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
         self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
+        self._since_s: float | None = None  # when it began with the present image
         self._aid = attach_aid(bus, self._role)
         key = topics.IMAGE.key(config.rig, camera)
         self.subscription = bus.subscribe(key, depth=QUEUE_DEPTH, newest_wins=True)
@@ -160,10 +220,14 @@ class _Worker:
         self.thread.join(JOIN_S)
 
     def status(self) -> DiagnosticStatus:
-        return self._role.status(self.subscription.dropped)
+        since_s = self._since_s
+        busy_s = 0.0 if since_s is None else time.monotonic() - since_s
+        return self._role.status(self.subscription.dropped, busy_s)
 
     def _run(self) -> None:
         while not self._stop.is_set():
             sample = self.subscription.recv(0.2)
             if sample is not None:
+                self._since_s = time.monotonic()  # stays where the thread ends or hangs
                 publish(self._bus, self._role.points(sample))
+                self._since_s = None

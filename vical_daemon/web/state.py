@@ -28,7 +28,7 @@ from vical_daemon.messages import (
     DiagnosticStatus,
     Level,
     MessageError,
-    decode_calibration,
+    admit_calibration,
     decode_diagnostics,
 )
 
@@ -138,7 +138,7 @@ class WebState:
         if parsed is None:
             return
         if parsed.topic is topics.CALIBRATION:
-            message = decode_calibration(sample.payload)
+            message = admit_calibration(sample.payload)
             if message.camera != parsed.name:
                 raise MessageError(f"{sample.key} speaks of {message.camera[:80]}")
             _admit(parsed.name, self._cameras)

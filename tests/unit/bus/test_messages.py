@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap_ros2._dynamic import generate_dynamic
 
 from vical_daemon import messages as m
 from vical_daemon.estimation.events import Cause, Event, EventKind
@@ -21,6 +22,7 @@ from vical_daemon.estimation.result import (
     Status,
 )
 from vical_daemon.estimation.wording import event_text
+from vical_daemon.messages.decoders import DECODERS
 from vical_daemon.messages.poses import covariance_for_ros, rotation_matrix
 from vical_daemon.messages.schemas import DEFINITIONS, typestore
 from vical_daemon.topics import TOPICS
@@ -380,6 +382,40 @@ def test_every_cut_is_refused(decode):
 # and begins with the number of events.
 _EVENTS_AT = GOOD[m.decode_calibration].index(b"\x07\0\0\0bumped\0") - 4
 _END_OF_0_1_0 = {m.decode_calibration: len(GOOD[m.decode_calibration][:_EVENTS_AT].rstrip(b"\0")) + 1}
+
+
+@pytest.mark.parametrize("decode", GOOD, ids=lambda f: f.__name__)
+def test_a_message_ends_where_its_type_says(decode):
+    """CDR pads by at most 3 bytes; other readers refuse more, and with it the whole log."""
+    assert decode(GOOD[decode] + bytes(3)) is not None
+    with pytest.raises(m.MessageError, match="behind its last field"):
+        decode(GOOD[decode] + bytes(4))
+
+
+READERS = {decode: t.type_name for t in TOPICS for decode in GOOD if DECODERS[t.type_name] is decode}
+
+
+@pytest.mark.parametrize("decode", READERS, ids=lambda f: f.__name__)
+def test_what_we_decode_others_decode_too(decode, rng_bus):
+    """rosbags, its conversion to ROS 1, and mcap-ros2: none refuses a message that we take."""
+    name, good = READERS[decode], GOOD[decode]
+    read = generate_dynamic(name, m.ros2_schema(name))[name]
+    taken = 0
+    for k in range(400):
+        raw = bytearray(good)
+        for _ in range(rng_bus.integers(1, 4)):
+            raw[rng_bus.integers(4, len(raw))] = rng_bus.choice([0, 1, 2, 255, rng_bus.integers(256)])
+        cut = len(raw) if k % 4 else int(rng_bus.integers(4, len(raw)))
+        data = bytes(raw[:cut]) + bytes(int(rng_bus.integers(0, 6)))
+        try:
+            m.check_message(name, data)
+        except m.MessageError:
+            continue
+        taken += 1
+        typestore().deserialize_cdr(data, name)
+        typestore().cdr_to_ros1(data, name)
+        read(data)
+    assert taken > 20
 
 
 @pytest.mark.parametrize("decode", GOOD, ids=lambda f: f.__name__)

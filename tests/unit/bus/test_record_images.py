@@ -76,10 +76,12 @@ def test_the_log_holds_what_can_be_opened_and_says_what_failed(tmp_path) -> None
     recorder = Recorder(config, LogFolder(tmp_path), private_clock())
     recorder.tick()
     key = topics.IMAGE.key("rig0", "cam0")
-    for payload in (m.encode_image(STAMP_NS, "cam0", SMOOTH, "mono8"), b"junk"):
+    raw = m.encode_image(STAMP_NS, "cam0", SMOOTH, "bayer_rggb8")
+    for payload in (m.encode_image(STAMP_NS, "cam0", SMOOTH, "mono8"), raw, b"junk"):
         recorder.write(arrival(Sample(key, payload, 0), private_clock()))
     recorder.close()
     found = {x.channel.topic: x for path in tmp_path.glob("*.mcap") for x in LogReader(path).messages()}
     assert set(found) == {f"/{key}", f"/{key}/compressed"}
     assert found[f"/{key}/compressed"].channel.type_name == "sensor_msgs/msg/CompressedImage"
-    assert recorder._images.failures == 1
+    assert found[f"/{key}"].payload == raw
+    assert recorder._images.failures == 1 and recorder.malformed == 1

@@ -23,6 +23,7 @@ from vical_daemon.wall_clock import private_clock
 
 IMU = topics.IMU.key("rig0", "imu0")
 COMMAND = topics.COMMAND.key("rig0", "record")
+CLOCK = private_clock()
 
 
 def settings(folder: Path, more: str = ""):
@@ -382,3 +383,49 @@ def test_invented_keys_fill_neither_memory_nor_log(make, tmp_path):
         feed(recorder, 1, i, key=topics.IMU.key("rig0", f"junk{i}"))
     assert recorder.messages == 512
     assert recorder.status(RecordQueue(), 0).values["refused"] == "88"
+
+
+def test_what_does_not_decode_is_neither_recorded_nor_repeated_in_later_files(make, tmp_path, caplog):
+    """Two junk messages once made 22 segments unreadable for mcap-ros2 and rosbags-convert."""
+    recorder = make()
+    recorder.tick()
+    info = topics.CAMERA_INFO.key("rig0", "cam0")
+    good = m.encode_camera_info(1, "cam0", (8, 6), [1, 2, 3, 4], "radtan", [])
+    for payload in (good, b"junk", good[:-9], good + bytes(9)):
+        for _ in range(2):
+            recorder.write(arrival(Sample(info, payload, 0), private_clock()))
+    recorder.write(arrival(Sample(topics.TF_STATIC.key("rig0"), b"junk", 0), private_clock()))
+    feed(recorder, 3)
+    command(recorder, "split")
+    recorder.close()
+    paths = LogFolder(tmp_path / "log").segments()
+    assert len(paths) == 2
+    for path in paths:
+        for x in LogReader(path).messages():
+            m.check_message(x.channel.type_name, x.payload)
+    values = recorder.status(RecordQueue(), 0).values
+    assert values["malformed"] == "7" and values["messages"] == str(2 + 3 + 1)
+    assert caplog.text.count("not recorded, no sensor_msgs/msg/CameraInfo") == 1
+
+
+def test_a_key_that_no_log_can_hold_does_not_end_the_segment(make, tmp_path):
+    recorder = make()
+    recorder.tick()
+    feed(recorder, 1)
+    for name in ("a-b", "a b", "é", "1"):
+        item = arrival(Sample(f"vical/rig0/imu/{name}", m.encode_imu(1, "x", (0,) * 3, (0,) * 3), 0), CLOCK)
+        assert item is None or recorder.write(item) is None
+    feed(recorder, 1, 1)
+    assert recorder.recording
+    recorder.close()
+    (path,) = LogFolder(tmp_path / "log").segments()
+    assert numbers(path) == [0, 1]
+
+
+def test_invented_keys_leave_room_for_those_of_the_rig(make, tmp_path):
+    recorder = make("imus: {imu7: {port: /dev/x}}\n")
+    recorder.tick()
+    for i in range(600):
+        feed(recorder, 1, i, key=topics.IMU.key("rig0", f"junk{i}"))
+    feed(recorder, 1, key=topics.IMU.key("rig0", "imu7"))
+    assert recorder.messages == 512 + 1

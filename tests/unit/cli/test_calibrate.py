@@ -145,6 +145,8 @@ def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
         def add_points(self, frame) -> None:
             fed.append((frame.t_cam_ns, frame.ids.tobytes(), frame.uv_px.tobytes()))
 
+        waiting = 0
+
         def process(self) -> list:
             return []
 

@@ -100,6 +100,8 @@ class Believer:
 
     def add_points(self, frame: PointsFrame) -> None: ...
 
+    waiting = 0
+
     def process(self) -> list[Any]:
         return []
 

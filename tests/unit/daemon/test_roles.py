@@ -76,6 +76,8 @@ class FakeEstimator:
     def add_points(self, frame: PointsFrame) -> None:
         self.fed.append((frame.camera, frame.t_cam_ns))
 
+    waiting = 0
+
     def process(self) -> list[Any]:
         return ["verdict"]
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
-from vical_daemon.estimation.measurements import BoolArray, PointsFrame
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.plausible import usable_points
 
 STEP_S = 1.5  # the window is adjusted again after this much new data
 SLACK_S = 1e-3  # stamps are not quite even
@@ -51,8 +50,6 @@ def ready(waiting: Sequence[Stamped], begin_s: float, end_s: float) -> Ready:
 
 
 def cleaned(frame: PointsFrame) -> PointsFrame:
-    """Return the tracks with finite pixels, each identity once."""
-    ok: BoolArray = np.asarray(np.isfinite(frame.uv_px).all(axis=1))
-    _, first = np.unique(frame.ids, return_index=True)
-    ok[np.setdiff1d(np.arange(len(ok)), first)] = False
+    """Return the tracks at possible pixels, each identity once."""
+    ok = usable_points(frame)
     return PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok])

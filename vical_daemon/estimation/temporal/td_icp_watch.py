@@ -128,10 +128,18 @@ class DelayWatch:
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s)."""
         if self._imu and t_imu_ns <= self._imu[-1][0]:
-            return
+            if t_imu_ns > self._imu[-1][0] - self._every_ns:
+                return
+            self._set_back()
         self._imu.append((t_imu_ns, gyro_rps))
         while self._imu[0][0] < t_imu_ns - self._window_ns - round(_KEEP_S * 1e9):
             self._imu.popleft()
+
+    def _set_back(self) -> None:
+        """The clock has been set back: what was collected has no place on the new time axis."""
+        self._imu.clear()
+        for camera in self._cameras.values():
+            camera.frames, camera.next_ns = [], 0
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image; most are left out, and all of them between windows."""
