@@ -9,6 +9,8 @@ import os
 
 import pytest
 
+# Nothing that our processes do may end in a warning of numpy's; pytest's own filter does not reach children.
+os.environ.setdefault("PYTHONWARNINGS", "error::RuntimeWarning")
 LONGEST_FIRST = (
     "test_euroc.py",
     "test_calibrator.py",

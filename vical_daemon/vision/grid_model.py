@@ -149,6 +149,11 @@ def _root(lens: float, u: FloatArray, v: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(1 - 4 * lens * (u * u + v * v), 1e-6)))
 
 
+# Trial parameters may be wild; points that then overflow are not finite, and no corner is looked for there.
+_wild_guesses = np.errstate(over="ignore", invalid="ignore")
+
+
+@_wild_guesses
 def _project(parameters: FloatArray, x: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Pixels of scaled board points (n, 2), shape (n, 2)."""
     half, middle = _frame(shape)
@@ -157,6 +162,7 @@ def _project(parameters: FloatArray, x: FloatArray, shape: tuple[int, int]) -> F
     return np.stack([u * stretch + middle[0], v * stretch + middle[1]], axis=-1)
 
 
+@_wild_guesses
 def _jacobian(parameters: FloatArray, x: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Derivative of `_project` by the nine parameters, shape (n, 2, 9)."""
     half, _ = _frame(shape)

@@ -167,7 +167,10 @@ def solve(problem: DriftProblem) -> DriftSolution:
 
 def _inverse(S: FloatArray) -> tuple[FloatArray, float]:
     """Inverse and log determinant of a positive definite matrix, by Cholesky in scaled units."""
-    scale = 1.0 / np.sqrt(np.diagonal(S))
+    diagonal = np.diagonal(S)
+    if not (diagonal > 0.0).all():  # rounding, or numbers that are not finite
+        raise np.linalg.LinAlgError("matrix is not positive definite")
+    scale = 1.0 / np.sqrt(diagonal)
     L = np.linalg.cholesky(S * np.outer(scale, scale))
     inverse = np.linalg.inv(L) * scale
     return inverse.T @ inverse, 2.0 * float(np.log(np.diagonal(L)).sum() - np.log(scale).sum())

@@ -268,7 +268,9 @@ class _Fit:
             return None
         e, J, Jt = lin
         good = weight > 0.25
-        error = float(np.sqrt(np.mean(e[good] ** 2))) if good.any() else np.inf
+        if not good.any():
+            return None
+        error = float(np.sqrt(np.mean(e[good] ** 2)))
         H, g, each = self._normal(e, J, Jt, weight / max(error, 1e-9) ** 2)
         self._prior(H, g, bias)
         try:
