@@ -126,7 +126,7 @@ def test_all_that_was_announced_on_the_way_is_told_at_the_end(
     assert len(told) > 2
     assert [event.said for event in told] == [f"event {k + 1}" for k in range(len(told))]
     text = calibration_text.describe(calibration_run.document(job, outcome))
-    assert all(event in text for event in told)
+    assert all(event.said in text for event in told)
 
 
 def test_the_roles_add_nothing_to_what_the_estimator_is_fed(

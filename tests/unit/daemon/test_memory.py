@@ -134,7 +134,10 @@ def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config:
     assert memory.stored == ["cam0"] and not memory.replaced
     assert memory.devices == {**of_c1, "camera/cam0": "C2"}
     told = memory.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
-    assert told[0] == "camera/cam0 is another device now (serial C2, not C1): the calibration begins anew"
+    assert (
+        event_text(told[0])
+        == "camera/cam0 is another device now (serial C2, not C1): the calibration begins anew"
+    )
     memory.close(None)
     for serial, p_m in (("C1", [0.08, 0.02, -0.03]), ("C2", [0.6, 0.0, 0.0])):
         prior = _later(config, serial).priors()["cam0"]
