@@ -54,7 +54,8 @@ def figure_start(path: Path) -> None:
 
     from vical_daemon.estimation.so3 import quat_from_matrix
     from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-    from vical_daemon.estimation.temporal.rotation_start import camera_turns, shift_costs
+    from vical_daemon.estimation.temporal.rotation_start import shift_costs
+    from vical_daemon.estimation.temporal.rotation_turns import camera_turns
 
     shift, rng, motion = 1.3, np.random.default_rng(1), hand_motion(1, 60.0)
     t_imu = np.arange(0.0, 16.0, 1.0 / IMU_HZ)
