@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from vical_daemon.messages import (
+    COMPRESSED_IMAGE_TYPE,
+    IMAGE_TYPE,
+    IMU_TYPE,
+    POINTS_TYPE,
+    TRACKS_TYPE,
+)
 from vical_daemon.messages.schemas import typestore
 from vical_daemon.recording.logs import LogRecording, RawMessage
 from vical_daemon.recording.model import RecordingError
@@ -32,7 +39,7 @@ class BagRecording(LogRecording):
             ) from None
 
 
-_WANTED = frozenset({"sensor_msgs/msg/Imu", "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
+_WANTED = frozenset({IMU_TYPE, IMAGE_TYPE, COMPRESSED_IMAGE_TYPE, POINTS_TYPE, TRACKS_TYPE})
 
 
 def _to_cdr(data: bytes, type_name: str) -> bytes:

@@ -133,3 +133,10 @@ def test_the_fastest_stream_is_the_reference_however_long_the_recording():
     assert result.reference == "mocap" and result.status == "ok", result.reason
     found = result.sensors["camera"]
     assert abs(found.timeshift_s - 0.12) < 4 * found.timeshift_sigma_s < 4e-3
+
+
+def test_a_gyro_below_10_hz_is_refused_as_calibrate_does():
+    t_imu, gyro, t_cam, R = record(turning, 30.0)
+    result = td_icp(t_imu[::12], gyro[::12], t_cam, R)
+    assert result.status == "refused"
+    assert "8.33 samples a second" in result.reason and "at least 10" in result.reason

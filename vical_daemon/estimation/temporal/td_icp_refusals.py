@@ -36,7 +36,8 @@ def refuse_motion(
     if np.count_nonzero(near) < 2 * MIN_ORIENTATIONS:
         return (
             f"camera and imu do not overlap in time: the camera covers {t_cam[0]:.1f} to {t_cam[-1]:.1f} s, "
-            f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?)"
+            f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?); bring both to "
+            "one epoch, or shift one by the difference"
         )
     mean_rate = _mean_rates(t_imu, gyro[near])
     # Where the camera rests at times, its rate is that in motion, and so must the gyro's be. Pairs that move
@@ -111,7 +112,8 @@ def refuse_start(start: Start | None, options: TdIcpOptions) -> str:
     if start.agreement < 0.3:
         return (
             f"no delay {reach} makes the rotations of camera and gyro agree in size "
-            f"(best: {100 * start.agreement:.0f} % of the turns at {start.timeshift_s:+.2f} s)"
+            f"(best: {100 * start.agreement:.0f} % of the turns at {start.timeshift_s:+.2f} s); is it the "
+            "same recording, and is image stabilisation off?"
         )
     if start.mirrored or start.misfit_rad > max(0.5 * start.typical_rad, 0.01):
         return (
