@@ -29,9 +29,6 @@ _WINDOW_S, _LEAST_S = 20.0, 5.0
 _HOLE_S = 0.5
 _MOST_WINDOWS = 6
 _MOST_STARTS = 3
-# What the sigmas of a window are short of: products of errors scatter, and only their mean is taken off. From
-# `python -m benchmarks td_icp --study tracks` without it (nine sets of 15 s: mean normalised square 1.6).
-_SHORT = 1.3
 _WANTED = [0, 1, 2, 6]  # mounting and delay among the unknowns of a result
 _INLIERS = 0.5
 
@@ -135,8 +132,8 @@ def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -
         [[*so3.log(best.R_imu_cam.T @ f.R_imu_cam), f.timeshift_s - best.timeshift_s] for _, f in fits]
     )
     information = np.linalg.inv(np.stack([f.covariance for _, f in fits]))
-    P = _SHORT**2 * np.linalg.inv(information.sum(axis=0))
-    mean = P @ np.einsum("kij,kj->i", information, offsets) / _SHORT**2
+    P = np.linalg.inv(information.sum(axis=0))
+    mean = P @ np.einsum("kij,kj->i", information, offsets)
     stretches = [(o + x, C) for o, (_, f) in zip(offsets, fits, strict=True) for x, C in f.stretches]
     widened = np.array(
         [
