@@ -16,6 +16,7 @@ from vical_mocks.trajectory import hand_motion
 
 from benchmarks.td_icp_live import study_online, study_wrong
 from benchmarks.td_icp_streams import study_handheld, study_joint, study_real
+from benchmarks.td_icp_tracks import study_tracks
 from benchmarks.td_icp_trials import DEG, HEADER, IMU_HZ, TRAJECTORIES, row_of, simulate_gyro, trial
 
 
@@ -54,7 +55,8 @@ def figure_start(path: Path) -> None:
 
     from vical_daemon.estimation.so3 import quat_from_matrix
     from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-    from vical_daemon.estimation.temporal.rotation_start import camera_turns, shift_costs
+    from vical_daemon.estimation.temporal.rotation_start import shift_costs
+    from vical_daemon.estimation.temporal.rotation_turns import camera_turns
 
     shift, rng, motion = 1.3, np.random.default_rng(1), hand_motion(1, 60.0)
     t_imu = np.arange(0.0, 16.0, 1.0 / IMU_HZ)
@@ -83,7 +85,7 @@ def figure_start(path: Path) -> None:
 def main(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks td_icp", description=__doc__)
     parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--study", default="main,robust,wrong,handheld,joint,real,online")
+    parser.add_argument("--study", default="main,robust,wrong,handheld,joint,tracks,real,online")
     parser.add_argument("--data", type=Path, default=Path("../shared/data/euroc_imu_april"))
     parser.add_argument("--figure", type=Path, help="only draw the figure of the coarse start there")
     args = parser.parse_args(list(argv))
@@ -96,6 +98,7 @@ def main(argv: Sequence[str]) -> int:
         "wrong": lambda: study_wrong(args.trials),
         "handheld": lambda: study_handheld(args.trials),
         "joint": lambda: study_joint(args.trials),
+        "tracks": lambda: study_tracks(min(args.trials, 30)),
         "real": lambda: study_real(args.data),
         "online": study_online,
     }

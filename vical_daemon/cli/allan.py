@@ -47,8 +47,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.tau_min is not None and args.tau_min <= 0:
         raise CliError("--tau-min must be above 0", EXIT_USAGE)
-    samples = imu_data.load(args)
-    _warn_if_moved(samples)
+    samples, remark = imu_data.at_rest(imu_data.load(args))
+    if remark:
+        print(f"vical: warning: {remark}", file=sys.stderr)
     curves: dict[str, list[AllanCurve]] = {"gyro": [], "accel": []}
     fits: dict[str, list[NoiseFit]] = {"gyro": [], "accel": []}
     for sensor, signal in (("gyro", samples.gyro_rps), ("accel", samples.accel_mps2)):
@@ -74,18 +75,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print_tables(samples, fits)
     return 0
-
-
-def _warn_if_moved(samples: EvenSamples) -> None:
-    from vical_daemon.cli.imu_data import moved_at_s
-
-    at_s = moved_at_s(samples)
-    if at_s is not None:
-        print(
-            f"vical: warning: {samples.name}: the IMU moved, first {at_s:.0f} s from the start: these are "
-            "figures of a motion, not of the sensor; use --skip and --seconds, or record it at rest",
-            file=sys.stderr,
-        )
 
 
 def _progress(args: argparse.Namespace, what: str) -> None:

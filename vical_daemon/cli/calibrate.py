@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         from vical_daemon.vision.target import load_target
 
         load_target(Path(args.target))  # a wrong file is refused before the recording is read
-    recording = open_recording(args.input)
+    recording = open_recording(args.input, cameras=[args.camera] if args.camera else ())
     for warning in recording.warnings:
         print(f"vical: warning: {warning}", file=sys.stderr)
     job = calibration_run.make_job(

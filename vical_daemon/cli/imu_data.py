@@ -6,7 +6,7 @@ import argparse
 import csv
 import io
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,8 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.recording.asl import TABLE_LIMIT
 
 MOVED_RPS, MOVED_MPS2 = 9e-3, 0.2  # 0.5 deg/s; twenty mg
+_LIVELY = 5.0  # scatter of the gyro within a second over that of the quietest ones
+LEAST_REST_S = 10.0
 LOST_LIMIT = 0.02  # a recording that misses more samples than this is refused
 
 
@@ -76,20 +78,47 @@ def load(args: argparse.Namespace) -> EvenSamples:
     return samples
 
 
-def moved_at_s(samples: EvenSamples) -> float | None:
-    """Return when a recording that should be at rest first moves, s; None if it never does.
+def at_rest(samples: EvenSamples) -> tuple[EvenSamples, str]:
+    """Return the longest part in which the imu rests, and a remark for people; empty where it never moves.
 
-    Judged by means over a second: warming up and noise stay far below these limits, a touch does not.
+    Judged second by second, against the quietest quarter of them: warming up and noise stay far below the
+    limits, a touch does not. A second beside one that moved does not count as rest.
+
+    Raises:
+        CliError: It never rests for long enough.
     """
     n = max(round(samples.rate_hz), 1)
     count = len(samples.gyro_rps) // n
     if count < 2:
-        return None
-    moved = np.zeros(count, dtype=bool)
-    for signal, limit in ((samples.gyro_rps, MOVED_RPS), (samples.accel_mps2, MOVED_MPS2)):
-        means = signal[: count * n].reshape(count, n, 3).mean(axis=1)
-        moved |= (np.abs(means - np.median(means, axis=0)) > limit).any(axis=1)
-    return float(np.argmax(moved)) * n / samples.rate_hz if moved.any() else None
+        return samples, ""
+    signals = ((samples.gyro_rps, MOVED_RPS), (samples.accel_mps2, MOVED_MPS2))
+    blocks = [signal[: count * n].reshape(count, n, 3) for signal, _ in signals]
+    swing = np.linalg.norm(blocks[0].std(axis=1), axis=1)
+    quiet = swing <= np.quantile(swing, 0.25)
+    moved = swing > np.maximum(_LIVELY * np.median(swing[quiet]), MOVED_RPS)
+    for block, (_, limit) in zip(blocks, signals, strict=True):
+        means = block.mean(axis=1)
+        moved |= (np.abs(means - np.median(means[quiet], axis=0)) > limit).any(axis=1)
+    if not moved.any():
+        return samples, ""
+    beside = moved.copy()
+    beside[1:] |= moved[:-1]
+    beside[:-1] |= moved[1:]
+    edges = np.flatnonzero(np.diff(np.concatenate(([1], beside.astype(np.int64), [1]))))
+    begins, ends = edges[::2], edges[1::2]  # of the runs that rest
+    longest = int(np.argmax(ends - begins)) if len(begins) else 0
+    if not len(begins) or ends[longest] - begins[longest] < LEAST_REST_S:
+        raise CliError(
+            f"{samples.name}: the IMU never rests for {LEAST_REST_S:g} s: its figures would be those of "
+            "a motion; record it at rest"
+        )
+    part = slice(int(begins[longest]) * n, int(ends[longest]) * n)
+    rest = replace(samples, gyro_rps=samples.gyro_rps[part], accel_mps2=samples.accel_mps2[part])
+    first = float(np.argmax(moved)) * n / samples.rate_hz
+    return rest, (
+        f"{samples.name}: the IMU moved, first {first:.0f} s from the start; only its longest rest is used, "
+        f"{part.start / samples.rate_hz:.0f} to {part.stop / samples.rate_hz:.0f} s"
+    )
 
 
 def even_grid(name: str, t_ns: IntArray, gyro: FloatArray, accel: FloatArray) -> EvenSamples:

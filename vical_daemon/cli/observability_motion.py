@@ -33,7 +33,7 @@ def motion_of(args: argparse.Namespace, blocks: frozenset[str]) -> tuple[Motion,
     Raises:
         CliError: No board, no imu, or no motion to work with.
     """
-    recording = open_recording(args.input, check=False)
+    recording = open_recording(args.input, cameras=[args.camera] if args.camera else (), check=False)
     initial = read_initial(args.initial) if args.initial else Initial()
     cameras = recording.cameras
     name = args.camera or next(iter(cameras), None)

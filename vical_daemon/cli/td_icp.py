@@ -84,11 +84,14 @@ def options_of(args: argparse.Namespace, initial: Initial) -> TdIcpOptions:
     return TdIcpOptions(search_s=args.search, gyro_density=noise.gyro_density, gyro_walk=noise.gyro_walk)
 
 
-def open_input(path: str) -> Recording:
-    """Open a recording without judging it; warnings go to stderr."""
+def open_input(path: str, camera: str | None = None) -> Recording:
+    """Open a recording without judging it, of a folder only one camera; warnings go to stderr."""
     from vical_daemon.recording import open_recording
 
-    recording = open_recording(path, check=False)  # wrong units are found here, with the reason
+    cameras = () if camera is None else (camera,)
+    recording = open_recording(
+        path, cameras=cameras, check=False
+    )  # wrong units are found here, with the reason
     for warning in recording.warnings:
         print(f"vical: warning: {warning}", file=sys.stderr)
     return recording
@@ -123,7 +126,7 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     from vical_daemon.estimation.td_icp import REFUSED, td_icp
     from vical_daemon.estimation.temporal.track_registration import track_registration
 
-    recording = open_input(args.input)
+    recording = open_input(args.input, args.camera)
     cameras = recording.cameras
     if not cameras:
         raise CliError(f"{recording.path} holds no camera: neither images nor points")

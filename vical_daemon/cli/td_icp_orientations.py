@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,13 +10,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from vical_drivers.user_files import read_file
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.td_icp_sources import seconds
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
-from vical_daemon.recording.asl import TABLE_LIMIT
+from vical_daemon.recording.trajectory import read_trajectory
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -126,7 +126,7 @@ def _bag_messages(path: Path) -> Iterator[tuple[str, str, Any]]:
 
 
 def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream, int]:
-    """Read a trajectory: TUM (`t x y z qx qy qz qw`, seconds) or EuRoC (`t, x, y, z, qw, qx, qy, qz`, ns).
+    """Read a trajectory file (see `recording.trajectory`); what is unusual about it goes to stderr.
 
     Args:
         path: The file.
@@ -136,38 +136,16 @@ def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream,
         The stream, and the base that was used, ns.
 
     Raises:
-        CliError: The file is neither.
+        CliError: Too few poses, or no orientations.
+        RecordingError: The file is no trajectory, or its columns can be read in two ways.
     """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    lines = read_file(path, TABLE_LIMIT).decode("utf-8", "replace").splitlines()
-    for number, line in enumerate(lines, 1):
-        text = line.strip()
-        if not text or text.startswith("#") or (not rows and not (text[0].isdigit() or text[0] in "-+.")):
-            continue
-        words = text.replace(",", " ").split()
-        try:
-            values = [float(word) for word in words[1:8]]
-            stamp_ns = int(words[0]) if words[0].lstrip("+-").isdigit() else round(float(words[0]) * 1e9)
-        except ValueError:
-            raise CliError(f"{path} line {number}: not a number in '{text[:60]}'") from None
-        if len(values) < 7:
-            raise CliError(
-                f"{path} line {number}: expected `t x y z qx qy qz qw` (TUM) or "
-                "`t, x, y, z, qw, qx, qy, qz` (EuRoC)"
-            )
-        stamps.append(stamp_ns)
-        rows.append(values[3:7])
-    if len(rows) < _MIN_POSES:
-        raise CliError(f"{path}: {len(rows)} poses, at least {_MIN_POSES} are needed")
-    t_ns = np.array(stamps, dtype=np.int64)
-    if np.median(np.diff(t_ns)) < 1000:  # whole seconds or milliseconds would be no trajectory: bare seconds
-        t_ns = t_ns * 1_000_000_000
-    q = np.array(rows)
-    comma = "," in next(line for line in lines if line[:1].isdigit())
-    q = q if comma else q[:, [3, 0, 1, 2]]
-    base = int(t_ns[0]) if base_ns is None else base_ns
-    return _from_quaternions(path.name, t_ns, q, base), base
+    found = read_trajectory(path)
+    for warning in found.warnings:
+        print(f"vical: warning: {warning}", file=sys.stderr)
+    if len(found.t_ns) < _MIN_POSES:
+        raise CliError(f"{path}: {len(found.t_ns)} poses, at least {_MIN_POSES} are needed")
+    base = int(found.t_ns[0]) if base_ns is None else base_ns
+    return _from_quaternions(path.name, found.t_ns, found.q_wxyz, base), base
 
 
 def _from_quaternions(

@@ -41,6 +41,8 @@ def print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[st
     print(f"               ± {sigma_deg[0]:.3f} {sigma_deg[1]:.3f} {sigma_deg[2]:.3f} deg")
     print(f"  gyro bias    {bias[0]:+.3f} {bias[1]:+.3f} {bias[2]:+.3f} deg/s")
     print(f"  noise of one sighting  {np.rad2deg(result.camera_noise_rad):.3f} deg")
+    if result.widened > 1.0:
+        print(f"  sigmas widened {_because(result.widened)}")
     for row in watch:
         jump = "  jumped" if row["jumped"] else ""
         delay = f"{1e3 * row['timeshift_s']:+.3f} ± {1e3 * row['timeshift_sigma_s']:.3f} ms"
@@ -67,3 +69,9 @@ def print_joint(result: JointResult) -> None:
             f"  {name}: R_{result.reference}_{name} q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f} "
             f"± {sigma:.3f} deg, {sensor.pairs} orientations, {sensor.rejected} rejected"
         )
+        if sensor.widened > 1.0:
+            print(f"    its sigmas widened {_because(sensor.widened)}")
+
+
+def _because(widened: float) -> str:
+    return f"{widened:.1f} times: so far do stretches of the recording disagree (does the delay wander?)"

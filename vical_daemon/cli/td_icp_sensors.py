@@ -6,10 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.td_icp import choose_gyro, is_trajectory, open_input, options_of, prior_of
 from vical_daemon.cli.td_icp_orientations import pose_topic, trajectory_file
 from vical_daemon.cli.td_icp_sources import camera_stream, seconds
+from vical_daemon.estimation import so3
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
 from vical_daemon.estimation.temporal.td_icp_joint import (
     JointResult,
     OrientationStream,
@@ -20,6 +25,9 @@ from vical_daemon.recording import Recording, RecordingError
 
 if TYPE_CHECKING:
     from vical_daemon.priors import Initial
+
+_INTEGRATED_HZ = 30.0  # of a gyro's attitude: what lies between adds nothing to a hand's motion
+_INTEGRATED_SIGMA_RAD = 3e-3  # only a start: the fit measures it
 
 
 def register(args: argparse.Namespace, initial: Initial, names: list[str]) -> JointResult:
@@ -42,18 +50,30 @@ def register(args: argparse.Namespace, initial: Initial, names: list[str]) -> Jo
     recording = _recording(args.input, names)
     imus = {} if recording is None else recording.imus
     gyros = [name for name in names if name in imus]
-    if len(gyros) > 1:
-        raise CliError(f"one imu can be the reference, {' and '.join(gyros)} are two", EXIT_USAGE)
     base_ns = None if recording is None else recording.begin_ns
     streams = []
     for name in names:
-        if name not in gyros:
+        if recording is not None and name in gyros[1:] and base_ns is not None:
+            streams.append(_integrated(recording, name, base_ns))
+        elif name not in gyros:
             stream, base_ns = _stream(args, initial, recording, name, base_ns)
             streams.append(stream)
     if gyros and recording is not None and base_ns is not None:
         imu, t_ns, gyro = choose_gyro(recording, gyros[0])
         return joint_with_gyro(imu, seconds(t_ns, base_ns), gyro, streams, options)
     return joint_of_orientations(streams, options)
+
+
+def _integrated(recording: Recording, name: str, base_ns: int) -> OrientationStream:
+    """A further imu as a stream of orientations: its integrated gyro; its bias joins the reference's."""
+    _, t_ns, gyro = choose_gyro(recording, name)
+    cleaned = clean_gyro(seconds(t_ns, base_ns), gyro)
+    if isinstance(cleaned, str):
+        raise CliError(f"{name}: {cleaned}")
+    curve = GyroCurve.integrate(*cleaned, np.zeros(3))
+    step = max(1, round(1.0 / (_INTEGRATED_HZ * float(np.median(np.diff(curve.t_s))))))
+    R = so3.matrix_from_quat(curve.q_ref_imu[::step])
+    return OrientationStream(name, curve.t_s[::step], R, _INTEGRATED_SIGMA_RAD)
 
 
 def _recording(path: str, names: list[str]) -> Recording | None:

@@ -22,17 +22,6 @@ from vical_daemon.recording import Recording, Stream
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-_POSE_SIGMA_RAD = 3e-3  # only a start: the fit measures it
-# type -> path of the quaternion inside the message
-_POSE_TYPES = {
-    "nav_msgs/msg/Odometry": "pose.pose.orientation",
-    "geometry_msgs/msg/PoseStamped": "pose.orientation",
-    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose.orientation",
-    "geometry_msgs/msg/TransformStamped": "transform.rotation",
-    "geometry_msgs/msg/QuaternionStamped": "quaternion",
-    "sensor_msgs/msg/Imu": "orientation",
-}
-
 
 def seconds(t_ns: IntArray, base_ns: int) -> FloatArray:
     """Stamps in seconds since a base: what is small enough for a float to keep every nanosecond."""

@@ -22,6 +22,7 @@ from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.rotation_registration import Registration, closest_point_registration
 from vical_daemon.estimation.temporal.rotation_start import Start, debiased_start
 from vical_daemon.estimation.temporal.rotation_suspects import explain
+from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 from vical_daemon.estimation.temporal.td_icp_input import (
     clean_gyro,
     clean_orientations,
@@ -78,8 +79,13 @@ def td_icp(
     base = float(imu[0][0])
     shifts = (options.timeshift_guess_s - options.search_s, options.timeshift_guess_s + options.search_s)
     t_cam, R, covariance, index = cam
-    data = _Data(imu[0] - base, imu[1], t_cam - base, R, covariance, so3.quat_from_matrix(R), index, n_given)
-    return _register(data, shifts, options)
+    q = so3.quat_from_matrix(R)
+    keep = without_long_rest(t_cam, q)
+    data = _Data(
+        imu[0] - base, imu[1], t_cam[keep] - base, R[keep], covariance[keep], q[keep], index[keep], n_given
+    )
+    result = _register(data, shifts, options)
+    return replace(result, at_rest=int(np.count_nonzero(~keep)))
 
 
 @dataclass(frozen=True)
@@ -112,7 +118,7 @@ def _register(data: _Data, shifts: tuple[float, float], options: TdIcpOptions) -
     if refusal.reason:
         return data.refused(refusal.reason, still=refusal.still)
     start, bias = debiased_start(data.t_imu, data.gyro, t_cam, q, shifts)
-    reason = refuse_start(start, t_cam, q, options)
+    reason = refuse_start(start, options)
     if start is None or reason:
         return data.refused(data.mistake(shifts, start) or reason)
     curve = GyroCurve.integrate(data.t_imu, data.gyro, bias)
@@ -191,4 +197,5 @@ def _result(
         used=used,
         stamp_rate=float(fit.stamp_rate[0]),
         stamp_rate_sigma=float(fit.stamp_rate_sigma[0]),
+        widened=float(fit.widened[0].max()),
     )

@@ -19,13 +19,19 @@ __all__ = ["ImuArrays", "Kind", "Recording", "RecordingError", "Stream", "check_
 
 
 def open_recording(
-    path: Path | str, *, topics: Collection[str] | None = None, check: bool = True
+    path: Path | str,
+    *,
+    topics: Collection[str] | None = None,
+    cameras: Collection[str] = (),
+    check: bool = True,
 ) -> Recording:
     """Open a recording of any kind.
 
     Args:
         path: File or folder.
         topics: Topics, or names of imus and cameras, to take; None: all that are of use.
+        cameras: Of the cameras only these, where there is one of them: files of an ASL folder that belong to
+            others may be as broken as they like.
         check: Refuse wrong units, rates and clocks (`check_recording`).
 
     Raises:
@@ -34,9 +40,7 @@ def open_recording(
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path} does not exist; check the path")
-    recording = _open(path, topics)
-    if topics is not None and isinstance(recording, AslRecording):
-        recording.streams = tuple(s for s in recording.streams if s.name in topics)
+    recording = _open(path, topics, cameras)
     if check:
         check_recording(recording)
     return recording
@@ -56,13 +60,13 @@ def check_recording(recording: Recording) -> None:
         recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
 
 
-def _open(path: Path, topics: Collection[str] | None) -> Recording:
+def _open(path: Path, topics: Collection[str] | None, cameras: Collection[str]) -> Recording:
     if path.is_dir():
         if any(path.glob("*.mcap")):  # also of a ROS 2 bag folder: our reader bears damage
             return McapRecording(path, topics)
         if (path / "metadata.yaml").is_file():
             return BagRecording(path, topics)
-        return AslRecording(path)
+        return AslRecording(path, topics, cameras)
     if path.suffix == ".bag":
         return BagRecording(path, topics)
     if path.suffix == ".mcap" or path.name.endswith(".mcap.part"):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import gzip
 import io
 import os
+import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,15 @@ class _Source:
 class AslRecording(Recording):
     """An ASL folder; numbers are kept bit for bit as the text says them."""
 
-    def __init__(self, folder: Path) -> None:
-        """Parse all tables (images are read later, one by one).
+    def __init__(
+        self, folder: Path, names: Collection[str] | None = None, cameras: Collection[str] = ()
+    ) -> None:
+        """Parse the tables (images are read later, one by one).
+
+        Args:
+            folder: With `mav0`, or that itself.
+            names: Imus and cameras to read; None: all. Files of others are not looked at.
+            cameras: Of the cameras only these, if the folder has one of them.
 
         Raises:
             RecordingError: No imu or no camera there, or a table that cannot be read.
@@ -64,12 +72,20 @@ class AslRecording(Recording):
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         self._sources: list[_Source] = []
         for table in sorted(root.glob("imu*/data.csv")):
+            if names is not None and table.parent.name not in names:
+                continue
             self._sources.append(self._read_imu(table))
-        for camera in sorted(path for path in root.glob("cam*") if path.is_dir()):
+        folders = sorted(path for path in root.glob("cam*") if path.is_dir())
+        wanted = [path for path in folders if path.name in cameras] or folders
+        for camera in wanted:
+            if names is not None and camera.name not in names:
+                continue
             source = self._read_camera(camera)
             if source is not None:
                 self._sources.append(source)
         self.streams = tuple(source.stream for source in self._sources)
+        if not self.streams and names is not None and list(root.glob("imu*/data.csv")):
+            raise RecordingError(f"{folder} holds none of {', '.join(sorted(names))}")
         if not self.streams:
             raise RecordingError(
                 f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
@@ -97,7 +113,7 @@ class AslRecording(Recording):
 
     def _read_imu(self, path: Path) -> _Source:
         name = path.parent.name
-        rows = _load(path, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
+        rows = self._load(path, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
         finite = np.isfinite(rows["values"]).all(axis=1)
         rows = self._sorted(rows[finite], name, drop_equal=True)
         if not finite.all():
@@ -123,7 +139,7 @@ class AslRecording(Recording):
         return self._read_images(path, folder) if path.is_file() else None
 
     def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
-        rows = _load(path, _POINT_ROW, "timestamp [ns], id, u and v columns")
+        rows = self._load(path, _POINT_ROW, "timestamp [ns], id, u and v columns")
         finite = np.isfinite(rows["uv"]).all(axis=1)
         if not finite.all():
             self.warnings.append(f"{name}: {int((~finite).sum())} points that are not finite left out")
@@ -143,7 +159,13 @@ class AslRecording(Recording):
         return _Source(stream, t_ns, build)
 
     def _read_images(self, table: Path, folder: Path) -> _Source:
-        stamps, files = _image_list(table, folder)
+        stamps, files, lost = _image_list(table, folder)
+        if lost and not stamps:
+            raise RecordingError(
+                f"{table} line 1: there is no image {lost[0]} beside it, nor any other listed"
+            )
+        if lost:
+            self.warnings.append(f"{folder.name}: {len(lost)} images listed but not there, first {lost[0]}")
         if not stamps:
             raise RecordingError(f"{table}: no images listed")
         order = np.argsort(np.array(stamps, dtype=np.int64), kind="stable")
@@ -161,6 +183,22 @@ class AslRecording(Recording):
             )
 
         return _Source(self._stream("compressed", folder.name, table, t_ns), t_ns, build)
+
+    def _load(self, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
+        """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
+        text = _read_text(path)
+        whole = _without_cut_line(text, _width(dtype))
+        if len(whole) < len(text):
+            self.warnings.append(
+                f"{path.parent.name}: the last line of {path.name} is cut off; 1 line left out"
+            )
+        title = text[: text.find(b"\n")].decode("utf-8", "replace") if dtype == _IMU_ROW else ""
+        if _accelerometer_first(title):
+            raise RecordingError(
+                f"{path}: its title names the accelerometer before the gyro; {columns} are expected in this "
+                "order: swap the columns"
+            )
+        return _load(whole, path, dtype, columns)
 
     def _sorted(self, rows: npt.NDArray[Any], name: str, *, drop_equal: bool) -> npt.NDArray[Any]:
         """Return the rows in order of their stamps."""
@@ -197,9 +235,17 @@ class AslRecording(Recording):
         return Stream(key, kind, name, str(path), *stream_statistics(t_ns), resolution)
 
 
-def _load(path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
-    """Parse a table of numbers, plain or gzipped; stamps as integers, no digit is lost."""
-    text = _read_text(path)
+def _without_cut_line(text: bytes, columns: int) -> bytes:
+    """Return a table without its last line where that has no end and too few columns."""
+    kept, newline, last = text.rpartition(b"\n")
+    if not newline or not last.strip() or last.lstrip().startswith(b"#"):
+        return text
+    cells = last.split(b",")
+    return text if len(cells) >= columns and all(cell.strip() for cell in cells[:columns]) else kept + newline
+
+
+def _load(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
+    """Parse a table of numbers; stamps as integers, no digit is lost."""
     begin = _first_data_row(text)
     try:
         rows: npt.NDArray[Any] = np.loadtxt(
@@ -214,6 +260,14 @@ def _load(path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
         reason = str(error).split(";")[0].rstrip(".")
         raise RecordingError(f"{path}: {reason}; expected {columns}") from None
     return rows
+
+
+def _accelerometer_first(title: str) -> bool:
+    """Whether a table's title says that the accelerometer's columns stand in front of the gyro's."""
+    names = [name.strip().lower() for name in title.lstrip("# ").split(",")]
+    accel = [i for i, name in enumerate(names) if re.match(r"a(?![a-z]*(ng|tt))|lin|spec|force|f_", name)]
+    gyro = [i for i, name in enumerate(names) if re.match(r"w(_|x|y|z)|gyr|ang|omega|rot", name)]
+    return len(accel) >= 3 and len(gyro) >= 3 and accel[0] < gyro[0]
 
 
 def _width(dtype: np.dtype[Any]) -> int:
@@ -259,9 +313,9 @@ def _first_data_row(text: bytes) -> int:
     return 0
 
 
-def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path]]:
-    """Return stamps and files of ``data.csv``; names may not lead out of the folder."""
-    stamps, files = [], []
+def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path], list[str]]:
+    """Return stamps and files of ``data.csv``, and names without a file; names stay inside of the folder."""
+    stamps, files, lost = [], [], []
     for number, line in enumerate(_read_text(table).decode("utf-8", "replace").splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -273,12 +327,13 @@ def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path]]:
             )
         path = next((p for p in (folder / "data" / name, folder / name) if p.is_file()), None)
         if path is None:
-            raise RecordingError(f"{table} line {number}: there is no image {name} beside it")
+            lost.append(name)
+            continue
         if path.suffix.lower() not in _IMAGE_SUFFIXES:
             raise RecordingError(f"{path}: images must be png or jpg")
         stamps.append(int(stamp))
         files.append(path)
-    return stamps, files
+    return stamps, files, lost
 
 
 def _resolution(folder: Path) -> tuple[int, int] | None:

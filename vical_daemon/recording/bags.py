@@ -12,6 +12,13 @@ from typing import Any
 from vical_drivers.user_files import open_file
 
 from vical_daemon.mcap_log.chunks import CHUNK_LIMIT, Budget, decompress_lz4
+from vical_daemon.messages import (
+    COMPRESSED_IMAGE_TYPE,
+    IMAGE_TYPE,
+    IMU_TYPE,
+    POINTS_TYPE,
+    TRACKS_TYPE,
+)
 from vical_daemon.messages.schemas import typestore
 from vical_daemon.recording.logs import LogRecording, RawMessage
 from vical_daemon.recording.model import RecordingError
@@ -130,7 +137,7 @@ class BagRecording(LogRecording):
                 yield RawMessage(connection.topic, connection.msgtype, log_time_ns, payload)
 
 
-_WANTED = frozenset({"sensor_msgs/msg/Imu", "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
+_WANTED = frozenset({IMU_TYPE, IMAGE_TYPE, COMPRESSED_IMAGE_TYPE, POINTS_TYPE, TRACKS_TYPE})
 
 
 def _to_cdr(data: bytes, type_name: str) -> bytes:

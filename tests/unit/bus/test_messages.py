@@ -378,8 +378,8 @@ def test_every_cut_is_refused(decode):
             decode(good[:length])
 
 
-# A calibration that ends here is one of version 0.1.0, closed by the NUL of a string and at most 3 bytes of padding;
-# what follows is aligned and begins with the number of events.
+# A calibration that ends here is one of version 0.1.0, closed by the NUL of a string and at most 3 bytes of
+# padding; what follows is aligned and begins with the number of events.
 _EVENTS_AT = GOOD[m.decode_calibration].index(b"\x07\0\0\0bumped\0") - 4
 _END_OF_0_1_0 = len(GOOD[m.decode_calibration][:_EVENTS_AT].rstrip(b"\0")) + 1
 _ENDS_OF_0_1_0 = {m.decode_calibration: set(range(_END_OF_0_1_0, _END_OF_0_1_0 + 4))}

@@ -216,7 +216,15 @@ def test_units_and_motion_are_noticed(tmp_path, capsys):
     touched[1205:1290, 1] = 0.05
     code, error = allan(touched, down)
     assert code == 0
-    assert "the IMU moved, first 12 s from the start" in error
+    assert "the IMU moved, first 12 s from the start; only its longest rest is used, 0 to 11 s" in error
+    moving = 0.5 * np.sin(np.arange(2000) / 30.0)[:, None] * np.ones(3)
+    code, error = allan(moving, down)
+    assert code == 1
+    assert "never rests for 10 s" in error
+    moving[700:1900] = 0.0
+    code, error = allan(moving, down)
+    assert code == 0
+    assert "8 to 18 s" in error
 
 
 def test_many_lost_samples_are_refused(tmp_path, capsys):

@@ -8,7 +8,7 @@ import numpy as np
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.temporal.rotation_start import camera_turns
+from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 
 _HALF_S = 0.2  # windows of 0.4 s: hand motion is straight enough, 2 mm of noise give 0.1 m/s^2
 _STEP_S = 0.01
@@ -83,7 +83,7 @@ def gather(path: CameraPath) -> Evidence | None:
     kernels = np.array([kernel for _, kernel in windows])
     weights = np.array([weight for weight, _ in windows])
     sigma = np.linalg.norm(weights * path.sigma_m, axis=1)
-    turns = camera_turns(t, so3.quat_from_matrix(R), most=len(t) // 2)
+    turns = evenly(turns_apart(t, so3.quat_from_matrix(R)), len(t) // 2)
     first, second, turn = turns.first, turns.second, turns.rotvec_cam
     turn_sigma = np.hypot(path.sigma_rad[first], path.sigma_rad[second])
     others = _other_unknowns(weights, kernels, R, R_grid, sigma, (t[second] - t[first]) / turn_sigma)

@@ -10,7 +10,7 @@ fitted along: a turn by a known angle moves a feature by a length in pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +19,14 @@ from vical_daemon.estimation.camera_model import project_jacobians
 from vical_daemon.estimation.camera_rays import unproject
 from vical_daemon.estimation.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
+from vical_daemon.estimation.temporal.epipolar_errors import (
+    Effects,
+    TrackNoise,
+    gyro_scores,
+    persistent_scores,
+    sighting_errors,
+    track_noise,
+)
 from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
 from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
 
@@ -28,6 +36,11 @@ _BIAS_SIGMA_RPS = 0.02  # of a gyro that was not zeroed
 _FOCAL_SIGMA, _RATIO_SIGMA, _CENTRE_SIGMA = 0.1, 0.003, 0.03
 _DISTORTION_SIGMA = {"radtan": (0.1, 0.1, 0.005, 0.005), "equidistant": (0.05, 0.05, 0.05, 0.05)}
 _LENS_AFTER = 4  # iterations with the lens as given
+_GOOD = 0.25  # weight of a feature that fits
+_LEAST_SLOPE = 0.2
+_BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
+_FAR_S, _FAR_EVERY = (1.0, 2.0), 4  # pairs that show how long errors last
+_STRETCH_S = 5.0  # of the data, solved alone for comparison
 _BLOCK_S = 0.5  # errors of the fit are taken as independent beyond this
 
 
@@ -45,6 +58,9 @@ class EpipolarFit:
         timeshift_sigma_s: s.
         error: RMS epipolar error of the pairs used, in focal lengths.
         inliers: Share of the feature pairs that fit.
+        stretches: What stretches of the data say alone, [mounting about the camera's axes, rad; delay, s] and
+            its covariance, with errors that persist along tracks; empty unless asked for.
+        covariance: The same for the whole, shape (4, 4); with errors that persist.
     """
 
     R_imu_cam: FloatArray
@@ -56,6 +72,8 @@ class EpipolarFit:
     timeshift_sigma_s: float
     error: float
     inliers: float
+    stretches: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
+    covariance: FloatArray = field(default_factory=lambda: np.full((4, 4), np.nan))
 
 
 def epipolar_fit(
@@ -69,6 +87,7 @@ def epipolar_fit(
     fit_lens: bool = False,
     max_step_s: float = 0.02,
     most: int = _ITERATIONS,
+    gyro_density: float | None = None,
 ) -> EpipolarFit | None:
     """Fit mounting, delay, gyro bias (and the focal length) to tracks.
 
@@ -82,6 +101,8 @@ def epipolar_fit(
         fit_lens: Fit the lens too, within what a rough lens may be off by.
         max_step_s: Largest change of the delay in one iteration, s.
         most: Iterations.
+        gyro_density: Of the gyro's noise, rad/s/sqrt(Hz); where given, what is known of errors that persist
+            along tracks goes into `covariance` and `stretches`.
 
     Returns:
         The fit; None where the tracks do not allow one. Sigmas are empirical (sandwich over half-second
@@ -91,6 +112,7 @@ def epipolar_fit(
     if pairs is None:
         return None
     fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens, max_step_s)
+    fit.gyro_density, fit.frames = gyro_density, frames
     return fit.run(R_imu_cam.copy(), timeshift_s, most)
 
 
@@ -116,6 +138,8 @@ class _Fit:
         self.pairs, self.fit_lens, self.max_step_s = pairs, fit_lens, max_step_s
         self.intrinsics, self.distortion, self.model = lens[0].copy(), lens[1].copy(), lens[2]
         self.given = (lens[0].copy(), lens[1].copy())
+        self.gyro_density: float | None = None
+        self.frames: list[tuple[float, PointsFrame]] = []
         self.dray: list[FloatArray] = []
         self.shrinking = np.zeros((len(pairs.of), 2))
         self._rays()
@@ -217,14 +241,18 @@ class _Fit:
             across = ta[:, :2] ** 2 + tb[:, :2] ** 2
             self.shrinking = usable[:, None] * across / across.sum(-1, keepdims=True) / self.intrinsics[:2]
         # a turn delta local to the second image: d . (a x R (delta x b)) = delta . (b x R^T (d x a))
-        local = cross(self.b, np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0])
+        back = np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0]
+        local = cross(self.b, back)
         by_turn = self._turns(R, R12, dR, rate, area, A2)
         J = np.einsum("ni,nik->nk", local, by_turn[p.of])
         if self.fit_lens:
-            back = np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0]
             lens = np.einsum("ni,nik->nk", back, self.dray[1]) - np.einsum("ni,nik->nk", tb, self.dray[0])
             J = np.concatenate([J, lens], axis=1)
         Jt = np.einsum("ni,nik->nk", n, Bt)
+        if self.gyro_density is not None:
+            share = (usable / length)[:, None]
+            turned = np.matmul((A2 @ R)[p.of], local[..., None])[..., 0]
+            self.effects = Effects(-tb[:, :2] * share, back[:, :2] * share, turned * share)
         return e, J * (usable / length)[:, None], Jt * (usable / length)[:, None]
 
     def _turns(
@@ -267,7 +295,7 @@ class _Fit:
         if lin is None:
             return None
         e, J, Jt = lin
-        good = weight > 0.25
+        good = weight > _GOOD
         if not good.any():
             return None
         error = float(np.sqrt(np.mean(e[good] ** 2)))
@@ -283,6 +311,14 @@ class _Fit:
         np.add.at(sums, block, each)
         covariance = inverse @ (sums.T @ sums) @ inverse + inverse
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        stretches: list[tuple[FloatArray, FloatArray]] = []
+        whole = np.full((4, 4), np.nan)
+        if self.gyro_density is not None:
+            self.noise = self._track_noise((R, shift, bias), e, good)
+            stretches, whole, slope = self._persistent((e, J, Jt, weight), H.shape[0], error, bias)
+            bent = self._bent_by_noise(R, shift, bias, weight, slope, error)
+            R, shift = R @ so3.exp(-bent[:3]), shift - float(bent[3])
+            whole = whole + _BENT_UNSURE**2 * np.outer(bent, bent)
         if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
             return None
         return EpipolarFit(
@@ -295,4 +331,118 @@ class _Fit:
             float(sigma[3]),
             error,
             float(good[self.ok].mean()),
+            stretches,
+            whole,
         )
+
+    def _persistent(
+        self,
+        rows: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+        size: int,
+        error: float,
+        bias: FloatArray,
+    ) -> tuple[list[tuple[FloatArray, FloatArray]], FloatArray, float]:
+        """Answers of stretches, covariance of the whole, with errors that persist; slope of the influence."""
+        e, J, Jt, weight = rows
+        p, good = self.pairs, (weight > _GOOD).astype(np.float64)
+        # a robust fit gives way by the slope of its influence, not by its weight: the large errors hold less
+        u2 = 1.0 / np.sqrt(np.maximum(weight, 1e-12)) - 1.0
+        slope = float((good * weight * (1.0 - 3.0 * u2) / (1.0 + u2)).sum() / max(good.sum(), 1.0))
+        slope = max(slope, _LEAST_SLOPE)
+        # in the gradient large errors count by their weight: smaller, but as persistent
+        gain = float((good * (weight * e) ** 2).sum() / max(float((good * e**2).sum()), 1e-30))
+        noise = replace(self.noise, white=gain * self.noise.white, persistent=gain * self.noise.persistent)
+        prior, off = np.zeros((size, size)), np.zeros(size)
+        self._prior(prior, off, bias)
+        t = self.t_cam[p.first]
+        count = max(1, int((t[-1] - t[0]) / _STRETCH_S))
+        stretch = np.minimum(((t - t[0]) / max(t[-1] - t[0], 1e-9) * count).astype(int), count - 1)
+        assert self.gyro_density is not None
+        out = []
+        for chosen in [np.ones(len(t), dtype=np.bool_), *(stretch == k for k in range(count))]:
+            w = good * chosen[p.of] / max(error, 1e-9) ** 2
+            H, g, _ = self._normal(weight * e, J, Jt, w)
+            clear = self._without_direction(J, Jt, w) * w[:, None]
+            M = persistent_scores(clear, p, self.t_cam, self.effects, noise)
+            M += slope**2 * gyro_scores(clear, p, self.t_cam, self.effects, self.gyro_density)
+            inverse = np.linalg.inv(slope * H + prior)
+            C = inverse @ (M + prior) @ inverse
+            out.append((-(inverse @ (g + off))[:4], C[:4, :4]))
+        return out[1:], out[0][1], slope
+
+    def _bent_by_noise(
+        self,
+        R: FloatArray,
+        shift: float,
+        bias: FloatArray,
+        weight: FloatArray,
+        slope: float,
+        error: float,
+    ) -> FloatArray:
+        """What the errors of the sightings do to mounting and delay on average, shape (4,).
+
+        Rays with errors give directions and derivatives with errors of their own, which do not average out:
+        0.5 px turned the mounting by 0.2 deg. Errors of the same size are added once more, and again with the
+        opposite sign so that what is linear in them cancels; they move the answer as far again [Cook and
+        Stefanski, "Simulation-extrapolation estimation in parametric measurement error models", 1994].
+        """
+        given = self.pairs
+        first, second = sighting_errors(given, self.t_cam, self.noise, float(np.mean(self.intrinsics[:2])))
+        good = weight > _GOOD
+        moved: list[FloatArray] = []
+        squares: list[float] = []
+        H: FloatArray = np.zeros((0, 0))
+        for sign in (0.0, 1.0, -1.0):
+            self.pairs = replace(given, uv_1=given.uv_1 + sign * first, uv_2=given.uv_2 + sign * second)
+            self._rays()
+            lin = self._linearise(R, shift, bias)
+            if lin is None:
+                break
+            w = weight / max(error, 1e-9) ** 2
+            h, g, _ = self._normal(lin[0], lin[1], lin[2], w)
+            g[7:9] += (w * lin[0] ** 2) @ self.shrinking if self.fit_lens else 0.0
+            self._prior(h, np.zeros(len(g)), bias)
+            H = h if not moved else H
+            moved.append(g)
+            squares.append(float(np.mean(lin[0][good] ** 2)))
+        self.pairs = given
+        self._rays()
+        if len(moved) < 3:
+            return np.zeros(4)
+        # as much as doubles the residuals' variance, and by the slope of the influence as in `_persistent`
+        grown = 0.5 * (squares[1] + squares[2]) - squares[0]
+        share = squares[0] / max(grown, 0.1 * squares[0])
+        give = slope * float(np.mean(good)) / max(float(np.mean(weight)), 1e-9)
+        change = 0.5 * (moved[1] + moved[2]) - moved[0]
+        return np.asarray(-share * np.linalg.solve(give * H, change)[:4], dtype=np.float64)
+
+    def _track_noise(
+        self, at: tuple[FloatArray, float, FloatArray], e: FloatArray, good: BoolArray
+    ) -> TrackNoise:
+        """Errors of single sightings by the residuals, those of pairs far apart among them."""
+        lag = (self.t_cam[self.pairs.second] - self.t_cam[self.pairs.first])[self.pairs.of]
+        short, effects = self.pairs, self.effects
+        parts = [(e[good], lag[good], effects.by_first[good], effects.by_second[good])]
+        far = make_pairs(self.frames, _FAR_S, _FAR_EVERY)
+        if far is not None:
+            self.pairs = far
+            self._rays()
+            lin = self._linearise(*at)
+            if lin is not None:
+                lag = (self.t_cam[far.second] - self.t_cam[far.first])[far.of]
+                near = np.abs(lin[0]) < 2.5 * 1.4826 * np.median(np.abs(lin[0][self.ok])) + 1e-9
+                near &= self.ok
+                by = self.effects
+                parts.append((lin[0][near], lag[near], by.by_first[near], by.by_second[near]))
+            self.pairs, self.effects = short, effects
+            self._rays()
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return track_noise(columns[0], columns[1], columns[2], columns[3])
+
+    def _without_direction(self, J: FloatArray, Jt: FloatArray, weight: FloatArray) -> FloatArray:
+        """Derivatives by the shared unknowns with each pair's direction following along, shape (n, p)."""
+        begin, wJt = self.pairs.begin, Jt * weight[:, None]
+        tt = np.add.reduceat(wJt[:, :, None] * Jt[:, None, :], begin) + 1e-9 * np.eye(2)
+        tx = np.add.reduceat(wJt[:, :, None] * J[:, None, :], begin)
+        out: FloatArray = J - np.einsum("ni,nik->nk", Jt, np.linalg.solve(tt, tx)[self.pairs.of])
+        return out

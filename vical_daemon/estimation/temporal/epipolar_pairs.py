@@ -20,6 +20,7 @@ class Pairs:
         first, second: Places of the pair's images in the list of images, shape (P,).
         begin: First row of the pair, shape (P,).
         of: Pair of each row, shape (n,).
+        ids: Feature of each row, shape (n,).
         uv_1, uv_2: Pixels in both images, shape (n, 2).
     """
 
@@ -27,31 +28,37 @@ class Pairs:
     second: IntArray
     begin: IntArray
     of: IntArray
+    ids: IntArray
     uv_1: FloatArray
     uv_2: FloatArray
 
 
-def make_pairs(frames: list[tuple[float, PointsFrame]]) -> Pairs | None:
+def make_pairs(
+    frames: list[tuple[float, PointsFrame]], lags_s: tuple[float, ...] = _LAGS_S, every: int = 1
+) -> Pairs | None:
     """Pair images a tenth, a quarter and half a second apart; None where too few share features.
 
     Args:
         frames: (stamp in the camera's clock in s, tracks), in order of time.
+        lags_s: Other times apart, s.
+        every: Begin a pair in every n-th image only.
     """
     t = np.array([s for s, _ in frames])
-    first, second, count, uv_1, uv_2 = [], [], [], [], []
-    for lag in _LAGS_S:
+    first, second, count, ids, uv_1, uv_2 = [], [], [], [], [], []
+    for lag in lags_s:
         step = max(1, int(np.median(np.searchsorted(t, t[: len(t) // 2] + lag) - np.arange(len(t) // 2))))
-        for i in range(len(t) - step):
+        for i in range(0, len(t) - step, every):
             j = i + step
             if not 0.3 * lag < t[j] - t[i] < 3.0 * lag:
                 continue
             a, b = frames[i][1], frames[j][1]
-            _, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+            shared, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
             if len(ka) < _MIN_SHARED:
                 continue
             first.append(i)
             second.append(j)
             count.append(len(ka))
+            ids.append(shared)
             uv_1.append(a.uv_px[ka])
             uv_2.append(b.uv_px[kb])
     if len(first) < 10:
@@ -62,6 +69,7 @@ def make_pairs(frames: list[tuple[float, PointsFrame]]) -> Pairs | None:
         np.array(second),
         np.concatenate([[0], np.cumsum(sizes)[:-1]]),
         np.repeat(np.arange(len(sizes)), sizes),
+        np.concatenate(ids),
         np.concatenate(uv_1),
         np.concatenate(uv_2),
     )

@@ -24,6 +24,7 @@ from vical_daemon.estimation.temporal.orientation_problem import (
     linearise,
 )
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
+from vical_daemon.estimation.temporal.stretch_agreement import widening
 
 __all__ = ["DriftNoise", "Fit", "OrientationSensor", "polish"]
 
@@ -52,6 +53,8 @@ class Fit:
         stamp_rate: By how much the delay of each sensor grows with time, s/s, shape (S,). No part of the
             solution, where delays are constant: a value far from zero says that the stamps are wrong.
         stamp_rate_sigma: Its standard deviation, s/s, shape (S,).
+        widened: By how much stretches of the data disagree beyond their sigmas, [mounting, shift] of each
+            sensor; `covariance` is widened by it, shape (S, 2).
     """
 
     sensors: tuple[OrientationSensor, ...]
@@ -61,6 +64,7 @@ class Fit:
     rounds: int
     stamp_rate: FloatArray
     stamp_rate_sigma: FloatArray
+    widened: FloatArray
 
 
 def polish(
@@ -100,8 +104,11 @@ def polish(
         if not done:
             curve = make_curve(bias)
     assert solution is not None
-    rates = _stamp_rates(linear, len(sensors), scales_of(sensors, log_gyro))
-    return Fit(sensors, _wanted(solution.covariance, len(sensors)), bias, log_gyro, rounds, *rates)
+    S, scales = len(sensors), scales_of(sensors, log_gyro)
+    widened = widening(scaled(linear, scales), linear.used, S)
+    factor = np.concatenate([np.repeat(widened, (3, 1), axis=1).ravel(), np.ones(3)])
+    covariance = _wanted(solution.covariance, S) * np.outer(factor, factor)
+    return Fit(sensors, covariance, bias, log_gyro, rounds, *_stamp_rates(linear, S, scales), widened)
 
 
 def _stamp_rates(linear: Linear, S: int, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -138,6 +145,7 @@ def _update(
         local = np.einsum("kji,kj->ki", s.R_world_ref.T @ s.R_world_sensor, noise[rows])
         d2 = np.einsum("ki,ki->k", local, np.linalg.solve(s.covariance, local[..., None])[..., 0])
         by_median = 0.5 * float(np.log(max(float(np.median(d2)), 1e-12) / _MEDIAN_CHI2_3))
+        by_median = max(by_median, s.least_log_scale)
         log_scale = by_median if rescale else s.log_scale
         largest = max(largest, abs(float(x[3])))
         # the gate may not close in on itself: it stays as wide as the median of all demands

@@ -61,9 +61,12 @@ def estimate_scales(
     S = len(sensors)
     counts = np.array([np.count_nonzero(linear.used & (linear.sensor == i)) for i in range(S)])
 
+    least = np.array([s.least_log_scale for s in sensors])
+
     def cost(values: FloatArray) -> float:
         likelihood = drift_cost(scaled(linear, values)) + 6.0 * float(counts @ values[:S])
         outside = np.maximum(np.abs(values[S : 2 * S]) - _SLOW_LIMITS[1], 0.0)
+        outside = np.concatenate((outside, np.maximum(least - values[:S], 0.0)))
         return likelihood + float(values[-1] / noise.log_sigma) ** 2 + 1e3 * float(outside @ outside)
 
     scales = scales_of(sensors, log_gyro)

@@ -21,6 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
 _MIN_INTERVAL_S = 2e-5  # two sensors may see the same instant; their drift may not be told apart to infinity
+LEAST_NOISE_RAD = 1e-5  # two seconds of arc: below every stamp's rounding at a motion of 60 deg/s
 _SLOW_START = -1.5  # where the search for log(slow error after a second / noise of one orientation) starts
 _TURN_UNKNOWN = 1.0 / 5.0**2  # information about a world that may be turned by any angle
 # The gyro's scale errors and the symmetric part of its misalignment: xx yy zz, xy yz xz. The antisymmetric
@@ -58,6 +59,20 @@ class OrientationSensor:
     log_scale: float = 0.0
     log_slow: float = _SLOW_START
     jitter_s: float = 0.0
+
+    @property
+    def told_rad(self) -> float:
+        """Noise of one orientation as `covariance` says it, rms per axis, rad."""
+        return float(np.sqrt(np.trace(self.covariance.mean(axis=0)) / 3.0))
+
+    @property
+    def least_log_scale(self) -> float:
+        """The least that `log_scale` may become.
+
+        A stream integrated from a gyro has next to no noise, and eliminating the drift from still smaller
+        residuals costs all digits.
+        """
+        return float(np.log(LEAST_NOISE_RAD / self.told_rad))
 
 
 @dataclass(frozen=True)

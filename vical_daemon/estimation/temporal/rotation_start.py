@@ -16,32 +16,20 @@ import numpy.typing as npt
 
 from vical_daemon.estimation import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
+from vical_daemon.estimation.temporal.rotation_turns import (
+    BASELINES_S,
+    LONGEST_TURN_RAD,
+    MIN_PAIRS,
+    Turns,
+    camera_turns,
+)
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
 
 _GRID_S = 0.01
 _FINE_S = 0.0025
-_BASELINE_S = 0.2  # turns are taken over about this time: long against noise, short against outliers
-_MAX_PAIRS = 300
 _CANDIDATES = 4
-
-
-@dataclass(frozen=True)
-class Turns:
-    """Relative rotations between pairs of camera orientations.
-
-    Attributes:
-        first: Index of the earlier orientation, shape (k,).
-        second: Index of the later one, shape (k,).
-        rotvec_cam: Turn in the camera frame, rad, shape (k, 3).
-        angle: Its length, rad, shape (k,).
-    """
-
-    first: IntArray
-    second: IntArray
-    rotvec_cam: FloatArray
-    angle: FloatArray
+_CLEAR = 0.25  # misfit of turns over their size below which longer turns would not help
 
 
 @dataclass(frozen=True)
@@ -57,6 +45,8 @@ class Start:
         misfit_rad: Median length of the residual turn vectors.
         singular_values: Of the matched turns' scatter, largest first, shape (3,).
         typical_rad: Median size of the camera's turns, for comparison.
+        baseline_s: Time over which the turns were taken, s.
+        scale_rad: How far the sizes of two turns may differ and still agree.
         mirrored: A mirrored mounting (one axis reversed) fits far better: axes are mixed up.
     """
 
@@ -69,30 +59,13 @@ class Start:
     singular_values: FloatArray
     mirrored: bool
     typical_rad: float
+    baseline_s: float
+    scale_rad: float
 
-
-def camera_turns(t_cam_s: FloatArray, q_world_cam: FloatArray, most: int = _MAX_PAIRS) -> Turns:
-    """Pair each orientation with the one about 0.2 s later (at most 0.6 s: holes are left out).
-
-    Args:
-        t_cam_s: Stamps, increasing, s, shape (n,).
-        q_world_cam: Orientations w x y z, shape (n, 4).
-        most: So many pairs are kept, evenly.
-    """
-    first = np.arange(len(t_cam_s))
-    second = np.searchsorted(t_cam_s, t_cam_s + _BASELINE_S * 0.999)
-    inside = second < len(t_cam_s)
-    first, second = first[inside], second[inside]
-    dt = t_cam_s[second] - t_cam_s[first]
-    keep = dt < max(3.0 * _BASELINE_S, 1.5 * float(np.median(dt)) if len(dt) else 0.0)
-    first, second = first[keep], second[keep]
-    if len(first) > most:
-        chosen = np.linspace(0, len(first) - 1, most).round().astype(np.intp)
-        first, second = first[chosen], second[chosen]
-    turn = so3.rotvec_from_quat(
-        so3.quat_multiply(so3.quat_conjugate(q_world_cam[first]), q_world_cam[second])
-    )
-    return Turns(first, second, turn, np.linalg.norm(turn, axis=1))
+    @property
+    def misfit_share(self) -> float:
+        """Misfit over the size of the turns: noise over signal."""
+        return self.misfit_rad / max(self.typical_rad, 1e-9)
 
 
 def angles_between(qa: FloatArray, qb: FloatArray) -> FloatArray:
@@ -162,8 +135,7 @@ def debiased_start(
         if start is None:
             break
         bias = bias + start.bias_rps
-        turns = camera_turns(t_cam_s, q_world_cam)
-        if np.linalg.norm(start.bias_rps) * _BASELINE_S < 0.25 * agreement_scale(turns):
+        if np.linalg.norm(start.bias_rps) * start.baseline_s < 0.25 * start.scale_rad:
             break
     return start, bias
 
@@ -185,7 +157,8 @@ def coarse_start(
     """Find shift and mounting without any prior knowledge.
 
     Several local minima of the angle cost are judged by how well the turns agree as vectors: motion that
-    swings to and fro repeats its angles after half a period, but not its directions.
+    swings to and fro repeats its angles after half a period, but not its directions. Where the turns fit
+    badly, longer ones are tried: errors of orientations stay as large, and the turns grow.
 
     Args:
         curve: The imu's (or any reference's) orientation.
@@ -196,8 +169,26 @@ def coarse_start(
     Returns:
         The best start, or None where fewer than 8 turns can be formed.
     """
-    turns = camera_turns(t_cam_s, q_world_cam)
-    if len(turns.first) < 8:
+    best: Start | None = None
+    for least_s in BASELINES_S:
+        turns = camera_turns(t_cam_s, q_world_cam, least_s=least_s)
+        if best is not None and (turns.baseline_s < least_s or np.median(turns.angle) > LONGEST_TURN_RAD):
+            break
+        if turns.baseline_s > least_s:
+            continue  # noise made it longer already
+        start = _start_from(curve, t_cam_s, turns, shifts_s)
+        if start is not None and (best is None or start.misfit_share < best.misfit_share):
+            best = start
+        if best is not None and best.misfit_share < _CLEAR:
+            break
+    return best
+
+
+def _start_from(
+    curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shifts_s: tuple[float, float]
+) -> Start | None:
+    """Find shift and mounting from turns over one time."""
+    if len(turns.first) < MIN_PAIRS:
         return None
     scale = agreement_scale(turns)
     grid = np.arange(np.floor(shifts_s[0] / _GRID_S), np.ceil(shifts_s[1] / _GRID_S) + 1.0) * _GRID_S
@@ -247,6 +238,8 @@ def _start_at(
         fit.singular_values,
         fit.mirrored,
         float(np.median(turns.angle)),
+        turns.baseline_s,
+        scale,
     )
 
 

@@ -85,7 +85,7 @@ def _score(start: Start | None) -> float:
     """How badly a start fits: misfit over size of the turns; infinite where it is none."""
     if start is None or start.mirrored or start.agreement < 0.3:
         return float("inf")
-    return start.misfit_rad / max(start.typical_rad, 1e-9)
+    return start.misfit_share
 
 
 def stretched(rate: float, sensor: str = "camera", reference: str = "imu") -> str:

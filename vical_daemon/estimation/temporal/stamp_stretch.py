@@ -14,10 +14,10 @@ from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import (
     Start,
     agreement_scale,
-    camera_turns,
     coarse_start,
     shift_costs,
 )
+from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, camera_turns
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,6 +27,7 @@ _GRID_S = 0.02
 _LONGEST_S = 12.0  # with more data the grid of stretches would have to be finer
 _TURNS = 80  # enough to tell factors apart
 _AGREE = 0.6
+_BETTER = 0.6  # misfit over that of the stamps as they are
 
 
 def find_stretch(
@@ -52,7 +53,7 @@ def find_stretch(
     def cost(factor: float) -> float:
         stamps = middle + t / factor
         turns = camera_turns(stamps, q, _TURNS)
-        if len(turns.first) < 8:
+        if len(turns.first) < MIN_PAIRS:
             return 1.0
         return float(shift_costs(curve, stamps, turns, shifts, agreement_scale(turns)).min())
 
@@ -60,9 +61,13 @@ def find_stretch(
     best = float(coarse[np.argmin([cost(f) for f in coarse])])
     fine = best + np.arange(-3, 4) * _FINE * 2.0
     best = float(fine[np.argmin([cost(f) for f in fine])])
-    start = coarse_start(curve, middle + t / best, q, shifts_s)
-    if abs(best - 1.0) < 0.01 or start is None or not _agrees(start):
+    if abs(best - 1.0) < 0.01:
         return None
+    start, plain = (coarse_start(curve, middle + t / factor, q, shifts_s) for factor in (best, 1.0))
+    if start is None or not _agrees(start):
+        return None
+    if plain is not None and not plain.mirrored and start.misfit_share > _BETTER * plain.misfit_share:
+        return None  # noisy orientations fit as badly at any factor
     return best
 
 

@@ -8,6 +8,7 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 
 MIN_ORIENTATIONS = 12
+SLOWEST_GYRO_HZ = 10.0  # as for `calibrate`: between slower samples a hand turns to and fro unseen
 
 
 def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArray] | str:
@@ -20,6 +21,12 @@ def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArra
     order = np.argsort(t_s, kind="stable")
     t_s, gyro = t_s[order], gyro[order]
     keep = np.concatenate(([True], np.diff(t_s) > 1e-6))  # a sample stamped twice adds nothing
+    rate_hz = 1.0 / float(np.median(np.diff(t_s[keep]))) if np.count_nonzero(keep) > 1 else 0.0
+    if rate_hz < SLOWEST_GYRO_HZ:
+        return (
+            f"the gyro has {rate_hz:.3g} samples a second by its stamps; at least {SLOWEST_GYRO_HZ:g} are "
+            "needed (are its stamps in the right unit, is it the imu's file?)"
+        )
     return t_s[keep], gyro[keep]
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, Orientat
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
 from vical_daemon.estimation.temporal.rotation_start import coarse_start
 from vical_daemon.estimation.temporal.rotation_suspects import explain_stream, stretched
+from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro, clean_orientations
 from vical_daemon.estimation.temporal.td_icp_joint_result import JointResult, PairDelay, SensorDelay
 from vical_daemon.estimation.temporal.td_icp_refusals import RATE_SIGMAS, UNEVEN, refuse_start
@@ -58,19 +60,32 @@ class OrientationStream:
 
 
 def _thinned(streams: Sequence[OrientationStream], most: int = _MOST) -> list[OrientationStream]:
-    """Leave out every other orientation of the largest stream until all together are few enough."""
-    out = list(streams)
+    """Leave out long rest, then every other orientation of the largest stream until all are few enough."""
+    out = [_without_rest(s) for s in streams]
     while sum(len(s.t_s) for s in out) > most:
         i = int(np.argmax([len(s.t_s) for s in out]))
-        s = out[i]
-        sigma = np.asarray(s.rotation_sigma)
-        out[i] = replace(
-            s,
-            t_s=s.t_s[::2],
-            R_world_sensor=s.R_world_sensor[::2],
-            rotation_sigma=s.rotation_sigma if sigma.ndim == 0 else sigma[::2],
-        )
+        out[i] = _some(out[i], slice(None, None, 2))
     return out
+
+
+def _some(stream: OrientationStream, index: slice | npt.NDArray[Any]) -> OrientationStream:
+    sigma = np.asarray(stream.rotation_sigma)
+    return replace(
+        stream,
+        t_s=stream.t_s[index],
+        R_world_sensor=stream.R_world_sensor[index],
+        rotation_sigma=stream.rotation_sigma if sigma.ndim == 0 else sigma[index],
+    )
+
+
+def _without_rest(stream: OrientationStream) -> OrientationStream:
+    """The stream without most of its rest, where it mostly rests; as it is where it cannot be used anyway."""
+    cleaned = clean_orientations(stream.t_s, stream.R_world_sensor, stream.rotation_sigma)
+    if isinstance(cleaned, str):
+        return stream
+    t, R, _, index = cleaned
+    keep = without_long_rest(t, so3.quat_from_matrix(R))
+    return stream if keep.all() else _some(stream, index[keep])
 
 
 def joint_with_gyro(
@@ -173,8 +188,9 @@ def joint_of_orientations(
     options = options or TdIcpOptions()
     if len(streams) < 2:
         return JointResult(REFUSED, "two sensors at least are needed", streams[0].name if streams else "")
-    streams = _thinned(streams)
+    # the reference is only interpolated: it costs nothing, and thinned it would be interpolated worse
     reference = min(streams, key=lambda s: np.median(np.diff(np.sort(s.t_s))) if len(s.t_s) > 1 else 9.9)
+    streams = _thinned([s for s in streams if s is not reference])
     cleaned = clean_orientations(reference.t_s, reference.R_world_sensor, reference.rotation_sigma)
     if isinstance(cleaned, str):
         return JointResult(REFUSED, f"{reference.name}: {cleaned}", reference.name)
@@ -184,8 +200,6 @@ def joint_of_orientations(
     sensors: list[tuple[str, OrientationSensor]] = []
     reasons: list[str] = []
     for stream in streams:
-        if stream is reference:
-            continue
         other = clean_orientations(stream.t_s - base, stream.R_world_sensor, stream.rotation_sigma)
         if isinstance(other, str):
             reasons.append(f"{stream.name}: {other}")
@@ -193,7 +207,7 @@ def joint_of_orientations(
         t, R, covariance, _ = other
         q = so3.quat_from_matrix(R)
         start = coarse_start(curve, t, q, (guess - reach, guess + reach))
-        reason = refuse_start(start, t, q, options)
+        reason = refuse_start(start, options)
         if start is None or reason:
             mistake = explain_stream(curve, t, q, (guess - reach, guess + reach), start)
             reasons.append(f"{stream.name}: {mistake or reason}")
@@ -266,6 +280,7 @@ def _delay(fit: Fit, i: int, span_s: tuple[float, float]) -> SensorDelay:
         noise,
         pairs,
         len(sensor.t_s) - pairs,
+        float(fit.widened[i].max()),
     )
 
 

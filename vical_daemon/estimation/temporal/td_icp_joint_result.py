@@ -24,6 +24,8 @@ class SensorDelay:
         noise_rad: Measured noise of one orientation, rms per axis, rad.
         pairs: Orientations that took part.
         rejected: Orientations that did not.
+        widened: By how much stretches of the data disagree beyond what their noise explains; the sigmas are
+            widened by it.
     """
 
     timeshift_s: float
@@ -33,6 +35,7 @@ class SensorDelay:
     noise_rad: float
     pairs: int
     rejected: int
+    widened: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ class JointResult:
                     "noise_rad": s.noise_rad,
                     "pairs": s.pairs,
                     "rejected": s.rejected,
+                    "widened": s.widened,
                 }
                 for name, s in self.sensors.items()
             },

@@ -8,15 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.temporal.orientation_fit import Fit
-from vical_daemon.estimation.temporal.rotation_start import Start, camera_turns
+from vical_daemon.estimation.temporal.rotation_start import Start
 from vical_daemon.estimation.temporal.rotation_suspects import stretched
+from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, MIN_RATE_RPS, camera_turns
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions
 
 FloatArray = npt.NDArray[np.float64]
 
 _DEG = np.pi / 180.0
-_MIN_RATE_RPS = 3.0 * _DEG  # slower than this is "not moving"
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3
 _ROTATION_LOST_RAD = 3.0 * _DEG
@@ -42,7 +42,7 @@ def refuse_motion(
 ) -> Refusal:
     """Say why the motion cannot be used, from the rotation rates alone."""
     turns = camera_turns(t_cam, q)
-    if len(turns.first) < 8:
+    if len(turns.first) < MIN_PAIRS:
         return Refusal("the camera orientations are too far apart in time: at least 5 a second are needed")
     rate_cam = float(np.median(turns.angle / (t_cam[turns.second] - t_cam[turns.first])))
     reach = options.search_s + abs(options.timeshift_guess_s)
@@ -50,20 +50,23 @@ def refuse_motion(
     if np.count_nonzero(near) < 2 * MIN_ORIENTATIONS:
         return Refusal(
             f"camera and imu do not overlap in time: the camera covers {t_cam[0]:.1f} to {t_cam[-1]:.1f} s, "
-            f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?)"
+            f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?); bring both to "
+            "one epoch, or shift one by the difference"
         )
     mean_rate = _mean_rates(t_imu, gyro[near])
-    rate_imu = float(np.median(np.linalg.norm(mean_rate, axis=1)))
-    change = _changes(mean_rate)
-    swing = float(np.median(change))
+    # Where the camera rests at times, its rate is that in motion, and so must the gyro's be. Pairs that move
+    # in part count as moving, and the gyro's data reach further: it moves for a smaller share than the pairs.
+    middle = 1.0 - 0.25 * turns.moving_share if 0.0 < turns.moving_share < 0.9 else 0.5
+    rate_imu = float(np.quantile(np.linalg.norm(mean_rate, axis=1), middle))
+    swing = float(np.quantile(_changes(mean_rate), middle))
     ratio = rate_imu / max(rate_cam, 1e-9)
-    if rate_cam < _MIN_RATE_RPS and swing < _MIN_RATE_RPS:
+    if rate_cam < MIN_RATE_RPS and swing < MIN_RATE_RPS:
         return Refusal(
             f"no motion: the camera turns at {rate_cam / _DEG:.1f} deg/s (median); "
             "turn the rig to and fro about all axes at 20 to 60 deg/s",
             still=True,
         )
-    if rate_cam < _MIN_RATE_RPS and swing > 5.0 * _MIN_RATE_RPS:
+    if rate_cam < MIN_RATE_RPS and swing > 5.0 * MIN_RATE_RPS:
         return Refusal(
             "the imu turns but the camera does not: is the camera fixed to the imu, are its poses fresh?"
         )
@@ -83,7 +86,7 @@ def at_one_rate(t_imu: FloatArray, gyro: FloatArray) -> bool:
         gyro: Rates, rad/s, shape (n, 3).
     """
     rates = _mean_rates(t_imu, gyro)
-    return _is_steady(rates) and float(np.median(np.linalg.norm(rates, axis=1))) > _MIN_RATE_RPS
+    return _is_steady(rates) and float(np.median(np.linalg.norm(rates, axis=1))) > MIN_RATE_RPS
 
 
 def _is_steady(rates: FloatArray) -> bool:
@@ -118,19 +121,18 @@ def _wrong_unit(ratio: float) -> str:
     return ""
 
 
-def refuse_start(start: Start | None, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions) -> str:
+def refuse_start(start: Start | None, options: TdIcpOptions) -> str:
     """Say why no start was found; empty if there is one."""
     reach = f"within {options.search_s:g} s of {options.timeshift_guess_s:g} s"
     if start is None:
         return f"no delay {reach} makes the rotations of camera and gyro agree (not the same recording?)"
-    turns = camera_turns(t_cam, q)
-    typical = float(np.median(turns.angle))
     if start.agreement < 0.3:
         return (
             f"no delay {reach} makes the rotations of camera and gyro agree in size "
-            f"(best: {100 * start.agreement:.0f} % of the turns at {start.timeshift_s:+.2f} s)"
+            f"(best: {100 * start.agreement:.0f} % of the turns at {start.timeshift_s:+.2f} s); is it the "
+            "same recording, and is image stabilisation off?"
         )
-    if start.mirrored or start.misfit_rad > max(0.5 * typical, 0.01):
+    if start.mirrored or start.misfit_rad > max(0.5 * start.typical_rad, 0.01):
         return (
             "the rotations agree in size but not in direction: is this the same recording, is the camera "
             "fixed to the imu, are its orientations those of the camera in the world?"

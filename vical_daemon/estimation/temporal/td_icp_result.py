@@ -61,6 +61,7 @@ class TdIcpResult:
         gyro_bias_rps: Bias in the middle of the data, rad/s, shape (3,).
         pairs: Orientations that took part.
         rejected: Orientations refused as outliers or without imu data at their time.
+        at_rest: Of the rejected, those left out because the rig rested for most of the recording.
         iterations: Rounds of both iterative phases.
         camera_noise_rad: Measured noise of one orientation, rms per axis, rad (from tracks: of one feature).
         slow_noise_ratio: Measured slow error that a second brings over the noise of one orientation.
@@ -70,6 +71,8 @@ class TdIcpResult:
             near zero where both clocks are sound. The shift above is that in the middle of the data.
         stamp_rate_sigma: Its standard deviation, s/s.
         still: Refused because the rig stands still.
+        widened: By how much stretches of the data disagree beyond what their noise explains (1: they agree);
+            the sigmas are widened by it.
     """
 
     status: str
@@ -82,6 +85,7 @@ class TdIcpResult:
     gyro_bias_rps: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     pairs: int = 0
     rejected: int = 0
+    at_rest: int = 0
     iterations: int = 0
     camera_noise_rad: float = float("nan")
     slow_noise_ratio: float = float("nan")
@@ -90,6 +94,7 @@ class TdIcpResult:
     stamp_rate: float = float("nan")
     stamp_rate_sigma: float = float("nan")
     still: bool = False
+    widened: float = 1.0
 
     def to_json(self) -> dict[str, object]:
         """Return what `vical td-icp --json` prints."""
@@ -104,10 +109,12 @@ class TdIcpResult:
             "gyro_bias_rps": [_number(v) for v in self.gyro_bias_rps],
             "pairs": self.pairs,
             "rejected": self.rejected,
+            "at_rest": self.at_rest,
             "iterations": self.iterations,
             "camera_noise_rad": _number(self.camera_noise_rad),
             "stamp_rate_ppm": _number(1e6 * self.stamp_rate),
             "stamp_rate_sigma_ppm": _number(1e6 * self.stamp_rate_sigma),
+            "widened": self.widened,
         }
 
 

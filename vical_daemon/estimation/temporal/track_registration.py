@@ -1,9 +1,9 @@
 """Temporal calibration from tracks of unknown points: the epipolar constraint with the gyro's rotation.
 
 Rotations strung together from pairs of images are only good for a start; from there mounting, delay and gyro
-bias are fitted to the tracks themselves (`epipolar_fit`), in windows of the recording. The windows' formal
-sigmas leave out errors that a whole window shares, so the scatter between windows decides how far to trust
-their mean [Birge, 1932].
+bias are fitted to the tracks themselves (`epipolar_fit`), in windows of the recording. Their covariances know
+errors that persist along tracks (`epipolar_errors`) and the gyro's noise; what they do not know shows in how
+stretches of five seconds scatter (`stretch_agreement`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from vical_daemon.estimation import so3
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.td_icp import td_icp
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
+from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
 from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions, TdIcpResult
@@ -28,9 +29,7 @@ _WINDOW_S, _LEAST_S = 20.0, 5.0
 _HOLE_S = 0.5
 _MOST_WINDOWS = 6
 _MOST_STARTS = 3
-_ENOUGH = 3  # windows from which their scatter is believed
-# What a single window's formal sigmas were found to be short of, on a simulation with known truth
-_SHORT_ROTATION, _SHORT_SHIFT = 3.0, 2.0
+_WANTED = [0, 1, 2, 6]  # mounting and delay among the unknowns of a result
 _INLIERS = 0.5
 
 
@@ -60,7 +59,8 @@ def track_registration(
     if not windows:
         reason = f"the tracks cover less than {_LEAST_S:g} s without a hole"
         return TdIcpResult(REFUSED, reason, rejected=len(frames))
-    start = _start(imu, windows, lens, options or TdIcpOptions())
+    options = options or TdIcpOptions()
+    start = _start(imu, windows, lens, options)
     if start.status == REFUSED:
         return start
     fits: list[tuple[int, EpipolarFit]] = []
@@ -69,8 +69,9 @@ def track_registration(
         fit = None
         if len(t) > 100:
             fit = epipolar_fit(
-                t, gyro, window, lens, start.R_imu_cam, start.timeshift_cam_imu_s, fit_lens=True
-            )
+                t, gyro, window, lens, start.R_imu_cam, start.timeshift_cam_imu_s,
+                fit_lens=True, gyro_density=options.gyro_density,
+            )  # fmt: skip
         if fit is not None and fit.inliers > _INLIERS and np.isfinite(fit.timeshift_sigma_s):
             fits.append((len(window), fit))
     if not fits:
@@ -125,23 +126,25 @@ def _start(
 
 
 def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -> TdIcpResult:
-    """Weighted mean of the windows; sigmas widened by how far the windows scatter."""
+    """Weighted mean of the windows; sigmas widened where stretches of the recording disagree."""
     best = min((f for _, f in fits), key=lambda f: f.timeshift_sigma_s)
     offsets = np.array(
         [[*so3.log(best.R_imu_cam.T @ f.R_imu_cam), f.timeshift_s - best.timeshift_s] for _, f in fits]
     )
-    sigmas = np.array([[*np.sqrt(np.diag(f.rotation_covariance)), f.timeshift_sigma_s] for _, f in fits])
-    weight = sigmas**-2.0
-    mean = np.sum(weight * offsets, axis=0) / weight.sum(axis=0)
-    factor = np.array([_SHORT_ROTATION] * 3 + [_SHORT_SHIFT])
-    if len(fits) >= _ENOUGH:
-        ratio = np.sum(weight * (offsets - mean) ** 2, axis=0) / (len(fits) - 1)
-        # the three axes of the mounting are judged together: few windows say little about one of them
-        factor = np.sqrt(np.maximum(1.0, [*[ratio[:3].mean()] * 3, ratio[3]]))
-    sigma = factor / np.sqrt(weight.sum(axis=0))
+    information = np.linalg.inv(np.stack([f.covariance for _, f in fits]))
+    P = np.linalg.inv(information.sum(axis=0))
+    mean = P @ np.einsum("kij,kj->i", information, offsets)
+    stretches = [(o + x, C) for o, (_, f) in zip(offsets, fits, strict=True) for x, C in f.stretches]
+    widened = np.array(
+        [
+            scatter_factor([x[part] for x, _ in stretches], [C[part, part] for _, C in stretches])
+            for part in (slice(0, 3), slice(3, 4))
+        ]
+    )
+    P = P * np.outer(np.repeat(widened, (3, 1)), np.repeat(widened, (3, 1)))
     R = best.R_imu_cam @ so3.exp(mean[:3])
     covariance = np.zeros((7, 7))
-    covariance[[0, 1, 2, 6], [0, 1, 2, 6]] = sigma**2
+    covariance[np.ix_(_WANTED, _WANTED)] = P
     bias = np.mean([f.gyro_bias for _, f in fits], axis=0)
     covariance[[3, 4, 5], [3, 4, 5]] = np.var([f.gyro_bias for _, f in fits], axis=0) + 1e-8
     reasons = lost_in_words(covariance, R)
@@ -150,13 +153,14 @@ def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -
         status=DEGENERATE if reasons else OK,
         reason="; ".join(reasons),
         timeshift_cam_imu_s=best.timeshift_s + float(mean[3]),
-        timeshift_sigma_s=float(sigma[3]),
+        timeshift_sigma_s=float(np.sqrt(P[3, 3])),
         R_imu_cam=R,
-        rotation_sigma_rad=sigma[:3],
+        rotation_sigma_rad=np.sqrt(np.diagonal(P)[:3]),
         covariance=covariance,
         gyro_bias_rps=bias,
         pairs=pairs,
         rejected=n_frames - pairs,
         iterations=rounds,
         camera_noise_rad=float(np.median([f.error for _, f in fits])),
+        widened=float(widened.max()),
     )

@@ -1,0 +1,108 @@
+"""Recordings as people have them: broken files, missing images, cut lines, swapped columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from vical_daemon.messages import POINTS_TYPE
+from vical_daemon.messages.schemas import DEFINITIONS
+from vical_daemon.recording import RecordingError, open_recording
+
+
+def test_files_of_another_camera_are_not_looked_at(tmp_path, write_asl):
+    folder = write_asl(tmp_path / "a")
+    other = folder / "mav0/cam1"
+    other.mkdir()
+    (other / "corners.csv").write_text("junk\nmore junk\n")
+    with pytest.raises(RecordingError, match="cam1"):
+        open_recording(folder)
+    recording = open_recording(folder, cameras=["cam0"])
+    assert list(recording.cameras) == ["cam0"] and list(recording.imus) == ["imu0"]
+    with pytest.raises(
+        RecordingError, match="cam1"
+    ):  # there is no cam7: all are read, so that they can be named
+        open_recording(folder, cameras=["cam7"])
+
+
+def test_a_missing_image_is_left_out_and_counted(tmp_path, a_motion, write_asl):
+    folder = write_asl(tmp_path / "a", corners=False)
+    camera = folder / "mav0/cam0"
+    (camera / "data").mkdir()
+    stamps = [int(a_motion()[0][0]) + i * 10**8 for i in range(50)]
+    for stamp in stamps:
+        (camera / "data" / f"{stamp}.png").write_bytes(b"image")
+    (camera / "data.csv").write_text("\n".join(f"{stamp},{stamp}.png" for stamp in stamps))
+    (camera / "data" / f"{stamps[7]}.png").unlink()
+    recording = open_recording(folder)
+    assert recording.cameras["cam0"].count == 49
+    assert any(f"1 images listed but not there, first {stamps[7]}.png" in w for w in recording.warnings)
+    for stamp in stamps:
+        (camera / "data" / f"{stamp}.png").unlink(missing_ok=True)
+    with pytest.raises(RecordingError, match="there is no image"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize("table", ["mav0/imu0/data.csv", "mav0/cam0/corners.csv"])
+def test_a_last_line_that_was_cut_off_is_left_out_and_counted(tmp_path, write_asl, table):
+    folder = write_asl(tmp_path / "a")
+    whole = open_recording(folder)
+    path = folder / table
+    last = path.read_text().rstrip("\n").splitlines()[-1]
+    path.write_text(path.read_text().rstrip("\n") + "\n" + last[: last.index(",") + 3])
+    recording = open_recording(folder)
+    assert any("cut off; 1 line left out" in w for w in recording.warnings)
+    assert [s.count for s in recording.streams] == [s.count for s in whole.streams]
+    path.write_text(path.read_text() + "\n" + last + "\n")  # the same line with more behind it is no end
+    with pytest.raises(RecordingError, match="expected timestamp"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize(
+    ("title", "refused"),
+    [
+        ("#timestamp [ns],a_RS_S_x [m s^-2],a_y,a_z,w_RS_S_x [rad s^-1],w_y,w_z", True),
+        ("timestamp,accel_x,accel_y,accel_z,gyro_x,gyro_y,gyro_z", True),
+        ("t,ax,ay,az,wx,wy,wz", True),
+        ("t,linear_acceleration.x,linear_acceleration.y,linear_acceleration.z,angular_velocity.x,"
+         "angular_velocity.y,angular_velocity.z", True),
+        ("#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z", False),
+        ("t,angular_velocity.x,angular_velocity.y,angular_velocity.z,linear_acceleration.x,"
+         "linear_acceleration.y,linear_acceleration.z", False),
+    ],
+)  # fmt: skip
+def test_a_title_that_names_the_accelerometer_first_is_believed(tmp_path, write_asl, title, refused):
+    folder = write_asl(tmp_path / "a")
+    path = folder / "mav0/imu0/data.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([title, *(lines[1:] if lines[0].startswith("#") else lines)]) + "\n")
+    if not refused:
+        assert open_recording(folder).imu_samples > 0
+        return
+    with pytest.raises(RecordingError, match=r"accelerometer before the gyro.*swap the columns"):
+        open_recording(folder)
+
+
+def test_our_points_in_a_bag_of_ros_1_are_read(tmp_path: Path):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(DEFINITIONS[POINTS_TYPE], POINTS_TYPE))
+    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    uv = np.arange(6.0)
+    with Bag1Writer(tmp_path / "a.bag") as bag:
+        connection = bag.add_connection("/cam0/points", POINTS_TYPE, typestore=store)
+        for i in range(5):
+            message = store.types[POINTS_TYPE](
+                header(seq=i, stamp=stamp(sec=1_700_000_000, nanosec=i * 10**8), frame_id="cam0"),
+                640, 480, np.array([4, 5, 6], dtype=np.int64), uv + i, np.zeros(0),
+            )  # fmt: skip
+            bag.write(connection, 10**18 + i, store.serialize_ros1(message, POINTS_TYPE))
+    recording = open_recording(tmp_path / "a.bag", check=False)
+    (camera,) = recording.cameras.values()
+    assert camera.kind == "points" and camera.resolution == (640, 480)
+    frames = list(recording.points_frames(camera.name))
+    assert [f.t_cam_ns for f in frames] == [1_700_000_000 * 10**9 + i * 10**8 for i in range(5)]
+    assert frames[2].uv_px.ravel().tolist() == (uv + 2).tolist() and frames[2].ids.tolist() == [4, 5, 6]

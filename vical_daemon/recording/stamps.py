@@ -1,0 +1,97 @@
+"""Stamps as text: to nanoseconds without losing a digit, whatever unit they are written in."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import IntArray
+
+FACTOR_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+UNIT_WORDS = {"ns": "nanoseconds", "us": "microseconds", "ms": "milliseconds", "s": "seconds"}
+_NAMED = {"ns": "ns", "nsec": "ns", "us": "us", "µs": "us", "usec": "us", "ms": "ms", "msec": "ms"}
+_NAMED |= {"s": "s", "sec": "s"} | {word: unit for unit, word in UNIT_WORDS.items()}
+_LATEST_NS = 4_102_444_800 * FACTOR_NS["s"]  # the year 2100: no stamp lies behind it
+
+
+class StampError(ValueError):
+    """A stamp that is no number; holds its place in the column, counted from 0."""
+
+    def __init__(self, index: int) -> None:
+        super().__init__(f"stamp {index} is no number")
+        self.index = index
+
+
+def numbers(texts: Iterable[str]) -> list[int] | list[Decimal]:
+    """Read stamps exactly: as integers where all are, else as decimal fractions.
+
+    Raises:
+        StampError: One is no finite number.
+    """
+    texts = list(texts)
+    try:
+        return [int(text) for text in texts]
+    except ValueError:
+        pass
+    values = []
+    for i, text in enumerate(texts):
+        try:
+            value = Decimal(text.strip())
+        except InvalidOperation:
+            raise StampError(i) from None
+        if not value.is_finite():
+            raise StampError(i)
+        values.append(value)
+    return values
+
+
+def to_ns(values: list[int] | list[Decimal], unit: str) -> IntArray:
+    """Return stamps of a unit of `FACTOR_NS` in ns.
+
+    Raises:
+        StampError: One does not fit into 64 bits.
+    """
+    factor = FACTOR_NS[unit]
+    whole = [value * factor if isinstance(value, int) else round(value * factor) for value in values]
+    for i, value in enumerate(whole):
+        if abs(value) >= 2**63:
+            raise StampError(i)
+    return np.array(whole, dtype=np.int64)
+
+
+def unit_named(title: str) -> str | None:
+    """Return the unit that the title of a column names: `timestamp [ns]`, `time_us`; None: none.
+
+    >>> unit_named("#timestamp [ns]"), unit_named("t_ms"), unit_named("time")
+    ('ns', 'ms', None)
+    """
+    words = re.split(r"[^a-zµ]+", title.lower().strip())
+    return next((_NAMED[word] for word in reversed(words) if word in _NAMED), None)
+
+
+def unit_by_spacing(
+    values: list[int] | list[Decimal], slowest_hz: float, fastest_hz: float, usual_hz: float
+) -> str:
+    """Return the unit in which the spacing of stamps makes sense.
+
+    Nanoseconds wherever they do; else the unit whose rate comes closest to the usual one. Two stamps of a
+    stream are never so far in the future that a unit could be excluded by its size alone, but the latest is.
+
+    Args:
+        values: Stamps in any order; repeated ones do not count.
+        slowest_hz: Lowest rate that such a stream has.
+        fastest_hz: Highest.
+        usual_hz: A middling one.
+    """
+    ordered = np.unique(np.array(values, dtype=object))
+    if len(ordered) < 2:
+        return "ns"
+    step_ns = float(np.median(np.diff(ordered).astype(np.float64)))
+    if 0.9e9 / fastest_hz <= step_ns <= 1.1e9 / slowest_hz:
+        return "ns"
+    latest = max(abs(ordered[0]), abs(ordered[-1]))
+    possible = [unit for unit, factor in FACTOR_NS.items() if latest * factor <= _LATEST_NS] or ["ns"]
+    return min(possible, key=lambda unit: abs(np.log(step_ns * FACTOR_NS[unit] * usual_hz * 1e-9)))
