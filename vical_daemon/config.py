@@ -18,7 +18,11 @@ from vical_daemon.strict_yaml import ConfigError, Document, parse, read
 __all__ = ["Config", "ConfigError", "load", "loads"]
 
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,62}"  # as `topics.check_name`
-URI = r"(v4l2|iidc|aravis|folder):.+|/.+|\d+"
+LOG_SCHEME = "log:"
+"""Of a `port` or `uri` that is a recording, played as if its device were there."""
+EMULATED = "emulated"
+"""The `port` or `uri` of a device that `vical run` emulates."""
+URI = rf"(v4l2|iidc|aravis|folder|log):.+|/.+|\d+|{EMULATED}"
 Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
 Pixels = Annotated[int, Bound(low=16, high=16384)]
@@ -45,7 +49,8 @@ class ImuConfig:
     """One IMU.
 
     Attributes:
-        port: Serial port, best a stable name below /dev/serial/by-id or /dev/vical.
+        port: Serial port, best a stable name below /dev/serial/by-id or /dev/vical; or log:FILE (a
+            recording, played as if its IMU were there; log:FILE#NAME of several) or emulated.
         driver: gx3: MicroStrain 3DM-GX3-25 (and MIP devices).
         protocol: auto asks the device which one it speaks.
         rate_hz: Samples a second; the GX3 divides 1000 Hz.
@@ -83,7 +88,8 @@ class CameraConfig:
     """One camera.
 
     Attributes:
-        uri: v4l2:/dev/video0, iidc:GUID, aravis:NAME, folder:PATH; `vical devices` prints it.
+        uri: v4l2:/dev/video0, iidc:GUID, aravis:NAME, folder:PATH; `vical devices` prints it. Or log:FILE
+            or emulated, as an IMU's `port`.
         size: width, height, px.
         rate_hz: Frames a second.
         exposure_s: Exposure time; None: as the camera has it.
@@ -241,6 +247,8 @@ class Config:
         cameras: By name.
         target: Target file (Kalibr's format); relative to the settings file.
         path: Where this was read from; empty when made in memory.
+
+    Relative paths in `target`, ``log:FILE`` and ``folder:PATH`` are taken from the folder of this file.
     """
 
     rig: Name = "rig0"
@@ -292,8 +300,27 @@ def loads(text: str, name: str = "config") -> Config:
 
 
 def _check(document: Document, path: Path | None) -> Config:
-    config = replace(schema.build(document, Config), path=path)
+    config = _anchored(replace(schema.build(document, Config), path=path))
     problems = [schema.mistake(document, where, text) for where, text in contradictions(config)]
     if problems:
         raise ConfigError(problems[0], problems)
     return config
+
+
+def _anchored(config: Config) -> Config:
+    """Take the relative paths of devices that are files from the folder of the settings file."""
+    if config.path is None:
+        return config
+    folder = config.path.absolute().parent
+
+    def anchor(name: str) -> str:
+        for scheme in (LOG_SCHEME, "folder:"):
+            if name.startswith(scheme):
+                return f"{scheme}{folder / name.removeprefix(scheme)}"
+        return name
+
+    return replace(
+        config,
+        imus={name: replace(imu, port=anchor(imu.port)) for name, imu in config.imus.items()},
+        cameras={name: replace(camera, uri=anchor(camera.uri)) for name, camera in config.cameras.items()},
+    )
