@@ -33,7 +33,8 @@ Start here:
   vical run -c vical.yaml                       acquire, stamp, record, calibrate, publish
 
 Every command takes --json (machine output alone on stdout) and --help.
-Exit code: 0 done, 1 a known failure (one line on stderr), 2 bad usage or config.
+Exit code: 0 done, 1 a known failure (one line on stderr), 2 bad usage or config,
+3 done, but the calibration is not `converged`.
 """
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 EXIT_FAILURE = 1
 EXIT_USAGE = 2
+EXIT_NOT_CONVERGED = 3  # done, but the result is not `converged`
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE, what a shell reports for `cat big | head -1`
 EXIT_INTERRUPTED = 130  # 128 + SIGINT
 
