@@ -20,7 +20,7 @@ from vical_daemon.export.text import comment, matrix_rows, number, row
 
 def write_camchain(rig: Rig) -> str:
     """Write camchain-imucam.yaml: cam0, cam1, … in the order of the rig (Kalibr knows no other names)."""
-    parts = [comment(rig.note)]
+    parts = [comment(rig.header)]
     before: RigCamera | None = None
     for index, camera in enumerate(rig.cameras.values()):
         parts.append(f"cam{index}:" + ("" if camera.name == f"cam{index}" else f"  # {camera.name}") + "\n")
