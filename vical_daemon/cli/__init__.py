@@ -127,7 +127,9 @@ def _selected(words: list[str]) -> str | None:
 
 def _set_up_logging(args: argparse.Namespace) -> None:
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname).1s %(name)s: %(message)s")
+    time_of_day = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "  # the journal has its own
+    line = f"{time_of_day}%(levelname).1s %(name)s: %(message)s"
+    logging.basicConfig(level=level, stream=sys.stderr, format=line, datefmt="%H:%M:%S")
     if not args.verbose:  # libraries talk about themselves at INFO
         for library in ("asyncio", "aiohttp", "rosbags"):
             logging.getLogger(library).setLevel(logging.WARNING)

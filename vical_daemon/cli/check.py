@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.errors import EXIT_USAGE, NOTHING_TO_RUN, CliError
 from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
@@ -48,6 +48,10 @@ def run(args: argparse.Namespace) -> int:
         findings = [Finding("config", args.config, problem) for problem in error.problems]
         _print(findings, as_json=args.json)
         raise CliError(_count(findings), EXIT_USAGE) from None
+    if not config.imus and not config.cameras:
+        finding = Finding("config", args.config, f"{args.config}: {NOTHING_TO_RUN}")
+        _print([finding], as_json=args.json)
+        raise CliError(finding.problem, EXIT_USAGE)
     findings = [Finding("config", f"{args.config}: {_summary(config)}")]
     for finding in _findings(config, devices=not args.no_devices):
         findings.append(finding)

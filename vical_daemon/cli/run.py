@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.children import STOP_S, Children
-from vical_daemon.cli.errors import CliError, report_thread
+from vical_daemon.cli.errors import EXIT_USAGE, NOTHING_TO_RUN, CliError, report_thread
 from vical_daemon.cli.options import add_config, add_json
 from vical_daemon.cli.stop_signals import die_with, leave_at_once, stop_signals
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = load(args.config)
     if not config.imus and not config.cameras:
-        raise CliError(f"{args.config}: neither imus nor cameras: there is nothing to run", 2)
+        raise CliError(f"{args.config}: {NOTHING_TO_RUN}", EXIT_USAGE)
     if not args.roles:
         return _run_children(args, process_sets.needed_processes(config))
     roles = process_sets.role_names(args.roles)
