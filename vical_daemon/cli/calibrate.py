@@ -53,6 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="",
         help=f"comma-separated, estimated without being suspected first: {', '.join(ESTIMATE)}",
     )
+    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
+    parser.add_argument("--seconds", type=float, metavar="S", help="use only S seconds (after --skip)")
     parser.add_argument("--report", metavar="F.html", help="write a report with figures")
     parser.add_argument(
         "-o", "--output", metavar="F.json", help="also write the result there, for `vical export`"
@@ -70,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate and print; 1 if there is no usable result, 3 if it is not converged."""
     accepted = _words("--accept", args.accept, ACCEPT)
     fix, estimate = _words("--fix", args.fix, FIX), _words("--estimate", args.estimate, ESTIMATE)
+    if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
+        raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
     for path in (args.report, args.output):
         if path and not Path(path).absolute().parent.is_dir():
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
@@ -93,6 +97,8 @@ def run(args: argparse.Namespace) -> int:
         imu=args.imu,
         fix=fix,
         estimate=estimate,
+        skip_s=args.skip,
+        seconds=args.seconds,
     )
     bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
     outcome = calibration_run.run_job(job, bar.show, keep_frames=bool(args.report))
@@ -132,6 +138,8 @@ def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[s
 
     inputs = [Path(p) for p in (args.input, args.target, args.initial) if p]
     settings = {"fix": args.fix, "estimate": args.estimate}
+    if args.skip or args.seconds is not None:
+        settings["part"] = f"{outcome.estimate.duration_s:.1f} s, from {args.skip:g} s on"
     report.write_report(
         Path(args.report),
         result | {"trace": outcome.traces},

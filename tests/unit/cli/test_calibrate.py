@@ -17,6 +17,7 @@ from vical_daemon.estimators import Estimator
 from vical_daemon.mcap_log import LogWriter
 from vical_daemon.priors import read_initial
 from vical_daemon.recording import open_recording
+from vical_daemon.recording.logs import stamp_of
 
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "euroc_imu_april"
 G = 9.80665
@@ -204,6 +205,28 @@ def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
     assert [entry[0] for entry in fed] == sorted(entry[0] for entry in fed)
 
 
+def test_only_the_part_that_was_asked_for_is_used(short: Path) -> None:
+    recording = open_recording(short)
+    job = calibration_run.make_job(
+        recording,
+        read_initial(short / "initial.yaml"),
+        target=str(short / "target.yaml"),
+        skip_s=2.5,
+        seconds=3.0,
+    )
+    begin_ns = recording.begin_ns + 2_500_000_000
+    everything = [(key, payload) for key, payload in recording.messages()]
+    expected = [
+        item for item in everything if begin_ns <= (stamp_of(item[1]) or 0) <= begin_ns + 3_000_000_000
+    ]
+    assert 500 < len(expected) < len(everything) / 2
+    assert list(job.messages()) == expected
+    assert job.duration_s == 3.0
+    job.seconds = None
+    assert job.duration_s == pytest.approx(recording.duration_s - 2.5)
+    assert list(job.messages())[-1] == everything[-1]
+
+
 def _scale_csv(path: Path, columns: slice, factor: float) -> None:
     rows = [line.split(",") for line in path.read_text().splitlines()]
     for row in rows:
@@ -267,6 +290,14 @@ def _spoil_accept(folder: Path) -> list[str]:
     return _arguments(folder, "--accept", "degenrate")
 
 
+def _spoil_skip(folder: Path) -> list[str]:
+    return _arguments(folder, "--skip", "9.5")
+
+
+def _spoil_seconds(folder: Path) -> list[str]:
+    return _arguments(folder, "--seconds", "0")
+
+
 def _spoil_camera_name(folder: Path) -> list[str]:
     return _arguments(folder, "--camera", "cam7")
 
@@ -306,6 +337,8 @@ def _spoil_report(folder: Path) -> list[str]:
         (_spoil_nothing_fixed, 2, "does not give it"),
         (_spoil_fix, 2, "did you mean intrinsics"),
         (_spoil_estimate, 2, "imu_intrinsics"),
+        (_spoil_skip, 2, "is only 9.0 s long"),
+        (_spoil_seconds, 2, "--seconds must be above 0"),
         (_spoil_accept, 2, "did you mean degenerate"),
         (_spoil_camera_name, 1, "cam7"),
         (_spoil_size, 2, "image size"),
