@@ -191,7 +191,6 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
         camera["resolution"] = list(job.priors[name].resolution)
     if result["imu"] is not None:
         result["imu"] |= {"name": job.imu.name, "noise": asdict(_noise_of(job))}
-    result["note"] = f"vical, from {job.recording.path.name}"
     result["warnings"] = list(job.recording.warnings)
     first = next(iter(job.cameras))
     result["trace"] = outcome.traces[first]
