@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     for finding in _findings(config, devices=not args.no_devices):
         findings.append(finding)
         if not args.json:
-            _print_line(finding)
+            print_line(finding)
     if args.json:
         _print(findings, as_json=True)
     if any(finding.problem for finding in findings):
@@ -176,13 +176,14 @@ def _check_camera(
 def _print(findings: list[Finding], *, as_json: bool) -> None:
     if not as_json:
         for finding in findings:
-            _print_line(finding)
+            print_line(finding)
         return
     problems = [finding.problem for finding in findings if finding.problem]
     checked = [{"what": f.what, "found": f.text, "problem": f.problem} for f in findings]
     print(json.dumps({"ok": not problems, "problems": problems, "checked": checked}))
 
 
-def _print_line(finding: Finding) -> None:
+def print_line(finding: Finding) -> None:
+    """Print a finding for a person."""
     mark, text = ("FAIL", finding.problem) if finding.problem else ("ok", finding.text)
     print(f"{mark:<5}{finding.what:<16}{text}", flush=True)
