@@ -121,7 +121,7 @@ def _latency_timers(folder: Path) -> Iterator[Finding]:
         text = _read(path) or ""
         slow = text.isdigit() and int(text) > _FTDI_LATENCY_MS
         problem = (
-            f"{path.parent.name}: the adapter's latency timer is {text} ms, samples come late and in bunches: "
+            f"{path.parent.name}: the latency timer is {text} ms, samples come late and in bunches: "
             f"echo {_FTDI_LATENCY_MS} | sudo tee {path} (`vical install-service` makes that last)"
         )
         yield Finding("latency timer", f"{path.parent.name}: {text} ms", problem if slow else "")
