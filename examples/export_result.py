@@ -6,7 +6,7 @@ import json
 import sys
 from pathlib import Path
 
-from vical_daemon.export import export, rig_from_json
+from vical_daemon.export import ExportError, export, rig_from_json
 
 
 def main(path: str) -> None:
@@ -24,4 +24,9 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    if len(sys.argv) != 2:
+        sys.exit("usage: export_result.py result.json")
+    try:
+        main(sys.argv[1])
+    except (OSError, ValueError, ExportError) as error:
+        sys.exit(f"{sys.argv[1]}: {error}")

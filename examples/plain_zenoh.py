@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
-def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> None:
-    """Ask for the last pose of every camera, then print each new one."""
+def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> int:
+    """Ask for the last pose of every camera, then print each new one; 1 where there is no bus."""
     typestore = get_typestore(Stores.ROS2_JAZZY)
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
@@ -33,7 +33,12 @@ def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> None:
             f"{sample.key_expr}: p {p.x:.4f} {p.y:.4f} {p.z:.4f} m, q {q.w:.4f} {q.x:.4f} {q.y:.4f} {q.z:.4f}"
         )
 
-    with zenoh.open(config) as session:
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError:
+        print(f"no bus at {endpoint}; start `vical run -c FILE` there", file=sys.stderr)
+        return 1
+    with session:
         for reply in session.get("vical/*/calibration/*/pose"):
             if reply.ok is not None:
                 show(reply.ok)
@@ -43,4 +48,4 @@ def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    sys.exit(main(*sys.argv[1:2]))

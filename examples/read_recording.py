@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from vical_daemon.recording import open_recording
+from vical_daemon.recording import RecordingError, open_recording
 
 
 def main(path: str) -> None:
@@ -24,4 +24,9 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    if len(sys.argv) != 2:
+        sys.exit("usage: read_recording.py RECORDING")
+    try:
+        main(sys.argv[1])
+    except RecordingError as error:
+        sys.exit(str(error))

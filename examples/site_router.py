@@ -12,7 +12,7 @@ import sys
 import time
 
 from vical_daemon import client
-from vical_daemon.zenoh_bus import open_bus
+from vical_daemon.zenoh_bus import BusError, open_bus
 
 
 def main(ca: str, certificate: str, key: str, *robots: str) -> None:
@@ -39,4 +39,9 @@ def main(ca: str, certificate: str, key: str, *robots: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) < 5:
+        sys.exit("usage: site_router.py CA.pem SITE.pem SITE.key ROBOT ...")
+    try:
+        main(*sys.argv[1:])
+    except BusError as error:
+        sys.exit(str(error))

@@ -23,7 +23,11 @@ NAMESPACE = r"/|/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
 NAMESPACE_HINT = (
     "a ROS name like robot7 or /site/robot7: letters, digits and _ between slashes, no digit first"
 )
-URI = r"(v4l2|iidc|aravis|folder):.+|/.+|\d+"
+LOG_SCHEME = "log:"
+"""Of a `port` or `uri` that is a recording, played as if its device were there."""
+EMULATED = "emulated"
+"""The `port` or `uri` of a device that `vical run` emulates."""
+URI = rf"(v4l2|iidc|aravis|folder|log):.+|/.+|\d+|{EMULATED}"
 Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
 HostName = Annotated[
     str, Bound(pattern=r"[A-Za-z0-9._-]{1,253}|[0-9A-Fa-f:]{2,45}", hint="a name without port")
@@ -53,7 +57,8 @@ class ImuConfig:
     """One IMU.
 
     Attributes:
-        port: Serial port, best a stable name below /dev/serial/by-id or /dev/vical.
+        port: Serial port, best a stable name below /dev/serial/by-id or /dev/vical; or log:FILE (a
+            recording, played as if its IMU were there; log:FILE#NAME of several) or emulated.
         driver: gx3: MicroStrain 3DM-GX3-25 (and MIP devices).
         protocol: auto asks the device which one it speaks.
         rate_hz: Samples a second; the GX3 divides 1000 Hz.
@@ -91,7 +96,8 @@ class CameraConfig:
     """One camera.
 
     Attributes:
-        uri: v4l2:/dev/video0, iidc:GUID, aravis:NAME, folder:PATH; `vical devices` prints it.
+        uri: v4l2:/dev/video0, iidc:GUID, aravis:NAME, folder:PATH; `vical devices` prints it. Or log:FILE
+            or emulated, as an IMU's `port`.
         size: width, height, px.
         rate_hz: Frames a second.
         exposure_s: Exposure time; None: as the camera has it.
@@ -274,6 +280,8 @@ class Config:
         target: Target file (Kalibr's format); relative to the settings file.
         ros2: ROS 2's names on the bus as well; None: not.
         path: Where this was read from; empty when made in memory.
+
+    Relative paths in `target`, ``log:FILE`` and ``folder:PATH`` are taken from the folder of this file.
     """
 
     rig: Name = "rig0"
@@ -332,8 +340,27 @@ def loads(text: str, name: str = "config") -> Config:
 
 
 def _check(document: Document, path: Path | None) -> Config:
-    config = replace(schema.build(document, Config), path=path)
+    config = _anchored(replace(schema.build(document, Config), path=path))
     problems = [schema.mistake(document, where, text) for where, text in contradictions(config)]
     if problems:
         raise ConfigError(problems[0], problems)
     return config
+
+
+def _anchored(config: Config) -> Config:
+    """Take the relative paths of devices that are files from the folder of the settings file."""
+    if config.path is None:
+        return config
+    folder = config.path.absolute().parent
+
+    def anchor(name: str) -> str:
+        for scheme in (LOG_SCHEME, "folder:"):
+            if name.startswith(scheme):
+                return f"{scheme}{folder / name.removeprefix(scheme)}"
+        return name
+
+    return replace(
+        config,
+        imus={name: replace(imu, port=anchor(imu.port)) for name, imu in config.imus.items()},
+        cameras={name: replace(camera, uri=anchor(camera.uri)) for name, camera in config.cameras.items()},
+    )

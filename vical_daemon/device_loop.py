@@ -107,7 +107,8 @@ class DeviceLoop(Generic[T]):
         flush: Called after each read, in this thread; may take its time if a `StandIn` calls `read_on`.
         read_timeout_s: Longest blocking read; how fast `stop` is noticed.
         silence_s: Without data for so long the device is closed and opened again.
-        longest_pause_s: Pauses between attempts to open grow up to this.
+        first_pause_s: Before the second attempt to open.
+        longest_pause_s: The pauses double up to this.
     """
 
     def __init__(
@@ -120,13 +121,14 @@ class DeviceLoop(Generic[T]):
         flush: Callable[[], None] | None = None,
         read_timeout_s: float = 0.2,
         silence_s: float = 20.0,
+        first_pause_s: float = 0.2,
         longest_pause_s: float = 1.0,
     ) -> None:
         self.name = name
         self._open_source, self._deliver, self._stop = open_source, deliver, stop
         self._flush = flush or (lambda: None)
         self._read_timeout_s, self._silence_s = read_timeout_s, silence_s
-        self._longest_pause_s = longest_pause_s
+        self._first_pause_s, self._longest_pause_s = first_pause_s, longest_pause_s
         self._health = DeviceHealth()
         self._source: Source[T] | None = None
         self._broken = False  # the source raised what it should not: close it
@@ -158,18 +160,25 @@ class DeviceLoop(Generic[T]):
         )
 
     def _run(self) -> None:
-        pause_s = 0.1
+        pause_s = self._first_pause_s
         while not self._stop.is_set():
             self._t_loop_s = time.monotonic()
             try:
                 with self._open_source() as source:
                     self._opened(source)
                     if self._stream():
-                        pause_s = 0.1
+                        pause_s = self._first_pause_s
             except Exception as error:  # also what a library raises when its device is gone
                 self._failed(error)
+            self._pause(pause_s)
             pause_s = min(2 * pause_s, self._longest_pause_s)
-            self._stop.wait(pause_s)
+
+    def _pause(self, pause_s: float) -> None:
+        """Wait in short steps: whoever waits for a device is alive, not stuck."""
+        end_s = time.monotonic() + pause_s
+        while not self._stop.is_set() and (left_s := end_s - time.monotonic()) > 0:
+            self._t_loop_s = time.monotonic()
+            self._stop.wait(min(left_s, self._read_timeout_s))
 
     def _stream(self) -> bool:
         """Read until `stop`, or until nothing came for `silence_s`; True if anything came."""

@@ -7,6 +7,7 @@ disturb when bytes and frames leave. One trajectory moves both.
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import struct
 import time
 from collections.abc import Mapping
@@ -149,14 +150,14 @@ class LiveRig:
 
     def camera(self) -> LiveCamera:
         """Return the camera as a `FrameSource`."""
-        return LiveCamera(self._pipes["camera"])
+        return LiveCamera(self._pipes["camera"], self.settings.camera_rate_hz)
 
 
 class LiveCamera(Closing):
     """The receiving end of the simulated camera: a `FrameSource`."""
 
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe = pipe
+    def __init__(self, pipe: Connection, rate_hz: float) -> None:
+        self._pipe, self._rate_hz = pipe, rate_hz
         self._samples = self._lost = 0
         self._next_sequence: int | None = None
         self._t_first_ns = self._t_last_ns = 0
@@ -164,7 +165,8 @@ class LiveCamera(Closing):
     @property
     def info(self) -> DeviceInfo:
         """Who the camera is."""
-        return DeviceInfo("camera", "rendered board", SERIAL_CAMERA, protocol="simulated")
+        details = {"rate_hz": f"{self._rate_hz:g}"}
+        return DeviceInfo("camera", "rendered board", SERIAL_CAMERA, protocol="simulated", details=details)
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `FrameSource.read`."""
@@ -206,6 +208,7 @@ class LiveCamera(Closing):
 
 def _run_imu(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> None:
     """Emulate the IMU until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the parent: when it ends, the pipe closes
     from vical_mocks.gx3_emulator import Gx3Emulator
     from vical_mocks.imu import GX3_25_ERRORS, FloatArray, ImuErrors
 
@@ -232,6 +235,7 @@ def _run_imu(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> N
 
 def _run_camera(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> None:
     """Render until the pipe closes; pictures are drawn ahead of time where the processor allows."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     import cv2
 
     from vical_mocks.camera import CameraSettings, SimulatedCamera

@@ -58,3 +58,12 @@ def test_a_wrong_config_exits_2_with_all_of_it(rig, capsys) -> None:
 def test_no_devices_opens_nothing(rig, capsys) -> None:
     assert main(["check", "-c", rig("/dev/nothing"), "--no-devices"]) == 0
     assert "imus.imu0" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["", "rig: rover\n"])
+def test_a_config_without_devices_is_not_well(tmp_path: Path, capsys, text: str) -> None:
+    (tmp_path / "vical.yaml").write_text(text)
+    assert main(["check", "-c", str(tmp_path / "vical.yaml")]) == 2
+    out, err = capsys.readouterr()
+    assert "all is well" not in out
+    assert "neither imus nor cameras" in err and err.count("\n") == 1

@@ -18,7 +18,7 @@ import pytest
 from vical_mocks.gx3_emulator import Gx3Emulator
 
 from vical_daemon.bus import Sample
-from vical_daemon.messages import decode_diagnostics, decode_imu
+from vical_daemon.messages import decode_diagnostics, decode_imu, decode_points
 from vical_daemon.recording import open_recording
 from vical_daemon.vision.target import Checkerboard
 from vical_daemon.zenoh_bus import open_bus
@@ -244,3 +244,41 @@ def test_a_killed_child_is_started_again(daemon: Daemon) -> None:
     _wait_for(lambda: len(_alive(_children(parent))) == 3)
     after = _children(parent)
     assert children[0] in after and children[2] in after and children[1] not in after
+
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def test_the_service_runs_without_hardware(daemon: Daemon) -> None:
+    """`vical run -c examples/no_hardware.yaml`: emulated IMU and rendered camera, all else as on a robot."""
+    text = (EXAMPLES / "no_hardware.yaml").read_text().replace("web: {enabled: true}", "bus: {tcp_port: 0}")
+    assert "tcp_port" in text
+    (daemon.folder / "vical.yaml").write_text(text)
+    board = "no_hardware_target.yaml"
+    (daemon.folder / board).write_text((EXAMPLES / board).read_text())
+    parent = daemon.vical("run")
+    _wait_for(daemon.socket.exists, 120)
+    bus = open_bus(mode="client", socket=daemon.socket)
+    got: list[Sample] = []
+    for what in ("imu/imu0", "camera/cam0/points", "calibration/cam0"):
+        bus.subscribe(f"vical/no_hardware/{what}", got.append)
+
+    def seen(kind: str) -> list[Sample]:
+        return [s for s in list(got) if s.key.endswith(kind)]
+
+    _wait_for(lambda: sum(len(decode_points(s.payload).ids) == 54 for s in seen("/points")) > 10, 120)
+    _wait_for(lambda: len(seen("/imu0")) > 500 and seen("/calibration/cam0"), 120)
+    age_s = time.time() - decode_imu(seen("/imu0")[-1].payload).stamp_ns * 1e-9
+    assert -1 < age_s < 60
+    bus.close()
+    parent.send_signal(signal.SIGINT)
+    _, err = parent.communicate(timeout=60)
+    assert parent.returncode == 0 and "Traceback" not in err, err
+
+
+def test_halves_of_the_emulated_rig_are_refused(daemon: Daemon) -> None:
+    text = (EXAMPLES / "no_hardware.yaml").read_text()
+    (daemon.folder / "vical.yaml").write_text(text + "bus: {tcp_port: 0}\n")
+    process = daemon.vical("run", "imu")
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2 and "run both in one process (`vical run acquire`)" in err.splitlines()[-1]

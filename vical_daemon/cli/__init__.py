@@ -31,7 +31,8 @@ Start here:
   vical run -c vical.yaml                       acquire, stamp, record, calibrate, publish
 
 Every command takes --json (machine output alone on stdout) and --help.
-Exit code: 0 done, 1 a known failure (one line on stderr), 2 bad usage or config.
+Exit code: 0 done, 1 a known failure (one line on stderr), 2 bad usage or config,
+3 done, but the calibration is not `converged`.
 """
 
 
@@ -124,7 +125,9 @@ def _selected(words: list[str]) -> str | None:
 
 def _set_up_logging(args: argparse.Namespace) -> None:
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname).1s %(name)s: %(message)s")
+    time_of_day = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "  # the journal has its own
+    line = f"{time_of_day}%(levelname).1s %(name)s: %(message)s"
+    logging.basicConfig(level=level, stream=sys.stderr, format=line, datefmt="%H:%M:%S")
     if not args.verbose:  # libraries talk about themselves at INFO
         for library in ("asyncio", "aiohttp", "rosbags"):
             logging.getLogger(library).setLevel(logging.WARNING)

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json, suggest
 
 if TYPE_CHECKING:
@@ -24,7 +24,11 @@ examples:
   vical calibrate log.mcap --target target.yaml --initial lens.yaml --fix intrinsics
   vical calibrate euroc_folder --target april.yaml --json -o result.json --report result.html
   vical export result.json --format kalibr -o camchain.yaml
+
+exit code: 0 converged; 3 there is a result, but it is converging or degenerate (--accept makes that 0);
+1 no result; 2 bad usage
 """
+ACCEPT = ("converging", "degenerate")
 _UNUSABLE = ("waiting", "initialising", "inconsistent")
 
 
@@ -49,16 +53,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="",
         help=f"comma-separated, estimated without being suspected first: {', '.join(ESTIMATE)}",
     )
+    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
+    parser.add_argument("--seconds", type=float, metavar="S", help="use only S seconds (after --skip)")
     parser.add_argument("--report", metavar="F.html", help="write a report with figures")
     parser.add_argument(
         "-o", "--output", metavar="F.json", help="also write the result there, for `vical export`"
+    )
+    parser.add_argument(
+        "--accept",
+        metavar="STATUS",
+        default="",
+        help=f"comma-separated, exit 0 instead of 3 for a result that is: {', '.join(ACCEPT)}",
     )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate and print; 1 if there is no usable result."""
+    """Calibrate and print; 1 if there is no usable result, 3 if it is not converged."""
+    accepted = _words("--accept", args.accept, ACCEPT)
     fix, estimate = _words("--fix", args.fix, FIX), _words("--estimate", args.estimate, ESTIMATE)
+    if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
+        raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
     for path in (args.report, args.output):
         if path and not Path(path).absolute().parent.is_dir():
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
@@ -82,15 +97,17 @@ def run(args: argparse.Namespace) -> int:
         imu=args.imu,
         fix=fix,
         estimate=estimate,
+        skip_s=args.skip,
+        seconds=args.seconds,
     )
     bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
     outcome = calibration_run.run_job(job, bar.show, keep_frames=bool(args.report))
     bar.close()
-    return _deliver(args, job, outcome)
+    return _deliver(args, job, outcome, accepted)
 
 
-def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome) -> int:
-    """Print, write what was asked for, and say in one line if the result cannot be used."""
+def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tuple[str, ...]) -> int:
+    """Print, write what was asked for, and say in one line if the result cannot be used as it is."""
     from vical_daemon.cli.calibration_run import document
 
     result = document(job, outcome)
@@ -110,9 +127,10 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome) -> int:
         from vical_daemon.cli.calibration_run import suspects
 
         raise CliError(f"no calibration: {status}: {why or 'too little data'} ({suspects(job)})")
-    if status != "converged":
-        print(f"vical: warning: {status}: {why}", file=sys.stderr)
-    return 0
+    if status == "converged":
+        return 0
+    print(f"vical: warning: {status}: {why}", file=sys.stderr)
+    return 0 if status in accepted else EXIT_NOT_CONVERGED
 
 
 def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any]) -> None:
@@ -120,6 +138,8 @@ def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[s
 
     inputs = [Path(p) for p in (args.input, args.target, args.initial) if p]
     settings = {"fix": args.fix, "estimate": args.estimate}
+    if args.skip or args.seconds is not None:
+        settings["part"] = f"{outcome.estimate.duration_s:.1f} s, from {args.skip:g} s on"
     report.write_report(
         Path(args.report),
         result | {"trace": outcome.traces},

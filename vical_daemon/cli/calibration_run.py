@@ -6,7 +6,7 @@ Everything happens in one thread and in the order of the stamps, so two runs are
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from vical_daemon.estimators import make_estimator
 from vical_daemon.priors import Initial
 from vical_daemon.publications import publish
 from vical_daemon.recording import Recording, Stream
+from vical_daemon.recording.logs import stamp_of
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.frame_report import FrameReport
@@ -42,6 +43,8 @@ class Job:
         cameras: Stream of each camera.
         config: The rig, as the roles want it.
         priors: What is known about each camera.
+        skip_s: Seconds of the recording that are left out at its beginning.
+        seconds: How many are used then; None: all.
     """
 
     recording: Recording
@@ -49,6 +52,23 @@ class Job:
     cameras: dict[str, Stream]
     config: Config
     priors: dict[str, CameraPrior]
+    skip_s: float = 0.0
+    seconds: float | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds of the recording that are used."""
+        left_s = self.recording.duration_s - self.skip_s
+        return left_s if self.seconds is None else min(self.seconds, left_s)
+
+    def messages(self) -> Iterator[tuple[str, bytes]]:
+        """Yield (key, payload) of the streams and the part of the recording that are used."""
+        begin_ns = self.recording.begin_ns + round(self.skip_s * 1e9)
+        end_ns = begin_ns + round(self.duration_s * 1e9)
+        for key, payload in self.recording.messages([self.imu, *self.cameras.values()]):
+            stamp_ns = stamp_of(payload)
+            if stamp_ns is not None and begin_ns <= stamp_ns <= end_ns:
+                yield key, payload
 
 
 @dataclass(slots=True)
@@ -69,6 +89,8 @@ def make_job(
     imu: str | None = None,
     fix: Sequence[str] = (),
     estimate: Sequence[str] = (),
+    skip_s: float = 0.0,
+    seconds: float | None = None,
 ) -> Job:
     """Choose streams and put what is known into the form of a config.
 
@@ -80,10 +102,16 @@ def make_job(
         imu: Which; None: the only one.
         fix: See `CalibrationOptions`.
         estimate: See `CalibrationOptions`.
+        skip_s: See `Job`.
+        seconds: See `Job`.
 
     Raises:
         CliError: No such stream, or something needed is not known.
     """
+    if skip_s >= recording.duration_s:
+        raise CliError(
+            f"--skip {skip_s:g}: {recording.path} is only {recording.duration_s:.1f} s long", EXIT_USAGE
+        )
     imu_stream = _choose("imu", recording.imus, imu)
     chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
     if not chosen:
@@ -103,7 +131,7 @@ def make_job(
             estimate=tuple(estimate),  # type: ignore[arg-type]
         ),
     )
-    return Job(recording, imu_stream, chosen, config, priors)
+    return Job(recording, imu_stream, chosen, config, priors, skip_s, seconds)
 
 
 def _config(rig: str, imu: Stream, priors: dict[str, CameraPrior], noise: ImuNoise) -> Config:
@@ -139,15 +167,16 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     for key in (job.imu.key, *(_points_key(job, name) for name in job.cameras)):
         bus.subscribe(key, role.take)
     _attach_detectors(bus, job)
-    total = job.imu.count + sum(stream.count for stream in job.cameras.values())
+    count = job.imu.count + sum(stream.count for stream in job.cameras.values())
+    total = count * job.duration_s / max(job.recording.duration_s, 1e-9)
     t_shown_s = time.monotonic()
-    for done, (key, payload) in enumerate(job.recording.messages([job.imu, *job.cameras.values()])):
+    for done, (key, payload) in enumerate(job.messages()):
         bus.publish(key, payload)
         if key != job.imu.key:
             publish(bus, role.step())
             if time.monotonic() - t_shown_s > 0.1:
                 t_shown_s = time.monotonic()
-                progress(done / total, role.latest)
+                progress(min(done / total, 1.0), role.latest)
     publish(bus, role.finish())
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
@@ -158,11 +187,11 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     """Return the result as `--json` prints it; `cpu_s` counts from the start of the process."""
     result = outcome.estimate.to_json()
     result["status"] = str(outcome.estimate.status)
-    result["duration_s"] = job.recording.duration_s
+    result["duration_s"] = job.duration_s
     for name, camera in result["cameras"].items():
         camera["resolution"] = list(job.priors[name].resolution)
     if result["imu"] is not None:
-        result["imu"]["noise"] = asdict(_noise_of(job))
+        result["imu"] |= {"name": job.imu.name, "noise": asdict(_noise_of(job))}
     result["warnings"] = list(job.recording.warnings)
     first = next(iter(job.cameras))
     result["trace"] = outcome.traces[first]

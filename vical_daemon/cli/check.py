@@ -6,15 +6,17 @@ import argparse
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.errors import EXIT_USAGE, NOTHING_TO_RUN, CliError
 from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
+    from vical_drivers.samples import FrameSource, ImuSource
+
     from vical_daemon.config import CameraConfig, Config, ImuConfig
 
 _IMU_SECONDS = 2.5
@@ -46,11 +48,15 @@ def run(args: argparse.Namespace) -> int:
         findings = [Finding("config", args.config, problem) for problem in error.problems]
         _print(findings, as_json=args.json)
         raise CliError(_count(findings), EXIT_USAGE) from None
+    if not config.imus and not config.cameras:
+        finding = Finding("config", args.config, f"{args.config}: {NOTHING_TO_RUN}")
+        _print([finding], as_json=args.json)
+        raise CliError(finding.problem, EXIT_USAGE)
     findings = [Finding("config", f"{args.config}: {_summary(config)}")]
     for finding in _findings(config, devices=not args.no_devices):
         findings.append(finding)
         if not args.json:
-            _print_line(finding)
+            print_line(finding)
     if args.json:
         _print(findings, as_json=True)
     if any(finding.problem for finding in findings):
@@ -77,10 +83,17 @@ def _findings(config: Config, *, devices: bool) -> Iterator[Finding]:
     yield _check_disk(config)
     if not devices:
         return
-    for name, imu in config.imus.items():
-        yield _check_imu(f"imus.{name}", imu)
-    for name, camera in config.cameras.items():
-        yield from _check_camera(f"cameras.{name}", camera)
+    from vical_daemon.cli.emulated import emulated_devices
+    from vical_daemon.roles.camera import open_camera
+    from vical_daemon.roles.imu import open_imu
+
+    with emulated_devices(config, ("imu", "camera")) as options:
+        open_source = options.get("imu", {}).get("open_source", open_imu)
+        for name, imu in config.imus.items():
+            yield _check_imu(f"imus.{name}", imu, open_source)
+        open_source = options.get("camera", {}).get("open_source", open_camera)
+        for name, camera in config.cameras.items():
+            yield from _check_camera(f"cameras.{name}", camera, open_source)
 
 
 def _check_target(config: Config) -> Iterator[Finding]:
@@ -118,13 +131,11 @@ def _check_disk(config: Config) -> Finding:
     return Finding("record", text)
 
 
-def _check_imu(what: str, imu: ImuConfig) -> Finding:
+def _check_imu(what: str, imu: ImuConfig, open_source: Callable[[ImuConfig], ImuSource]) -> Finding:
     from vical_drivers.errors import DriverError
 
-    from vical_daemon.roles.imu import open_imu
-
     try:
-        with open_imu(imu) as source:
+        with open_source(imu) as source:
             info, count = source.info, 0
             end_s = time.monotonic() + _IMU_SECONDS
             while time.monotonic() < end_s:
@@ -132,7 +143,8 @@ def _check_imu(what: str, imu: ImuConfig) -> Finding:
             rate_hz = source.stats().rate_hz
     except DriverError as error:
         return Finding(what, imu.port, str(error))
-    text = f"{imu.port}: {info.model} serial {info.serial_number} firmware {info.firmware}, {info.protocol}"
+    firmware = f" firmware {info.firmware}" if info.firmware else ""
+    text = f"{imu.port}: {info.model} serial {info.serial_number}{firmware}, {info.protocol}"
     if not count:
         return Finding(what, text, f"{imu.port}: {info.model} answers but sends no samples; power-cycle it")
     if abs(rate_hz / imu.rate_hz - 1) > 0.05:
@@ -140,12 +152,20 @@ def _check_imu(what: str, imu: ImuConfig) -> Finding:
     return Finding(what, f"{text}, {rate_hz:.1f} Hz")
 
 
-def _check_camera(what: str, camera: CameraConfig) -> Iterator[Finding]:
-    from vical_drivers.camera.opening import check_camera
+def _check_camera(
+    what: str, camera: CameraConfig, open_source: Callable[[CameraConfig], FrameSource]
+) -> Iterator[Finding]:
+    from vical_drivers.camera.opening import judge_camera
+    from vical_drivers.errors import DriverError
 
     from vical_daemon.roles.camera import driver_options
 
-    problems = check_camera(camera.uri, **driver_options(camera))
+    try:
+        source = open_source(camera)
+    except DriverError as error:
+        yield Finding(what, camera.uri, str(error))
+        return
+    problems = judge_camera(source, camera.uri, **driver_options(camera))
     if not problems:
         width, height = camera.size
         yield Finding(what, f"{camera.uri}: {width} x {height} at {camera.rate_hz:g} Hz")
@@ -156,13 +176,14 @@ def _check_camera(what: str, camera: CameraConfig) -> Iterator[Finding]:
 def _print(findings: list[Finding], *, as_json: bool) -> None:
     if not as_json:
         for finding in findings:
-            _print_line(finding)
+            print_line(finding)
         return
     problems = [finding.problem for finding in findings if finding.problem]
     checked = [{"what": f.what, "found": f.text, "problem": f.problem} for f in findings]
     print(json.dumps({"ok": not problems, "problems": problems, "checked": checked}))
 
 
-def _print_line(finding: Finding) -> None:
+def print_line(finding: Finding) -> None:
+    """Print a finding for a person."""
     mark, text = ("FAIL", finding.problem) if finding.problem else ("ok", finding.text)
     print(f"{mark:<5}{finding.what:<16}{text}", flush=True)

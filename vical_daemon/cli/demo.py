@@ -16,13 +16,13 @@ from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json, check_port
 
 if TYPE_CHECKING:
-    from vical_mocks.live_rig import LiveRig
-
     from vical_daemon.cli.demo_screen import Watch
     from vical_daemon.cli.demo_truth import StampWitness
+    from vical_daemon.cli.emulated import EmulatedRig
     from vical_daemon.cli.process_sets import RoleThreads
     from vical_daemon.config import Config
     from vical_daemon.estimation.result import CalibrationEstimate
+    from vical_daemon.vision.target import Checkerboard
 
 CAMERA, IMU = "cam0", "imu0"
 RATE_HZ = 12.5
@@ -30,19 +30,19 @@ FILTER_SAMPLES = 10
 MOST, AFTER_CONVERGENCE = 80.0, 10.0  # seconds of data
 ENOUGH_SHARE = 0.6  # of the images used in time; with fewer the machine is said to be busy
 BUSY_FACTOR = 4.0  # on a busy machine the demo takes at most so many times its seconds
-BOARD = {"kind": "checkerboard", "cols": 9, "rows": 6, "row_spacing_m": 0.045, "col_spacing_m": 0.045}
+BOARD = {"cols": 9, "rows": 6, "row_spacing_m": 0.045, "col_spacing_m": 0.045}
 _CONFIG = """\
-# What `vical demo` runs. On a robot only `port` and `uri` differ.
+# What `vical demo` runs, and `vical run -c vical.yaml` as a service. On a robot only `port` and `uri` differ.
 rig: demo
 imus:
   {imu}:
-    port: {port}
+    port: emulated
     rate_hz: 100
     filter_samples: {taps}         # as long as a sample lasts, the default
     noise: {{gyro_density: 3.8e-4, accel_density: 1.2e-3}}
 cameras:
   {camera}:
-    uri: folder:simulated      # the demo puts its rendered camera here
+    uri: emulated
     size: [640, 480]
     rate_hz: {rate}
     lens:                      # a data sheet's focal length, and nothing about mounting or delay
@@ -82,14 +82,15 @@ def run(args: argparse.Namespace) -> int:
     before = set(out.rglob("*.mcap"))
     for stored in (out / "store").glob("*.json"):  # of an earlier demo: this one is to start from nothing
         stored.unlink()
-    from vical_mocks.live_rig import LiveRig, LiveRigSettings
-
     from vical_daemon.cli import demo_truth
+    from vical_daemon.cli.emulated import make_rig
+    from vical_daemon.vision.target import Checkerboard
+
+    board = Checkerboard(**BOARD)  # type: ignore[arg-type]
 
     _say(f"simulating a 3DM-GX3-25 on a pseudo terminal and a camera before a checkerboard; files in {out}")
-    settings = LiveRigSettings(board=BOARD, seed=args.seed, camera_rate_hz=RATE_HZ)
-    with LiveRig(settings) as rig:
-        config = _write_config(out, rig.port)
+    with make_rig(board, RATE_HZ, seed=args.seed) as rig:
+        config = _write_config(out, board, rig.port)
         if args.web is not None:
             config = replace(config, web=replace(config.web, enabled=True, port=args.web))
         stamps = demo_truth.StampWitness(rig.imu_instant_ns, FILTER_SAMPLES)
@@ -119,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_roles(
-    config: Config, rig: LiveRig, stamps: StampWitness, args: argparse.Namespace
+    config: Config, rig: EmulatedRig, stamps: StampWitness, args: argparse.Namespace
 ) -> tuple[CalibrationEstimate, list[dict[str, Any]]]:
     """Run every role as a thread over one LocalBus for the given time of data."""
     from vical_daemon.bus import LocalBus
@@ -197,23 +198,22 @@ def _follow(watch: Watch, roles: RoleThreads, args: argparse.Namespace) -> None:
             screen.show(watch)
 
 
-def _write_config(out: Path, port: str) -> Config:
+def _write_config(out: Path, board: Checkerboard, port: str) -> Config:
+    """Write target and settings; returns the settings with the port of the rig that runs now."""
     from vical_daemon.config import load
-    from vical_daemon.vision.target import Checkerboard
 
-    board = {key: value for key, value in BOARD.items() if key != "kind"}
-    (out / "target.yaml").write_text(Checkerboard(**board).to_yaml(), encoding="utf-8")  # type: ignore[arg-type]
+    (out / "target.yaml").write_text(board.to_yaml(), encoding="utf-8")
     text = _CONFIG.format(
         imu=IMU,
         camera=CAMERA,
-        port=port,
         rate=RATE_HZ,
         taps=FILTER_SAMPLES,
         log=json.dumps(str(out)),
         store=json.dumps(str(out / "store")),
     )
     (out / "vical.yaml").write_text(text, encoding="utf-8")
-    return load(out / "vical.yaml")
+    config = load(out / "vical.yaml")
+    return replace(config, imus={IMU: replace(config.imus[IMU], port=port)})
 
 
 def _folder(given: str | None) -> Path:

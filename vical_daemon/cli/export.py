@@ -42,6 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--imu-noise", metavar="F.yaml", help="Kalibr's imu.yaml with the noise densities")
     parser.add_argument("--imu-topic", metavar="T", default="/imu0", help="ROS topic of the IMU")
     parser.add_argument("--image-topic", metavar="T", help="ROS topic of the images (one camera)")
+    parser.add_argument(
+        "--imu-frame", metavar="NAME", help="of the imu in ros and urdf (default: as on the bus, else imu)"
+    )
+    parser.add_argument(
+        "--force", action="store_true", help="write directions too that the motion did not determine"
+    )
     parser.epilog = _EPILOG
     add_json(parser)
 
@@ -51,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
     from vical_daemon.export import export
 
     rig = _complete(read_source(args.source), args)
-    files = export(rig, args.format)
+    files = export(rig, args.format, force=args.force)
+    if rig.status not in ("", "converged"):
+        print(f"vical: warning: not converged: {rig.status}: {rig.reason}", file=sys.stderr)
     for camera in rig.cameras.values():
         for direction in camera.unobservable:
             print(f"vical: warning: {camera.name}: not revealed by the motion: {direction}", file=sys.stderr)
@@ -139,28 +147,38 @@ def _from_log(path: Path) -> Rig:
     from vical_daemon.messages import (
         CALIBRATION_TYPE,
         CAMERA_INFO_TYPE,
+        POSE_TYPE,
         decode_calibration,
         decode_camera_info,
+        decode_pose,
         merge_calibrations,
     )
 
     last: dict[str, bytes] = {}
     sizes: dict[str, tuple[int, int]] = {}
+    devices: dict[str, str] = {}
+    frames: set[str] = set()
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     for file in files:
-        for message in LogReader(file).messages():
+        reader = LogReader(file)
+        for message in reader.messages():
             if message.channel.type_name == CALIBRATION_TYPE:
                 last[message.channel.topic] = message.payload
+            elif message.channel.type_name == POSE_TYPE:
+                frames.add(decode_pose(message.payload).frame_id)
             elif message.channel.type_name == CAMERA_INFO_TYPE:
                 info = decode_camera_info(message.payload)
                 sizes[info.frame_id] = (info.width, info.height)
+        for name, values in reader.metadata:
+            devices |= values if name == "devices" else {}
     if not last:
         raise CliError(
             f"{path}: no calibration in this log; run `vical calibrate {path} --target FILE -o result.json` "
             "and export result.json"
         )
     estimate = merge_calibrations(decode_calibration(data) for data in last.values())
-    return rig_from_estimate(estimate, sizes, note=f"vical, from {path.name}, status {estimate.status}")
+    rig = rig_from_estimate(estimate, sizes, note=f"vical, from {path.name}")
+    return replace(rig, devices=devices, imu_frame=frames.pop() if len(frames) == 1 else rig.imu_frame)
 
 
 def _from_store() -> Rig:
@@ -177,7 +195,8 @@ def _from_store() -> Rig:
         raise CliError(f"no calibration is stored in {folder}: nothing has converged on this machine yet")
     cameras = {entry.camera: entry.known for entry in stored}
     estimate = with_changes(stored[-1].estimate, cameras=cameras)
-    return rig_from_estimate(estimate, note=f"vical, stored for imu {stored[-1].imu_serial}")
+    devices = {"imu": stored[-1].imu_serial} | {f"camera/{e.camera}": e.camera_serial for e in stored}
+    return replace(rig_from_estimate(estimate, note="vical, from the store"), devices=devices)
 
 
 def _complete(rig: Rig, args: argparse.Namespace) -> Rig:
@@ -200,7 +219,8 @@ def _complete(rig: Rig, args: argparse.Namespace) -> Rig:
         from vical_daemon.priors import read_initial
 
         noise = read_initial(args.imu_noise).imu_noise or noise
-    return replace(rig, cameras=cameras, noise=noise, imu_topic=args.imu_topic)
+    frame = args.imu_frame or rig.imu_frame
+    return replace(rig, cameras=cameras, noise=noise, imu_topic=args.imu_topic, imu_frame=frame)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
@@ -17,16 +19,44 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.add_argument("log", metavar="LOG", help="an MCAP or bag file, a bag folder or an ASL folder")
+    parser.add_argument(
+        "logs", metavar="LOG", nargs="+", help="an MCAP or bag file, a bag folder or an ASL folder"
+    )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what the recording holds, and whether `vical calibrate` would take it."""
+    """Print what each recording holds, and whether `vical calibrate` takes it; 1 if one is unreadable."""
+    from vical_daemon.mcap_log import LogError
+    from vical_daemon.recording import RecordingError
+
+    found: list[dict[str, object]] = []
+    broken: list[str] = []
+    for number, name in enumerate(args.logs):
+        try:
+            summary, problem = _summarise(Path(name))
+        except (RecordingError, LogError) as error:
+            text = str(error) if name in str(error) else f"{name}: {error}"
+            broken.append(text)
+            found.append({"path": name, "problem": text})
+            continue
+        found.append(_as_json(summary, problem))
+        if not args.json:
+            print(("\n" if number else "") + _as_text(summary, problem), flush=True)
+    if args.json and not (len(args.logs) == 1 and broken):
+        print(json.dumps(found[0] if len(args.logs) == 1 else {"logs": found}))
+    if broken:
+        for line in broken[:-1]:
+            print(f"vical: error: {line}", file=sys.stderr)
+        raise CliError(broken[-1])
+    return 0
+
+
+def _summarise(path: Path) -> tuple[Summary, str]:
+    """Return what a recording holds, and why `vical calibrate` would not take it (empty: it would)."""
     from vical_daemon.recording import RecordingError, check_recording, open_recording
     from vical_daemon.recording.summary import summarise_log, summarise_recording
 
-    path = Path(args.log)
     problem = ""
     if path.is_file() and (path.suffix == ".mcap" or path.name.endswith(".mcap.part")):
         summary = summarise_log(path)
@@ -34,18 +64,13 @@ def run(args: argparse.Namespace) -> int:
             check_recording(open_recording(path, check=False))
         except RecordingError as error:
             problem = str(error)
-    else:
-        recording = open_recording(path, check=False)
-        try:
-            check_recording(recording)
-        except RecordingError as error:
-            problem = str(error)
-        summary = summarise_recording(recording)
-    if args.json:
-        print(json.dumps(_as_json(summary, problem)))
-    else:
-        print(_as_text(summary, problem))
-    return 0
+        return summary, problem
+    recording = open_recording(path, check=False)
+    try:
+        check_recording(recording)
+    except RecordingError as error:
+        problem = str(error)
+    return summarise_recording(recording), problem
 
 
 def _as_json(summary: Summary, problem: str) -> dict[str, object]:

@@ -13,6 +13,7 @@ from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.guidance import WeakDirection
+    from vical_daemon.estimation.measurements import FloatArray
     from vical_daemon.estimation.observability import Motion, Observability, Setup
     from vical_daemon.estimation.observability_model import ModelRank
 
@@ -87,6 +88,24 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[WeakDi
     return missing_motion(part, setup.R_imu_cam, turning.scatter(), turning.rate_change_rps2)
 
 
+_PRIOR = 1e3  # of `covariance_of`: ten metres, a radian, a second: next to no knowledge
+_LOST_SHARE = 0.1  # of the prior: an unknown that keeps so much of it was not determined
+
+
+def sigmas(result: Observability) -> FloatArray:
+    """Bound on the standard deviation of each unknown, infinite for what the motion did not determine.
+
+    A lost direction has a trace of every unknown in it, of rounding and of noise. So what counts is how much
+    of a prior of next to nothing is left, not whether an unknown has any part in such a direction.
+    """
+    import numpy as np
+
+    from vical_daemon.estimation.observability import covariance_of
+
+    sigma = np.sqrt(np.diag(covariance_of(result, _PRIOR)))
+    return np.where(sigma > _LOST_SHARE * _PRIOR * result.units, np.inf, sigma)
+
+
 def _document(
     result: Observability, motion: Motion, missing: list[WeakDirection], model: ModelRank, frames: int
 ) -> dict[str, Any]:
@@ -94,8 +113,10 @@ def _document(
 
     from vical_daemon.estimation.wording import axis_name, guidance_document, guidance_text
 
+    bounds = sigmas(result)
+
     def sigma(block: str) -> list[float | None]:
-        return [float(v) if np.isfinite(v) else None for v in result.sigma[result.blocks[block]]]
+        return [float(v) if np.isfinite(v) else None for v in bounds[result.blocks[block]]]
 
     rates = np.sqrt(np.mean(motion.rate_rps**2, axis=0))
     return {

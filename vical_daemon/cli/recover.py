@@ -41,11 +41,20 @@ def run(args: argparse.Namespace) -> int:
         for warning in item.warnings:
             print(warning, file=sys.stderr)
     if args.json:
-        found = [{"source": str(r.source), "output": str(r.output), "messages": r.messages} for r in done]
+        found = [
+            {
+                "source": str(r.source),
+                "output": str(r.output),
+                "messages": r.messages,
+                "was_complete": r.was_complete,
+            }
+            for r in done
+        ]
         print(json.dumps({"recovered": found}))
     else:
         for item in done:
-            print(f"{item.output}: {item.messages} messages")
+            what = "complete, nothing to recover: " if item.was_complete else ""
+            print(f"{item.output}: {what}{item.messages} messages")
         if not done:
             print("nothing to recover")
     return 0

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.children import STOP_S, Children
-from vical_daemon.cli.errors import CliError, report_thread
+from vical_daemon.cli.errors import EXIT_USAGE, NOTHING_TO_RUN, CliError, report_thread
 from vical_daemon.cli.options import add_config, add_json
 from vical_daemon.cli.stop_signals import die_with, leave_at_once, stop_signals
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = load(args.config)
     if not config.imus and not config.cameras:
-        raise CliError(f"{args.config}: neither imus nor cameras: there is nothing to run", 2)
+        raise CliError(f"{args.config}: {NOTHING_TO_RUN}", EXIT_USAGE)
     if not args.roles:
         return _run_children(args, process_sets.needed_processes(config))
     roles = process_sets.role_names(args.roles)
@@ -88,6 +88,7 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     """Run roles as threads of this process; consumers are started first and stopped last."""
     from vical_daemon import notify
     from vical_daemon.cli.bus_access import open_for_roles
+    from vical_daemon.cli.emulated import emulated_devices
     from vical_daemon.cli.process_sets import RoleThreads
 
     bus = open_for_roles(config, roles, stop)
@@ -96,11 +97,14 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
     threads = RoleThreads(config, bus)
     try:
-        for role in reversed(roles):
-            threads.start(role)
-        _attend(config, bus, roles, threads, stop)
+        with emulated_devices(config, roles) as options:
+            try:
+                for role in reversed(roles):
+                    threads.start(role, options.get(role))
+                _attend(config, bus, roles, threads, stop)
+            finally:
+                clean = threads.stop_all()
     finally:
-        clean = threads.stop_all()
         bus.close()
     threads.raise_failure()
     return 0 if clean else 1

@@ -43,6 +43,7 @@ START, SERVICE, DEVICES, CALIBRATION, LOGS, RESULTS = (
 COMMANDS = (
     Command("demo", START, "the whole system without hardware, truth beside the estimate at the end"),
     Command("check", START, "read config and devices, say what is wrong"),
+    Command("doctor", START, "what on this computer stands in the way of good stamps, and what to do"),
     Command("target", START, "a board to print, to scale, and its target YAML"),
     Command("run", SERVICE, "the daemon, or single roles of it"),
     Command("watch", SERVICE, "subscribe to calibration updates and show them live"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--from", dest="source", type=Path, metavar="FILE", help="an existing target YAML")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="F.pdf or F.svg")
     parser.add_argument("--yaml", type=Path, metavar="FILE", help="target YAML (default: beside the board)")
+    parser.add_argument(
+        "--force", action="store_true", help="overwrite a target YAML that says something else"
+    )
     parser.add_argument("--paper", default="a4", help="a5 ... a0, letter, legal, tabloid or WxH in mm (a4)")
     grid = parser.add_argument_group("aprilgrid")
     grid.add_argument("--tag-cols", type=int, metavar="N", help="tags along x (6)")
@@ -77,17 +81,41 @@ def run(args: argparse.Namespace) -> int:
         sheet = lay_out(target, args.paper)
     except (SheetError, TargetError) as error:
         raise CliError(str(error), exit_code=2) from None
+    write_yaml = _must_write(args, yaml_path, target)
     try:
         if kind == ".pdf":
             args.out.write_bytes(to_pdf(sheet, describe(target)))
         else:
             args.out.write_text(to_svg(sheet), encoding="utf-8")
-        if args.source is None or yaml_path.resolve() != args.source.resolve():
+        if write_yaml:
             yaml_path.write_text(target.to_yaml(), encoding="utf-8")
     except OSError as error:
         raise CliError(f"{error.filename or args.out}: cannot be written ({error.strerror})") from None
     _report(args, target, sheet.size_mm, yaml_path)
     return 0
+
+
+def _must_write(args: argparse.Namespace, yaml_path: Path, target: Target) -> bool:
+    """Tell whether the YAML must be written; False: it holds this target already, perhaps with notes.
+
+    Raises:
+        CliError: It says something else, and nobody said --force.
+    """
+    from vical_daemon.vision.target import TargetError, load_target
+
+    if not yaml_path.exists():
+        return True
+    if args.source is not None and yaml_path.resolve() == args.source.resolve():
+        return False
+    with suppress(TargetError):
+        if load_target(yaml_path) == target:
+            return False
+    if not args.force:
+        raise CliError(
+            f"{yaml_path} exists and says something else (sizes that were measured?); choose another name "
+            "with -o or --yaml, print it with --from, or overwrite it with --force"
+        )
+    return True
 
 
 def _target(args: argparse.Namespace) -> Target:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import threading
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Any
@@ -34,20 +35,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show until interrupted, converged or out of time."""
-    from vical_daemon.cli.bus_access import open_client
+    """Show until interrupted, converged or out of time; a bus that is not there yet is waited for."""
+    from vical_daemon.cli.bus_wait import wait_for_bus
 
-    bus = open_client(args.config, args.connect)
+    begin_s = time.monotonic()
+    end_s = begin_s + args.timeout if args.timeout else float("inf")
+    never = threading.Event()
+    bus = wait_for_bus(
+        args.config, args.connect, end_s=begin_s if args.once else end_s, stop=never, quiet=args.quiet
+    )
+    assert bus is not None  # nobody stops it
     try:
         view = View(args.rig, as_json=args.json)
         view.begin(bus)
-        return _loop(args, view)
+        return _loop(args, view, end_s)
     finally:
         bus.close()
 
 
-def _loop(args: argparse.Namespace, view: View) -> int:
-    end_s = time.monotonic() + args.timeout if args.timeout else float("inf")
+def _loop(args: argparse.Namespace, view: View, end_s: float) -> int:
     if args.once:
         end_s = min(end_s, time.monotonic() + 3.0)
     with _screen(hidden=args.json) as show:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from vical_daemon.bus import Bus
     from vical_daemon.config import Config
 
+_RETRY_S = 0.5
 _EPILOG = """\
   vical web -c vical.yaml                 page at http://127.0.0.1:8080/
   vical web --port 0 --foxglove 8765      no settings needed: asks the bus what there is; Foxglove as well
@@ -39,19 +40,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until interrupted."""
+    """Serve until interrupted; a bus that is not there yet is waited for, as is what it carries."""
     check_port("--port", args.port)
     check_port("--foxglove", args.foxglove)
-    from vical_daemon.cli.bus_access import open_client
+    from vical_daemon.cli.bus_wait import wait_for_bus
     from vical_daemon.config import load
     from vical_daemon.roles import web
     from vical_daemon.wall_clock import private_clock
 
-    bus = open_client(args.config, args.connect)
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    bus = wait_for_bus(args.config, args.connect, end_s=float("inf"), stop=stop, quiet=args.quiet)
+    if bus is None:
+        return 0
     try:
-        config = load(args.config) if args.config else _discover(bus)
+        config = load(args.config) if args.config else _discover(bus, stop)
+        if config is None:
+            return 0
         settings = config.web
         for name, value in (("host", args.host), ("port", args.port), ("foxglove_port", args.foxglove)):
             if value is not None:
@@ -73,20 +78,30 @@ def _tell(args: argparse.Namespace) -> Callable[[str], None]:
     return ready
 
 
-def _discover(bus: Bus) -> Config:
-    """Make up the part of a config that the page needs from what is on the bus.
+def _discover(bus: Bus, stop: threading.Event) -> Config | None:
+    """Make up the part of a config that the page needs from what is on the bus; None when stopped.
 
     Raises:
-        CliError: Nothing there, or several rigs.
+        CliError: Several rigs.
     """
     from vical_daemon import topics
     from vical_daemon.config import CameraConfig, Config, ImuConfig
 
-    found = [topics.parse_key(sample.key) for sample in bus.latest(f"{topics.ROOT}/**", 2.0)]
-    parsed = [entry for entry in found if entry is not None]
+    parsed: list[topics.ParsedKey] = []
+    told = False
+    while not parsed and not stop.is_set():
+        found = [topics.parse_key(sample.key) for sample in bus.latest(f"{topics.ROOT}/**", 2.0)]
+        parsed = [entry for entry in found if entry is not None]
+        if not parsed and not told:
+            told = True
+            print(
+                "vical: waiting: nothing on the bus yet; is `vical run` (vical.target) up?", file=sys.stderr
+            )
+        if not parsed:
+            stop.wait(_RETRY_S)
+    if not parsed:
+        return None
     rigs = sorted({entry.rig for entry in parsed})
-    if not rigs:
-        raise CliError("nothing is on the bus yet; is `vical run` (vical.target) up?")
     if len(rigs) > 1:
         raise CliError(f"there are the rigs {', '.join(rigs)}: say which with -c FILE", EXIT_USAGE)
     about_cameras = (topics.CALIBRATION, topics.CAMERA_INFO, topics.POSE)

@@ -18,7 +18,7 @@ class ExportFile:
 
 
 def _kalibr(rig: Rig) -> list[ExportFile]:
-    imu = kalibr.write_imu(rig.noise, rig.imu_topic, rig.note)
+    imu = kalibr.write_imu(rig.noise, rig.imu_topic, rig.header)
     return [ExportFile("camchain-imucam.yaml", kalibr.write_camchain(rig)), ExportFile("imu.yaml", imu)]
 
 
@@ -31,7 +31,7 @@ def _openvins(rig: Rig) -> list[ExportFile]:
 
 def _vins(rig: Rig) -> list[ExportFile]:
     cameras = [
-        ExportFile(f"cam{i}.yaml", slam.write_vins_camera(c)) for i, c in enumerate(rig.cameras.values())
+        ExportFile(f"cam{i}.yaml", slam.write_vins_camera(c, rig)) for i, c in enumerate(rig.cameras.values())
     ]
     return [ExportFile("vins.yaml", slam.write_vins(rig)), *cameras]
 
@@ -56,16 +56,29 @@ FORMATS: dict[str, Callable[[Rig], list[ExportFile]]] = {
 _FOUR_COEFFICIENTS = ("kalibr", "openvins", "vins")  # have no fifth for radtan
 
 
-def export(rig: Rig, format_name: str) -> list[ExportFile]:
+def export(rig: Rig, format_name: str, *, force: bool = False) -> list[ExportFile]:
     """Turn a rig into the files of a format; the first one is the main file.
 
+    Args:
+        rig: What to write.
+        format_name: One of `FORMATS`.
+        force: Write also directions that the motion did not determine. Our own JSON names them and needs
+            no force; the reader of any other format would take their numbers for known.
+
     Raises:
-        ExportError: No camera, an unknown format, or something that the format needs is not known.
+        ExportError: No camera, an unknown format, something that the format needs is not known, or a
+            direction that the motion did not determine.
     """
     if format_name not in FORMATS:
         raise ExportError(f"format {format_name!r} is none of {', '.join(FORMATS)}")
     if not rig.cameras:
         raise ExportError("there is no camera in the source: the calibration had no solution yet")
+    withheld = [f"{c.name}: {what}" for c in rig.cameras.values() for what in c.unobservable]
+    if withheld and format_name != "json" and not force:
+        raise ExportError(
+            f"the motion did not determine everything ({'; '.join(withheld)}): record such a motion, or "
+            "write it all the same with --force"
+        )
     longer = [c.name for c in rig.cameras.values() if len(c.distortion) > 4]
     if longer and format_name in _FOUR_COEFFICIENTS:
         raise ExportError(

@@ -22,7 +22,7 @@ from vical_daemon.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
 
 def write_camchain(rig: Rig) -> str:
     """Write camchain-imucam.yaml: cam0, cam1, … in the order of the rig (Kalibr knows no other names)."""
-    parts = [comment(rig.note)]
+    parts = [comment(rig.header)]
     before: RigCamera | None = None
     for index, camera in enumerate(rig.cameras.values()):
         parts.append(f"cam{index}:" + ("" if camera.name == f"cam{index}" else f"  # {camera.name}") + "\n")

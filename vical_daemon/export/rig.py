@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
+from vical_daemon.estimation.result import Status
 
 
 class ExportError(ValueError):
@@ -66,6 +68,18 @@ class RigCamera:
         return T
 
     @property
+    def sigmas(self) -> str:
+        """Standard deviations in words: lever arm along the axes of the imu, rotation about the camera's."""
+        parts = []
+        if self.covariance is not None:
+            sigma = np.sqrt(np.diag(self.covariance))
+            parts.append("lever arm " + " ".join(f"{1e3 * v:.2g}" for v in sigma[:3]) + " mm")
+            parts.append("rotation " + " ".join(f"{np.rad2deg(v):.2g}" for v in sigma[3:]) + " deg")
+        if self.timeshift_sigma_s is not None:
+            parts.append(f"time shift {1e3 * self.timeshift_sigma_s:.2g} ms")
+        return ", ".join(parts)
+
+    @property
     def size(self) -> tuple[int, int]:
         """Width and height, px.
 
@@ -92,8 +106,12 @@ class Rig:
         accel_matrix: M_a of f = M_a (f_m - b_a), lower triangular, shape (3, 3).
         gravity_mps2: Magnitude of gravity.
         imu_topic: ROS topic of the imu.
-        imu_frame: Name of the imu frame for ROS.
-        note: One line on where the numbers come from; written as a comment.
+        imu_frame: Name of the imu frame for ROS, as it is on the bus.
+        note: One line on where the numbers come from.
+        status: Where the calibration stood (`Status`); empty: the source does not say.
+        reason: Why, in words.
+        t_ns: Stamp of the newest data used, UNIX ns; 0: not known.
+        devices: Serial numbers by device, e.g. ``camera/cam0``.
     """
 
     cameras: dict[str, RigCamera]
@@ -106,6 +124,28 @@ class Rig:
     imu_topic: str = "/imu0"
     imu_frame: str = "imu"
     note: str = ""
+    status: str = ""
+    reason: str = ""
+    t_ns: int = 0
+    devices: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def header(self) -> str:
+        """What stands above the numbers in every file: source, status, date, devices and sigmas, in lines."""
+        lines = [self.note] if self.note else []
+        if self.status:
+            not_yet = "" if self.status == Status.CONVERGED else "NOT CONVERGED: "
+            why = f" ({self.reason})" if self.reason and not_yet else ""
+            lines.append(f"status: {not_yet}{self.status}{why}")
+        if self.t_ns:
+            lines.append(f"data until {datetime.fromtimestamp(self.t_ns * 1e-9, UTC):%Y-%m-%d %H:%M:%S} UTC")
+        if self.devices:
+            lines.append("devices: " + ", ".join(f"{name} {serial}" for name, serial in self.devices.items()))
+        for camera in self.cameras.values():
+            if sigmas := camera.sigmas:
+                lines.append(f"{camera.name}, one sigma: {sigmas}")
+            lines += [f"{camera.name}, NOT DETERMINED by the motion: {what}" for what in camera.unobservable]
+        return "\n".join(" ".join(line.split()) for line in lines)
 
     def only_camera(self, format_name: str) -> RigCamera:
         """Return the camera of a format that holds one.

@@ -28,7 +28,7 @@ def write_camera_info(camera: RigCamera, rig: Rig) -> str:
         for k, v in zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (x, y, z, qx, qy, qz, qw), strict=True)
     )
     return (
-        comment(rig.note)
+        comment(rig.header)
         + f"# t_imu = t_cam + {number(camera.timeshift_cam_imu_s)} s\n"
         + f"# ros2 run tf2_ros static_transform_publisher {transform} "
         + f"--frame-id {rig.imu_frame} --child-frame-id {camera.name}\n"
@@ -46,18 +46,21 @@ def _ros_matrix(name: str, rows: int, cols: int, values: list[float]) -> str:
 
 
 def write_urdf(rig: Rig) -> str:
-    """Write fixed joints from the imu to every camera's optical frame.
+    """Write fixed joints from the imu to every camera.
 
-    The joint's origin is the child in the parent: our T_imu_cam. URDF's rpy is R = Rz(y) Ry(p) Rx(r).
-    The optical frame (z forward, x right) is our camera frame. URDF has no place for a time shift.
+    The frames are named as on the bus: a camera's frame is the `frame_id` of its images; it is what ROS
+    calls an optical frame (z forward, x right). The joint's origin is the child in the parent: our
+    T_imu_cam. URDF's rpy is R = Rz(y) Ry(p) Rx(r). URDF has no place for a time shift.
     """
-    lines = ['<?xml version="1.0"?>', '<robot name="vical_rig">', f"  <!-- {_xml_comment(rig.note)} -->"]
+    lines = ['<?xml version="1.0"?>', '<robot name="vical_rig">']
+    lines += [f"  <!-- {_xml_comment(line)} -->" for line in rig.header.splitlines()]
     lines.append(f'  <link name="{rig.imu_frame}"/>')
     for camera in rig.cameras.values():
-        frame = f"{camera.name}_optical_frame"
+        frame = camera.name
         rpy = Rotation.from_matrix(camera.R_imu_cam).as_euler("xyz")
         lines += [
-            f"  <!-- {camera.name}: t_imu = t_cam + {number(camera.timeshift_cam_imu_s)} s -->",
+            f"  <!-- {frame}: optical frame (z forward, x right); "
+            f"t_imu = t_cam + {number(camera.timeshift_cam_imu_s)} s -->",
             f'  <link name="{frame}"/>',
             f'  <joint name="{rig.imu_frame}_to_{frame}" type="fixed">',
             f'    <parent link="{rig.imu_frame}"/>',
@@ -82,7 +85,8 @@ def write_basalt(rig: Rig) -> str:
     `T_imu_cam` is ours; `cam_time_offset_ns` is added to the image stamps (t_imu = t_cam + offset, our
     sign; one for all cameras, so the first one's). Noises are continuous-time densities. Its biases act as
     a = (I + S) a_m - b, so S = M_a - I and b = M_a b_a. radtan and plumb_bob become pinhole-radtan8 with
-    the other coefficients 0, known to Basalt since its Monado fork; rpmax 0: no limit.
+    the other coefficients 0, known to Basalt since its Monado fork; rpmax 0: no limit. Its reader takes
+    `value0` by name, so a second key holds what is a comment in other formats.
     """
     cameras = list(rig.cameras.values())
     noise = rig.noise
@@ -104,7 +108,7 @@ def write_basalt(rig: Rig) -> str:
         "cam_time_offset_ns": round(cameras[0].timeshift_cam_imu_s * 1e9),
         "vignette": [],
     }
-    return json.dumps({"value0": value}, indent=2) + "\n"
+    return json.dumps({"value0": value, "comment": rig.header.splitlines()}, indent=2) + "\n"
 
 
 def _basalt_pose(camera: RigCamera) -> dict[str, float]:
@@ -148,6 +152,7 @@ def write_json(rig: Rig) -> str:
         }
     noise = rig.noise
     imu = {
+        "name": rig.imu_frame,
         "gyro_bias_rps": rig.gyro_bias_rps.tolist(),
         "accel_bias_mps2": rig.accel_bias_mps2.tolist(),
         "gyro_matrix": rig.gyro_matrix.tolist(),
@@ -160,5 +165,6 @@ def write_json(rig: Rig) -> str:
             "rate_hz": noise.rate_hz,
         },
     }
-    document = {"note": rig.note, "cameras": cameras, "imu": imu, "gravity_mps2": rig.gravity_mps2}
+    about = {key: getattr(rig, key) for key in ("note", "status", "reason", "t_ns", "devices")}
+    document = about | {"cameras": cameras, "imu": imu, "gravity_mps2": rig.gravity_mps2}
     return json.dumps(document, indent=2) + "\n"

@@ -18,7 +18,7 @@ def write_openvins_cameras(rig: Rig) -> str:
     Kalibr's layout, but `T_imu_cam` (camera to imu, ours). `timeshift_cam_imu` is its
     calib_camimu_dt: t_imu = t_cam + dt, read from cam0 alone.
     """
-    parts = ["%YAML:1.0\n\n", comment(rig.note)]
+    parts = ["%YAML:1.0\n\n", comment(rig.header)]
     names = list(rig.cameras)
     for index, camera in enumerate(rig.cameras.values()):
         overlaps = [i for i in range(len(names)) if i != index]
@@ -53,7 +53,7 @@ def write_openvins_imu(rig: Rig) -> str:
         "Tg": np.zeros((3, 3)),
     }
     return (
-        "%YAML:1.0\n\n" + comment(rig.note) + "imu0:\n"
+        "%YAML:1.0\n\n" + comment(rig.header) + "imu0:\n"
         f"  T_i_b:\n{matrix_rows(np.eye(4), 4)}\n"
         f"  accelerometer_noise_density: {number(noise.accel_density)}  # m/s^2/sqrt(Hz)\n"
         f"  accelerometer_random_walk: {number(noise.accel_walk)}  # m/s^3/sqrt(Hz)\n"
@@ -92,7 +92,7 @@ def write_vins(rig: Rig) -> str:
         f"body_T_cam{i}: !!opencv-matrix\n{opencv_matrix(c.T_imu_cam)}\n\n" for i, c in enumerate(cameras)
     )
     return (
-        "%YAML:1.0\n\n" + comment(rig.note) + f"imu: 1\nnum_of_cam: {len(cameras)}\n\n"
+        "%YAML:1.0\n\n" + comment(rig.header) + f"imu: 1\nnum_of_cam: {len(cameras)}\n\n"
         f'imu_topic: "{rig.imu_topic}"\n{topics}output_path: "~/output/"\n\n'
         f"{calibs}image_width: {first.size[0]}\nimage_height: {first.size[1]}\n\n"
         f"estimate_extrinsic: 0   # these are calibrated\n\n{poses}"
@@ -109,7 +109,7 @@ def write_vins(rig: Rig) -> str:
     )
 
 
-def write_vins_camera(camera: RigCamera) -> str:
+def write_vins_camera(camera: RigCamera, rig: Rig) -> str:
     """Write a camera file of VINS-Fusion (camodocal): PINHOLE for radtan, KANNALA_BRANDT for equidistant."""
     fx, fy, cx, cy = (number(v) for v in camera.intrinsics)
     d = [number(v) for v in camera.distortion]
@@ -118,12 +118,12 @@ def write_vins_camera(camera: RigCamera) -> str:
     if camera.distortion_model == "equidistant":
         # Camodocal counts the coefficient of theta itself, so its k2 is our k1.
         return (
-            f"{HEAD}model_type: KANNALA_BRANDT\n{head}projection_parameters:\n"
+            f"{HEAD}{comment(rig.header)}model_type: KANNALA_BRANDT\n{head}projection_parameters:\n"
             f"   k2: {d[0]}\n   k3: {d[1]}\n   k4: {d[2]}\n   k5: {d[3]}\n"
             f"   mu: {fx}\n   mv: {fy}\n   u0: {cx}\n   v0: {cy}\n"
         )
     return (
-        f"{HEAD}model_type: PINHOLE\n{head}distortion_parameters:\n"
+        f"{HEAD}{comment(rig.header)}model_type: PINHOLE\n{head}distortion_parameters:\n"
         f"   k1: {d[0]}\n   k2: {d[1]}\n   p1: {d[2]}\n   p2: {d[3]}\n"
         f"projection_parameters:\n   fx: {fx}\n   fy: {fy}\n   cx: {cx}\n   cy: {cy}\n"
     )
@@ -143,7 +143,7 @@ def write_orbslam3(rig: Rig) -> str:
     keys |= dict(zip(names, camera.distortion, strict=True))
     noise = rig.noise
     return (
-        "%YAML:1.0\n\n" + comment(rig.note) + f'File.version: "1.0"\n\nCamera.type: "{kind}"\n'
+        "%YAML:1.0\n\n" + comment(rig.header) + f'File.version: "1.0"\n\nCamera.type: "{kind}"\n'
         + "".join(f"Camera1.{key}: {number(value)}\n" for key, value in keys.items())
         + f"\nCamera.width: {camera.size[0]}\nCamera.height: {camera.size[1]}\n"
         f"Camera.fps: {round(camera.rate_hz or 20)}\nCamera.RGB: 0\n\n"
@@ -186,7 +186,7 @@ def write_opencv(rig: Rig) -> str:
     width, height = camera.size
     fisheye = int(camera.distortion_model == "equidistant")
     return (
-        f"{HEAD}{comment(rig.note)}image_width: {width}\nimage_height: {height}\n"
+        f"{HEAD}{comment(rig.header)}image_width: {width}\nimage_height: {height}\n"
         f"fisheye_model: {fisheye}\n"
         f"camera_matrix: !!opencv-matrix\n{opencv_matrix(K)}\n"
         f"distortion_coefficients: !!opencv-matrix\n{opencv_matrix(np.array([camera.distortion]))}\n"

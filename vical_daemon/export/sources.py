@@ -60,7 +60,12 @@ def rig_from_json(document: dict[str, Any], noise: ImuNoise | None = None, note:
         gyro_matrix=_array(imu, "gyro_matrix", (3, 3), np.eye(3)),
         accel_matrix=_array(imu, "accel_matrix", (3, 3), np.eye(3)),
         gravity_mps2=magnitude,
+        imu_frame=str(imu.get("name") or "imu"),
         note=note or str(document.get("note", "")),
+        status=str(document.get("status") or ""),
+        reason=str(document.get("reason") or document.get("guidance") or ""),
+        t_ns=int(document.get("t_ns") or 0),
+        devices={str(k): str(v) for k, v in (document.get("devices") or {}).items()},
     )
 
 

@@ -24,16 +24,23 @@ _TEMPORARY = ".recovering"
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What came out of a recovery."""
+    """What came out of a recovery; `output` is `source` itself where nothing was missing."""
 
     source: Path
     output: Path
     messages: int
     warnings: tuple[str, ...]
 
+    @property
+    def was_complete(self) -> bool:
+        """Whether there was nothing to recover."""
+        return self.output == self.source
 
-def recover(source: Path, output: Path | None = None) -> Recovery:
+
+def recover(source: Path, output: Path | None = None, *, even_empty: bool = False) -> Recovery:
     """Rewrite every whole message, schema, metadata record and attachment into a sound file.
+
+    A file that is complete, under its final name, is left alone: there is no copy.
 
     The result appears under its name only when it is complete and on the disk; a second crash in the
     middle of the recovery costs nothing.
@@ -41,9 +48,10 @@ def recover(source: Path, output: Path | None = None) -> Recovery:
     Args:
         source: Damaged file; it is left as it is.
         output: Name of the result; None: ``NAME.mcap`` for ``NAME.mcap.part``, else ``NAME.recovered.mcap``.
+        even_empty: Write a log without a message, too.
 
     Raises:
-        LogError: It is still being written, is no MCAP, or the disk refuses.
+        LogError: It is still being written, is no MCAP, holds no whole message, or the disk refuses.
     """
     if is_being_written(source):
         raise LogError(f"{source} is still being written; stop the recorder first")
@@ -54,6 +62,10 @@ def recover(source: Path, output: Path | None = None) -> Recovery:
     temporary = output.with_name(output.name + _TEMPORARY)
     try:
         count = _rewrite(reader, temporary)
+        if reader.complete and not reader.warnings and not source.name.endswith(PART_SUFFIX):
+            return Recovery(source, source, count, ())
+        if not count and not even_empty:
+            raise LogError(f"{source}: not one whole message in its {source.stat().st_size} bytes")
         publish(temporary, output)
     except OSError as error:
         raise LogError(f"cannot write {temporary}: {describe(error)}") from None
@@ -84,7 +96,7 @@ def recover_folder(folder: Path) -> list[Recovery]:
         try:
             if output.exists():  # died between the rename of the result and the removal of the part
                 output = output.with_name(output.name.removesuffix(".mcap") + ".recovered.mcap")
-            done.append(recover(part, output))
+            done.append(recover(part, output, even_empty=True))  # or it would be tried again for ever
         except LogError:
             continue
         part.unlink()

@@ -14,7 +14,7 @@ from vical_drivers.samples import Frame, FrameSource
 from vical_daemon import topics
 from vical_daemon.acquisition import Line, clock_of_the_service, run_lines, start_line
 from vical_daemon.bus import Bus
-from vical_daemon.config import CameraConfig, Config
+from vical_daemon.config import LOG_SCHEME, CameraConfig, Config
 from vical_daemon.device_loop import SingleReads
 from vical_daemon.messages import encode_image
 from vical_daemon.wall_clock import WallClock
@@ -63,11 +63,15 @@ class CameraRole:
 
 
 def open_camera(config: CameraConfig) -> FrameSource:
-    """Open the device that the config names.
+    """Open the device that the config names, or play the recording that it names (`playback`).
 
     Raises:
         DriverError: It cannot be opened; one line.
     """
+    if config.uri.startswith(LOG_SCHEME):
+        from vical_daemon.playback import LogCamera
+
+        return LogCamera(config.uri)
     from vical_drivers.camera import opening
 
     return opening.open_camera(config.uri, **driver_options(config))

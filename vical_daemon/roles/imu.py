@@ -13,7 +13,7 @@ from vical_drivers.samples import ImuSample, ImuSource
 from vical_daemon import topics
 from vical_daemon.acquisition import Line, clock_of_the_service, run_lines, start_direct_line
 from vical_daemon.bus import Bus
-from vical_daemon.config import Config, ImuConfig
+from vical_daemon.config import LOG_SCHEME, Config, ImuConfig
 from vical_daemon.messages import imu_encoder
 from vical_daemon.wall_clock import WallClock
 
@@ -59,11 +59,15 @@ class ImuRole:
 
 
 def open_imu(config: ImuConfig) -> ImuSource:
-    """Open the device that the config names.
+    """Open the device that the config names, or play the recording that it names (`playback`).
 
     Raises:
         DriverError: It cannot be opened; one line.
     """
+    if config.port.startswith(LOG_SCHEME):
+        from vical_daemon.playback import LogImu
+
+        return LogImu(config.port)
     from vical_drivers.microstrain import device
 
     return device.open_imu(

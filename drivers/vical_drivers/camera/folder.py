@@ -1,4 +1,7 @@
-"""Image folders as a camera: the ASL layout (``data.csv`` beside ``data/``), as EuRoC's ``mav0/cam0``."""
+"""Image folders as a camera: the ASL layout (``data.csv`` beside ``data/``), as EuRoC's ``mav0/cam0``.
+
+A folder behaves as a camera does: a frame comes when its time has come, and its stamp is CLOCK_MONOTONIC.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import io
 import time
 from collections import deque
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +27,9 @@ _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
 
 class ImageFolder(Closing):
-    """A `FrameSource` that replays a folder as fast as it is read.
+    """A `FrameSource` that plays a folder once, in real time, as if its camera were there.
+
+    The first frame is dated by the first `read`; the others follow it as far apart as they were recorded.
 
     Args:
         path: Folder with ``data.csv`` (``timestamp [ns], file name``); images in ``data/`` or beside it.
@@ -31,7 +37,7 @@ class ImageFolder(Closing):
 
     Raises:
         DeviceNotFoundError: No such folder or no ``data.csv``.
-        DeviceRefusedError: No decoder was given, or the list is damaged.
+        DeviceRefusedError: No decoder was given, or the list is damaged or not in order.
     """
 
     def __init__(self, path: str, settings: CameraSettings) -> None:
@@ -43,8 +49,12 @@ class ImageFolder(Closing):
         listing = self._folder / "data.csv"
         if not listing.is_file():
             raise DeviceNotFoundError(f"folder:{path}: no data.csv there; give a folder like mav0/cam0")
-        self._frames = deque(self._parse(listing))
-        self._total = len(self._frames)
+        frames = self._parse(listing)
+        self._frames = deque(frames)
+        self._total = len(frames)
+        steps_ns = np.diff([t_ns for t_ns, _ in frames])
+        self._rate_hz = 1e9 / float(np.median(steps_ns)) if len(steps_ns) else 0.0
+        self._offset_ns: int | None = None  # CLOCK_MONOTONIC minus the recorded clock
         self._statistics = FrameStatistics()
         self._missing = 0
         self._sequence = 0
@@ -62,6 +72,8 @@ class ImageFolder(Closing):
                 frames.append((int(row[0]), self._image_path(row[1].strip())))
             except (ValueError, IndexError) as error:
                 raise DeviceRefusedError(f"{listing}: line {number} is not 'stamp, file name'") from error
+        if any(later[0] <= earlier[0] for earlier, later in pairwise(frames)):
+            raise DeviceRefusedError(f"{listing}: the stamps do not increase from line to line")
         return frames
 
     def _image_path(self, name: str) -> Path:
@@ -77,13 +89,25 @@ class ImageFolder(Closing):
             serial_number=f"folder-{self._folder.name}",
             path=str(self._folder),
             protocol="folder",
-            details={"frames": str(self._total), "encoding": self._settings.encoding},
+            details={
+                "frames": str(self._total),
+                "encoding": self._settings.encoding,
+                "rate_hz": f"{self._rate_hz:.3f}",
+            },
         )
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame; None at the end of the folder (after `timeout_s`)."""
+        """Return the next frame when it is due; None after `timeout_s`, and at the end of the folder."""
+        now_ns = time.monotonic_ns()
+        end_ns = now_ns + round(max(0.0, timeout_s) * 1e9)
         while self._frames:
-            t_ns, path = self._frames.popleft()
+            if self._offset_ns is None:
+                self._offset_ns = now_ns - self._frames[0][0]
+            t_host_ns = self._frames[0][0] + self._offset_ns
+            if t_host_ns > end_ns:
+                break
+            time.sleep(max(0, t_host_ns - time.monotonic_ns()) * 1e-9)
+            _, path = self._frames.popleft()
             self._sequence += 1
             try:
                 data = np.frombuffer(read_file(path, _IMAGE_LIMIT), dtype=np.uint8)
@@ -93,9 +117,9 @@ class ImageFolder(Closing):
                 self._missing += 1
                 continue
             dropped, self._missing = self._missing, 0
-            self._statistics.add(t_ns, dropped)
+            self._statistics.add(t_host_ns, dropped)
             return Frame(
-                t_exposure_mid_ns=t_ns,
+                t_exposure_mid_ns=t_host_ns,
                 t_arrival_ns=time.monotonic_ns(),
                 sequence=self._sequence - 1,
                 image=image,
@@ -103,7 +127,7 @@ class ImageFolder(Closing):
                 stamp_rule="recorded",
                 dropped_before=dropped,
             )
-        time.sleep(max(0.0, timeout_s))
+        time.sleep(max(0, end_ns - time.monotonic_ns()) * 1e-9)
         return None
 
     def stats(self) -> SourceStats:

@@ -163,6 +163,11 @@ def check_camera(uri: str, *, timeout_s: float = 3.0, **wanted: Any) -> list[str
         source = open_camera(uri, **wanted)
     except DriverError as error:
         return [str(error)]
+    return judge_camera(source, uri, timeout_s, **wanted)
+
+
+def judge_camera(source: FrameSource, uri: str, timeout_s: float = 3.0, **wanted: Any) -> list[str]:
+    """Do what `check_camera` does with a camera that is open already; closes it."""
     with source:
         problems = _compare(source.info, wanted)
         try:
@@ -171,7 +176,13 @@ def check_camera(uri: str, *, timeout_s: float = 3.0, **wanted: Any) -> list[str
             return [*problems, str(error)]
     if frame is None:
         problems.append(f"{uri}: no frame within {timeout_s:g} s")
-    elif frame.stamp_rule.startswith("raw-") and wanted.get("stamp") != "raw":
+        return problems
+    height, width = frame.image.shape[:2]
+    if wanted.get("width") is not None and (width, height) != (wanted["width"], wanted["height"]):
+        problems.append(
+            f"{uri}: asked for {wanted['width']} x {wanted['height']} pixels, got {width} x {height}"
+        )
+    if frame.stamp_rule.startswith("raw-") and wanted.get("stamp") != "raw":
         problems.append(
             f"{uri}: the exposure is not known, so stamps are not mid-exposure ({frame.stamp_rule}); "
             "set exposure_s, or state assume_exposure_s"
@@ -183,10 +194,12 @@ def _compare(info: DeviceInfo, wanted: Mapping[str, Any]) -> list[str]:
     problems = []
     for key, tolerance in (("rate_hz", 0.01), ("exposure_s", 0.05)):
         asked, got = wanted.get(key), info.details.get(key, "")
+        if asked is None:
+            continue
+        name = info.path or info.model
         try:
-            differs = asked is not None and abs(float(got) - asked) > tolerance * asked
+            if abs(float(got) - asked) > tolerance * asked:
+                problems.append(f"{name}: asked for {key} {asked:g}, got {got}")
         except ValueError:
-            differs = True
-        if differs:
-            problems.append(f"{info.path or info.model}: asked for {key} {asked:g}, got {got}")
+            problems.append(f"{name}: asked for {key} {asked:g}; the camera does not say what it does")
     return problems

@@ -94,6 +94,38 @@ def test_recover_file_and_folder(log, tmp_path, capsys):
     folder.unlock()
 
 
+def test_recovering_what_is_complete_makes_no_copy(log, tmp_path, capsys):
+    before = sorted(tmp_path.iterdir())
+    assert main(["recover", str(log)]) == 0
+    assert "complete, nothing to recover: 2596 messages" in capsys.readouterr().out
+    assert main(["recover", str(log), "-o", str(tmp_path / "b.mcap"), "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["recovered"]
+    assert found["was_complete"] and found["output"] == str(log)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_recovering_next_to_nothing_is_no_success(log, tmp_path, capsys):
+    log.write_bytes(log.read_bytes()[:100])
+    before = sorted(tmp_path.iterdir())
+    assert main(["recover", str(log)]) == 1
+    assert "not one whole message in its 100 bytes" in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_info_of_several_logs_names_the_broken_one(log, asl_folder, tmp_path, capsys):
+    broken = tmp_path / "broken.mcap"
+    broken.write_text("text")
+    words = [str(log), str(broken), str(asl_folder)]
+    assert main(["info", *words]) == 1
+    out, err = capsys.readouterr()
+    assert str(log) in out and str(asl_folder) in out and str(broken) not in out
+    assert err.count("\n") == 1 and str(broken) in err
+    assert main(["info", *words, "--json"]) == 1
+    logs = json.loads(capsys.readouterr().out)["logs"]
+    assert [bool(entry.get("topics")) for entry in logs] == [True, False, True]
+    assert str(broken) in logs[1]["problem"]
+
+
 def test_replay_publishes_in_time_and_order(asl_folder):
     recording = open_recording(asl_folder)
     bus, got = LocalBus(), []

@@ -13,10 +13,12 @@ import pytest
 
 from vical_daemon.cli import calibration_run, calibration_text, main
 from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.result import Status
 from vical_daemon.estimators import Estimator
 from vical_daemon.mcap_log import LogWriter
 from vical_daemon.priors import read_initial
 from vical_daemon.recording import open_recording
+from vical_daemon.recording.logs import stamp_of
 
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "euroc_imu_april"
 G = 9.80665
@@ -67,7 +69,7 @@ def _arguments(folder: Path, *more: str) -> list[str]:
 
 
 def _calibrate(folder: Path, capsys: pytest.CaptureFixture[str]) -> dict:
-    code = main(_arguments(folder, "--json"))
+    code = main(_arguments(folder, "--json", "--accept", "converging"))
     out = capsys.readouterr().out
     assert code == 0
     return json.loads(out)
@@ -81,7 +83,8 @@ def test_json_has_the_promised_keys_and_the_same_bits_through_an_mcap(
         for key, payload in open_recording(shortest).messages():
             writer.write(key, payload, 1_700_000_000_000_000_000)
     first = _calibrate(shortest, capsys)
-    assert main(["calibrate", str(log), *_arguments(shortest, "--json")[2:]]) == 0
+    more = _arguments(shortest, "--json", "--accept", "converging")[2:]
+    assert main(["calibrate", str(log), *more]) == 0
     second = json.loads(capsys.readouterr().out)
     assert first.pop("cpu_s") > 0 and second.pop("cpu_s") > 0
     assert json.dumps(first) == json.dumps(second)
@@ -96,6 +99,40 @@ def test_json_has_the_promised_keys_and_the_same_bits_through_an_mcap(
     assert 1 <= len(first["trace"]) <= 6
     assert "cam0 in the imu frame" in calibration_text.describe(first | {"cpu_s": 1.0})
     assert "what would help: nod" in calibration_text.describe(first | {"guidance": "nod"})
+
+
+@pytest.fixture(scope="session")
+def outcome(shortest: Path) -> calibration_run.Outcome:
+    job = calibration_run.make_job(
+        open_recording(shortest),
+        read_initial(shortest / "initial.yaml"),
+        target=str(shortest / "target.yaml"),
+        fix=("intrinsics",),
+    )
+    return calibration_run.run_job(job, lambda share, estimate: None)
+
+
+@pytest.mark.parametrize(
+    ("status", "accept", "code"),
+    [
+        ("converged", "", 0),
+        ("converging", "", 3),
+        ("degenerate", "", 3),
+        ("degenerate", "converging", 3),
+        ("converging", "converging", 0),
+        ("degenerate", "converging,degenerate", 0),
+        ("inconsistent", "converging,degenerate", 1),
+    ],
+)
+def test_the_exit_code_tells_whether_it_converged(
+    shortest: Path, outcome, monkeypatch: pytest.MonkeyPatch, capsys, status: str, accept: str, code: int
+) -> None:
+    changed = replace(outcome, estimate=replace(outcome.estimate, status=Status(status), guidance="nod"))
+    monkeypatch.setattr(calibration_run, "run_job", lambda *_, **__: changed)
+    assert main(_arguments(shortest, "--json", "--accept", accept)) == code
+    out, err = capsys.readouterr()
+    assert json.loads(out)["status"] == status  # written in any case
+    assert (f"{status}: " in err) == (status != "converged")
 
 
 def test_all_that_was_announced_on_the_way_is_told_at_the_end(
@@ -173,6 +210,28 @@ def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
     assert [entry[0] for entry in fed] == sorted(entry[0] for entry in fed)
 
 
+def test_only_the_part_that_was_asked_for_is_used(short: Path) -> None:
+    recording = open_recording(short)
+    job = calibration_run.make_job(
+        recording,
+        read_initial(short / "initial.yaml"),
+        target=str(short / "target.yaml"),
+        skip_s=2.5,
+        seconds=3.0,
+    )
+    begin_ns = recording.begin_ns + 2_500_000_000
+    everything = [(key, payload) for key, payload in recording.messages()]
+    expected = [
+        item for item in everything if begin_ns <= (stamp_of(item[1]) or 0) <= begin_ns + 3_000_000_000
+    ]
+    assert 500 < len(expected) < len(everything) / 2
+    assert list(job.messages()) == expected
+    assert job.duration_s == 3.0
+    job.seconds = None
+    assert job.duration_s == pytest.approx(recording.duration_s - 2.5)
+    assert list(job.messages())[-1] == everything[-1]
+
+
 def _scale_csv(path: Path, columns: slice, factor: float) -> None:
     rows = [line.split(",") for line in path.read_text().splitlines()]
     for row in rows:
@@ -232,6 +291,18 @@ def _spoil_estimate(folder: Path) -> list[str]:
     return _arguments(folder, "--estimate", "everything")
 
 
+def _spoil_accept(folder: Path) -> list[str]:
+    return _arguments(folder, "--accept", "degenrate")
+
+
+def _spoil_skip(folder: Path) -> list[str]:
+    return _arguments(folder, "--skip", "9.5")
+
+
+def _spoil_seconds(folder: Path) -> list[str]:
+    return _arguments(folder, "--seconds", "0")
+
+
 def _spoil_camera_name(folder: Path) -> list[str]:
     return _arguments(folder, "--camera", "cam7")
 
@@ -271,6 +342,9 @@ def _spoil_report(folder: Path) -> list[str]:
         (_spoil_nothing_fixed, 2, "does not give it"),
         (_spoil_fix, 2, "did you mean intrinsics"),
         (_spoil_estimate, 2, "imu_intrinsics"),
+        (_spoil_skip, 2, "is only 9.0 s long"),
+        (_spoil_seconds, 2, "--seconds must be above 0"),
+        (_spoil_accept, 2, "did you mean degenerate"),
         (_spoil_camera_name, 1, "cam7"),
         (_spoil_size, 2, "image size"),
         (_spoil_report, 2, "folder does not exist"),

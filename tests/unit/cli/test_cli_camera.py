@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from vical_drivers.camera import opening
 from vical_drivers.camera.v4l2 import camera as v4l2
@@ -139,3 +140,15 @@ def test_silence_ends_with_a_hint(kernel: FakeKernel, capsys: pytest.CaptureFixt
     path = kernel.plug(FakeCamera(faults=dict.fromkeys(range(10_000), "lost")))
     assert main(["camera", "stream", path, "--timeout", "0.01"]) == 1
     assert "triggered from outside" in capsys.readouterr().err
+
+
+def test_a_folder_with_unix_stamps_shows_ages_that_can_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((48, 64), np.uint8))
+    lines = [f"{1_403_636_579_763_555_584 + k * 50_000_000},a.png" for k in range(3)]
+    (tmp_path / "data.csv").write_text("\n".join(lines) + "\n")
+    assert main(["camera", "stream", f"folder:{tmp_path}", "--frames", "3", "--json"]) == 0
+    frames = [json.loads(line) for line in capsys.readouterr().out.splitlines()][:-1]
+    ages_s = [(f["t_arrival_ns"] - f["t_exposure_mid_ns"]) * 1e-9 for f in frames]
+    assert all(0 <= age_s < 60 for age_s in ages_s)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import types
@@ -197,3 +198,17 @@ def test_table_names_are_unique_and_each_module_keeps_the_convention() -> None:
         module = sys.modules[commands[name].module]
         assert callable(module.add_arguments) and callable(module.run)
     assert all(c.summary and "\n" not in c.summary for c in table.COMMANDS)
+
+
+@pytest.mark.parametrize("journal", [False, True])
+def test_log_lines_carry_the_time_where_no_journal_adds_it(journal: bool) -> None:
+    code = (
+        "import argparse, logging, vical_daemon.cli as cli;"
+        "cli._set_up_logging(argparse.Namespace(verbose=False, quiet=False));"
+        "logging.getLogger('vical_daemon.x').info('hello')"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "JOURNAL_STREAM"}
+    environment |= {"JOURNAL_STREAM": "8:1234"} if journal else {}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    expected = "I vical_daemon.x: hello" if journal else r"\d\d:\d\d:\d\d I vical_daemon.x: hello"
+    assert re.fullmatch(expected, done.stderr.strip())

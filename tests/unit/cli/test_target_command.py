@@ -24,6 +24,25 @@ def test_board_and_its_yaml(name: str, tmp_path: Path, capsys: pytest.CaptureFix
     assert board.points_m.shape == (20, 3)
 
 
+def test_a_measured_board_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["target", "--type", "checkerboard", "--square", "20mm", "-o", str(tmp_path / "board.pdf")]
+    assert main(words) == 0
+    measured = tmp_path / "board.yaml"
+    with_a_note = "# printed on Monday\n" + measured.read_text()
+    measured.write_text(with_a_note)
+    assert main(words) == 0  # the same board: nothing to lose
+    assert measured.read_text() == with_a_note
+    measured.write_text(with_a_note.replace("rowSpacingMeters: 0.02", "rowSpacingMeters: 0.01987"))
+    (tmp_path / "board.pdf").unlink()
+    capsys.readouterr()
+    assert main(words) == 1
+    err = capsys.readouterr().err
+    assert "board.yaml exists and says something else" in err and "--force" in err and err.count("\n") == 1
+    assert "0.01987" in measured.read_text() and not (tmp_path / "board.pdf").exists()
+    assert main([*words, "--force"]) == 0
+    assert "0.01987" not in measured.read_text()
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [

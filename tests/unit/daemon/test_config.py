@@ -271,3 +271,15 @@ class TestInitial:
         np.testing.assert_allclose(reference.T_imu_cam[1], [-0.01753, -0.06850, 0.00430], atol=1e-5)
         initial = read_initial(SHARED / "initial.yaml")
         assert initial.cameras["cam0"].resolution == (752, 480) and initial.imu_rate_hz == 200
+
+
+def test_devices_that_are_files_lie_beside_the_settings_file(tmp_path: Path) -> None:
+    (tmp_path / "vical.yaml").write_text(
+        "imus: {imu0: {port: 'log:run.mcap#imu1', rate_hz: 208}}\n"
+        "cameras: {cam0: {uri: 'folder:mav0/cam0'}, cam1: {uri: 'log:/data/run.mcap'}, cam2: {uri: emulated}}\n"
+        "target: target.yaml\n"
+    )
+    config = load(tmp_path / "vical.yaml")
+    assert config.imus["imu0"].port == f"log:{tmp_path}/run.mcap#imu1"
+    uris = [camera.uri for camera in config.cameras.values()]
+    assert uris == [f"folder:{tmp_path}/mav0/cam0", "log:/data/run.mcap", "emulated"]

@@ -68,7 +68,14 @@ def _wait_for(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
 
 def _loop(opener, got, stop, **options) -> DeviceLoop[int]:
     loop = DeviceLoop(
-        "imu/imu0", opener, got.append, stop, read_timeout_s=0.02, longest_pause_s=0.05, **options
+        "imu/imu0",
+        opener,
+        got.append,
+        stop,
+        read_timeout_s=0.02,
+        first_pause_s=0.02,
+        longest_pause_s=0.05,
+        **options,
     )
     loop.start()
     return loop
@@ -304,3 +311,19 @@ def test_levels() -> None:
     assert _judge(replace(good, state="lost", problem="gone"), outbox, 100.0) == (Level.ERROR, "gone")
     assert _judge(good, outbox, 200.0)[0] is Level.WARN
     outbox.close()
+
+
+def test_a_pause_between_two_attempts_to_open_is_not_a_stuck_thread(stop) -> None:
+    attempts: list[int] = []
+
+    def opener() -> ScriptedSource:
+        attempts.append(1)
+        raise DeviceNotFoundError("not there")
+
+    loop = DeviceLoop("imu/imu0", opener, lambda _item: None, stop, read_timeout_s=0.02, first_pause_s=600.0)
+    loop.start()
+    _wait_for(lambda: bool(attempts))
+    t_paused_s = loop._t_loop_s
+    _wait_for(lambda: loop._t_loop_s > t_paused_s)  # the loop goes round while it waits
+    assert len(attempts) == 1
+    assert _judge(loop.health(), Outbox(LocalBus(), 1, "out"), 100.0)[0] is Level.ERROR

@@ -49,6 +49,10 @@ def rig(pinhole_camera, fisheye_camera):
         gyro_matrix=np.array([[1.006, 0.004, -0.003], [-0.002, 0.995, 0.005], [0.001, -0.006, 1.003]]),
         accel_matrix=np.array([[1.004, 0, 0], [0.003, 0.997, 0], [-0.002, 0.001, 1.002]]),
         note="made by a test",
+        status="converging",
+        reason='turn about "x": -- <more>\nthan #5',
+        t_ns=1_400_000_000_000_000_000,
+        devices={"imu/imu0": "6223-00042", "camera/cam0": "SN: 7"},
     )
 
 

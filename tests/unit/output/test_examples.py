@@ -2,6 +2,8 @@
 
 import importlib.util
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,27 @@ def test_reading_a_recording(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "imu0: imu, 800 messages" in out
     assert "12.0 points per image" in out
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "says"),
+    [
+        ("plain_zenoh.py", ["tcp/127.0.0.1:1"], "no bus at tcp/127.0.0.1:1"),
+        ("watch_calibration.py", ["tcp/127.0.0.1:1"], "no bus at tcp/127.0.0.1:1"),
+        ("watch_async.py", ["tcp/127.0.0.1:1"], "no bus at tcp/127.0.0.1:1"),
+        ("site_router.py", ["ca.pem", "site.pem", "site.key", "users.txt"], "cannot be read"),
+        ("site_router.py", [], "usage: "),
+        ("read_recording.py", ["nowhere.mcap"], "nowhere.mcap does not exist"),
+        ("read_recording.py", [], "usage: "),
+        ("export_result.py", ["nowhere.json"], "nowhere.json: "),
+        ("export_result.py", [], "usage: "),
+    ],
+)
+def test_without_bus_or_file_it_ends_in_one_line(name, words, says, tmp_path):
+    command = [sys.executable, str(ROOT / "examples" / name), *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 1
+    assert says in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
 def test_foxglove_layout_is_json_and_names_our_topics():

@@ -265,6 +265,46 @@ def test_urdf_joint_places_the_camera(rig):
         assert joint.find("parent").get("link") == "imu"
 
 
+def test_ros_and_urdf_name_the_frames_as_the_bus_does(rig):
+    named = replace(rig, imu_frame="imu0")
+    joints = ET.fromstring(files(named, "urdf")["rig.urdf"]).findall("joint")
+    urdf = {(j.find("parent").get("link"), j.find("child").get("link")) for j in joints}
+    ros = set()
+    for text in files(named, "ros").values():
+        words = next(line for line in text.splitlines() if "static_transform_publisher" in line).split()
+        ros.add((words[words.index("--frame-id") + 1], words[words.index("--child-frame-id") + 1]))
+    assert urdf == ros == {("imu0", "cam0"), ("imu0", "left")}
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_every_file_says_how_good_it_is(rig, name):
+    rig = rig if name not in ("opencv", "orbslam3") else single(rig)
+    for file in export(rig, name):
+        text = file.text.replace("\\", "")
+        for needed in ("converging", "2014-05-13 16:53:20 UTC", "6223-00042", "0.02 ms"):
+            if name == "json":
+                continue
+            assert needed in text, (file.name, needed)
+    back = rig_from_json(json.loads(export(rig, "json")[0].text))
+    assert (back.status, back.reason, back.t_ns, back.devices) == (
+        rig.status, rig.reason, rig.t_ns, rig.devices,
+    )  # fmt: skip
+    assert back.header == rig.header
+
+
+@pytest.mark.parametrize("name", sorted(FORMATS))
+def test_what_the_motion_did_not_determine_needs_force(rig, name):
+    camera = replace(rig.cameras["cam0"], unobservable=("lever arm along the optical axis",))
+    rig = replace(rig, cameras={"cam0": camera})
+    if name == "json":  # says so itself
+        assert json.loads(export(rig, name)[0].text)["cameras"]["cam0"]["unobservable"]
+        return
+    with pytest.raises(ExportError, match=r"cam0: lever arm along the optical axis.*--force"):
+        export(rig, name)
+    for file in export(rig, name, force=True):
+        assert "NOT DETERMINED by the motion: lever arm along the optical axis" in file.text
+
+
 def test_basalt_direction_offset_and_bias_form(rig):
     value = json.loads(files(rig, "basalt")["calibration.json"])["value0"]
     for pose, camera in zip(value["T_imu_cam"], rig.cameras.values(), strict=True):

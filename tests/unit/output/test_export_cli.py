@@ -67,6 +67,21 @@ def test_kalibr_goes_in_and_basalt_comes_out(result_file, tmp_path, capsys):
     assert value["cam_time_offset_ns"] == -5_120_000
 
 
+def test_a_withheld_direction_is_written_only_by_force(result_file, capsys):
+    document = json.loads(result_file.read_text())
+    document["cameras"]["cam0"]["unobservable"] = ["lever arm along the optical axis"]
+    result_file.write_text(json.dumps(document))
+    words = ["export", str(result_file), "--format", "kalibr"]
+    assert main(words) == 1
+    out, err = capsys.readouterr()
+    assert not out and err.count("\n") == 1 and "--force" in err
+    assert main([*words, "--force"]) == 0
+    out, err = capsys.readouterr()
+    assert "# status: NOT CONVERGED: converging" in out and "lever arm along the optical axis" in out
+    assert "vical: warning: not converged: converging" in err
+    assert yaml.safe_load(out)["cam0"]["T_cam_imu"]
+
+
 def test_options_fill_in_what_the_source_lacks(result_file, tmp_path, capsys):
     document = json.loads(result_file.read_text())
     for camera in document["cameras"].values():
@@ -98,14 +113,17 @@ def test_log_gives_its_last_calibration(tmp_path, capsys):
 
     path = tmp_path / "log.mcap"
     t0 = 1_700_000_000_000_000_000
-    with LogWriter(path) as log:
+    serials = {"camera/cam0": "SN7", "imu/imu0": "6223-1"}
+    with LogWriter(path, {"devices": serials}) as log:
         info = encode_camera_info(t0, "cam0", (640, 480), [500.0, 500, 320, 240], "radtan", [0.0] * 4)
         log.write(topics.CAMERA_INFO.key("rig0", "cam0"), info, t0)
         for k, shift in enumerate((0.001, 0.002)):
             payload = encode_calibration(estimate(t0 + k, "cam0", shift), "cam0")
             log.write(topics.CALIBRATION.key("rig0", "cam0"), payload, t0 + k)
     assert main(["export", str(path), "--format", "kalibr"]) == 0
-    chain = yaml.safe_load(capsys.readouterr().out)
+    text = capsys.readouterr().out
+    assert "# devices: camera/cam0 SN7, imu/imu0 6223-1" in text and "# status: converged" in text
+    chain = yaml.safe_load(text)
     assert chain["cam0"]["timeshift_cam_imu"] == pytest.approx(0.002)
     assert chain["cam0"]["resolution"] == [640, 480]
 

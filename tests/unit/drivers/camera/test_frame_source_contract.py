@@ -189,7 +189,7 @@ class TestFrameSource:
             # some frames may wait already; nobody reads faster than a camera delivers for long
             assert any(stand.source.read(0.0) is None for _ in range(100))
             return
-        while stand.source.read(0.0) is not None:
+        while stand.source.read(0.5) is not None:  # its frames are 0.05 s apart
             pass
         assert stand.source.read(0.01) is None
 

@@ -1,0 +1,111 @@
+"""A recording played as live devices: stamps of now, one time base, played again, joined late."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from vical_drivers.errors import DeviceNotFoundError, DeviceRefusedError
+from vical_drivers.samples import FrameSource, ImuSource
+
+from vical_daemon import playback
+from vical_daemon.config import CameraConfig, ImuConfig
+from vical_daemon.mcap_log import LogWriter
+from vical_daemon.messages import encode_image, encode_imu, encode_points
+from vical_daemon.roles.camera import open_camera
+from vical_daemon.roles.imu import open_imu
+
+T0_NS = 1_700_000_000_000_000_000
+IMU_STEP_NS, FRAME_STEP_NS = 5_000_000, 40_000_000
+FIRST_FRAME_NS = 3_000_000  # after the first inertial sample
+IMU_COUNT, FRAME_COUNT = 40, 5
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """0.2 s of an IMU at 200 Hz and a camera at 25 Hz, of long ago."""
+    path = tmp_path / "run.mcap"
+    with LogWriter(path) as writer:
+        for k in range(IMU_COUNT):
+            t_ns = T0_NS + k * IMU_STEP_NS
+            payload = encode_imu(t_ns, "imu0", (0.1 * k, 0.0, 0.0), (0.0, 0.0, 9.8))
+            writer.write("vical/rig0/imu/imu0", payload, t_ns)
+        for k in range(FRAME_COUNT):
+            t_ns = T0_NS + FIRST_FRAME_NS + k * FRAME_STEP_NS
+            payload = encode_image(t_ns, "cam0", np.full((48, 64), k, np.uint8), "mono8")
+            writer.write("vical/rig0/camera/cam0/image", payload, t_ns)
+    return path
+
+
+def _samples(imu: ImuSource, count: int) -> list:
+    samples: list = []
+    while len(samples) < count:
+        samples += imu.read(60.0)
+    return samples
+
+
+def test_imu_and_camera_share_the_recorded_time_base(log: Path) -> None:
+    before_ns = time.monotonic_ns()
+    with (
+        open_imu(ImuConfig(port=f"log:{log}")) as imu,
+        open_camera(CameraConfig(uri=f"log:{log}")) as camera,
+    ):
+        assert isinstance(imu, ImuSource) and isinstance(camera, FrameSource)
+        samples = _samples(imu, 10)
+        frame = camera.read(60.0)
+        assert imu.info.serial_number == "log-run-imu0" and camera.info.serial_number == "log-run-cam0"
+    assert frame is not None and samples[0].t_host_ns >= before_ns
+    stamps = [s.t_host_ns for s in samples]
+    assert [b - a for a, b in itertools.pairwise(stamps)] == [IMU_STEP_NS] * (len(stamps) - 1)
+    assert samples[3].gyro_rps == (pytest.approx(0.3), 0.0, 0.0)
+    # Whichever frame the camera joined at, it keeps its recorded distance from the samples.
+    number = int(frame.image[0, 0])
+    distance_ns = frame.t_exposure_mid_ns - stamps[0] - FIRST_FRAME_NS - number * FRAME_STEP_NS
+    period_ns = (IMU_COUNT - 1) * IMU_STEP_NS + round(playback.PAUSE_S * 1e9)
+    assert distance_ns % period_ns == 0  # 0, unless this machine slept through the first play
+    assert all(s.t_arrival_ns >= s.t_host_ns for s in samples)
+
+
+def test_it_begins_again_and_time_goes_on(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(playback, "PAUSE_S", 0.05)
+    with open_imu(ImuConfig(port=f"log:{log}")) as imu:
+        samples = _samples(imu, IMU_COUNT + 5)
+        assert imu.stats().reconnects >= 1
+    steps = [b.t_host_ns - a.t_host_ns for a, b in itertools.pairwise(samples)]
+    period_ns = (IMU_COUNT - 1) * IMU_STEP_NS + 50_000_000
+    assert steps[: IMU_COUNT - 1] == [IMU_STEP_NS] * (IMU_COUNT - 1)
+    assert (samples[IMU_COUNT].t_host_ns - samples[0].t_host_ns) % period_ns == 0
+    assert samples[IMU_COUNT].gyro_rps == samples[0].gyro_rps
+
+
+def test_nothing_comes_before_its_time(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(playback, "PAUSE_S", 3600.0)
+    with open_imu(ImuConfig(port=f"log:{log}")) as imu:
+        _samples(imu, IMU_COUNT)  # now the recording pauses
+        assert imu.read(0.01) == []
+
+
+def test_what_is_not_there_is_one_line(log: Path, tmp_path: Path) -> None:
+    with pytest.raises(DeviceNotFoundError, match=r"nowhere\.mcap does not exist"):
+        open_imu(ImuConfig(port=f"log:{tmp_path}/nowhere.mcap"))
+    with pytest.raises(DeviceNotFoundError, match=r"no camera 'cam7' in it \(there: cam0\)"):
+        open_camera(CameraConfig(uri=f"log:{log}#cam7"))
+
+
+def test_several_devices_must_be_named_and_points_are_no_images(tmp_path: Path) -> None:
+    path = tmp_path / "two.mcap"
+    with LogWriter(path) as writer:
+        for name, k in itertools.product(("imu0", "imu1"), range(3)):
+            t_ns = T0_NS + k * IMU_STEP_NS
+            writer.write(f"vical/rig0/imu/{name}", encode_imu(t_ns, name, (0.0,) * 3, (0.0, 0.0, 9.8)), t_ns)
+        points = encode_points(T0_NS, "cam0", np.arange(4), np.ones((4, 2)), None, (64, 48))
+        writer.write("vical/rig0/camera/cam0/points", points, T0_NS)
+    with pytest.raises(DeviceRefusedError, match=r"two\.mcap#NAME with one of imu0, imu1"):
+        open_imu(ImuConfig(port=f"log:{path}"))
+    with open_imu(ImuConfig(port=f"log:{path}#imu1")) as imu:
+        assert imu.info.serial_number == "log-two-imu1"
+    with pytest.raises(DeviceNotFoundError, match="of points alone, `vical replay`"):
+        open_camera(CameraConfig(uri=f"log:{path}"))
