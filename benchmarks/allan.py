@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.noise import FLICKER, allan_curve, fit_noise
+from vical_daemon.estimation.tools.noise_densities import FLICKER, allan_curve, fit_noise
 
 RATE_HZ = 100.0
 # White noise N (U/sqrt(Hz)) and rate random walk K (U/s/sqrt(Hz)) of each axis: the class of a GX3-25.

@@ -24,13 +24,13 @@ from vical_mocks.points import SimulatedRun, simulate
 
 from benchmarks.bus_junk import RIG, Junk, unopened
 from benchmarks.soak import usage
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.bus import Sample
-from vical_daemon.config import Config, load
-from vical_daemon.estimate_role import EstimateRole
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.calibrate.estimators import make_estimator
+from vical_daemon.calibrate.worker import EstimateRole
+from vical_daemon.config.model import Config, load
 from vical_daemon.estimation.result import CalibrationEstimate, Status
-from vical_daemon.estimators import make_estimator
 from vical_daemon.vision.target import Checkerboard
 
 SECONDS, JUNK_FROM_S, JUNK_FOR_S = 60.0, 2.0, 50.0
@@ -138,7 +138,7 @@ class Seen:
 
 def send_junk(socket: str, count: int, over_s: float, begin_ns: int, pipe: Any) -> None:
     """Say when it is ready, wait, and send `count` messages at an even rate."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     source = Junk(24)
     pool = [source.message(k, begin_ns) for k in range(min(_POOL, count))]
@@ -199,7 +199,7 @@ def calibrating(junk: int, seed: int = 11) -> tuple[list[tuple[str, str]], bool]
 
 def _live(run: SimulatedRun, folder: Path, junk: int, begin_ns: int) -> tuple[Seen, float]:
     """Everything in processes of its own, in real time."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     seen, socket = Seen(), folder / "zenoh.sock"
     with ExitStack() as stack:

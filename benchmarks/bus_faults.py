@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bus_calibration import calibrating
-from vical_daemon import messages as m
-from vical_daemon import topics
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
 
 IMU, IMAGE = topics.IMU.key("rig0", "imu0"), topics.IMAGE.key("rig0", "cam0")
 JUNK = 1_000_000
@@ -88,7 +88,7 @@ def _scenarios(faults: dict[str, Callable[[Path, float], list[Any]]], seconds: f
 
 def scenario(fault: Callable[[Path, float], list[Any]], seconds: float) -> dict[str, Any]:
     """Publish for some seconds beside a fault and return what the good subscriber saw."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     with tempfile.TemporaryDirectory() as folder:
         socket = Path(folder) / "z.sock"
@@ -141,7 +141,7 @@ def publish(bus: Any, seconds: float, busy: Callable[[], bool]) -> dict[str, Any
 
 def subscribe_well(socket: str, pipe: Connection) -> None:
     """Count good samples and their age; refuse junk."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     bus = open_bus(mode="client", socket=socket)
     ages, refused, images = [], 0, 0
@@ -168,7 +168,7 @@ def subscribe_well(socket: str, pipe: Connection) -> None:
 
 def subscribe_slowly(socket: str, seconds_each: float) -> None:
     """Take everything, slowly."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     bus = open_bus(mode="client", socket=socket)
     bus.subscribe("vical/**", lambda _: time.sleep(seconds_each))
@@ -177,7 +177,7 @@ def subscribe_slowly(socket: str, seconds_each: float) -> None:
 
 def publish_junk(socket: str, count: int) -> None:
     """Send rubbish of all sizes to every key of ours, as fast as it goes."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     bus = open_bus(mode="client", socket=socket)
     keys = [topic.key("rig0", "imu0" if topic.kind == "imu" else "cam0") for topic in topics.TOPICS]
@@ -235,7 +235,7 @@ def _three(values: Any) -> str:
 
 def router_restart(times: int = 5) -> None:
     """Close and open the router under two clients; how long until samples flow again."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     gaps, worst_publish = [], 0.0
     with tempfile.TemporaryDirectory() as folder:

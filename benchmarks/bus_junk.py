@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon import messages as m
-from vical_daemon import topics
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 
 RIG = "rig0"

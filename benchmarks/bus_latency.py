@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from vical_daemon import messages as m
-from vical_daemon import topics
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
 
 _CONTEXT = mp.get_context("spawn")
 
@@ -50,7 +50,7 @@ def _image(t_ns: int, pixels: Any) -> bytes:
 
 def row(name: str, key: str, rate_hz: float, build: Any, seconds: float) -> str:
     """Send at a rate from the process that hosts the bus, as `acquire` does."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     with tempfile.TemporaryDirectory() as folder:
         socket = str(Path(folder) / "z.sock")
@@ -81,8 +81,8 @@ def row(name: str, key: str, rate_hz: float, build: Any, seconds: float) -> str:
 
 def receive(socket: str, key: str, pipe: Connection) -> None:
     """Note the age of every message by its stamp (both processes share CLOCK_MONOTONIC)."""
-    from vical_daemon.recording.logs import stamp_of
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
+    from vical_daemon.logs.recorded_logs import stamp_of
 
     bus = open_bus(mode="client", socket=socket)
     ages_ms: list[float] = []

@@ -78,11 +78,11 @@ def _acquire(folder: str, stop: Any, ready: Any, answers: Any, size: tuple[int, 
     from vical_mocks.v4l2_camera import FakeCamera
     from vical_mocks.v4l2_kernel import FakeKernel, RealClock
 
-    from vical_daemon.bus import Bus
-    from vical_daemon.outbox import Outbox
-    from vical_daemon.roles.camera import QUEUE_DEPTH, CameraRole
-    from vical_daemon.wall_clock import WallClock
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.acquire.camera import QUEUE_DEPTH, CameraRole
+    from vical_daemon.acquire.publish_queue import Outbox
+    from vical_daemon.bus.interface import Bus
+    from vical_daemon.bus.zenoh_bus import open_bus
+    from vical_daemon.service.wall_clock import WallClock
 
     camera = FakeCamera(
         formats={"GREY": {size: (rate_hz,)}}, static=True, transfer_ns=round(TRANSFER_S * 1e9)
@@ -117,9 +117,9 @@ def _acquire(folder: str, stop: Any, ready: Any, answers: Any, size: tuple[int, 
 
 def _record(folder: str, stop: Any, ready: Any, answers: Any) -> None:
     """The process `record`: subscribes to everything of the camera and writes MCAP, flushed each second."""
-    from vical_daemon.mcap_log.writer import LogWriter
-    from vical_daemon.messages import decode_image
-    from vical_daemon.zenoh_bus import BusError, open_bus
+    from vical_daemon.bus.messages import decode_image
+    from vical_daemon.bus.zenoh_bus import BusError, open_bus
+    from vical_daemon.logs.mcap.writer import LogWriter
 
     for _ in range(100):
         try:

@@ -16,14 +16,14 @@ from itertools import pairwise
 from pathlib import Path
 from unittest import mock
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.bus import Sample
-from vical_daemon.config import loads
-from vical_daemon.mcap_log import LogFolder, LogReader
-from vical_daemon.record_queue import RecordQueue, arrival
-from vical_daemon.recorder import Recorder
-from vical_daemon.wall_clock import WallClock, private_clock
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.config.model import loads
+from vical_daemon.logs.mcap import LogFolder, LogReader
+from vical_daemon.record.queue import RecordQueue, arrival
+from vical_daemon.record.recorder import Recorder
+from vical_daemon.service.wall_clock import WallClock, private_clock
 
 _IMU = topics.IMU.key("rig0", "imu0")
 

@@ -21,10 +21,10 @@ from vical_mocks.rotations import exp_so3, skew
 
 from benchmarks.feed import CAMERA, Record, Snapshot, error_against_truth
 from benchmarks.projection import View, jacobians
-from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
 
 FloatArray = npt.NDArray[np.float64]
 # attitude, position, velocity, gyro bias, accelerometer bias, gravity; lever arm, mounting, shift, lens

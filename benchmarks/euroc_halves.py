@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from vical_daemon.bus.messages import decode_imu, decode_points
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.noise.consistency import MODES, modes
 from vical_daemon.estimation.result import CameraEstimate
-from vical_daemon.estimation.trust.consistency import MODES, modes
-from vical_daemon.messages import decode_imu, decode_points
-from vical_daemon.recording import open_recording
+from vical_daemon.logs import open_recording
 from vical_daemon.vision.target import load_target
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "euroc_imu_april"

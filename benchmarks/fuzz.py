@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.config import ConfigError, loads
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.config.model import ConfigError, loads
 from vical_daemon.estimation.result import PoseEstimate
-from vical_daemon.mcap_log import LogError, LogReader, LogWriter
-from vical_daemon.recording import RecordingError, open_recording
+from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.mcap import LogError, LogReader, LogWriter
 
 Case = tuple[str, bytes, Callable[[bytes], object], tuple[type[Exception], ...]]
 

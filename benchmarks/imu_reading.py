@@ -23,9 +23,9 @@ from vical_drivers.microstrain.device import MicrostrainImu, open_imu
 from vical_drivers.samples import ImuSample
 
 from vical_daemon import config as config_module
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.roles import imu as imu_role
-from vical_daemon.wall_clock import WallClock
+from vical_daemon.acquire import imu as imu_role
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.service.wall_clock import WallClock
 
 KEY = "vical/bench/imu/imu0"
 COLUMNS = (
@@ -192,7 +192,7 @@ def _read_and_publish(source: _Noted, bus: _NotedBus, stop: threading.Event) -> 
 
 def _acquire(args: argparse.Namespace) -> int:
     """The process `acquire` as the service runs it: bus router, device thread, encoder."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     port, rate_hz, seconds, socket = args.acquire, args.rate, args.seconds, args.socket
     if args.fifo:
@@ -259,7 +259,7 @@ def _wake_ups(period_s: float, seconds: float) -> list[float]:
 
 def _subscribe(socket: str) -> int:
     """What stands where the recorder does: note when each sample came, until the bus is gone."""
-    from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
+    from vical_daemon.bus.zenoh_bus import BusError, ZenohBus, open_bus
 
     bus: ZenohBus | None = None
     while bus is None:

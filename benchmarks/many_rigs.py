@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from vical_daemon import messages as m
-from vical_daemon import topics
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 
 _CONTEXT = mp.get_context("spawn")
@@ -33,8 +33,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--rigs", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=20.0)
     args = parser.parse_args(argv)
+    from vical_daemon.bus.zenoh_bus import open_bus
     from vical_daemon.client import Client
-    from vical_daemon.zenoh_bus import open_bus
 
     with tempfile.TemporaryDirectory() as folder:
         socket = Path(folder) / "site.sock"
@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
 
 def run_rigs(socket: str, names: list[str], seconds: float, sent: Any, slot: int) -> None:
     """Some rigs in one process, each with a session of its own."""
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     buses = {name: open_bus(mode="client", socket=socket) for name in names}
     time.sleep(1.0)

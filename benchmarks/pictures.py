@@ -21,7 +21,7 @@ from typing import Any
 
 from vical_daemon.cli import live_table
 from vical_daemon.cli.watch import View
-from vical_daemon.mcap_log import LogReader
+from vical_daemon.logs.mcap import LogReader
 
 ROOT = Path(__file__).resolve().parents[1]
 EUROC = ROOT.parent / "shared" / "data" / "euroc_imu_april"
@@ -82,7 +82,7 @@ def terminal(browser: Any, work: Path, log: Path, path: Path) -> None:
     """Draw what `vical watch` showed at the end of the log."""
     from rich.console import Console
 
-    from vical_daemon.bus import Sample
+    from vical_daemon.bus.interface import Sample
 
     view = View("*", as_json=False)
     for message in LogReader(log).messages():

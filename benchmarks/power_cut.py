@@ -23,11 +23,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vical_daemon import messages as m
-from vical_daemon import topics
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.mcap_log import LogError, LogFolder, LogReader, LogSession
-from vical_daemon.store import CalibrationStore
+from vical_daemon.logs.mcap import LogError, LogFolder, LogReader, LogSession
+from vical_daemon.results.store import CalibrationStore
 
 _SHARED = struct.Struct(
     "<qqq"

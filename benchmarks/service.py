@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.machine import Machine, MachineError
-from vical_daemon.mcap_log import recover
-from vical_daemon.recording import open_recording
+from vical_daemon.logs import open_recording
+from vical_daemon.logs.mcap import recover
 from vical_daemon.vision.target import Checkerboard
 
 REPOSITORY = Path(__file__).resolve().parents[1]

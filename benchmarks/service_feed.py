@@ -11,10 +11,10 @@ import numpy as np
 from vical_mocks.live_rig import LiveRig, LiveRigSettings
 from vical_mocks.points import board_points
 
-from vical_daemon import topics
-from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics, encode_points
-from vical_daemon.wall_clock import shared_clock
-from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
+from vical_daemon.bus import topics
+from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics, encode_points
+from vical_daemon.bus.zenoh_bus import BusError, ZenohBus, open_bus
+from vical_daemon.service.wall_clock import shared_clock
 
 BOARD = {"kind": "checkerboard", "cols": 8, "rows": 6, "row_spacing_m": 0.05, "col_spacing_m": 0.05}
 RATE_HZ = 15.0

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.mcap_log import LogReader
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.logs.mcap import LogReader
 
 _CONTEXT = mp.get_context("spawn")
 _IMU, _IMAGE = topics.IMU.key("rig0", "imu0"), topics.IMAGE.key("rig0", "cam0")
@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="soak")
     parser.add_argument("--minutes", type=float, default=20.0)
     args = parser.parse_args(argv)
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -97,10 +97,10 @@ def publish_and_watch(bus: Any, pid: int, seconds: float) -> tuple[list[tuple[An
 
 def record(folder: str, done: Any) -> None:
     """The role as it runs in `vical-record.service`."""
-    from vical_daemon.config import loads
-    from vical_daemon.roles import record as role
-    from vical_daemon.wall_clock import private_clock
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
+    from vical_daemon.config.model import loads
+    from vical_daemon.record import role as role
+    from vical_daemon.service.wall_clock import private_clock
 
     record = f"{{directory: {folder}/log, rotate_s: 20, quota_bytes: 400000000, reserve_bytes: 0}}"
     config = loads(f"rig: rig0\nrecord: {record}\n")

@@ -21,18 +21,18 @@ from vical_mocks.points import board_points
 from vical_mocks.rig import reference_rig
 
 from benchmarks.soak import usage
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.config import CameraConfig, Config, ImuConfig, RecordConfig
-from vical_daemon.estimate_role import EstimateRole
-from vical_daemon.estimators import make_estimator
-from vical_daemon.mcap_log import LogFolder
-from vical_daemon.publications import publish
-from vical_daemon.record_queue import arrival
-from vical_daemon.recorder import Recorder
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.outgoing import publish
+from vical_daemon.calibrate.estimators import make_estimator
+from vical_daemon.calibrate.worker import EstimateRole
+from vical_daemon.config.model import CameraConfig, Config, ImuConfig, RecordConfig
+from vical_daemon.logs.mcap import LogFolder
+from vical_daemon.record.queue import arrival
+from vical_daemon.record.recorder import Recorder
+from vical_daemon.service.wall_clock import private_clock
 from vical_daemon.vision.target import Checkerboard
-from vical_daemon.wall_clock import private_clock
 from vical_daemon.web.state import WebState
 
 _T0_NS = 1_700_000_000_000_000_000

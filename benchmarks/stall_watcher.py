@@ -7,12 +7,12 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from vical_daemon import topics
-from vical_daemon.bus import Sample
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import MessageError, decode_calibration, decode_diagnostics
+from vical_daemon.bus.zenoh_bus import BusError, ZenohBus, open_bus
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.result import CalibrationEstimate, Status
-from vical_daemon.messages import MessageError, decode_calibration, decode_diagnostics
-from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
 
 _LOOK_S = 0.2
 _LONELY_S = 1.0  # without a router for so long: connect anew

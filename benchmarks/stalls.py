@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.stall_watcher import Watcher
-from vical_daemon.estimation import so3
 from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.estimation.wording import event_text
 from vical_daemon.vision.target import Checkerboard

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import yaml
 
 from benchmarks.euroc_halves import read
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 

@@ -53,7 +53,7 @@ def figure_start(path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from vical_daemon.estimation.so3 import quat_from_matrix
+    from vical_daemon.estimation.geometry.so3 import quat_from_matrix
     from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
     from vical_daemon.estimation.temporal.rotation_start import shift_costs
     from vical_daemon.estimation.temporal.rotation_turns import camera_turns

@@ -14,7 +14,7 @@ from vical_mocks.trajectory import hand_motion
 from benchmarks.td_icp_trials import DEG, GYRO, IMU_HZ, WALK, simulate_gyro
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.estimation.td_icp import TdIcpOptions, td_icp
+from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, td_icp
 from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
 
 FloatArray = npt.NDArray[np.float64]

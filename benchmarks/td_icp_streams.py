@@ -12,10 +12,10 @@ from vical_mocks.rotations import exp_so3, log_so3
 from vical_mocks.trajectory import hand_motion
 
 from benchmarks.td_icp_trials import DEG, GYRO, IMU_HZ, WALK, simulate_gyro
+from vical_daemon.estimation.init.lens_refinement import refine_lens
 from vical_daemon.estimation.measurements import PointsFrame
-from vical_daemon.estimation.start.lens_refinement import refine_lens
-from vical_daemon.estimation.td_icp import TdIcpOptions, TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.camera_orientations import target_orientations
+from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream, joint_with_gyro
 
 FloatArray = npt.NDArray[np.float64]
@@ -92,8 +92,8 @@ def study_joint(trials: int) -> None:
 
 def study_real(folder: Path) -> None:
     """Windows of 10 s of a real recording whose delay is next to nothing (hardware trigger; Kalibr: 5 us)."""
-    from vical_daemon.priors import read_initial
-    from vical_daemon.recording import open_recording
+    from vical_daemon.config.priors import read_initial
+    from vical_daemon.logs import open_recording
     from vical_daemon.vision.target import load_target
 
     if not folder.is_dir():

@@ -27,10 +27,10 @@ IMAGES_HZ = 10.0
 
 def serve(pipe: Connection, socket: str) -> None:
     """Child: role web as a client of the bus; sends its address, ends when told."""
-    from vical_daemon.config import CameraConfig, Config, ImuConfig, WebConfig
-    from vical_daemon.roles import web
-    from vical_daemon.wall_clock import private_clock
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
+    from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
+    from vical_daemon.service.wall_clock import private_clock
+    from vical_daemon.web import role as web
 
     bus, stop = open_bus(mode="client", socket=socket), threading.Event()
     config = Config(
@@ -86,7 +86,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--seconds", type=float, default=1500.0)
     parser.add_argument("--speed", type=float, default=20.0, help="times the rate of a rig")
     args = parser.parse_args(argv)
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()

@@ -23,10 +23,10 @@ import numpy as np
 
 def serve(pipe: Connection, seconds: float) -> None:
     """Child: role web over a LocalBus; sends its address, then CPU seconds of the page and of the bus."""
-    from vical_daemon.bus import LocalBus
-    from vical_daemon.config import CameraConfig, Config, ImuConfig, WebConfig
-    from vical_daemon.roles import web
-    from vical_daemon.wall_clock import private_clock
+    from vical_daemon.bus.interface import LocalBus
+    from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
+    from vical_daemon.service.wall_clock import private_clock
+    from vical_daemon.web import role as web
 
     feed = _feed_module()
     recorded = LocalBus()

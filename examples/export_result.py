@@ -6,7 +6,7 @@ import json
 import sys
 from pathlib import Path
 
-from vical_daemon.export import ExportError, export, rig_from_json
+from vical_daemon.results.export import ExportError, export, rig_from_json
 
 
 def main(path: str) -> None:

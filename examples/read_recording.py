@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from vical_daemon.recording import RecordingError, open_recording
+from vical_daemon.logs import RecordingError, open_recording
 
 
 def main(path: str) -> None:

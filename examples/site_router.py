@@ -12,7 +12,7 @@ import sys
 import time
 
 from vical_daemon import client
-from vical_daemon.zenoh_bus import BusError, open_bus
+from vical_daemon.bus.zenoh_bus import BusError, open_bus
 
 
 def main(ca: str, certificate: str, key: str, *robots: str) -> None:

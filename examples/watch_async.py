@@ -9,7 +9,7 @@ import asyncio
 import sys
 
 from vical_daemon import client
-from vical_daemon.zenoh_bus import BusError
+from vical_daemon.bus.zenoh_bus import BusError
 
 
 async def main(endpoint: str | None = None) -> int:

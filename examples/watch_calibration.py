@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from vical_daemon import client
-from vical_daemon.zenoh_bus import BusError
+from vical_daemon.bus.zenoh_bus import BusError
 
 
 def main(endpoint: str | None = None) -> int:

@@ -20,12 +20,12 @@ from typing import Any, Self
 
 from vical_drivers.closing import Closing
 
-from vical_daemon import topics
-from vical_daemon.bus import Bus, Sample, Subscription
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus, Sample, Subscription
+from vical_daemon.bus.messages import MessageError, admit_calibration
+from vical_daemon.bus.topics import parse_key
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.wording import event_text
-from vical_daemon.messages import MessageError, admit_calibration
-from vical_daemon.topics import parse_key
 
 _DEPTH = 256
 
@@ -246,8 +246,8 @@ def connect(
     Raises:
         BusError: Nobody there, or not admitted.
     """
-    from vical_daemon.local_bus import open_local_bus
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.local_bus import open_local_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     if endpoint:
         return Client(open_bus(mode="client", connect=[endpoint], **security), rig)

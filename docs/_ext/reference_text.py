@@ -22,7 +22,7 @@ PACKAGES = {
 
 def topics_table() -> str:
     """The table of keys."""
-    from vical_daemon import topics
+    from vical_daemon.bus import topics
 
     lines = [
         "| key | type | rate | priority | when full | recorded | last kept |",
@@ -39,7 +39,7 @@ def topics_table() -> str:
 
 def messages_text() -> str:
     """Definitions of our own messages."""
-    from vical_daemon.messages.schemas import DEFINITIONS
+    from vical_daemon.bus.messages.schemas import DEFINITIONS
 
     return "\n\n".join(f"### {name}\n\n```text\n{text.rstrip()}\n```" for name, text in DEFINITIONS.items())
 
@@ -68,7 +68,7 @@ def causes_table() -> str:
 
 def config_text() -> str:
     """Every setting with type, default, bounds and meaning, from the dataclasses that check it."""
-    from vical_daemon.config import Config
+    from vical_daemon.config.model import Config
 
     return "\n\n".join(_section(Config, "", []))
 

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.euroc_halves import read
 from benchmarks.target_free import OPENVINS, camera_of
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.cli import main
-from vical_daemon.estimation.so3 import log, matrix_from_quat
+from vical_daemon.estimation.geometry.so3 import log, matrix_from_quat
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 

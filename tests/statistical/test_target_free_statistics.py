@@ -12,8 +12,8 @@ from vical_mocks.tracks import simulate_tracks
 from benchmarks.bound import BoundOptions, bounds
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from benchmarks.scores import nees
-from vical_daemon.estimation.free.carry import IMU
 from vical_daemon.estimation.measurements import CalibrationOptions
+from vical_daemon.estimation.smoother.carry import IMU
 
 pytestmark = [pytest.mark.statistical, pytest.mark.timeout(600)]
 TRIALS, SECONDS, CAMERA_HZ = 6, 9.0, 8.0

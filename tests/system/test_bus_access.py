@@ -15,13 +15,14 @@ from pathlib import Path
 
 import pytest
 
-from vical_daemon import bus_places, client, topics
-from vical_daemon.bus_places import Reach, local_sockets, reach, why_closed
+from vical_daemon import client
+from vical_daemon.bus import bus_places, topics
+from vical_daemon.bus.bus_places import Reach, local_sockets, reach, why_closed
+from vical_daemon.bus.local_bus import open_local_bus
+from vical_daemon.bus.messages import encode_string
+from vical_daemon.bus.zenoh_bus import BusError, open_bus
 from vical_daemon.cli.bus_access import open_client, open_for_roles
-from vical_daemon.config import BusConfig, Config
-from vical_daemon.local_bus import open_local_bus
-from vical_daemon.messages import encode_string
-from vical_daemon.zenoh_bus import BusError, open_bus
+from vical_daemon.config.model import BusConfig, Config
 
 pytestmark = pytest.mark.system
 COMMAND = topics.COMMAND.key("rover", "record")
@@ -50,11 +51,12 @@ def vical_elsewhere(
     """
     code = (
         "import os, pathlib, sys\n"
-        "from vical_daemon import bus_places\n"
+        "from vical_daemon.config import paths\n"
+        f"paths.LOOPBACK_PORT = {port}\n"
+        "from vical_daemon.bus import bus_places\n"
         f"bus_places.SERVICE_SOCKET = pathlib.Path({str(service)!r})\n"
-        f"bus_places.LOOPBACK_PORT = {port}\n"
         "from vical_daemon.cli import bus_access, main, watch, web\n"
-        "import rich.live, vical_daemon.cli.live_table, vical_daemon.messages, vical_daemon.roles.web\n"
+        "import rich.live, vical_daemon.cli.live_table, vical_daemon.bus.messages, vical_daemon.web.role\n"
         "'localhost'.encode('idna')\n"
         f"os.setgroups({list(groups)!r}); os.setgid({NOBODY}); os.setuid({NOBODY})\n"
         f"sys.exit(main({words!r}))\n"

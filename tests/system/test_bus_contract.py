@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import Bus, LocalBus, key_matches
-from vical_daemon.zenoh_bus import BusError, open_bus
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus, LocalBus, key_matches
+from vical_daemon.bus.zenoh_bus import BusError, open_bus
 
 pytestmark = pytest.mark.system
 IMU = topics.IMU.key("rig0", "imu0")

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from vical_daemon import topics
+from vical_daemon.bus import topics
+from vical_daemon.bus.messages import decode_string, encode_string
+from vical_daemon.bus.zenoh_bus import BusError, open_bus
+from vical_daemon.bus.zenoh_commands import CommandJournal
 from vical_daemon.cli.bus_access import open_for_roles
-from vical_daemon.config import Config
-from vical_daemon.messages import decode_string, encode_string
-from vical_daemon.zenoh_bus import BusError, open_bus
-from vical_daemon.zenoh_commands import CommandJournal
+from vical_daemon.config.model import Config
 
 pytestmark = pytest.mark.system
 COMMAND = topics.COMMAND.key("rig0", "record")

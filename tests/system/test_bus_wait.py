@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import encode_camera_info
+from vical_daemon.bus.zenoh_bus import BusError, open_bus
 from vical_daemon.cli import main
 from vical_daemon.cli.bus_wait import wait_for_bus
 from vical_daemon.cli.web import _discover
-from vical_daemon.messages import encode_camera_info
-from vical_daemon.zenoh_bus import BusError, open_bus
 
 pytestmark = pytest.mark.system
 NEVER = float("inf")

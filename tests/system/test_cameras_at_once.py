@@ -14,11 +14,11 @@ from vical_drivers.samples import FrameSource
 from vical_mocks.v4l2_camera import FakeCamera, UvcClockModel
 from vical_mocks.v4l2_kernel import FakeKernel, RealClock
 
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.config import CameraConfig, loads
-from vical_daemon.messages import decode_image
-from vical_daemon.roles import camera as camera_role
-from vical_daemon.wall_clock import WallClock
+from vical_daemon.acquire import camera as camera_role
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.messages import decode_image
+from vical_daemon.config.model import CameraConfig, loads
+from vical_daemon.service.wall_clock import WallClock
 
 pytestmark = pytest.mark.system
 CLOCK = WallClock(1_700_000_000_000_000_000)

@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 
 from vical_daemon.cli import main
-from vical_daemon.config import load
+from vical_daemon.config.model import load
 
 pytestmark = pytest.mark.system
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.mcap_log import LogReader
-from vical_daemon.zenoh_bus import open_bus
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.zenoh_bus import open_bus
+from vical_daemon.logs.mcap import LogReader
 
 pytestmark = pytest.mark.system
 IMU = topics.IMU.key("rig0", "imu0")

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from vical_mocks.gx3_emulator import Gx3Emulator
 
-from vical_daemon.bus import Sample
-from vical_daemon.messages import decode_diagnostics, decode_imu, decode_points
-from vical_daemon.recording import open_recording
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import decode_diagnostics, decode_imu, decode_points
+from vical_daemon.bus.zenoh_bus import open_bus
+from vical_daemon.logs import open_recording
 from vical_daemon.vision.target import Checkerboard
-from vical_daemon.zenoh_bus import open_bus
 
 # Five Python processes start: on a machine under load that alone may take a minute.
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]

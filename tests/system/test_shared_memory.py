@@ -20,8 +20,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from vical_daemon import topics, zenoh_session
-from vical_daemon.zenoh_bus import open_bus
+from vical_daemon.bus import topics, zenoh_session
+from vical_daemon.bus.zenoh_bus import open_bus
 
 KIB = 1024
 UNLIMITED = resource.RLIM_INFINITY

@@ -13,7 +13,7 @@ from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
     from vical_daemon.cli.imu_data import EvenSamples
-    from vical_daemon.estimation.noise import AllanCurve, NoiseFit
+    from vical_daemon.estimation.tools.noise_densities import AllanCurve, NoiseFit
 
 _EPILOG = """\
 Leave the IMU alone on a heavy table, warmed up, for two hours or more (four is good), then:
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Analyse and print."""
     from vical_daemon.cli import imu_data
-    from vical_daemon.estimation import noise
+    from vical_daemon.estimation.tools import noise_densities as noise
 
     if args.tau_min is not None and args.tau_min <= 0:
         raise CliError("--tau-min must be above 0", EXIT_USAGE)
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     _progress(args, "")
     combined = noise.imu_noise(fits["gyro"], fits["accel"], samples.rate_hz)
     if args.output:
-        from vical_daemon.export.kalibr import write_imu
+        from vical_daemon.results.export.kalibr import write_imu
 
         length = _length(samples.duration_s)
         note = f"vical allan {Path(args.input).name}: {length} at {samples.rate_hz:.2f} Hz"
@@ -88,7 +88,7 @@ def _document(
     """Return the result with SI units in the keys' documentation: see docs/allan.md."""
     from dataclasses import asdict
 
-    from vical_daemon.estimation.noise import imu_noise
+    from vical_daemon.estimation.tools.noise_densities import imu_noise
 
     axes: dict[str, Any] = {}
     for sensor, sensor_fits in fits.items():

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vical_daemon.estimation.noise import AllanCurve, NoiseFit
-from vical_daemon.report.figures import AXES, SOFT
+from vical_daemon.estimation.tools.noise_densities import AllanCurve, NoiseFit
+from vical_daemon.results.report.figures import AXES, SOFT
 
 _UNITS = {"gyro": ("Gyroscope", "rad/s"), "accel": ("Accelerometer", "m/s^2")}
 

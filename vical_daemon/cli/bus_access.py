@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vical_daemon import notify
-from vical_daemon.bus import Bus
-from vical_daemon.bus_places import LOOPBACK_PORT, own_socket
-from vical_daemon.config import BusConfig, Config, load
-from vical_daemon.local_bus import open_local_bus
-from vical_daemon.places import make_private
-from vical_daemon.zenoh_bus import BusError, ZenohBus, open_bus
-from vical_daemon.zenoh_commands import CommandJournal
+from vical_daemon.bus.bus_places import own_socket
+from vical_daemon.bus.interface import Bus
+from vical_daemon.bus.local_bus import open_local_bus
+from vical_daemon.bus.zenoh_bus import BusError, ZenohBus, open_bus
+from vical_daemon.bus.zenoh_commands import CommandJournal
+from vical_daemon.config.model import BusConfig, Config, load
+from vical_daemon.config.paths import LOOPBACK_PORT, make_private
+from vical_daemon.service import notify
 
 _log = logging.getLogger(__name__)
 _HOSTS = {"imu", "camera"}
@@ -52,7 +52,7 @@ def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) 
     if bus is not None:
         _log.info("on the bus as zenoh id %s", bus.session.info.zid())  # the journal of commands names it
     if bus is not None and config.ros2 is not None:
-        from vical_daemon.zenoh_ros2 import Ros2Bus
+        from vical_daemon.bus.zenoh_ros2 import Ros2Bus
 
         node = f"{config.rig}_{min(roles, default='vical')}"
         return Ros2Bus(bus, node, config.ros2.domain, config.ros2_namespace)

@@ -6,9 +6,9 @@ import sys
 import threading
 import time
 
-from vical_daemon.bus import Bus
+from vical_daemon.bus.interface import Bus
+from vical_daemon.bus.zenoh_bus import BusError
 from vical_daemon.cli import bus_access
-from vical_daemon.zenoh_bus import BusError
 
 _RETRY_S = 0.5
 _NOBODY = "nothing answers"  # of `zenoh_session`: all other refusals will not change by waiting

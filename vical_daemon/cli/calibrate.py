@@ -78,8 +78,8 @@ def run(args: argparse.Namespace) -> int:
         if path and not Path(path).absolute().parent.is_dir():
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
     from vical_daemon.cli import calibration_run
-    from vical_daemon.priors import Initial, read_initial
-    from vical_daemon.recording import open_recording
+    from vical_daemon.config.priors import Initial, read_initial
+    from vical_daemon.logs import open_recording
 
     initial = read_initial(args.initial) if args.initial else Initial()
     if args.target:
@@ -134,7 +134,7 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
 
 
 def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any]) -> None:
-    from vical_daemon import report
+    from vical_daemon.results import report
 
     inputs = [Path(p) for p in (args.input, args.target, args.initial) if p]
     settings = {"fix": args.fix, "estimate": args.estimate}

@@ -10,24 +10,24 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus, Sample
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.outgoing import publish
+from vical_daemon.calibrate.estimators import make_estimator
+from vical_daemon.calibrate.worker import EstimateRole
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.config import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
-from vical_daemon.config_rules import NEEDS_TARGET
-from vical_daemon.estimate_role import EstimateRole
-from vical_daemon.estimation.camera_model import PLUMB_BOB
+from vical_daemon.config.cross_checks import NEEDS_TARGET
+from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
+from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.events import Event
+from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.estimation.result import CalibrationEstimate
-from vical_daemon.estimators import make_estimator
-from vical_daemon.priors import Initial
-from vical_daemon.publications import publish
-from vical_daemon.recording import Recording, Stream
-from vical_daemon.recording.logs import stamp_of
+from vical_daemon.logs import Recording, Stream
+from vical_daemon.logs.recorded_logs import stamp_of
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.frame_report import FrameReport
+    from vical_daemon.estimation.model.frame_report import FrameReport
 
 Progress = Callable[[float, CalibrationEstimate | None], None]
 PUBLISH_EVERY_S = 1.0  # of the data: often enough for a progress bar
@@ -215,7 +215,7 @@ def _attach_detectors(bus: LocalBus, job: Job) -> None:
     images = {name for name, stream in job.cameras.items() if stream.kind in ("image", "compressed")}
     if not images:
         return
-    from vical_daemon.roles.detect import DetectRole, attach_aid
+    from vical_daemon.detect.role import DetectRole, attach_aid
 
     for name in images:
         detect = DetectRole(job.config, name, prior=job.priors[name])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from vical_daemon.euler import euler_deg, euler_sigma_deg
+from vical_daemon.results.euler import euler_deg, euler_sigma_deg
 
 
 def describe(result: dict[str, Any]) -> str:

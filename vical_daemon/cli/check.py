@@ -17,7 +17,7 @@ from vical_daemon.cli.options import add_config, add_json
 if TYPE_CHECKING:
     from vical_drivers.samples import FrameSource, ImuSource
 
-    from vical_daemon.config import CameraConfig, Config, ImuConfig
+    from vical_daemon.config.model import CameraConfig, Config, ImuConfig
 
 _IMU_SECONDS = 2.5
 
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check everything; 2 if the config is wrong, 1 if something else is."""
-    from vical_daemon.config import ConfigError, load
+    from vical_daemon.config.model import ConfigError, load
 
     try:
         config = load(args.config)
@@ -83,9 +83,9 @@ def _findings(config: Config, *, devices: bool) -> Iterator[Finding]:
     yield _check_disk(config)
     if not devices:
         return
+    from vical_daemon.acquire.camera import open_camera
+    from vical_daemon.acquire.imu import open_imu
     from vical_daemon.cli.emulated import emulated_devices
-    from vical_daemon.roles.camera import open_camera
-    from vical_daemon.roles.imu import open_imu
 
     with emulated_devices(config, ("imu", "camera")) as options:
         open_source = options.get("imu", {}).get("open_source", open_imu)
@@ -114,7 +114,7 @@ def _check_target(config: Config) -> Iterator[Finding]:
 
 
 def _check_disk(config: Config) -> Finding:
-    from vical_daemon.places import state_directory
+    from vical_daemon.config.paths import state_directory
 
     folder = Path(config.record.directory or state_directory() / "log")
     existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
@@ -158,7 +158,7 @@ def _check_camera(
     from vical_drivers.camera.opening import judge_camera
     from vical_drivers.errors import DriverError
 
-    from vical_daemon.roles.camera import driver_options
+    from vical_daemon.acquire.camera import driver_options
 
     try:
         source = open_source(camera)

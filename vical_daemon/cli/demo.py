@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vical_daemon.cli.demo_truth import StampWitness
     from vical_daemon.cli.emulated import EmulatedRig
     from vical_daemon.cli.process_sets import RoleThreads
-    from vical_daemon.config import Config
+    from vical_daemon.config.model import Config
     from vical_daemon.estimation.result import CalibrationEstimate
     from vical_daemon.vision.target import Checkerboard
 
@@ -123,10 +123,10 @@ def _run_roles(
     config: Config, rig: EmulatedRig, stamps: StampWitness, args: argparse.Namespace
 ) -> tuple[CalibrationEstimate, list[dict[str, Any]]]:
     """Run every role as a thread over one LocalBus for the given time of data."""
-    from vical_daemon.bus import LocalBus
+    from vical_daemon.bus.interface import LocalBus
     from vical_daemon.cli.demo_screen import Watch
-    from vical_daemon.cli.process_sets import RoleThreads
-    from vical_daemon.wall_clock import private_clock
+    from vical_daemon.cli.process_sets import ROLE_MODULES, RoleThreads
+    from vical_daemon.service.wall_clock import private_clock
 
     bus, clock = LocalBus(), private_clock()
     roles = RoleThreads(config, bus)
@@ -135,7 +135,7 @@ def _run_roles(
     try:
         page = ("web",) if config.web.enabled else ()
         for role in (*page, "record", "estimate", "detect", "camera", "imu"):
-            import_module(f"vical_daemon.roles.{role}")  # before its source starts: it hears the first sample
+            import_module(ROLE_MODULES[role])  # before its source starts: it hears the first sample
             options: dict[str, Any] = {"clock": clock}
             if role == "web":
                 options["ready"] = lambda address: _say(f"live page at {address}")
@@ -200,7 +200,7 @@ def _follow(watch: Watch, roles: RoleThreads, args: argparse.Namespace) -> None:
 
 def _write_config(out: Path, board: Checkerboard, port: str) -> Config:
     """Write target and settings; returns the settings with the port of the rig that runs now."""
-    from vical_daemon.config import load
+    from vical_daemon.config.model import load
 
     (out / "target.yaml").write_text(board.to_yaml(), encoding="utf-8")
     text = _CONFIG.format(

@@ -6,12 +6,12 @@ import sys
 import time
 from typing import Any
 
-from vical_daemon import topics
-from vical_daemon.bus import Bus, Sample
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus, Sample
+from vical_daemon.bus.messages import decode_calibration, decode_diagnostics
 from vical_daemon.cli import live_table
 from vical_daemon.cli.errors import CliError
 from vical_daemon.estimation.result import CalibrationEstimate, Status
-from vical_daemon.messages import decode_calibration, decode_diagnostics
 
 
 class Watch:

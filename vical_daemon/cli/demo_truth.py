@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from vical_drivers.samples import ImuSample, ImuSource
 
-from vical_daemon.config import ImuConfig
-from vical_daemon.estimation import so3
-from vical_daemon.roles.imu import open_imu
+from vical_daemon.acquire.imu import open_imu
+from vical_daemon.config.model import ImuConfig
+from vical_daemon.estimation.geometry import so3
 
 SIGMAS_ALLOWED = 4.0
 _RESTARTED_NS = 20_000_000  # larger: the device's timer was set anew, its ticks no longer tell when

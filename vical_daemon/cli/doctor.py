@@ -144,7 +144,7 @@ def _real_time() -> Finding:
 
 
 def _locked_memory() -> Finding:
-    from vical_daemon.zenoh_session import can_share_memory
+    from vical_daemon.bus.zenoh_session import can_share_memory
 
     enough = can_share_memory()
     text = (
@@ -156,7 +156,7 @@ def _locked_memory() -> Finding:
 
 
 def _disk() -> Finding:
-    from vical_daemon.places import state_directory
+    from vical_daemon.config.paths import state_directory
 
     folder = (state_directory() / "log").absolute()
     existing = next(p for p in (folder, *folder.parents) if p.exists())

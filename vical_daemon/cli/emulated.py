@@ -12,13 +12,13 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.config import EMULATED
+from vical_daemon.config.model import EMULATED
 
 if TYPE_CHECKING:
     from vical_drivers.samples import FrameSource, ImuSource
     from vical_mocks.live_rig import LiveRig
 
-    from vical_daemon.config import CameraConfig, Config, ImuConfig
+    from vical_daemon.config.model import CameraConfig, Config, ImuConfig
     from vical_daemon.vision.target import Target
 
     EmulatedRig = LiveRig
@@ -74,13 +74,13 @@ def emulated_devices(config: Config, roles: Collection[str]) -> Iterator[RoleOpt
 
 
 def _imu_opener(rig: EmulatedRig) -> Callable[[ImuConfig], ImuSource]:
-    from vical_daemon.roles.imu import open_imu
+    from vical_daemon.acquire.imu import open_imu
 
     return lambda imu: open_imu(replace(imu, port=rig.port) if imu.port == EMULATED else imu)
 
 
 def _camera_opener(rig: EmulatedRig) -> Callable[[CameraConfig], FrameSource]:
-    from vical_daemon.roles.camera import open_camera
+    from vical_daemon.acquire.camera import open_camera
 
     return lambda camera: rig.camera() if camera.uri == EMULATED else open_camera(camera)
 

@@ -13,7 +13,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
-    from vical_daemon.export import ExportFile, Rig
+    from vical_daemon.results.export import ExportFile, Rig
 
 FORMATS = ("kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json")
 _RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recording: 18 hours
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, convert, write."""
-    from vical_daemon.export import export
+    from vical_daemon.results.export import export
 
     rig = _complete(read_source(args.source), args)
     files = export(rig, args.format, force=args.force)
@@ -105,8 +105,8 @@ def read_source(source: str) -> Rig:
     Raises:
         CliError: Nothing there that holds a calibration.
     """
-    from vical_daemon.export import rig_from_json
-    from vical_daemon.export.kalibr import read_camchain
+    from vical_daemon.results.export import rig_from_json
+    from vical_daemon.results.export.kalibr import read_camchain
 
     path = Path(source)
     if source == "store" and not path.exists():
@@ -142,9 +142,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 def _from_log(path: Path) -> Rig:
     """Read the last calibration of every camera, and image sizes, from our own log."""
-    from vical_daemon.export import rig_from_estimate
-    from vical_daemon.mcap_log import LogReader
-    from vical_daemon.messages import (
+    from vical_daemon.bus.messages import (
         CALIBRATION_TYPE,
         CAMERA_INFO_TYPE,
         POSE_TYPE,
@@ -153,6 +151,8 @@ def _from_log(path: Path) -> Rig:
         decode_pose,
         merge_calibrations,
     )
+    from vical_daemon.logs.mcap import LogReader
+    from vical_daemon.results.export import rig_from_estimate
 
     last: dict[str, bytes] = {}
     sizes: dict[str, tuple[int, int]] = {}
@@ -185,9 +185,9 @@ def _from_store() -> Rig:
     """Read the newest stored calibration of every camera."""
     from dataclasses import replace as with_changes
 
-    from vical_daemon.export import rig_from_estimate
-    from vical_daemon.places import state_directory
-    from vical_daemon.store import CalibrationStore
+    from vical_daemon.config.paths import state_directory
+    from vical_daemon.results.export import rig_from_estimate
+    from vical_daemon.results.store import CalibrationStore
 
     folder = state_directory() / "calibration"
     stored = sorted(CalibrationStore(folder).all(), key=lambda entry: entry.saved_ns)
@@ -216,7 +216,7 @@ def _complete(rig: Rig, args: argparse.Namespace) -> Rig:
         cameras = {n: replace(c, topic=args.image_topic) for n, c in cameras.items()}
     noise = rig.noise
     if args.imu_noise:
-        from vical_daemon.priors import read_initial
+        from vical_daemon.config.priors import read_initial
 
         noise = read_initial(args.imu_noise).imu_noise or noise
     frame = args.imu_frame or rig.imu_frame

@@ -12,7 +12,7 @@ from vical_daemon.cli.imu_options import add_input
 from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.imu_static import ImuCalibration, SensorCalibration
+    from vical_daemon.estimation.tools.imu_static import ImuCalibration, SensorCalibration
 
 _EPILOG = """\
 Record 20 or more rests of 3 s, each in another position (all six faces, edges, corners), turned by hand in
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.min_rest <= 0:
         raise CliError("--min-rest must be above 0", EXIT_USAGE)
     from vical_daemon.cli import imu_data
-    from vical_daemon.estimation.imu_static import calibrate_imu
+    from vical_daemon.estimation.tools.imu_static import calibrate_imu
 
     samples = imu_data.load(args)
     found = calibrate_imu(samples.gyro_rps, samples.accel_mps2, samples.rate_hz, args.gravity, args.min_rest)
@@ -88,7 +88,7 @@ def to_document(found: ImuCalibration) -> dict[str, Any]:
 
 def to_yaml(document: dict[str, Any], note: str) -> str:
     """Write the result for people and programs; numbers as in `to_document`."""
-    from vical_daemon.export.text import comment, number, row
+    from vical_daemon.results.export.text import comment, number, row
 
     lines = [comment(note), "# corrected = matrix @ (measured - bias); SI units\n"]
     for name in ("accel", "gyro"):

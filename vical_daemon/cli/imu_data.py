@@ -15,7 +15,7 @@ from vical_drivers.user_files import read_text
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.imu_options import COLUMNS
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.recording.asl import TABLE_LIMIT
+from vical_daemon.logs.asl import TABLE_LIMIT
 
 MOVED_RPS, MOVED_MPS2 = 9e-3, 0.2  # 0.5 deg/s; twenty mg
 _LIVELY = 5.0  # scatter of the gyro within a second over that of the quietest ones
@@ -64,8 +64,8 @@ def load(args: argparse.Namespace) -> EvenSamples:
         raise CliError(
             f"{path}: only {np.count_nonzero(use)} samples after --skip and --seconds, 100 are needed"
         )
-    from vical_daemon.recording.checks import check_imu
-    from vical_daemon.recording.model import ImuArrays
+    from vical_daemon.logs.checks import check_imu
+    from vical_daemon.logs.model import ImuArrays
 
     check_imu(name, ImuArrays(t_ns[use], gyro[use], accel[use]))  # units: g and deg/s are refused by name
     samples = even_grid(name, t_ns[use], gyro[use], accel[use])
@@ -152,7 +152,7 @@ def even_grid(name: str, t_ns: IntArray, gyro: FloatArray, accel: FloatArray) ->
 
 
 def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, FloatArray, str]:
-    from vical_daemon.recording import open_recording
+    from vical_daemon.logs import open_recording
 
     recording = open_recording(path, check=False)
     names = list(recording.imus)

@@ -14,7 +14,7 @@ from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
 
 if TYPE_CHECKING:
-    from vical_daemon.recording.summary import Summary, TopicSummary
+    from vical_daemon.logs.summary import Summary, TopicSummary
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,8 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what each recording holds, and whether `vical calibrate` takes it; 1 if one is unreadable."""
-    from vical_daemon.mcap_log import LogError
-    from vical_daemon.recording import RecordingError
+    from vical_daemon.logs import RecordingError
+    from vical_daemon.logs.mcap import LogError
 
     found: list[dict[str, object]] = []
     broken: list[str] = []
@@ -54,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _summarise(path: Path) -> tuple[Summary, str]:
     """Return what a recording holds, and why `vical calibrate` would not take it (empty: it would)."""
-    from vical_daemon.recording import RecordingError, check_recording, open_recording
-    from vical_daemon.recording.summary import summarise_log, summarise_recording
+    from vical_daemon.logs import RecordingError, check_recording, open_recording
+    from vical_daemon.logs.summary import summarise_log, summarise_recording
 
     problem = ""
     if path.is_file() and (path.suffix == ".mcap" or path.name.endswith(".mcap.part")):

@@ -17,7 +17,7 @@ from textwrap import indent
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
-from vical_daemon.whole_file import write_whole
+from vical_daemon.service.atomic_file import write_whole
 
 _UNITS = Path("etc/systemd/system")
 _HOMES = ("/home", "/root", "/run/user")

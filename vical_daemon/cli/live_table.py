@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
-from vical_daemon.euler import euler_deg, euler_sigma_deg
+from vical_daemon.results.euler import euler_deg, euler_sigma_deg
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -14,8 +14,8 @@ from vical_daemon.cli.options import add_json
 if TYPE_CHECKING:
     from vical_daemon.estimation.guidance import WeakDirection
     from vical_daemon.estimation.measurements import FloatArray
-    from vical_daemon.estimation.observability import Motion, Observability, Setup
-    from vical_daemon.estimation.observability_model import ModelRank
+    from vical_daemon.estimation.tools.observability import Motion, Observability, Setup
+    from vical_daemon.estimation.tools.observability_model import ModelRank
 
 BLOCKS = ("intrinsics", "imu_matrix", "target_scale", "readout")
 
@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     if not Path(args.input).exists():
         raise CliError(f"{args.input} does not exist; check the path")
     from vical_daemon.cli.observability_motion import motion_of
-    from vical_daemon.estimation.observability import gramian
-    from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
+    from vical_daemon.estimation.tools.observability import gramian
+    from vical_daemon.estimation.tools.observability_model import ModelBlocks, model_rank
 
     motion, setup, frames = motion_of(args, frozenset(blocks))
     result = gramian(motion, setup, frames)
@@ -75,8 +75,8 @@ def _missing(result: Observability, motion: Motion, setup: Setup) -> list[WeakDi
     """What is missing, from the bound with next to no prior."""
     import numpy as np
 
-    from vical_daemon.estimation.observability import covariance_of
-    from vical_daemon.estimation.trust.missing_motion import RunningMotion, missing_motion
+    from vical_daemon.estimation.status.excitation import RunningMotion, missing_motion
+    from vical_daemon.estimation.tools.observability import covariance_of
 
     covariance = covariance_of(result)
     order = [result.blocks[name] for name in ("lever_arm", "rotation", "timeshift")]
@@ -100,7 +100,7 @@ def sigmas(result: Observability) -> FloatArray:
     """
     import numpy as np
 
-    from vical_daemon.estimation.observability import covariance_of
+    from vical_daemon.estimation.tools.observability import covariance_of
 
     sigma = np.sqrt(np.diag(covariance_of(result, _PRIOR)))
     return np.where(sigma > _LOST_SHARE * _PRIOR * result.units, np.inf, sigma)

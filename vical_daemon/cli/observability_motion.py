@@ -12,13 +12,13 @@ from scipy.interpolate import CubicSpline
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.td_icp import choose_gyro, prior_of
 from vical_daemon.cli.td_icp_sources import board_poses, lens_of, seconds
-from vical_daemon.estimation.observability import Motion, Setup
-from vical_daemon.estimation.start.lens_refinement import LensFit
-from vical_daemon.estimation.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
+from vical_daemon.config.priors import Initial, read_initial
+from vical_daemon.estimation.init.lens_refinement import LensFit
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-from vical_daemon.priors import Initial, read_initial
-from vical_daemon.recording import open_recording
+from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
+from vical_daemon.estimation.tools.observability import Motion, Setup
+from vical_daemon.logs import open_recording
 
 FloatArray = npt.NDArray[np.float64]
 

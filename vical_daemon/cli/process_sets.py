@@ -6,13 +6,12 @@ import logging
 import threading
 from collections.abc import Mapping, Sequence
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
-from vical_daemon.bus import Bus
+from vical_daemon.bus.interface import Bus
 from vical_daemon.cli.errors import EXIT_USAGE, CliError, describe_known
 from vical_daemon.cli.options import suggest
-from vical_daemon.config import Config
+from vical_daemon.config.model import Config
 
 _log = logging.getLogger(__name__)
 
@@ -23,6 +22,15 @@ PROCESSES: dict[str, tuple[str, ...]] = {
     "web": ("web",),
 }
 """Process (`vical run NAME`, unit `vical-NAME.service`) -> its roles."""
+ROLE_MODULES = {
+    "imu": "vical_daemon.acquire.imu",
+    "camera": "vical_daemon.acquire.camera",
+    "record": "vical_daemon.record.role",
+    "detect": "vical_daemon.detect.role",
+    "estimate": "vical_daemon.calibrate.role",
+    "web": "vical_daemon.web.role",
+}
+"""Role -> the module whose `run` it is; imported when the role starts."""
 
 
 def role_names(words: Sequence[str]) -> list[str]:
@@ -52,7 +60,7 @@ def needed_processes(config: Config) -> list[str]:
         needed.append("calibrate")
     if config.web.enabled:
         needed.append("web")
-    return [name for name in needed if all(find_spec(f"vical_daemon.roles.{r}") for r in PROCESSES[name])]
+    return needed
 
 
 STOP_S = 10.0
@@ -84,7 +92,7 @@ class RoleThreads:
 
         def guarded() -> None:
             try:
-                run = import_module(f"vical_daemon.roles.{role}").run  # loads scipy, OpenCV: for a minute
+                run = import_module(ROLE_MODULES[role]).run  # loads scipy, OpenCV: for a minute
                 run(self._config, self._bus, stop, **(options or {}))
             except Exception as error:
                 self.errors[role] = error

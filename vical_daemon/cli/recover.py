@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Recover one file, or every part in a folder."""
-    from vical_daemon.mcap_log import LogFolder, recover, recover_folder
+    from vical_daemon.logs.mcap import LogFolder, recover, recover_folder
 
     path = Path(args.log)
     if path.is_dir():

@@ -14,8 +14,8 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
-    from vical_daemon.bus import Bus
-    from vical_daemon.recording import Recording
+    from vical_daemon.bus.interface import Bus
+    from vical_daemon.logs import Recording
 
 _PROGRESS_S = 1.0
 
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Publish with the time between stamps that there was; without a router, host the bus meanwhile."""
-    from vical_daemon.recording import open_recording
+    from vical_daemon.logs import open_recording
 
     if args.speed < 0 or args.wait < 0:
         raise CliError("--speed and --wait must not be negative", EXIT_USAGE)
@@ -69,10 +69,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _open_bus(args: argparse.Namespace) -> Bus:
     """Join the bus of the rig; where there is none, host it, so that others can come."""
+    from vical_daemon.bus.zenoh_bus import BusError, open_bus
     from vical_daemon.cli.bus_access import open_client, socket_path
-    from vical_daemon.config import BusConfig, load
-    from vical_daemon.places import make_private
-    from vical_daemon.zenoh_bus import BusError, open_bus
+    from vical_daemon.config.model import BusConfig, load
+    from vical_daemon.config.paths import make_private
 
     try:
         return open_client(args.config, args.connect)
@@ -114,10 +114,10 @@ def replay(
         progress: Show it on stderr.
 
     Returns:
-        ``messages``, ``duration_s`` and ``late_ms``, by how much the latest message came late.
+        ``bus/messages``, ``duration_s`` and ``late_ms``, by how much the latest message came late.
     """
-    from vical_daemon.recording.logs import stamp_of
-    from vical_daemon.topics import check_name
+    from vical_daemon.bus.topics import check_name
+    from vical_daemon.logs.recorded_logs import stamp_of
 
     prefix = f"vical/{check_name(rig)}/" if rig else ""
     begin_s, count, late_s, shown_s = time.monotonic(), 0, 0.0, 0.0

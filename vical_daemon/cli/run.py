@@ -19,9 +19,9 @@ from vical_daemon.cli.options import add_config, add_json
 from vical_daemon.cli.stop_signals import die_with, leave_at_once, stop_signals
 
 if TYPE_CHECKING:
-    from vical_daemon.bus import Bus
+    from vical_daemon.bus.interface import Bus
     from vical_daemon.cli.process_sets import RoleThreads
-    from vical_daemon.config import Config
+    from vical_daemon.config.model import Config
 
 _log = logging.getLogger(__name__)
 _TICK_S = 1.0
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     if args.parent and not die_with(args.parent):
         raise CliError("the `vical run` that started this process has ended")
     from vical_daemon.cli import process_sets
-    from vical_daemon.config import load
+    from vical_daemon.config.model import load
 
     config = load(args.config)
     if not config.imus and not config.cameras:
@@ -86,10 +86,10 @@ def _leave(code: int) -> int:
 
 def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     """Run roles as threads of this process; consumers are started first and stopped last."""
-    from vical_daemon import notify
     from vical_daemon.cli.bus_access import open_for_roles
     from vical_daemon.cli.emulated import emulated_devices
     from vical_daemon.cli.process_sets import RoleThreads
+    from vical_daemon.service import notify
 
     bus = open_for_roles(config, roles, stop)
     if bus is None:  # told to stop while waiting for the router
@@ -112,8 +112,9 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
 
 def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, stop: threading.Event) -> None:
     """Tell systemd how it goes, once a second, until the end."""
-    from vical_daemon import notify, topics
-    from vical_daemon.liveness import Liveness
+    from vical_daemon.bus import topics
+    from vical_daemon.service import notify
+    from vical_daemon.service.liveness import Liveness
 
     liveness = Liveness(roles, time.monotonic())
     key = topics.STATUS.pattern.format(rig=config.rig, name="*")

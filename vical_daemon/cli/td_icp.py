@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from vical_daemon.config.priors import Initial
     from vical_daemon.estimation.measurements import CameraPrior
-    from vical_daemon.estimation.td_icp import TdIcpOptions
+    from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
     from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
     from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport
-    from vical_daemon.priors import Initial
-    from vical_daemon.recording import Recording
+    from vical_daemon.logs import Recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         raise CliError("--search must be above 0 and at most 60 seconds", EXIT_USAGE)
     if args.watch is not None and not 3.0 <= args.watch <= 120.0:
         raise CliError("--watch must be 3 to 120 seconds", EXIT_USAGE)
-    from vical_daemon.priors import Initial, read_initial
+    from vical_daemon.config.priors import Initial, read_initial
 
     initial = read_initial(args.initial) if args.initial else Initial()
     if not Path(args.input).exists():
@@ -75,7 +75,7 @@ def is_trajectory(path: Path) -> bool:
 
 def options_of(args: argparse.Namespace, initial: Initial) -> TdIcpOptions:
     """Return the settings that follow from the command line and what is known of the imu."""
-    from vical_daemon.estimation.td_icp import TdIcpOptions
+    from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
 
     noise = initial.imu_noise
     if noise is None:
@@ -86,7 +86,7 @@ def options_of(args: argparse.Namespace, initial: Initial) -> TdIcpOptions:
 
 def open_input(path: str, camera: str | None = None) -> Recording:
     """Open a recording without judging it, of a folder only one camera; warnings go to stderr."""
-    from vical_daemon.recording import open_recording
+    from vical_daemon.logs import open_recording
 
     cameras = () if camera is None else (camera,)
     recording = open_recording(
@@ -123,7 +123,7 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     """One imu and one camera."""
     from vical_daemon.cli.td_icp_report import print_single, report_json
     from vical_daemon.cli.td_icp_sources import camera_stream, seconds, track_frames
-    from vical_daemon.estimation.td_icp import REFUSED, td_icp
+    from vical_daemon.estimation.temporal.td_icp import REFUSED, td_icp
     from vical_daemon.estimation.temporal.track_registration import track_registration
 
     recording = open_input(args.input, args.camera)
@@ -205,7 +205,7 @@ def _joint(args: argparse.Namespace, initial: Initial, names: list[str]) -> int:
     """Any number of sensors."""
     from vical_daemon.cli.td_icp_report import print_joint
     from vical_daemon.cli.td_icp_sensors import register
-    from vical_daemon.estimation.td_icp import REFUSED
+    from vical_daemon.estimation.temporal.td_icp import REFUSED
 
     result = register(args, initial, names)
     if args.json:

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.td_icp_sources import seconds
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
-from vical_daemon.recording.trajectory import read_trajectory
+from vical_daemon.logs.trajectory import read_trajectory
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -95,8 +95,8 @@ def _variance(covariance: Any) -> float:
 
 def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
     """Yield (topic, type, function that decodes) of all messages of any log of ROS messages."""
-    from vical_daemon.mcap_log import LogError, LogReader
-    from vical_daemon.messages.schemas import typestore
+    from vical_daemon.bus.messages.schemas import typestore
+    from vical_daemon.logs.mcap import LogError, LogReader
 
     store = typestore()
     folder = path.is_dir() and not (path / "metadata.yaml").is_file()
@@ -118,7 +118,7 @@ def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
 
 
 def _bag_messages(path: Path) -> Iterator[tuple[str, str, Any]]:
-    from vical_daemon.recording.bags import open_bag
+    from vical_daemon.logs.bags import open_bag
 
     with open_bag(path) as reader:
         for c, _, data in reader.messages():

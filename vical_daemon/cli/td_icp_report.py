@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vical_daemon.estimation.td_icp import TdIcpResult
+    from vical_daemon.estimation.temporal.td_icp import TdIcpResult
     from vical_daemon.estimation.temporal.td_icp_joint import JointResult
     from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport
 
@@ -28,7 +28,7 @@ def print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[st
     """One imu and one camera, for people."""
     import numpy as np
 
-    from vical_daemon.estimation.so3 import quat_from_matrix
+    from vical_daemon.estimation.geometry.so3 import quat_from_matrix
 
     q = quat_from_matrix(result.R_imu_cam)
     sigma_deg, bias = np.rad2deg(result.rotation_sigma_rad), np.rad2deg(result.gyro_bias_rps)
@@ -54,7 +54,7 @@ def print_joint(result: JointResult) -> None:
     """Any number of sensors, for people."""
     import numpy as np
 
-    from vical_daemon.estimation.so3 import quat_from_matrix
+    from vical_daemon.estimation.geometry.so3 import quat_from_matrix
 
     print(f"reference: {result.reference}   (t_b = t_a + shift)")
     for pair in result.pairs:

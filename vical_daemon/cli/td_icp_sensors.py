@@ -12,7 +12,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.td_icp import choose_gyro, is_trajectory, open_input, options_of, prior_of
 from vical_daemon.cli.td_icp_orientations import pose_topic, trajectory_file
 from vical_daemon.cli.td_icp_sources import camera_stream, seconds
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
 from vical_daemon.estimation.temporal.td_icp_joint import (
@@ -21,10 +21,10 @@ from vical_daemon.estimation.temporal.td_icp_joint import (
     joint_of_orientations,
     joint_with_gyro,
 )
-from vical_daemon.recording import Recording, RecordingError
+from vical_daemon.logs import Recording, RecordingError
 
 if TYPE_CHECKING:
-    from vical_daemon.priors import Initial
+    from vical_daemon.config.priors import Initial
 
 _INTEGRATED_HZ = 30.0  # of a gyro's attitude: what lies between adds nothing to a hand's motion
 _INTEGRATED_SIGMA_RAD = 3e-3  # only a start: the fit measures it

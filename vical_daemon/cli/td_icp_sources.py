@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
+from vical_daemon.estimation.init.lens_refinement import LensFit, refine_lens
+from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
-from vical_daemon.estimation.start.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.start.lens_refinement import LensFit, refine_lens
-from vical_daemon.estimation.start.seen_poses import Lens
 from vical_daemon.estimation.temporal.camera_orientations import Orientations, target_orientations
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
-from vical_daemon.recording import Recording, Stream
+from vical_daemon.logs import Recording, Stream
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -156,7 +156,7 @@ def _frames(recording: Recording, stream: Stream, target: str) -> list[PointsFra
 
 
 def _image(payload: bytes, kind: str) -> tuple[int, Any]:
-    from vical_daemon.messages import decode_compressed_image, decode_image
+    from vical_daemon.bus.messages import decode_compressed_image, decode_image
 
     if kind == "image":
         raw = decode_image(payload)

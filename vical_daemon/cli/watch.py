@@ -14,7 +14,7 @@ from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
-    from vical_daemon.bus import Bus, Sample
+    from vical_daemon.bus.interface import Bus, Sample
     from vical_daemon.estimation.result import CalibrationEstimate
 
 _REFRESH_S = 0.25
@@ -86,7 +86,7 @@ class View:
 
     def begin(self, bus: Bus) -> None:
         """Ask for the last values first: a late joiner sees the state at once."""
-        from vical_daemon import topics
+        from vical_daemon.bus import topics
 
         for topic in (topics.CALIBRATION, topics.STATUS):
             key = topic.pattern.format(rig=self._rig, name="*")
@@ -96,7 +96,7 @@ class View:
 
     def take(self, sample: Sample) -> None:
         """Take a message; others than calibrations and statuses are ignored."""
-        from vical_daemon import topics
+        from vical_daemon.bus import topics
 
         parsed = topics.parse_key(sample.key)
         if parsed is not None and parsed.topic is topics.CALIBRATION:
@@ -114,7 +114,7 @@ class View:
 
     def silent(self) -> dict[tuple[str, str], float]:
         """Return the cameras whose estimates have stopped, with the age of the last one, s."""
-        from vical_daemon.liveness import FRESH_S
+        from vical_daemon.service.liveness import FRESH_S
 
         now_s = time.monotonic()
         ages = {key: now_s - heard_s for key, heard_s in list(self._heard_s.items())}
@@ -143,7 +143,7 @@ class View:
                 self._print(*entry)
 
     def _on_estimate(self, rig: str, camera: str, sample: Sample) -> None:
-        from vical_daemon.messages import MessageError, decode_calibration
+        from vical_daemon.bus.messages import MessageError, decode_calibration
 
         try:
             estimate = decode_calibration(sample.payload).estimate
@@ -162,7 +162,7 @@ class View:
             print(f"{rig}  {one_line(camera, estimate)}", flush=True)
 
     def _on_status(self, rig: str, sample: Sample) -> None:
-        from vical_daemon.messages import MessageError, decode_diagnostics
+        from vical_daemon.bus.messages import MessageError, decode_diagnostics
 
         try:
             statuses = decode_diagnostics(sample.payload).statuses

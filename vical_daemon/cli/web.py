@@ -16,8 +16,8 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_config, add_json, check_port
 
 if TYPE_CHECKING:
-    from vical_daemon.bus import Bus
-    from vical_daemon.config import Config
+    from vical_daemon.bus.interface import Bus
+    from vical_daemon.config.model import Config
 
 _RETRY_S = 0.5
 _EPILOG = """\
@@ -44,9 +44,9 @@ def run(args: argparse.Namespace) -> int:
     check_port("--port", args.port)
     check_port("--foxglove", args.foxglove)
     from vical_daemon.cli.bus_wait import wait_for_bus
-    from vical_daemon.config import load
-    from vical_daemon.roles import web
-    from vical_daemon.wall_clock import private_clock
+    from vical_daemon.config.model import load
+    from vical_daemon.service.wall_clock import private_clock
+    from vical_daemon.web import role as web
 
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
@@ -84,8 +84,8 @@ def _discover(bus: Bus, stop: threading.Event) -> Config | None:
     Raises:
         CliError: Several rigs.
     """
-    from vical_daemon import topics
-    from vical_daemon.config import CameraConfig, Config, ImuConfig
+    from vical_daemon.bus import topics
+    from vical_daemon.config.model import CameraConfig, Config, ImuConfig
 
     parsed: list[topics.ParsedKey] = []
     told = False

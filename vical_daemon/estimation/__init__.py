@@ -1,7 +1,10 @@
 """Estimation: arithmetic only (numpy, scipy); nothing here reads a clock, a file or a socket.
 
-`calibrator` (with a target), `target_free` and `td_icp` are what the roles use. Beside what these share
-(rotations, cameras, inertial data, the filter) there are four folders: `start`, from nothing to a running
-filter; `trust`, how far to believe it; `free`, the parts of calibration without a target; `temporal`, those
-of TD-ICP.
+The roles use `calibrator` (with a target), `target_free`, `target_free_rig` and `temporal.td_icp`. Input and
+output are in `measurements`, `result`, `events`, `guidance` and `wording`. The packages, from the bottom:
+`geometry` (rotations, cameras, planar poses), `inertial` (readings and their integration), `model` (state and
+measurement model), `temporal` (TD-ICP), `noise` (noise levels measured from data), `filter` (the unscented
+filter), `selection` (which model of the rig the data support), `init` (from nothing to a running filter),
+`status` (how far to trust a calibration), `smoother` (windows of bundle adjustment, for calibration without a
+target), and `tools` (Allan deviation, IMU calibration at rest, observability).
 """

@@ -11,35 +11,37 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.events import Cause, Event, EventKind
-from vical_daemon.estimation.frame_queue import FrameQueue
-from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.image_intake import (
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.frame_queue import FrameQueue
+from vical_daemon.estimation.filter.image_intake import (
     ImageIntake,
     by_present_stamps,
     trace_by_present_stamps,
 )
-from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.imu_intake import ImuIntake
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_intake import ImuIntake
+from vical_daemon.estimation.init.initializer import LATE_S, Starting
+from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
     FloatArray,
     PointsFrame,
 )
-from vical_daemon.estimation.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.state import ATTITUDE, POSITION, Layout, make_layout
+from vical_daemon.estimation.noise import target_alternative as target_doubt
 from vical_daemon.estimation.plausible import stamp_sigma_problem, usable_points
-from vical_daemon.estimation.recent_past import RecentPast
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
-from vical_daemon.estimation.start.starting import LATE_S, Starting
-from vical_daemon.estimation.state import ATTITUDE, POSITION, Layout, make_layout
+from vical_daemon.estimation.selection import clock_drift
+from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection.model_acceptance import BeyondDoubt
+from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
+from vical_daemon.estimation.status.holdout_check import HeldBack
+from vical_daemon.estimation.status.recent_past import RecentPast
+from vical_daemon.estimation.status.status_evaluator import Judge
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
-from vical_daemon.estimation.trust import clock_drift, hypotheses, target_doubt
-from vical_daemon.estimation.trust.beyond_doubt import BeyondDoubt
-from vical_daemon.estimation.trust.change_watch import Action, ChangeWatch
-from vical_daemon.estimation.trust.held_back import HeldBack
-from vical_daemon.estimation.trust.judge import Judge
 
 _KEEP_S = 5.0
 _STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most

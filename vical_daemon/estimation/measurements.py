@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.camera_model import COEFFICIENTS
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

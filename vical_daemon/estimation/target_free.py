@@ -15,27 +15,27 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.events import Cause
-from vical_daemon.estimation.frame_report import FrameReport
-from vical_daemon.estimation.free.bundle import Bundle, Fit
-from vical_daemon.estimation.free.carry import DRIFT, FULL, LENS, SHIFT, Carry
-from vical_daemon.estimation.free.handover import afresh, aged, next_window
-from vical_daemon.estimation.free.judge import FreeJudge
-from vical_daemon.estimation.free.reports import window_reports
-from vical_daemon.estimation.free.starter import Starter
-from vical_daemon.estimation.free.thinning import Thinning
-from vical_daemon.estimation.free.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
-from vical_daemon.estimation.free.window import Window
-from vical_daemon.estimation.image_intake import (
+from vical_daemon.estimation.filter.image_intake import (
     ImageIntake,
     by_present_stamps,
     trace_by_present_stamps,
 )
-from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.imu_intake import ImuIntake
+from vical_daemon.estimation.filter.unobservable_directions import has_turned
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.plausible import stamp_sigma_problem
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
-from vical_daemon.estimation.unshown_axes import has_turned
+from vical_daemon.estimation.smoother.bundle import Bundle, Fit
+from vical_daemon.estimation.smoother.carry import DRIFT, FULL, LENS, SHIFT, Carry
+from vical_daemon.estimation.smoother.handover import afresh, aged, next_window
+from vical_daemon.estimation.smoother.judge import FreeJudge
+from vical_daemon.estimation.smoother.reports import window_reports
+from vical_daemon.estimation.smoother.starter import Starter
+from vical_daemon.estimation.smoother.thinning import Thinning
+from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
+from vical_daemon.estimation.smoother.window import Window
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
-from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.result import CalibrationEstimate, ImuEstimate, Status, TracePoint
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 

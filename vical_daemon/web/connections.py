@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from aiohttp.http_exceptions import HttpProcessingError
 
-from vical_daemon.log_limit import LogLimit
+from vical_daemon.bus.log_limit import LogLimit
 
 CONNECTIONS_LIMIT = 128
 """Open at a time: twice the viewers that are admitted (32 of values, 32 of pictures)."""

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon import topics
-from vical_daemon.bus import Sample
-from vical_daemon.messages import (
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import (
     MessageError,
     PointsMessage,
     decode_compressed_image,

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from aiohttp import web
 
-from vical_daemon.log_limit import LogLimit
+from vical_daemon.bus.log_limit import LogLimit
 from vical_daemon.web.connections import BODY_S, Gate, Malformed, http_logger
 from vical_daemon.web.hosts import AllowedHosts
 from vical_daemon.web.images import CameraView, Sight, drawn_jpeg, picture_event

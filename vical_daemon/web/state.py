@@ -10,8 +10,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from vical_daemon import topics
-from vical_daemon.bus import Sample
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import (
+    CalibrationMessage,
+    DiagnosticStatus,
+    Level,
+    MessageError,
+    admit_calibration,
+    decode_diagnostics,
+)
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance, Verb
 from vical_daemon.estimation.wording import (
@@ -22,15 +30,7 @@ from vical_daemon.estimation.wording import (
     motion_caption,
     silence,
 )
-from vical_daemon.liveness import FRESH_S
-from vical_daemon.messages import (
-    CalibrationMessage,
-    DiagnosticStatus,
-    Level,
-    MessageError,
-    admit_calibration,
-    decode_diagnostics,
-)
+from vical_daemon.service.liveness import FRESH_S
 
 HISTORY = 1500
 """Rows kept of each camera: 1.6 MB, which five minutes of estimates at 5 Hz fill."""

@@ -7,12 +7,13 @@ import time
 
 import pytest
 
-from vical_daemon import notify, topics
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.config import Config, ImuConfig
-from vical_daemon.messages import decode_diagnostics
-from vical_daemon.roles import imu
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.acquire import imu
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.messages import decode_diagnostics
+from vical_daemon.config.model import Config, ImuConfig
+from vical_daemon.service import notify
+from vical_daemon.service.wall_clock import private_clock
 
 pytestmark = pytest.mark.system
 

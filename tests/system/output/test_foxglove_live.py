@@ -15,11 +15,11 @@ import aiohttp
 import numpy as np
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
-from vical_daemon.config import CameraConfig, Config, ImuConfig
-from vical_daemon.foxglove_live import FoxgloveError, FoxgloveServer, rig_keys
-from vical_daemon.messages import encode_imu, encode_points
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import encode_imu, encode_points
+from vical_daemon.config.model import CameraConfig, Config, ImuConfig
+from vical_daemon.web.foxglove import FoxgloveError, FoxgloveServer, rig_keys
 
 pytestmark = pytest.mark.system
 CONFIG = Config(imus={"imu0": ImuConfig(port="none")}, cameras={"cam0": CameraConfig(uri="none")})
@@ -113,7 +113,7 @@ def test_taken_port_is_said(bus):
 
 
 def test_vical_web_finds_the_rig_by_itself(tmp_path, web_feed):
-    from vical_daemon.zenoh_bus import open_bus
+    from vical_daemon.bus.zenoh_bus import open_bus
 
     path = tmp_path / "zenoh.sock"
     environment = os.environ | {"VICAL_RUNTIME_DIR": str(tmp_path), "VICAL_STATE_DIR": str(tmp_path)}

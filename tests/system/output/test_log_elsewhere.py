@@ -15,9 +15,9 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.mcap_log import LogWriter
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.logs.mcap import LogWriter
 
 pytestmark = pytest.mark.system
 T0_NS = 1_700_000_000_000_000_000

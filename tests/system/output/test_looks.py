@@ -14,12 +14,12 @@ from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
 from benchmarks import pictures
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
 from vical_daemon.cli import live_table, main
 from vical_daemon.cli.watch import View
-from vical_daemon.mcap_log import LogWriter
+from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.vision.target import Checkerboard
 
 pytestmark = pytest.mark.system

@@ -11,11 +11,11 @@ from zenoh_ros2_sdk import ROS2Subscriber
 from zenoh_ros2_sdk.discovery import get_topic_names_and_types
 from zenoh_ros2_sdk.session import ZenohSession
 
+from vical_daemon.bus.messages import Transform, encode_imu, encode_pose, encode_transforms
+from vical_daemon.bus.messages.schemas import ros2_schema
+from vical_daemon.bus.ros2_names import type_hash
+from vical_daemon.bus.zenoh_ros2 import Ros2Outlet
 from vical_daemon.estimation.result import PoseEstimate
-from vical_daemon.messages import Transform, encode_imu, encode_pose, encode_transforms
-from vical_daemon.messages.schemas import ros2_schema
-from vical_daemon.ros2_names import type_hash
-from vical_daemon.zenoh_ros2 import Ros2Outlet
 
 pytestmark = pytest.mark.system
 T0_NS = 1_700_000_000_123_456_789
@@ -78,7 +78,7 @@ def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
 
 def test_the_bus_of_a_process_speaks_ros_when_told(tmp_path):
     from vical_daemon.cli.bus_access import open_for_roles
-    from vical_daemon.config import BusConfig, Config, Ros2Config
+    from vical_daemon.config.model import BusConfig, Config, Ros2Config
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -11,11 +11,11 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 
-from vical_daemon.bus import LocalBus
-from vical_daemon.config import CameraConfig, Config, ImuConfig, WebConfig
-from vical_daemon.messages import decode_diagnostics
-from vical_daemon.roles import web
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import decode_diagnostics
+from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
+from vical_daemon.service.wall_clock import private_clock
+from vical_daemon.web import role as web
 from vical_daemon.web.connections import CONNECTIONS_LIMIT, IDLE_S
 
 pytestmark = pytest.mark.system

@@ -12,14 +12,14 @@ import aiohttp
 import numpy as np
 import pytest
 
-from vical_daemon.bus import LocalBus
-from vical_daemon.config import Config, WebConfig
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import Level, decode_string
+from vical_daemon.config.model import Config, WebConfig
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import Guidance, Lack, Verb
 from vical_daemon.estimation.result import Status
-from vical_daemon.messages import Level, decode_string
-from vical_daemon.roles import web
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.service.wall_clock import private_clock
+from vical_daemon.web import role as web
 
 pytestmark = pytest.mark.system
 

@@ -3,7 +3,15 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vical_daemon import topics
+from vical_daemon.bus import topics
+from vical_daemon.bus.messages import (
+    DiagnosticStatus,
+    Level,
+    encode_calibration,
+    encode_diagnostics,
+    encode_image,
+    encode_points,
+)
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
@@ -13,14 +21,6 @@ from vical_daemon.estimation.result import (
     Status,
 )
 from vical_daemon.estimation.wording import guidance_text
-from vical_daemon.messages import (
-    DiagnosticStatus,
-    Level,
-    encode_calibration,
-    encode_diagnostics,
-    encode_image,
-    encode_points,
-)
 
 RIG, CAMERA = "rig0", "cam0"
 T0_NS = 1_700_000_000_000_000_000

@@ -9,10 +9,10 @@ import pytest
 
 from benchmarks.stall_watcher import Watcher
 from benchmarks.stalls import Outcome, change
-from vical_daemon.bus import Sample
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import encode_calibration
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.messages import encode_calibration
 
 X = Event(EventKind.OTHER, said="x")
 

@@ -13,8 +13,8 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.rosbag2 import reader as ros2
 from rosbags.typesys import Stores, get_typestore
 
-from vical_daemon.mcap_log.chunks import Budget
-from vical_daemon.recording import RecordingError, bags
+from vical_daemon.logs import RecordingError, bags
+from vical_daemon.logs.mcap.chunks import Budget
 
 SIZE = 200_000  # bytes of the one message
 

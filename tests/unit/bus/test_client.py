@@ -8,11 +8,11 @@ import time
 
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import encode_calibration
 from vical_daemon.client import AsyncClient, Client, ClientError
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.messages import encode_calibration
 
 
 def payload(status: Status = Status.CONVERGED, camera: str = "cam0", frames: int = 1) -> bytes:

@@ -7,13 +7,13 @@ import threading
 
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
 from vical_daemon.cli import main
 from vical_daemon.cli.replay import replay
-from vical_daemon.mcap_log import LogFolder, LogReader, LogWriter
-from vical_daemon.recording import open_recording
-from vical_daemon.recording.logs import stamp_of
+from vical_daemon.logs import open_recording
+from vical_daemon.logs.mcap import LogFolder, LogReader, LogWriter
+from vical_daemon.logs.recorded_logs import stamp_of
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.mcap_log import LogError, LogReader, LogWriter, is_being_written, recover, recover_folder
-from vical_daemon.mcap_log.files import LockedFile
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.logs.mcap import LogError, LogReader, LogWriter, is_being_written, recover, recover_folder
+from vical_daemon.logs.mcap.files import LockedFile
 
 IMU = topics.IMU.key("rig0", "imu0")
 POINTS = topics.POINTS.key("rig0", "cam0")

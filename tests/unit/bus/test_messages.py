@@ -11,7 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic
 
-from vical_daemon import messages as m
+from vical_daemon.bus import messages as m
+from vical_daemon.bus.messages.decoders import DECODERS
+from vical_daemon.bus.messages.poses import covariance_for_ros, rotation_matrix
+from vical_daemon.bus.messages.schemas import DEFINITIONS, typestore
+from vical_daemon.bus.topics import TOPICS
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.guidance import Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.result import (
@@ -22,10 +26,6 @@ from vical_daemon.estimation.result import (
     Status,
 )
 from vical_daemon.estimation.wording import event_text
-from vical_daemon.messages.decoders import DECODERS
-from vical_daemon.messages.poses import covariance_for_ros, rotation_matrix
-from vical_daemon.messages.schemas import DEFINITIONS, typestore
-from vical_daemon.topics import TOPICS
 
 STAMP_NS = 1_753_000_000_123_456_789
 

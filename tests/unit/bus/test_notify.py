@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from vical_daemon import notify
+from vical_daemon.service import notify
 
 
 @pytest.fixture

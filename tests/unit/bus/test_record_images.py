@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.bus import Sample
-from vical_daemon.config import loads
-from vical_daemon.mcap_log import LogFolder, LogReader
-from vical_daemon.record_images import ImageCompressor
-from vical_daemon.record_queue import arrival
-from vical_daemon.recorder import Recorder
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.config.model import loads
+from vical_daemon.logs.mcap import LogFolder, LogReader
+from vical_daemon.record.images import ImageCompressor
+from vical_daemon.record.queue import arrival
+from vical_daemon.record.recorder import Recorder
+from vical_daemon.service.wall_clock import private_clock
 from vical_daemon.vision.image_codec import decode_image
-from vical_daemon.wall_clock import private_clock
 
 STAMP_NS = 1_700_000_000_123_456_789
 RNG = np.random.default_rng(5)

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.config import loads
-from vical_daemon.mcap_log import LogFolder, LogReader
-from vical_daemon.record_queue import Arrival, RecordQueue, arrival
-from vical_daemon.recorder import Recorder
-from vical_daemon.recording import open_recording
-from vical_daemon.roles import record
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.config.model import loads
+from vical_daemon.logs import open_recording
+from vical_daemon.logs.mcap import LogFolder, LogReader
+from vical_daemon.record import role as record
+from vical_daemon.record.queue import Arrival, RecordQueue, arrival
+from vical_daemon.record.recorder import Recorder
+from vical_daemon.service.wall_clock import private_clock
 
 IMU = topics.IMU.key("rig0", "imu0")
 COMMAND = topics.COMMAND.key("rig0", "record")
@@ -337,7 +337,7 @@ def test_passwords_stay_out_of_logs(tmp_path):
     path.write_text(
         f"rig: rig0\nbus:\n  user: a\n  password: geheim\nrecord: {{directory: {tmp_path / 'log'}}}\n"
     )
-    from vical_daemon.config import load
+    from vical_daemon.config.model import load
 
     recorder = Recorder(load(path), LogFolder(tmp_path / "log"), private_clock())
     recorder.tick()

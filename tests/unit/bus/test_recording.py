@@ -13,12 +13,12 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from vical_daemon import messages as m
-from vical_daemon.mcap_log import LogWriter
-from vical_daemon.recording import RecordingError, open_recording
-from vical_daemon.recording.checks import gyro_scale
-from vical_daemon.recording.logs import stamp_of
-from vical_daemon.recording.model import ImuArrays, Stamped, in_stamp_order
+from vical_daemon.bus import messages as m
+from vical_daemon.logs import RecordingError, open_recording
+from vical_daemon.logs.checks import gyro_scale
+from vical_daemon.logs.mcap import LogWriter
+from vical_daemon.logs.model import ImuArrays, Stamped, in_stamp_order
+from vical_daemon.logs.recorded_logs import stamp_of
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 G = 9.80665

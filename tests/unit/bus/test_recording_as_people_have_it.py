@@ -9,9 +9,9 @@ import pytest
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from vical_daemon.messages import POINTS_TYPE
-from vical_daemon.messages.schemas import DEFINITIONS
-from vical_daemon.recording import RecordingError, open_recording
+from vical_daemon.bus.messages import POINTS_TYPE
+from vical_daemon.bus.messages.schemas import DEFINITIONS
+from vical_daemon.logs import RecordingError, open_recording
 
 
 def test_files_of_another_camera_are_not_looked_at(tmp_path, write_asl):

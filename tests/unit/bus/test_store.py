@@ -15,7 +15,7 @@ from vical_daemon.estimation.result import (
     PoseEstimate,
     Status,
 )
-from vical_daemon.store import CalibrationStore, StoreError, read_stored
+from vical_daemon.results.store import CalibrationStore, StoreError, read_stored
 
 
 def estimate(x_m: float = 0.1, **changes) -> CalibrationEstimate:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import key_matches
-from vical_daemon.topics import TOPICS, TopicError, parse_key
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import key_matches
+from vical_daemon.bus.topics import TOPICS, TopicError, parse_key
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.kind)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vical_daemon.recording import RecordingError
-from vical_daemon.recording.trajectory import read_trajectory
+from vical_daemon.logs import RecordingError
+from vical_daemon.logs.trajectory import read_trajectory
 
 EPOCH_NS = 1_700_000_000_123_456_789
 N = 20

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.cli import calibration_run, calibration_text, main
+from vical_daemon.config.priors import read_initial
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimators import Estimator
-from vical_daemon.mcap_log import LogWriter
-from vical_daemon.priors import read_initial
-from vical_daemon.recording import open_recording
-from vical_daemon.recording.logs import stamp_of
+from vical_daemon.logs import open_recording
+from vical_daemon.logs.mcap import LogWriter
+from vical_daemon.logs.recorded_logs import stamp_of
 
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "euroc_imu_april"
 G = 9.80665

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.cli.observability import sigmas
-from vical_daemon.estimation.observability import judge
+from vical_daemon.estimation.tools.observability import judge
 
 LAYOUT = {"rotation": slice(0, 3), "lever_arm": slice(3, 6), "timeshift": slice(6, 7)}
 LEVER = LAYOUT["lever_arm"]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from vical_daemon.cli.plain_output import readable
-from vical_daemon.places import state_directory
+from vical_daemon.config.paths import state_directory
 
 ENCODINGS = ["ascii", "latin-1", "cp437", "utf-8"]
 

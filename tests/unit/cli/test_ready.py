@@ -12,10 +12,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from vical_daemon.bus import LocalBus
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.zenoh_bus import BusError
 from vical_daemon.cli import bus_access, process_sets, run
-from vical_daemon.config import Config
-from vical_daemon.zenoh_bus import BusError
+from vical_daemon.config.model import Config
 
 
 def _listen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> socket.socket:

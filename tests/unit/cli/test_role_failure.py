@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from vical_daemon.bus import LocalBus
+from vical_daemon.bus.interface import LocalBus
 from vical_daemon.cli import process_sets
-from vical_daemon.config import Config
+from vical_daemon.config.model import Config
 from vical_daemon.vision.target import TargetError
 
 

@@ -10,7 +10,7 @@ from vical_mocks.rotations import exp_so3, log_so3
 from vical_mocks.trajectory import hand_motion
 
 from vical_daemon.cli import main
-from vical_daemon.estimation.so3 import matrix_from_quat
+from vical_daemon.estimation.geometry.so3 import matrix_from_quat
 
 
 def test_two_imus_are_registered_against_each_other(tmp_path: Path, capsys):

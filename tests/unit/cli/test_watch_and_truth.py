@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_calibration, encode_diagnostics
 from vical_daemon.cli import bus_access, demo_truth, live_table, main, watch
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.euler import euler_sigma_deg
-from vical_daemon.messages import DiagnosticStatus, Level, encode_calibration, encode_diagnostics
+from vical_daemon.results.euler import euler_sigma_deg
 
 
 def _estimate(status: Status = Status.CONVERGING) -> CalibrationEstimate:

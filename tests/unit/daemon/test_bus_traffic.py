@@ -9,19 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vical_daemon import messages as m
-from vical_daemon import notify, topics
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.config import Config, loads
-from vical_daemon.estimate_role import STUCK_S, EstimateRole
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.messages import Level
+from vical_daemon.calibrate import role as estimate
+from vical_daemon.calibrate.worker import STUCK_S, EstimateRole
+from vical_daemon.config.model import Config, loads
+from vical_daemon.detect import role as detect
+from vical_daemon.detect.role import DetectRole
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, Status
-from vical_daemon.liveness import Liveness
-from vical_daemon.messages import Level
-from vical_daemon.progress import Progress, Restarts
-from vical_daemon.roles import detect, estimate
-from vical_daemon.roles.detect import DetectRole
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.service import notify
+from vical_daemon.service.liveness import Liveness
+from vical_daemon.service.progress import Progress, Restarts
+from vical_daemon.service.wall_clock import private_clock
 
 MS = 1_000_000
 NOW = 1_800_000_000_000_000_000
@@ -240,7 +242,7 @@ class TestKeeper:
     def test_one_that_gets_nowhere_is_not_called_alive(
         self, service: Service, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        from vical_daemon import estimate_role
+        from vical_daemon.calibrate import worker as estimate_role
 
         service.until(lambda: service.made and service.made[0].frames > 10)
         monkeypatch.setattr(estimate_role, "STUCK_S", 0.2)

@@ -16,16 +16,16 @@ from vical_mocks.points import simulate
 from benchmarks.bus_calibration import away_sigmas, good_messages, load_config
 from benchmarks.bus_junk import RIG, Junk, unopened
 from benchmarks.soak import usage
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.estimate_role import EstimateRole
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.calibrate.estimators import input_keys, make_estimator
+from vical_daemon.calibrate.worker import EstimateRole
+from vical_daemon.detect.role import DetectRole
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimators import input_keys, make_estimator
-from vical_daemon.mcap_log import LogFolder
-from vical_daemon.record_queue import arrival
-from vical_daemon.recorder import Recorder
-from vical_daemon.roles.detect import DetectRole
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.logs.mcap import LogFolder
+from vical_daemon.record.queue import arrival
+from vical_daemon.record.recorder import Recorder
+from vical_daemon.service.wall_clock import private_clock
 from vical_daemon.web.state import WebState
 
 BEGIN_NS = 1_800_000_000_000_000_000
@@ -106,7 +106,7 @@ def test_every_log_opens_in_mcap_ros2_rosbags_and_rosbags_convert(
 
 
 def test_a_log_with_junk_in_it_would_be_noticed(tmp_path: Path) -> None:
-    from vical_daemon.mcap_log import LogWriter
+    from vical_daemon.logs.mcap import LogWriter
 
     path = tmp_path / "bad.mcap"
     writer = LogWriter(path)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from vical_mocks.points import SimulatedRun, simulate
 
-from vical_daemon import checkpoint
-from vical_daemon.checkpoint import FILE_NAME, OLDEST_S, Checkpoint
-from vical_daemon.config import Config, loads
+from vical_daemon.calibrate import checkpoint
+from vical_daemon.calibrate.checkpoint import FILE_NAME, OLDEST_S, Checkpoint
+from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import Status
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.service.wall_clock import private_clock
 
 DEVICES = {"imu/imu0": "I1", "camera/cam0": "C1"}
 CLOCK = private_clock()
@@ -140,7 +140,7 @@ class _Evil:
 
 def _dotted() -> bytes:
     """Reach through a module of ours for what it imports: STACK_GLOBAL follows dots."""
-    words = [b"vical_daemon.estimation.calibration_filter", b"np.load", b"x"]
+    words = [b"vical_daemon.estimation.filter.calibration_filter", b"np.load", b"x"]
     module, name, argument = (b"\x8c" + bytes([len(word)]) + word for word in words)
     return b"\x80\x04" + module + name + b"\x93" + argument + b"\x85R."
 

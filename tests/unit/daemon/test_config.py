@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vical_daemon import config as module
-from vical_daemon.config import Config, ConfigError, load, loads
-from vical_daemon.priors import calibration_options, camera_prior, read_initial
-from vical_daemon.strict_yaml import parse
+from vical_daemon.config.model import Config, ConfigError, load, loads
+from vical_daemon.config.priors import calibration_options, camera_prior, read_initial
+from vical_daemon.config.strict_yaml import parse
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "vical.yaml"
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "euroc_imu_april"

@@ -11,17 +11,9 @@ from vical_mocks.points import SimulatedRun, board_points, simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.rotations import log_so3
 
-from vical_daemon import topics
-from vical_daemon.bus import Bus, LocalBus, Sample
-from vical_daemon.config import Config, loads
-from vical_daemon.estimate_role import EstimateRole
-from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.estimation.so3 import matrix_from_quat
-from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
-from vical_daemon.health import StatusSender
-from vical_daemon.messages import (
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus, LocalBus, Sample
+from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
     decode_calibration,
@@ -29,7 +21,15 @@ from vical_daemon.messages import (
     encode_imu,
     encode_points,
 )
-from vical_daemon.wall_clock import WallClock
+from vical_daemon.calibrate.worker import EstimateRole
+from vical_daemon.config.model import Config, loads
+from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.geometry.so3 import matrix_from_quat
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
+from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
+from vical_daemon.service.health import StatusSender
+from vical_daemon.service.wall_clock import WallClock
 
 CONFIG = loads(
     "rig: rover\nimus: {imu0: {port: /dev/x, rate_hz: 100}}\n"

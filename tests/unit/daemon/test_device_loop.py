@@ -11,14 +11,15 @@ import pytest
 from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceReplacedError
 from vical_drivers.samples import DeviceInfo, SourceStats
 
-from vical_daemon import notify
-from vical_daemon.bus import LocalBus
-from vical_daemon.device_loop import DeviceLoop
-from vical_daemon.direct_outbox import DirectOutbox, StandIn
-from vical_daemon.health import STUCK_S, StatusSender, _judge, device_status
-from vical_daemon.messages import Level
-from vical_daemon.outbox import Outbox
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.acquire.device_loop import DeviceLoop
+from vical_daemon.acquire.device_status import STUCK_S, _judge, device_status
+from vical_daemon.acquire.direct_queue import DirectOutbox, StandIn
+from vical_daemon.acquire.publish_queue import Outbox
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import Level
+from vical_daemon.service import notify
+from vical_daemon.service.health import StatusSender
+from vical_daemon.service.wall_clock import private_clock
 
 
 class ScriptedSource:
@@ -294,7 +295,7 @@ def test_a_loop_held_up_by_the_bus_still_ends_and_closes_its_device(stop) -> Non
 
 
 def _streaming():
-    from vical_daemon.device_loop import DeviceHealth
+    from vical_daemon.acquire.device_loop import DeviceHealth
 
     return DeviceHealth("streaming", stats=SourceStats(rate_hz=100.0), data_age_s=0.01)
 

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 from vical_mocks.rig import reference_rig
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
-from vical_daemon.config import CalibrationConfig, CameraConfig, Config, ImuConfig, LensConfig
-from vical_daemon.estimation import so3
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import encode_calibration, encode_imu
+from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, ImuConfig, LensConfig
+from vical_daemon.detect.role import DetectRole, attach_aid
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
     PoseEstimate,
     Status,
 )
-from vical_daemon.messages import encode_calibration, encode_imu
-from vical_daemon.roles.detect import DetectRole, attach_aid
 
 STEP_NS = 1_000_000
 START_NS = 10**15

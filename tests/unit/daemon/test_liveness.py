@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from vical_daemon.bus import Sample
-from vical_daemon.liveness import START_S, Liveness
-from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
+from vical_daemon.service.liveness import START_S, Liveness
 
 
 def _status(role: str, level: Level = Level.OK, message: str = "") -> Sample:

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
-from vical_daemon.config import Config, loads
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
+from vical_daemon.calibrate.persistence import Memory, differences
+from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.wording import event_text
-from vical_daemon.memory import Memory, differences
-from vical_daemon.messages import DiagnosticStatus, Level, encode_diagnostics
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.service.wall_clock import private_clock
 
 
 def _camera(p_m=(0.08, 0.02, -0.03), turn_deg=0.0, shift_s=0.01, sigma=1e-4) -> CameraEstimate:
@@ -188,7 +188,9 @@ def test_the_journal_gets_an_event_as_fields_and_its_name_from_its_kind(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[tuple[str, dict[str, object]]] = []
-    monkeypatch.setattr("vical_daemon.notify.event", lambda name, text, **more: written.append((name, more)))
+    monkeypatch.setattr(
+        "vical_daemon.service.notify.event", lambda name, text, **more: written.append((name, more))
+    )
     memory = _later(config)
     memory.announce(Event(EventKind.BUMPED, cause=Cause.IMAGES_REFUSED))
     memory.announce(Event(EventKind.OTHER, said="bumped: only a text"))

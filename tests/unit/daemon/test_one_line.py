@@ -16,10 +16,10 @@ import pytest
 from vical_drivers.samples import DeviceInfo, SourceStats
 
 from vical_daemon import cli
+from vical_daemon.acquire.device_loop import DeviceLoop
 from vical_daemon.cli.errors import describe_known, report_thread, write_crash_log
-from vical_daemon.device_loop import DeviceLoop
-from vical_daemon.wall_clock import shared_clock
-from vical_daemon.whole_file import write_whole
+from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.wall_clock import shared_clock
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as `write` raises it: without the name of a file
 

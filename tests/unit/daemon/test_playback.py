@@ -11,12 +11,12 @@ import pytest
 from vical_drivers.errors import DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import FrameSource, ImuSource
 
-from vical_daemon import playback
-from vical_daemon.config import CameraConfig, ImuConfig
-from vical_daemon.mcap_log import LogWriter
-from vical_daemon.messages import encode_image, encode_imu, encode_points
-from vical_daemon.roles.camera import open_camera
-from vical_daemon.roles.imu import open_imu
+from vical_daemon.acquire import playback
+from vical_daemon.acquire.camera import open_camera
+from vical_daemon.acquire.imu import open_imu
+from vical_daemon.bus.messages import encode_image, encode_imu, encode_points
+from vical_daemon.config.model import CameraConfig, ImuConfig
+from vical_daemon.logs.mcap import LogWriter
 
 T0_NS = 1_700_000_000_000_000_000
 IMU_STEP_NS, FRAME_STEP_NS = 5_000_000, 40_000_000

@@ -9,15 +9,15 @@ import numpy as np
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
-from vical_daemon import messages as m
-from vical_daemon import topics
-from vical_daemon.config import loads
-from vical_daemon.estimate_role import EstimateRole
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.calibrate.predictions import Predictions
+from vical_daemon.calibrate.worker import EstimateRole
+from vical_daemon.config.model import loads
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.mcap_log import LogWriter
-from vical_daemon.predictions import Predictions
-from vical_daemon.recording import open_recording
+from vical_daemon.logs import open_recording
+from vical_daemon.logs.mcap import LogWriter
 
 CONFIG = loads(
     "rig: rover\nimus: {imu0: {port: /dev/x, rate_hz: 100}}\n"

@@ -12,20 +12,12 @@ import pytest
 from vical_drivers.microstrain import device as gx3_module
 from vical_drivers.samples import DeviceInfo, Frame, ImuSample, SourceStats
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus, Sample
-from vical_daemon.config import Config, loads
-from vical_daemon.estimate_role import EstimateRole
-from vical_daemon.estimation.measurements import PointsFrame
-from vical_daemon.estimation.result import (
-    CalibrationEstimate,
-    CameraEstimate,
-    PoseEstimate,
-    Status,
-    TracePoint,
-)
-from vical_daemon.estimators import input_keys
-from vical_daemon.messages import (
+from vical_daemon.acquire import camera as camera_module
+from vical_daemon.acquire import imu as imu_module
+from vical_daemon.acquire.camera import CameraRole
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
     decode_calibration,
@@ -41,12 +33,20 @@ from vical_daemon.messages import (
     encode_imu,
     encode_points,
 )
-from vical_daemon.roles import camera as camera_module
-from vical_daemon.roles import imu as imu_module
-from vical_daemon.roles.camera import CameraRole
-from vical_daemon.roles.detect import DetectRole
+from vical_daemon.calibrate.estimators import input_keys
+from vical_daemon.calibrate.worker import EstimateRole
+from vical_daemon.config.model import Config, loads
+from vical_daemon.detect.role import DetectRole
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.result import (
+    CalibrationEstimate,
+    CameraEstimate,
+    PoseEstimate,
+    Status,
+    TracePoint,
+)
+from vical_daemon.service.wall_clock import WallClock
 from vical_daemon.vision.detection import Detection
-from vical_daemon.wall_clock import WallClock
 
 CLOCK = WallClock(1_700_000_000_000_000_000)
 MS = 1_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vical_daemon.stamp_gate import StampGate
+from vical_daemon.calibrate.stamp_gate import StampGate
 
 MS = 1_000_000
 NOW = 1_800_000_000_000_000_000

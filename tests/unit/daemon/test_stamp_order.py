@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vical_daemon.stamp_order import StampOrder
+from vical_daemon.calibrate.reorder_buffer import StampOrder
 
 MS = 1_000_000
 

@@ -8,8 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from vical_daemon import wall_clock
-from vical_daemon.wall_clock import FILE_NAME, WallClock, measure_offset_ns, private_clock, shared_clock
+from vical_daemon.service import wall_clock
+from vical_daemon.service.wall_clock import (
+    FILE_NAME,
+    WallClock,
+    measure_offset_ns,
+    private_clock,
+    shared_clock,
+)
 
 
 def test_offset_is_unix_minus_monotonic() -> None:

@@ -5,14 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from vical_mocks.points import board_points
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import ImuNoise
-from vical_daemon.estimation.retract import retract
-from vical_daemon.estimation.state import LOWER, CameraState, State, make_layout
-from vical_daemon.estimation.trust.consistency import Consistency
-from vical_daemon.estimation.trust.corner_noise import CornerNoise
-from vical_daemon.estimation.trust.hypotheses import (
+from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.model.state import LOWER, CameraState, State, make_layout
+from vical_daemon.estimation.noise.consistency import Consistency
+from vical_daemon.estimation.noise.corner_noise import CornerNoise
+from vical_daemon.estimation.noise.lens_agreement import LensAgreement
+from vical_daemon.estimation.selection.model_selection import (
     ENTRY_SIGMA,
     IMU,
     LAG,
@@ -21,7 +22,6 @@ from vical_daemon.estimation.trust.hypotheses import (
     SIZE_SIGMA,
     TARGET,
 )
-from vical_daemon.estimation.trust.lens_agreement import LensAgreement
 
 NAME = "cam0"
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation import attitude as at
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import attitude as at
+from vical_daemon.estimation.geometry import so3
 
 H = 1e-6
 

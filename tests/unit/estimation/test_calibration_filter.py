@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from vical_mocks.points import simulate
 
-from vical_daemon.estimation.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.linearise import project_errors
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.linearise import project_errors
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
-from vical_daemon.estimation.retract import retract
-from vical_daemon.estimation.state import CameraState, MotionStart, State, make_layout
-from vical_daemon.estimation.trust.consistency import Consistency
-from vical_daemon.estimation.trust.corner_noise import CornerNoise
+from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.model.state import CameraState, MotionStart, State, make_layout
+from vical_daemon.estimation.noise.consistency import Consistency
+from vical_daemon.estimation.noise.corner_noise import CornerNoise
 
 
 @pytest.fixture(scope="module")

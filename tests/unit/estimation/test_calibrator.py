@@ -10,8 +10,8 @@ from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
-from vical_daemon.estimation.frame_report import FrameReport
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.result import Status
 
 

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import camera_model as cm
-from vical_daemon.estimation import camera_rays as cr
+from vical_daemon.estimation.geometry import camera_model as cm
+from vical_daemon.estimation.model import camera_rays as cr
 
 K = np.array([458.6, 457.3, 367.2, 248.4])
 D_RADTAN = np.array([-0.2834, 0.0739, 0.00019, 1.76e-05])

@@ -9,8 +9,8 @@ from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.init.motion_restart import MotionRestart
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
-from vical_daemon.estimation.motion_restart import MotionRestart
 from vical_daemon.estimation.result import Status
 
 BEGIN_S, END_S = 14.0, 22.0

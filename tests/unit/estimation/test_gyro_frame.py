@@ -3,9 +3,9 @@
 import numpy as np
 
 from tests.unit.estimation.some_filter import NAME, some_filter
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.gyro_frame import in_gyro_frame
-from vical_daemon.estimation.retract import retract
+from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.model.retract import retract
 
 
 def test_the_gyros_frame_is_that_in_which_its_matrix_is_symmetric():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.image_intake import ImageIntake
+from vical_daemon.estimation.filter.image_intake import ImageIntake
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.wording import event_text
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from vical_daemon.estimation.image_update import solve
-from vical_daemon.estimation.linearise import Image, Linear
+from vical_daemon.estimation.filter.image_update import solve
+from vical_daemon.estimation.filter.linearise import Image, Linear
 
 POINTS, STATES = 6, 3
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.imu_model import strapdown
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_model import strapdown
 
 
 def rates(t):

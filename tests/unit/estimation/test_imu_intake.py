@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.imu_intake import ImuIntake
+from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.wording import event_text
 
 PERIOD_NS = 5_000_000

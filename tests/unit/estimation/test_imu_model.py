@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation import imu_model as im
-from vical_daemon.estimation.imu_buffer import ImuSegment
+from vical_daemon.estimation.inertial import imu_model as im
+from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import ImuNoise
 
 G = np.array([0.3, -0.2, -9.8])

@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import COEFFICIENTS
-from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.linearise import (
+from vical_daemon.estimation.filter.linearise import (
     Image,
     Straightness,
     by_derivatives,
@@ -14,10 +11,13 @@ from vical_daemon.estimation.linearise import (
     project_errors,
     view_derivatives,
 )
-from vical_daemon.estimation.propagate import move_by_derivatives, move_by_sigma_points
-from vical_daemon.estimation.rates import Rates
-from vical_daemon.estimation.state import CameraState, State, make_layout
-from vical_daemon.estimation.target_modes import MODES
+from vical_daemon.estimation.filter.propagate import move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.model.rates import Rates
+from vical_daemon.estimation.model.state import CameraState, State, make_layout
+from vical_daemon.estimation.model.target_modes import MODES
 
 BOARD = np.stack([*np.meshgrid(np.arange(5) * 0.05, np.arange(4) * 0.05), np.zeros((4, 5))], axis=-1)
 

@@ -3,18 +3,24 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.guidance import Block, Lack, Verb
 from vical_daemon.estimation.measurements import ConvergenceTargets
-from vical_daemon.estimation.observability import Motion, Setup, gramian, lost_in_block, pose_sensitivities
-from vical_daemon.estimation.observability_model import ModelBlocks, model_rank
-from vical_daemon.estimation.trust.missing_motion import (
+from vical_daemon.estimation.status.excitation import (
     WIDE,
     RunningMotion,
     excitation_advice,
     missing_motion,
     weak_directions,
 )
+from vical_daemon.estimation.tools.observability import (
+    Motion,
+    Setup,
+    gramian,
+    lost_in_block,
+    pose_sensitivities,
+)
+from vical_daemon.estimation.tools.observability_model import ModelBlocks, model_rank
 from vical_daemon.estimation.wording import (
     axis_name,
     direction_line,

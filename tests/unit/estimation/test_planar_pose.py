@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.planar_pose import planar_pose
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.planar_pose import planar_pose
 
 SIGMA = 0.3 / 460
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 
 
 def _rotvecs():

@@ -10,8 +10,8 @@ from vical_mocks.tracks import simulate_tracks
 
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.inertial.stamp_steps import StampSteps
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.stamp_steps import StampSteps
 
 
 def followed(t_s):

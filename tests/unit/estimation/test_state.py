@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation import state as st
-from vical_daemon.estimation.retract import retract
+from vical_daemon.estimation.model import state as st
+from vical_daemon.estimation.model.retract import retract
 
 
 def test_rotation_from_grp_is_scipys_rotation_from_mrp_and_back():

@@ -14,9 +14,9 @@ from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, 
 from benchmarks.scores import nees
 from benchmarks.zoo import draw
 from vical_daemon.estimation.events import EventKind
-from vical_daemon.estimation.free.carry import FULL
-from vical_daemon.estimation.free.judge import FreeJudge
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.smoother.carry import FULL
+from vical_daemon.estimation.smoother.judge import FreeJudge
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 pytestmark = pytest.mark.timeout(400)

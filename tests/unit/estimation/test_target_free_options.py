@@ -9,8 +9,8 @@ from vical_mocks.tracks import simulate_tracks
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from benchmarks.scores import nees
 from vical_daemon.estimation.events import EventKind
-from vical_daemon.estimation.free.carry import IMU, LAG
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.smoother.carry import IMU, LAG
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 from vical_daemon.estimation.wording import event_text
 

@@ -9,9 +9,9 @@ from tests.unit.estimation import test_calibrator
 from tests.unit.estimation.test_calibrator import errors
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.model.target_modes import MODES, TargetModes
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.target_modes import MODES, TargetModes
-from vical_daemon.estimation.trust.hypotheses import TARGET, off
+from vical_daemon.estimation.selection.model_selection import TARGET, off
 
 BOARD = board_points()
 
@@ -130,7 +130,7 @@ def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypat
     sigma, beside = (np.array(e.cameras["cam0"].intrinsics_sigma) for e in (estimate, asked.estimate()))
     assert sigma[2:].max() < 0.75 * beside[2:].max()  # image centre
     monkeypatch.setattr(
-        "vical_daemon.estimation.trust.hypotheses.in_doubt", lambda _, name, **_how: name == TARGET
+        "vical_daemon.estimation.selection.model_selection.in_doubt", lambda _, name, **_how: name == TARGET
     )
     assert c.estimate().status == Status.CONVERGING
     assert c.estimate().reason == "sigmas are small; whether the target is as stated is not sure yet"

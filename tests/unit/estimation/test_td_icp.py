@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.td_icp import TdIcpOptions, td_icp, world_cam_from_cam_target
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, td_icp, world_cam_from_cam_target
 
 DEG = np.pi / 180
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.td_icp import td_icp
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_turns import (
     camera_turns,
     orientation_noise,
     without_long_rest,
 )
 from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
+from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream, joint_of_orientations
 
 DEG = np.pi / 180

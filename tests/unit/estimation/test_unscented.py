@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import unscented
+from vical_daemon.estimation.model import unscented
 
 
 def random_root(rng, n):

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.measurements import ImuNoise
-from vical_daemon.export import Rig, RigCamera
+from vical_daemon.results.export import Rig, RigCamera
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import allan_variance
+from vical_daemon.estimation.tools import allan_variance
 
 PHASE = {2: 0, 0: 1, -1: 1, -2: 2}  # power-law exponent of the rate noise -> integrations from white noise
 FINE = 8  # white noise values per sample: a sampled rate is the mean of a continuous one

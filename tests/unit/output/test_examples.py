@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vical_daemon.export import export
+from vical_daemon.results.export import export
 
 ROOT = Path(__file__).parents[3]
 
@@ -85,7 +85,7 @@ def reference():
 
 
 def test_reference_pages_cover_the_code(reference):
-    from vical_daemon import topics
+    from vical_daemon.bus import topics
     from vical_daemon.cli import table
     from vical_daemon.estimation.events import Cause, EventKind
 
@@ -101,4 +101,4 @@ def test_reference_pages_cover_the_code(reference):
     assert all(f"| `{cause}` |" in reference.causes_table() for cause in Cause if cause)
     modules = reference.modules_text()
     assert "`vical_drivers.clock`" in modules
-    assert "`vical_daemon.report.writer`" in modules
+    assert "`vical_daemon.results.report.writer`" in modules

@@ -16,9 +16,9 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.export import FORMATS, ExportError, Rig, export, rig_from_json
-from vical_daemon.export.kalibr import read_camchain
-from vical_daemon.export.text import number
+from vical_daemon.results.export import FORMATS, ExportError, Rig, export, rig_from_json
+from vical_daemon.results.export.kalibr import read_camchain
+from vical_daemon.results.export.text import number
 
 POINT_CAM = np.array([0.3, -0.2, 1.7])
 

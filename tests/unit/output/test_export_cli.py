@@ -15,7 +15,7 @@ from vical_daemon.estimation.result import (
     PoseEstimate,
     Status,
 )
-from vical_daemon.export import export
+from vical_daemon.results.export import export
 
 
 @pytest.fixture
@@ -107,9 +107,9 @@ def estimate(stamp, camera, shift):
 
 
 def test_log_gives_its_last_calibration(tmp_path, capsys):
-    from vical_daemon import topics
-    from vical_daemon.mcap_log import LogWriter
-    from vical_daemon.messages import encode_calibration, encode_camera_info
+    from vical_daemon.bus import topics
+    from vical_daemon.bus.messages import encode_calibration, encode_camera_info
+    from vical_daemon.logs.mcap import LogWriter
 
     path = tmp_path / "log.mcap"
     t0 = 1_700_000_000_000_000_000
@@ -129,7 +129,7 @@ def test_log_gives_its_last_calibration(tmp_path, capsys):
 
 
 def test_store_gives_the_newest_calibration(tmp_path, capsys, monkeypatch):
-    from vical_daemon.store import CalibrationStore
+    from vical_daemon.results.store import CalibrationStore
 
     monkeypatch.setenv("VICAL_STATE_DIR", str(tmp_path))
     monkeypatch.chdir(tmp_path)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import imu_static
+from vical_daemon.estimation.tools import imu_static
 
 RATE = 100.0
 

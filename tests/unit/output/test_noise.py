@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation import noise
+from vical_daemon.estimation.tools import noise_densities as noise
 
 
 def nbs14(count: int) -> np.ndarray:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.report import ClockSeries, ReportError, collect, write_report
-from vical_daemon.report.residuals import cells, gather, per_point_rms
-from vical_daemon.report.values import value, warnings_of
+from vical_daemon.results.report import ClockSeries, ReportError, collect, write_report
+from vical_daemon.results.report.residuals import cells, gather, per_point_rms
+from vical_daemon.results.report.values import value, warnings_of
 
 SIZE = (640, 480)
 

@@ -6,11 +6,9 @@ import time
 
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus
-from vical_daemon.config import CameraConfig, Config, ImuConfig, StoreConfig
-from vical_daemon.estimation.wording import event_text
-from vical_daemon.messages import (
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
     decode_calibration,
@@ -18,8 +16,10 @@ from vical_daemon.messages import (
     encode_imu,
     encode_string,
 )
-from vical_daemon.roles import estimate
-from vical_daemon.wall_clock import private_clock
+from vical_daemon.calibrate import role as estimate
+from vical_daemon.config.model import CameraConfig, Config, ImuConfig, StoreConfig
+from vical_daemon.estimation.wording import event_text
+from vical_daemon.service.wall_clock import private_clock
 
 
 class Run:

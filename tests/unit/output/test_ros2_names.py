@@ -6,9 +6,9 @@ import pytest
 from zenoh_ros2_sdk.attachment import Attachment
 from zenoh_ros2_sdk.discovery import _parse_liveliness_keyexpr
 
-from vical_daemon import ros2_names as names
-from vical_daemon import topics
-from vical_daemon.config import ConfigError, loads
+from vical_daemon.bus import ros2_names as names
+from vical_daemon.bus import topics
+from vical_daemon.config.model import ConfigError, loads
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = names.Ros2Topic("/chatter", "std_msgs/msg/String", depth=7)

@@ -6,7 +6,7 @@ import logging
 import pytest
 from aiohttp.http_exceptions import BadStatusLine
 
-from vical_daemon.log_limit import LogLimit
+from vical_daemon.bus.log_limit import LogLimit
 from vical_daemon.web.connections import IDLE_S, REPORT_S, UNSENT_S, Gate, Malformed, http_logger
 from vical_daemon.web.hosts import AllowedHosts
 

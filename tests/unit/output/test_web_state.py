@@ -6,14 +6,14 @@ import json
 import numpy as np
 import pytest
 
-from vical_daemon import topics
-from vical_daemon.bus import LocalBus, Sample
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.messages import Level, decode_calibration, encode_calibration, encode_diagnostics
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.wording import guidance_text
-from vical_daemon.liveness import FRESH_S
-from vical_daemon.messages import Level, decode_calibration, encode_calibration, encode_diagnostics
+from vical_daemon.service.liveness import FRESH_S
 from vical_daemon.vision.image_codec import decode_image
 from vical_daemon.web.images import CameraView, colour, draw, drawn_jpeg, picture_event, thinned
 from vical_daemon.web.metrics import metrics

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_rays import undistort
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, planar_pose
 from vical_daemon.estimation.measurements import PointsFrame
-from vical_daemon.estimation.planar_pose import PlanarPose, PlanarPoses, planar_pose
+from vical_daemon.estimation.model.camera_rays import undistort
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

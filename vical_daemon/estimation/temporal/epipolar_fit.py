@@ -14,11 +14,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_model import project_jacobians
-from vical_daemon.estimation.camera_rays import unproject
-from vical_daemon.estimation.imu_model import cross
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
+from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.temporal.epipolar_errors import (
     Effects,
     TrackNoise,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.imu_model import rotation_steps
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_model import rotation_steps
 from vical_daemon.estimation.measurements import FloatArray
 
 

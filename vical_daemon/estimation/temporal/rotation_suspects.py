@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import Start, coarse_start, debiased_start
 from vical_daemon.estimation.temporal.stamp_stretch import find_stretch

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]

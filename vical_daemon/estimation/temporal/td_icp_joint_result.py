@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
-from vical_daemon.estimation.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.camera_orientations import target_orientations
+from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport, DelayTracker
 
 FloatArray = npt.NDArray[np.float64]

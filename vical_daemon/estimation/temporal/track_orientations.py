@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.camera_rays import unproject
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 FloatArray = npt.NDArray[np.float64]

@@ -11,10 +11,10 @@ import pytest
 from vical_drivers.camera import check_camera, open_camera
 from vical_drivers.errors import DeviceRefusedError
 
-from vical_daemon.messages import decode_image as decode_image_message
-from vical_daemon.roles.camera import CameraRole
+from vical_daemon.acquire.camera import CameraRole
+from vical_daemon.bus.messages import decode_image as decode_image_message
+from vical_daemon.service.wall_clock import private_clock
 from vical_daemon.vision.image_codec import decode_image, encode_image
-from vical_daemon.wall_clock import private_clock
 
 T0_NS = 1_403_636_579_763_555_584  # EuRoC's clock: UNIX time of 2014
 STEP_NS = 80_000_000

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from vical_daemon.estimation.free.carry import CALIBRATION, FULL, IMU, INERTIAL, LAG, Carry, root_of
-from vical_daemon.estimation.free.doubts import FreeDoubts
-from vical_daemon.estimation.free.snapshot import camera_estimate
-from vical_daemon.estimation.state import CameraState
-from vical_daemon.estimation.trust.hypotheses import ENTRY_SIGMA, LAG_SIGMA_S
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.selection.model_selection import ENTRY_SIGMA, LAG_SIGMA_S
+from vical_daemon.estimation.smoother.carry import CALIBRATION, FULL, IMU, INERTIAL, LAG, Carry, root_of
+from vical_daemon.estimation.smoother.doubts import FreeDoubts
+from vical_daemon.estimation.smoother.snapshot import camera_estimate
 
 PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])
 NUMBERS = np.arange(FULL)[INERTIAL]

@@ -12,9 +12,9 @@ from vical_mocks.tracks import simulate_tracks
 
 from benchmarks.feed import feed
 from tests.unit.estimation.test_target_free import subject_for
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.free.partial import mounting_about, still_axis
-from vical_daemon.estimation.free.start import ArmPrior, NoStartError
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
+from vical_daemon.estimation.smoother.start import ArmPrior, NoStartError
 
 pytestmark = pytest.mark.timeout(400)
 

@@ -8,9 +8,12 @@ from scipy.spatial.transform import Rotation
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.free.bundle import Bundle
-from vical_daemon.estimation.free.carry import (
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.bundle import Bundle
+from vical_daemon.estimation.smoother.carry import (
     DRIFT,
     FULL,
     INERTIAL,
@@ -20,15 +23,12 @@ from vical_daemon.estimation.free.carry import (
     moved,
     tangents,
 )
-from vical_daemon.estimation.free.inertial import Order
-from vical_daemon.estimation.free.jitter import Lateness
-from vical_daemon.estimation.free.quality import correlation
-from vical_daemon.estimation.free.start import ArmPrior, LinearStart
-from vical_daemon.estimation.free.starter import start_sigmas
-from vical_daemon.estimation.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial_links import Links, make_link
-from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
-from vical_daemon.estimation.state import CameraState
+from vical_daemon.estimation.smoother.inertial import Order
+from vical_daemon.estimation.smoother.inertial_links import Links, make_link
+from vical_daemon.estimation.smoother.jitter import Lateness
+from vical_daemon.estimation.smoother.quality import correlation
+from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart
+from vical_daemon.estimation.smoother.starter import start_sigmas
 from vical_daemon.estimation.temporal.epipolar_fit import epipolar_fit
 
 SHIFT_S = 0.013

@@ -9,9 +9,9 @@ from vical_mocks.points import simulate
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
 
 from tests.unit.estimation.test_calibrator import calibrate, errors
-from vical_daemon.estimation.initialise import still_axes
+from vical_daemon.estimation.filter.snapshot import pose_covariance
+from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.snapshot import pose_covariance
 
 MOUNT = (NOMINAL_R_IMU_CAM, NOMINAL_P_IMU_CAM)
 

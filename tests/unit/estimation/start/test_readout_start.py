@@ -7,9 +7,9 @@ import pytest
 from vical_mocks.points import board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
 
+from vical_daemon.estimation.init.readout_start import looks_rolling, readout
+from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import PointsFrame
-from vical_daemon.estimation.start.readout_start import looks_rolling, readout
-from vical_daemon.estimation.start.seen_poses import Lens
 
 BOARD = board_points()
 

@@ -10,12 +10,12 @@ from vical_mocks.trajectory import hand_motion
 
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.events import EventKind
-from vical_daemon.estimation.imu_model import Motion
+from vical_daemon.estimation.inertial.imu_model import Motion
+from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
-from vical_daemon.estimation.rates import Rates
-from vical_daemon.estimation.retract import CameraPoints
-from vical_daemon.estimation.start.row_times import at_middle_row
-from vical_daemon.estimation.target_view import view
+from vical_daemon.estimation.model.rates import Rates
+from vical_daemon.estimation.model.retract import CameraPoints
+from vical_daemon.estimation.model.target_view import view
 
 READOUT_S = 0.02
 

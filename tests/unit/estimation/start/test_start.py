@@ -8,9 +8,9 @@ from vical_mocks.trajectory import hand_motion
 
 from benchmarks.detection import APRILGRID, rig_before
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, points_frame
+from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
+from vical_daemon.estimation.init.target_poses import Lens, pose_of
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.start.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.start.seen_poses import Lens, pose_of
 
 
 def answer(run, *, lens_known):

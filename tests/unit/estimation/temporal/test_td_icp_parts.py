@@ -5,11 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vical_mocks.points import board_points, simulate
 
-from vical_daemon.estimation import so3
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.init.lens_refinement import refine_lens
 from vical_daemon.estimation.measurements import PointsFrame
-from vical_daemon.estimation.start.lens_refinement import refine_lens
-from vical_daemon.estimation.td_icp import TdIcpOptions
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, cumulative_product
+from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
 from vical_daemon.estimation.temporal.td_icp_monitor import DelayMonitor
 from vical_daemon.estimation.temporal.track_orientations import relative_rotations, track_orientations
 

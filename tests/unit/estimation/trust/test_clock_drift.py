@@ -6,21 +6,21 @@ from scipy.stats import norm
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
-from vical_daemon.estimation import so3
-from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
-from vical_daemon.estimation.state import CameraState, State, make_layout
-from vical_daemon.estimation.trust.clock_drift import (
+from vical_daemon.estimation.model.state import CameraState, State, make_layout
+from vical_daemon.estimation.noise.consistency import Consistency
+from vical_daemon.estimation.noise.corner_noise import CornerNoise
+from vical_daemon.estimation.selection.clock_drift import (
     SKEW_SIGMA,
     apart,
     as_if_alike,
     averaged,
     stamps_variance,
 )
-from vical_daemon.estimation.trust.consistency import Consistency
-from vical_daemon.estimation.trust.corner_noise import CornerNoise
 
 NAME = "cam0"
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.trust.corner_noise import CornerNoise
+from vical_daemon.estimation.noise.corner_noise import CornerNoise
 
 
 @pytest.mark.parametrize("guess_px", [0.1, 0.5, 3.0])

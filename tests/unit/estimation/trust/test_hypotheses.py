@@ -12,7 +12,7 @@ from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, 
 from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.trust.hypotheses import (
+from vical_daemon.estimation.selection.model_selection import (
     ENTRY_SIGMA,
     IMU,
     LAG,

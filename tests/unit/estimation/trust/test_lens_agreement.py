@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.trust.lens_agreement import LensAgreement
+from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 
 LENS = np.array([500.0, 500.0, 320.0, 240.0, -0.2, 0.05, 0.0, 0.0])
 SIZE = np.array([1.0, 1.0, 1.0, 1.0, 1e-2, 2e-2, 1e-3, 1e-3])  # what one image of unit noise says, roughly

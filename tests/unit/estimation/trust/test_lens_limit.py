@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.state import CameraState
-from vical_daemon.estimation.trust.lens_limit import limit
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.noise.lens_limit import limit
 
 LENSES = {
     "radtan": (520.0, [-0.28, 0.07, 2e-4, -1e-4]),

@@ -9,7 +9,7 @@ from vical_mocks.points import simulate
 
 from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.trust.picture_cover import Cover, PictureCover
+from vical_daemon.estimation.status.image_coverage import Cover, PictureCover
 
 
 def spread(low, high, count=4000):

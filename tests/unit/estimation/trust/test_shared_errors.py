@@ -9,7 +9,7 @@ from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
-from vical_daemon.estimation.trust.shared_errors import SharedErrors
+from vical_daemon.estimation.noise.shared_errors import SharedErrors
 
 
 def learnt(rng, jitter_s=0.0, shift_px=0.0, images=200, corners=40, outliers=0.0):

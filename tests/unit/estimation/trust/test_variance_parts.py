@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from vical_daemon.estimation.trust.variance_parts import Observed, variances
+from vical_daemon.estimation.noise.variance_components import Observed, variances
 
 
 def drawn(seed, v0, v1, n=60):

@@ -1,0 +1,110 @@
+"""Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> bounded queue -> bus.
+
+The same thread publishes; another one reads on where the bus holds it up (`direct_outbox`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from vical_drivers.samples import ImuSample, ImuSource
+
+from vical_daemon.acquire.pipeline import Line, clock_of_the_service, run_lines, start_direct_line
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus
+from vical_daemon.bus.messages import imu_encoder
+from vical_daemon.config.model import LOG_SCHEME, Config, ImuConfig
+from vical_daemon.service.wall_clock import WallClock
+
+QUEUE_DEPTH = 8192  # 8 s at 1000 Hz
+
+OpenImu = Callable[[ImuConfig], ImuSource]
+
+
+class ImuRole:
+    """Turns the samples of one IMU into messages. No I/O.
+
+    Args:
+        rig: Name of the rig.
+        name: Name of the IMU.
+        clock: Monotonic to UNIX time.
+    """
+
+    def __init__(self, rig: str, name: str, clock: WallClock) -> None:
+        self.key = topics.IMU.key(rig, name)
+        self._encode, self._offset_ns = imu_encoder(name), clock.unix_ns(0)
+        self._t_last_ns = 0
+        self._backwards = 0
+        self._worst_sigma_ns = 0
+
+    def message(self, sample: ImuSample) -> bytes | None:
+        """Return the message of one sample; None if its stamp does not follow the one before.
+
+        The stamp is that of the measurement: wire time and filter delay were taken off by the driver.
+        """
+        t_host_ns = sample.t_host_ns
+        if t_host_ns <= self._t_last_ns:  # the device clock restarted: wait until time goes on
+            self._backwards += 1
+            return None
+        self._t_last_ns = t_host_ns
+        if sample.t_sigma_ns > self._worst_sigma_ns:
+            self._worst_sigma_ns = sample.t_sigma_ns
+        return self._encode(t_host_ns + self._offset_ns, sample.gyro_rps, sample.specific_force_mps2)
+
+    def counters(self) -> dict[str, str]:
+        """Return what the driver's counters do not say; the worst sigma is that since the last call."""
+        sigma_us, self._worst_sigma_ns = self._worst_sigma_ns * 1e-3, 0
+        return {"stamps_backwards": str(self._backwards), "stamp_sigma_us": f"{sigma_us:.1f}"}
+
+
+def open_imu(config: ImuConfig) -> ImuSource:
+    """Open the device that the config names, or play the recording that it names (`playback`).
+
+    Raises:
+        DriverError: It cannot be opened; one line.
+    """
+    if config.port.startswith(LOG_SCHEME):
+        from vical_daemon.acquire.playback import LogImu
+
+        return LogImu(config.port)
+    from vical_drivers.microstrain import device
+
+    return device.open_imu(
+        config.port,
+        protocol=config.protocol,
+        rate_hz=config.rate_hz,
+        filter_width=config.filter_samples,
+        baud=config.baud,
+        link=config.link,
+    )
+
+
+def run(
+    config: Config,
+    bus: Bus,
+    stop: threading.Event,
+    *,
+    clock: WallClock | None = None,
+    open_source: OpenImu = open_imu,
+) -> None:
+    """Acquire from every IMU of the config until `stop`.
+
+    Args:
+        config: The rig.
+        bus: Where samples and status go.
+        stop: Ends the role.
+        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        open_source: Opens a device (the demo's is the real one, on a pseudo terminal).
+    """
+    clock = clock or clock_of_the_service()
+
+    def start(name: str) -> Line[ImuSample]:
+        imu = config.imus[name]
+        maker = ImuRole(config.rig, name, clock)
+        return start_direct_line(
+            f"imu/{name}", maker, lambda: open_source(imu), bus, stop,
+            rate_hz=imu.rate_hz, depth=QUEUE_DEPTH,
+        )  # fmt: skip
+
+    run_lines(config.rig, "imu", [start(name) for name in config.imus], bus, stop, clock)

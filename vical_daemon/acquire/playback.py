@@ -1,0 +1,222 @@
+"""A recording played as if its devices were there: `port: log:FILE` and `uri: log:FILE` of the settings.
+
+Samples come when their time has come, with stamps of now on CLOCK_MONOTONIC. All devices of one recording
+share one time base, so that the time shift between them is the recorded one. The recording is played over
+and over: a rig whose motion jumps once in a while, which the estimator takes for a gap in the data.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from vical_drivers.camera.statistics import FrameStatistics
+from vical_drivers.closing import Closing
+from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceRefusedError
+from vical_drivers.samples import DeviceInfo, Frame, ImuSample, SourceStats
+
+from vical_daemon.bus.messages import MessageError, decode_compressed_image, decode_image, decode_imu
+from vical_daemon.config.model import LOG_SCHEME
+from vical_daemon.logs import Recording, RecordingError, Stream, open_recording
+from vical_daemon.logs.recorded_logs import stamp_of
+
+PAUSE_S = 2.0
+"""Between the end of a recording and its next beginning: longer than what a filter bridges by prediction."""
+
+_IMU_KINDS = ("imu",)
+_IMAGE_KINDS = ("image", "compressed")
+_MOST_SAMPLES = 1000  # that one read returns: after a process was held up, the rest comes with the next one
+_tapes: dict[Path, _Tape] = {}
+_tapes_lock = threading.Lock()
+
+
+class _Tape:
+    """One recording in this process; it starts when the first of its devices is read."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self._begin_ns = recording.begin_ns
+        self._period_ns = round((recording.duration_s + PAUSE_S) * 1e9)
+        self._t_start_ns: int | None = None
+        self._lock = threading.Lock()
+
+    def items(self, stream: Stream) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (number of the play, stamp on CLOCK_MONOTONIC in ns, message) of a stream, without an end.
+
+        Whoever comes later joins in where the recording is by then.
+        """
+        now_ns = time.monotonic_ns()
+        with self._lock:
+            if self._t_start_ns is None:
+                self._t_start_ns = now_ns
+            t_start_ns = self._t_start_ns
+        for play in itertools.count((now_ns - t_start_ns) // self._period_ns):
+            offset_ns = t_start_ns + play * self._period_ns - self._begin_ns
+            for _, payload in self.recording.messages([stream]):
+                stamp_ns = stamp_of(payload)
+                if stamp_ns is not None and stamp_ns + offset_ns >= now_ns:
+                    yield play, stamp_ns + offset_ns, payload
+
+
+class _LogDevice(Closing):
+    """What a played IMU and a played camera have in common.
+
+    Args:
+        uri: ``log:FILE`` or ``log:FILE#NAME``, where the recording has several such devices.
+        kinds: Kinds of streams that will do.
+        what: imu or camera.
+
+    Raises:
+        DeviceNotFoundError: There is no such recording, or no such device in it.
+        DeviceRefusedError: Several, and none is named.
+    """
+
+    def __init__(self, uri: str, kinds: tuple[str, ...], what: str) -> None:
+        path, _, name = uri.removeprefix(LOG_SCHEME).partition("#")
+        self._tape = _tape(Path(path))
+        self._stream = _choose(self._tape.recording, kinds, what, name)
+        self.info = DeviceInfo(
+            kind=what,
+            model="recording",
+            serial_number=f"log-{Path(path).stem}-{self._stream.name}",
+            path=uri,
+            protocol="log",
+            details={"rate_hz": f"{self._stream.rate_hz:.3f}", "topic": self._stream.source},
+        )
+        self._statistics = FrameStatistics()
+        self._items: Iterator[tuple[int, int, bytes]] | None = None
+        self._next: tuple[int, int, bytes] | None = None
+        self._play: int | None = None
+
+    def _due(self, end_ns: int) -> tuple[int, bytes] | None:
+        """Wait for the next message until `end_ns` (CLOCK_MONOTONIC); returns its stamp and the message."""
+        if self._items is None:
+            self._items = self._tape.items(self._stream)
+        if self._next is None:
+            try:
+                self._next = next(self._items)
+            except RecordingError as error:
+                self._items = None  # the next read takes it up again
+                raise DeviceLostError(str(error)) from None
+        play, t_host_ns, payload = self._next
+        _sleep_until(min(t_host_ns, end_ns))
+        if t_host_ns > end_ns:
+            return None
+        self._next = None
+        if self._play is not None and play != self._play:
+            self._statistics.restart()
+        self._play = play
+        self._statistics.add(t_host_ns, 0)
+        return t_host_ns, payload
+
+    def stats(self) -> SourceStats:
+        """Counters since it was opened; `reconnects`: how often the recording began again."""
+        return self._statistics.snapshot()
+
+    def close(self) -> None:
+        """Forget where it was; the recording goes on for the others."""
+        self._items = self._next = None
+
+
+class LogImu(_LogDevice):
+    """An `ImuSource`: the inertial samples of a recording."""
+
+    def __init__(self, uri: str) -> None:
+        super().__init__(uri, _IMU_KINDS, "imu")
+
+    def read(self, timeout_s: float) -> list[ImuSample]:
+        """See `ImuSource.read`."""
+        end_ns = time.monotonic_ns() + round(max(0.0, timeout_s) * 1e9)
+        samples: list[ImuSample] = []
+        while len(samples) < _MOST_SAMPLES and (item := self._due(end_ns)) is not None:
+            t_host_ns, payload = item
+            end_ns = time.monotonic_ns()  # what is due by now comes along; nobody waits for more
+            try:
+                message = decode_imu(payload)
+            except MessageError:
+                self._statistics.count("unreadable")
+                continue
+            samples.append(
+                ImuSample(
+                    t_host_ns, end_ns, message.stamp_ns // 1000, message.gyro_rps, message.specific_force_mps2
+                )
+            )
+        return samples
+
+
+class LogCamera(_LogDevice):
+    """A `FrameSource`: the images of a recording."""
+
+    def __init__(self, uri: str) -> None:
+        super().__init__(uri, _IMAGE_KINDS, "camera")
+        self._sequence = self._missing = 0
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """See `FrameSource.read`."""
+        item = self._due(time.monotonic_ns() + round(max(0.0, timeout_s) * 1e9))
+        if item is None:
+            return None
+        t_host_ns, payload = item
+        self._sequence += 1
+        try:
+            pixels, encoding = self._pixels(payload)
+        except (MessageError, ValueError):
+            self._statistics.count("unreadable")
+            self._missing += 1
+            return None
+        missing, self._missing = self._missing, 0
+        return Frame(
+            t_exposure_mid_ns=t_host_ns,
+            t_arrival_ns=time.monotonic_ns(),
+            sequence=self._sequence - 1,
+            image=pixels,
+            encoding=encoding,
+            stamp_rule="recorded",
+            dropped_before=missing,
+        )
+
+    def _pixels(self, payload: bytes) -> tuple[npt.NDArray[Any], str]:
+        if self._stream.kind == "compressed":
+            from vical_daemon.vision import image_codec
+
+            data = np.frombuffer(decode_compressed_image(payload).data, np.uint8)
+            return image_codec.decode_image(data), "mono8"
+        image = decode_image(payload)
+        return image.pixels(), image.encoding
+
+
+def _tape(path: Path) -> _Tape:
+    """Open a recording, once in this process."""
+    key = path.absolute()
+    with _tapes_lock:
+        if key not in _tapes:
+            try:
+                _tapes[key] = _Tape(open_recording(key, check=False))
+            except RecordingError as error:
+                raise DeviceNotFoundError(str(error)) from None
+        return _tapes[key]
+
+
+def _choose(recording: Recording, kinds: tuple[str, ...], what: str, name: str) -> Stream:
+    found = {stream.name: stream for stream in recording.streams if stream.kind in kinds}
+    if not found:
+        also = "; of points alone, `vical replay` plays them" if what == "camera" else ""
+        raise DeviceNotFoundError(f"{recording.path}: no {' or '.join(kinds)} messages in it{also}")
+    names = ", ".join(found)
+    if name and name not in found:
+        raise DeviceNotFoundError(f"{recording.path}: no {what} {name!r} in it (there: {names})")
+    if not name and len(found) > 1:
+        raise DeviceRefusedError(
+            f"{recording.path} holds several: write log:{recording.path.name}#NAME with one of {names}"
+        )
+    return found[name] if name else next(iter(found.values()))
+
+
+def _sleep_until(t_host_ns: int) -> None:
+    time.sleep(max(0, t_host_ns - time.monotonic_ns()) * 1e-9)

@@ -1,0 +1,85 @@
+"""A bounded queue and a thread between a device and the bus: a slow link never stalls a read."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+
+from vical_daemon.bus.interface import Bus
+
+_log = logging.getLogger(__name__)
+
+
+class Counted:
+    """What an outbox hands to the bus, counted."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._overflowed = self._refused = self._published = 0
+
+    @property
+    def dropped(self) -> int:
+        """Messages that did not fit, or that the bus did not take."""
+        return self._overflowed + self._refused
+
+    @property
+    def published(self) -> int:
+        """Messages handed to the bus."""
+        return self._published
+
+    def _hand_over(self, key: str, payload: bytes) -> None:
+        try:
+            self._bus.publish(key, payload)
+            self._published += 1
+        except Exception:  # a broken link must not end acquisition; the bus comes back by itself
+            self._refused += 1
+            _log.exception("cannot publish on %s", key)
+
+
+class Outbox(Counted):
+    """Publishes in the order of `put`, in a thread of its own; what does not fit is dropped and counted.
+
+    One thread puts. The queue is the interpreter's own: at 1000 samples a second a `Condition` costs more
+    than decoding them.
+
+    Args:
+        bus: Where to.
+        depth: Messages that may wait. When full the *oldest* goes: newer data are worth more.
+        name: Of the thread.
+    """
+
+    def __init__(self, bus: Bus, depth: int, name: str) -> None:
+        super().__init__(bus)
+        self._queue: SimpleQueue[tuple[str, bytes] | None] = SimpleQueue()
+        self._depth = depth
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Messages not published yet."""
+        return self._queue.qsize()
+
+    def put(self, key: str, payload: bytes) -> None:
+        """Queue one message; returns at once."""
+        if self._queue.qsize() >= self._depth:
+            self._make_room()
+        self._queue.put((key, payload))
+
+    def _make_room(self) -> None:
+        with suppress(Empty):  # the thread was faster
+            if self._queue.get_nowait() is None:
+                self._queue.put(None)  # closed in the meantime: that must not get lost
+            else:
+                self._overflowed += 1
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Publish what waits, then stop; gives up after `timeout_s`. May be called twice."""
+        self._queue.put(None)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while (message := self._queue.get()) is not None:
+            self._hand_over(*message)

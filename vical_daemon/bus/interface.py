@@ -1,0 +1,228 @@
+"""The bus: what every role talks through, and the in-memory bus for tests, demo and replay.
+
+Payloads are bytes (ROS 2 CDR, see `bus/messages`); keys and their delivery rules are in `topics`.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+from vical_daemon.bus.topics import parse_key
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One message as it travels.
+
+    Attributes:
+        key: Full key, e.g. ``vical/rig0/imu/imu0``.
+        payload: CDR bytes, as recorded.
+        sequence: Number given by the publisher for this key, from 0; gaps are losses.
+    """
+
+    key: str
+    payload: bytes
+    sequence: int
+
+
+Handler = Callable[[Sample], None]
+
+
+class Subscription(Protocol):
+    """A bounded queue of received samples, or a handler being fed."""
+
+    @property
+    def dropped(self) -> int:
+        """Samples that this subscriber missed (full queue, or gaps in the numbers)."""
+        ...
+
+    def recv(self, timeout_s: float | None = None) -> Sample | None:
+        """Return the next sample; None after `timeout_s` (0: at once) or when closed."""
+        ...
+
+    def close(self) -> None:
+        """Leave; may be called twice."""
+        ...
+
+
+class Bus(Protocol):
+    """Publish, subscribe, ask for the last value. Thread-safe."""
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send; delivery rules come from the `topics` table. Never raises on a slow subscriber."""
+        ...
+
+    def subscribe(
+        self,
+        key_expression: str,
+        handler: Handler | None = None,
+        *,
+        depth: int = 1024,
+        newest_wins: bool = False,
+    ) -> Subscription:
+        """Receive what matches (``*`` one chunk, ``**`` any number).
+
+        Args:
+            key_expression: Zenoh key expression.
+            handler: Called for each sample (LocalBus: in the publisher's thread, before `publish`
+                returns; zenoh: in a thread of its own). None: take them with `recv`.
+            depth: Queue length when there is no handler.
+            newest_wins: A full queue drops the oldest (images for a detector) instead of the newest.
+        """
+        ...
+
+    def latest(self, key_expression: str, timeout_s: float = 1.0) -> list[Sample]:
+        """Return the last value of each matching key that is kept (see `topics`), [] where none is."""
+        ...
+
+    def close(self) -> None:
+        """Leave; may be called twice."""
+        ...
+
+
+@lru_cache(maxsize=4096)  # asked for each sample, about the same few keys
+def key_matches(expression: str, key: str) -> bool:
+    """Tell whether a key matches a zenoh key expression made of chunks, ``*`` and ``**``.
+
+    >>> key_matches("vical/*/imu/**", "vical/rig0/imu/imu0")
+    True
+    >>> key_matches("vical/*", "vical/rig0/imu")
+    False
+    """
+    return _match(expression.split("/"), key.split("/"))
+
+
+def _match(pattern: list[str], chunks: list[str]) -> bool:
+    if not pattern:
+        return not chunks
+    if pattern[0] == "**":
+        return any(_match(pattern[1:], chunks[i:]) for i in range(len(chunks) + 1))
+    return bool(chunks) and pattern[0] in ("*", chunks[0]) and _match(pattern[1:], chunks[1:])
+
+
+class SampleQueue:
+    """A bounded queue between the bus and a reader; what does not fit is counted."""
+
+    def __init__(self, depth: int, newest_wins: bool) -> None:
+        self._depth = depth
+        self._newest_wins = newest_wins
+        self._queue: deque[Sample] = deque()
+        self._ready = threading.Condition()
+        self._closed = False
+        self.dropped = 0
+
+    def put(self, sample: Sample) -> None:
+        """Append a sample; when full the oldest or this one goes, never waits."""
+        with self._ready:
+            if len(self._queue) >= self._depth:
+                self.dropped += 1
+                if not self._newest_wins:
+                    return
+                self._queue.popleft()
+            self._queue.append(sample)
+            self._ready.notify()
+
+    def recv(self, timeout_s: float | None = None) -> Sample | None:
+        """Return the next sample, or None after the timeout or once closed and empty."""
+        with self._ready:
+            self._ready.wait_for(lambda: self._queue or self._closed, timeout_s)
+            return self._queue.popleft() if self._queue else None
+
+    def close(self) -> None:
+        """Wake whoever waits; what is queued can still be taken."""
+        with self._ready:
+            self._closed = True
+            self._ready.notify_all()
+
+
+class LocalSubscription:
+    """Subscription of a `LocalBus`."""
+
+    def __init__(
+        self, bus: LocalBus, expression: str, handler: Handler | None, depth: int, newest_wins: bool
+    ) -> None:
+        self.expression = expression
+        self._bus = bus
+        self._handler = handler
+        self._queue = SampleQueue(depth, newest_wins)
+
+    @property
+    def dropped(self) -> int:
+        """Samples lost to a full queue."""
+        return self._queue.dropped
+
+    def deliver(self, sample: Sample) -> None:
+        """Hand one sample over (called by the bus)."""
+        if self._handler is not None:
+            self._handler(sample)
+        else:
+            self._queue.put(sample)
+
+    def recv(self, timeout_s: float | None = None) -> Sample | None:
+        """Return the next sample, or None after the timeout or once closed."""
+        return self._queue.recv(timeout_s)
+
+    def close(self) -> None:
+        """Leave the bus and wake whoever waits."""
+        self._bus.remove(self)
+        self._queue.close()
+
+
+class LocalBus:
+    """Everything in one process, in the order of publication: replays are bit-identical."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._subscriptions: list[LocalSubscription] = []
+        self._numbers: dict[str, int] = {}
+        self._last: dict[str, Sample] = {}
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Deliver to every matching subscription before returning."""
+        with self._lock:
+            number = self._numbers.get(key, 0)
+            self._numbers[key] = number + 1
+            sample = Sample(key, payload, number)
+            parsed = parse_key(key)
+            if parsed is not None and parsed.topic.keep_last:
+                self._last[key] = sample
+            targets = [s for s in self._subscriptions if key_matches(s.expression, key)]
+        for subscription in targets:
+            subscription.deliver(sample)
+
+    def subscribe(
+        self,
+        key_expression: str,
+        handler: Handler | None = None,
+        *,
+        depth: int = 1024,
+        newest_wins: bool = False,
+    ) -> LocalSubscription:
+        """See `Bus.subscribe`."""
+        subscription = LocalSubscription(self, key_expression, handler, depth, newest_wins)
+        with self._lock:
+            self._subscriptions.append(subscription)
+        return subscription
+
+    def remove(self, subscription: LocalSubscription) -> None:
+        """Forget a subscription (called by its `close`)."""
+        with self._lock:
+            if subscription in self._subscriptions:
+                self._subscriptions.remove(subscription)
+
+    def latest(self, key_expression: str, timeout_s: float = 1.0) -> list[Sample]:  # noqa: ARG002
+        """See `Bus.latest`; answers at once."""
+        with self._lock:
+            return [s for k, s in sorted(self._last.items()) if key_matches(key_expression, k)]
+
+    def close(self) -> None:
+        """Close all subscriptions."""
+        with self._lock:
+            subscriptions = list(self._subscriptions)
+        for subscription in subscriptions:
+            subscription.close()

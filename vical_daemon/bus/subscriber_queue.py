@@ -1,0 +1,65 @@
+"""What has arrived on several keys, for a role that works in a loop of its own."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Sequence
+
+from vical_daemon.bus.interface import Bus, Sample
+
+
+class Inbox:
+    """One bounded queue over several subscriptions, in the order of arrival.
+
+    The bus' own thread only appends; nothing is decoded there.
+
+    Args:
+        bus: Where from.
+        key_expressions: What.
+        limit: Samples kept; when full the oldest goes and is counted.
+    """
+
+    def __init__(self, bus: Bus, key_expressions: Sequence[str], limit: int) -> None:
+        self._queue: deque[Sample] = deque()
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._arrived = threading.Event()
+        self._dropped = 0
+        self._subscriptions = [bus.subscribe(key, self._keep) for key in key_expressions]
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    @property
+    def dropped(self) -> int:
+        """Samples lost here, or before they came here (gaps in their numbers)."""
+        return self._dropped + sum(subscription.dropped for subscription in self._subscriptions)
+
+    def _keep(self, sample: Sample) -> None:
+        with self._lock:
+            if len(self._queue) >= self._limit:
+                self._queue.popleft()
+                self._dropped += 1
+            self._queue.append(sample)
+        self._arrived.set()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until something is there; False after the timeout."""
+        came = self._arrived.wait(timeout_s)
+        self._arrived.clear()
+        return came
+
+    def take(self, count: int) -> Iterator[Sample]:
+        """Yield at most `count` of the samples that are there."""
+        for _ in range(count):
+            with self._lock:
+                if not self._queue:
+                    return
+                sample = self._queue.popleft()
+            yield sample
+
+    def close(self) -> None:
+        """End the subscriptions; what is there can still be taken."""
+        for subscription in self._subscriptions:
+            subscription.close()

@@ -1,0 +1,226 @@
+"""Opening a zenoh session: its settings, security, the router's socket, and errors in one line.
+
+The traps that shaped these settings are listed in docs/bus.md.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import resource
+import socket as sockets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from vical_daemon.bus.bus_places import Reach, reach, why_closed
+
+_log = logging.getLogger(__name__)
+_SOURCE_PLACE = re.compile(r"[.,]?\s+at /\S+\.rs:\d+\.?")
+ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|wss|serial|unixsock-stream|unixpipe|vsock)/.+")
+"""How the endpoints look that zenoh understands."""
+_PAYLOAD_LIMIT = 256 * 2**20
+RETRY = {"retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}}
+"""How a session comes back to its router."""
+_POOL_BYTES = 4 * 2**20
+"""Shared memory of a router, bytes: three images of 1.3 MP. Every receiver of the same user locks it, so it
+stays below the usual limit of 8 MiB, for foreign programs' sake; an image that finds no room is copied."""
+_ENOUGH_LOCKED_BYTES = 64 * 2**20
+"""Limit of locked memory from which memory is shared, bytes: ten routers' pools with their bookkeeping
+(5.4 MiB each, measured: tests/system/test_shared_memory.py)."""
+_CAP_IPC_LOCK = 14
+"""Number of the capability in linux/capability.h."""
+_warned = False
+# Batches of 64 kB: without shared memory an image of 360 kB takes six of "data".
+_QUEUE_SIZES = {
+    "control": 2, "real_time": 16, "interactive_high": 2, "interactive_low": 2,
+    "data_high": 4, "data": 16, "data_low": 2, "background": 2,
+}  # fmt: skip
+
+
+class BusError(Exception):
+    """The bus cannot be opened; the message is one line that says what to try."""
+
+
+def can_share_memory() -> bool:
+    """Whether this process may lock enough memory for the bus to share images instead of copying them.
+
+    zenoh locks every segment that it maps, its own and those of the sessions that it receives from. Where the
+    limit is reached, it drops what it cannot map, silently. So memory is shared only where the limit leaves
+    room for several routers (docs/bus.md, "Shared memory").
+    """
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    return soft == resource.RLIM_INFINITY or soft >= _ENOUGH_LOCKED_BYTES or _may_lock_anything()
+
+
+def _may_lock_anything() -> bool:
+    """Whether the kernel exempts this process from the limit (CAP_IPC_LOCK, which root has)."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return False
+    found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    return found is not None and bool(int(found[1], 16) >> _CAP_IPC_LOCK & 1)
+
+
+def _warn_of_copies() -> None:
+    """Say once in a process that images are copied, and what to raise."""
+    global _warned
+    if not _warned:
+        _warned = True
+        _log.info(
+            "the bus copies images, because this process may lock too little memory to share them "
+            "(costs processor time, loses nothing); to share: ulimit -l unlimited, or LimitMEMLOCK=infinity "
+            "in a unit"
+        )
+
+
+def base_config(*, router: bool = False) -> dict[str, Any]:
+    """Return what all sessions have in common; only a router has memory to share."""
+    shared = can_share_memory()
+    return {
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
+        "transport": {
+            "shared_memory": {
+                "enabled": shared,
+                "transport_optimization": {"enabled": shared and router, "pool_size": _POOL_BYTES},
+            },
+            "link": {
+                "tx": {
+                    "queue": {
+                        "size": _QUEUE_SIZES,
+                        "congestion_control": {"block": {"wait_before_close": 1_000_000}},
+                    }
+                },
+                "rx": {"max_message_size": _PAYLOAD_LIMIT},
+            },
+        },
+    }
+
+
+def add_security(
+    config: dict[str, Any],
+    tls_ca: str | None,
+    certificate: str | None,
+    key: str | None,
+    password_file: str | None,
+    user: str | None,
+    password: str | None,
+) -> None:
+    """Add certificates and passwords to the settings; see `zenoh_bus.open_bus` for each.
+
+    Raises:
+        BusError: A file cannot be read.
+    """
+    for path in (tls_ca, certificate, key, password_file):
+        if path and not os.access(path, os.R_OK):
+            raise BusError(f"{path} cannot be read; see tls_ca, tls_certificate, tls_key and password_file")
+    if tls_ca or certificate or key:
+        tls: dict[str, Any] = {"enable_mtls": bool(tls_ca and certificate)}
+        if tls_ca:
+            tls["root_ca_certificate"] = tls_ca
+        if certificate and key:
+            tls |= {
+                "listen_certificate": certificate, "listen_private_key": key,
+                "connect_certificate": certificate, "connect_private_key": key,
+            }  # fmt: skip
+        config["transport"]["link"]["tls"] = tls
+    if password_file or user:
+        given = {"dictionary_file": password_file, "user": user, "password": password}
+        config["transport"]["auth"] = {"usrpwd": {k: v for k, v in given.items() if v}}
+
+
+@contextmanager
+def closed_to_others() -> Iterator[None]:
+    """Let what is created meanwhile, sockets above all, be for this user and group alone.
+
+    The mask is the whole process's: a router is opened before the roles are started.
+    """
+    before = os.umask(0o007)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+def free_socket(path: Path) -> None:
+    """Remove the socket of a router that was killed.
+
+    Raises:
+        BusError: Somebody answers there, or the folder is not ours.
+    """
+    probe = sockets.socket(sockets.AF_UNIX)
+    try:
+        probe.connect(str(path))
+    except FileNotFoundError:
+        return
+    except ConnectionRefusedError:
+        with suppress(FileNotFoundError):
+            path.unlink()
+        return
+    except OSError as error:
+        raise BusError(f"{path}: {error.strerror}; set bus.socket to a path that this user may use") from None
+    finally:
+        probe.close()
+    raise BusError(
+        f"another process already hosts the bus at {path}; stop it first (systemctl status vical-acquire)"
+    )
+
+
+def open_session(config: dict[str, Any]) -> Any:
+    """Open a session; where the process may lock too little memory, without shared memory."""
+    shared = config["transport"]["shared_memory"]["enabled"]
+    if not shared:
+        _warn_of_copies()
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError as error:
+        text = str(error)
+        if not shared or ("shm" not in text.lower() and "shared memory" not in text.lower()):
+            raise BusError(_explain(config, text)) from None
+    _warn_of_copies()  # /dev/shm is missing or full
+    config["transport"]["shared_memory"] = {"enabled": False}
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError as error:
+        raise BusError(_explain(config, str(error))) from None
+
+
+def _explain(config: dict[str, Any], text: str) -> str:
+    """Say in one line what is wrong and what to try; places in zenoh's own source help nobody."""
+    detail = " ".join(_SOURCE_PLACE.sub("", text).split())[:200]
+    if config["mode"] == "client":
+        endpoints = config["connect"]["endpoints"]
+        where = ", ".join(endpoint.removeprefix("unixsock-stream/") for endpoint in endpoints)
+        for protocol, _, place in (endpoint.partition("/") for endpoint in endpoints):
+            if protocol == "unixsock-stream" and reach(Path(place)) is Reach.CLOSED:
+                return why_closed(Path(place))
+        if any(_answers(endpoint) for endpoint in endpoints):
+            return (
+                f"no bus at {where}: a router is there but refuses us; check user and password, certificates"
+            )
+        words = f"no bus at {where}: nothing answers; start `vical run -c FILE` (or vical.target) there"
+        return words if detail.startswith("Unable to connect") else f"{words} ({detail})"
+    where = ", ".join(config["listen"]["endpoints"])
+    return f"cannot host the bus at {where}: is another router running there? ({detail})"
+
+
+def _answers(endpoint: str) -> bool:
+    """Whether anybody accepts connections at an endpoint (of the kinds that can be tried simply)."""
+    protocol, _, place = endpoint.partition("/")
+    try:
+        if protocol == "unixsock-stream":
+            return reach(Path(place)) is Reach.OPEN
+        host, _, port = place.partition("#")[0].rpartition(":")
+        if protocol not in ("tcp", "tls") or not port.isdigit():
+            return False
+        with sockets.create_connection((host.strip("[]"), int(port)), timeout=0.5):
+            return True
+    except OSError:
+        return False

@@ -1,0 +1,168 @@
+"""Keeps the running estimator in the runtime directory, so that a restarted process goes on where it was.
+
+A restart then costs a gap in the data and no calibration. The file holds for the same devices, config, code
+and boot only. It is used once: a state that makes the process fail again is not met a second time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import os
+import pickle
+import stat
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from vical_drivers.user_files import read_file
+
+from vical_daemon.calibrate.estimators import Estimator
+from vical_daemon.config.model import Config
+from vical_daemon.config.strict_yaml import MAX_BYTES
+from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.wall_clock import WallClock
+
+_log = logging.getLogger(__name__)
+FILE_NAME = "estimator"
+SAVE_EVERY_S = 2.0
+PROVEN_S = 10.0  # an estimator is not kept before it has run so long without failing
+OLDEST_S = 300.0  # an older state says too little about a rig that somebody may have touched meanwhile
+_COST = 100  # a save may take one part in so many of the time
+_SIZE_LIMIT = 2**26  # bytes; 0.4 MB after a minute
+_ARITHMETIC = "vical_daemon.estimation"
+_PLAIN = {("builtins", "slice"), ("collections", "deque"), ("numpy", "dtype"), ("numpy", "ndarray")} | {
+    (module, name)
+    for core in ("numpy._core", "numpy.core")
+    for module, name in (
+        (f"{core}.multiarray", "scalar"),
+        (f"{core}.multiarray", "_reconstruct"),
+        (f"{core}.numeric", "_frombuffer"),
+    )
+}
+"""What a state consists of, besides the classes of the estimation."""
+
+
+class _Head(msgspec.Struct, frozen=True):
+    identity: str
+    devices: dict[str, str]
+    saved_ns: int  # UNIX, by the service's clock
+
+
+class Checkpoint:
+    """The state of one estimator, on disk.
+
+    Args:
+        folder: The runtime directory; None: nothing is kept (demo, tests).
+        config: The rig.
+        clock: Of the service; another one means another boot, and stamps that do not follow.
+    """
+
+    def __init__(self, folder: Path | None, config: Config, clock: WallClock) -> None:
+        self._path = None if folder is None else folder / FILE_NAME
+        self._clock = clock
+        self._identity = _identity(config, clock)
+        self._next_s = time.monotonic() + PROVEN_S
+
+    def load(self, devices: Mapping[str, str]) -> tuple[Estimator, float] | None:
+        """Return the state that an earlier process left for these devices, and its age, s; or None.
+
+        Args:
+            devices: Serial numbers by component; empty: not known, then nothing is taken.
+        """
+        if self._path is None:
+            return None
+        try:
+            data = _read_private(self._path)
+            self.forget()
+            line, _, body = data.partition(b"\n")
+            head = msgspec.json.decode(line, type=_Head)
+            age_s = (self._clock.now_ns() - head.saved_ns) * 1e-9
+            if head.identity != self._identity or not devices or head.devices != dict(devices):
+                return None
+            if not 0.0 <= age_s <= OLDEST_S:
+                return None
+            return _Unpickler(io.BytesIO(body)).load(), age_s
+        except FileNotFoundError:
+            return None
+        except Exception as error:  # whatever stands there: the estimator then starts as it always did
+            _log.warning("%s is not used: %s", self._path, " ".join(str(error).split()))
+            return None
+
+    def save(self, estimator: Estimator, devices: Mapping[str, str]) -> None:
+        """Keep a converged estimator; does nothing most of the time, and never raises."""
+        begin_s = time.monotonic()
+        if self._path is None or begin_s < self._next_s or not devices:
+            return
+        try:
+            head = _Head(self._identity, dict(devices), self._clock.now_ns())
+            body = pickle.dumps(estimator, protocol=5)
+            write_whole(self._path, msgspec.json.encode(head) + b"\n" + body)
+        except Exception as error:
+            _log.warning("the estimator's state cannot be kept: %s", " ".join(str(error).split()))
+            self._next_s = float("inf")
+            return
+        end_s = time.monotonic()
+        self._next_s = end_s + max(SAVE_EVERY_S, _COST * (end_s - begin_s))
+
+    def forget(self) -> None:
+        """Remove the file: the next estimator starts from what is stored for the devices."""
+        self._next_s = time.monotonic() + PROVEN_S
+        if self._path is None:
+            return
+        try:
+            self._path.unlink(missing_ok=True)
+        except OSError as error:
+            _log.warning("%s: %s", self._path, error.strerror)
+
+
+class _Unpickler(pickle.Unpickler):
+    """Makes objects of the estimation and plain ones, nothing else: a file is never a program."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("builtins", "getattr"):  # a method of one of our objects
+            return _method
+        if (module, name) in _PLAIN:
+            return super().find_class(module, name)
+        if module == _ARITHMETIC or module.startswith(_ARITHMETIC + "."):
+            found = super().find_class(module, name)
+            if isinstance(found, type) and found.__module__.startswith(_ARITHMETIC):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is no part of an estimator")
+
+
+def _method(owner: object, name: str) -> Any:
+    if not type(owner).__module__.startswith(_ARITHMETIC) or name.startswith("__"):
+        raise pickle.UnpicklingError(f"{name} is no method of an estimator")
+    return getattr(owner, name)
+
+
+def _read_private(path: Path) -> bytes:
+    """Read a file that this user wrote and nobody else can.
+
+    Raises:
+        OSError: There is none, or it is somebody else's.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        about = os.fstat(descriptor)
+        writable = about.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid() or writable:
+            raise PermissionError(1, "others could have written it", str(path))
+        return file.read(_SIZE_LIMIT)
+
+
+def _identity(config: Config, clock: WallClock) -> str:
+    """Hash of all that a state depends on: code, config, target, clock."""
+    digest = hashlib.sha256(f"{sys.version} {np.__version__} {clock.boot_id} {clock.offset_ns}".encode())
+    digest.update(repr(config).encode())
+    files = sorted((Path(__file__).parent / "estimation").rglob("*.py"))
+    for path in (*files, *([config.target_path] if config.target_path else [])):
+        if path.is_file():
+            digest.update(read_file(path, MAX_BYTES))
+    return digest.hexdigest()

@@ -1,0 +1,105 @@
+"""Chooses the estimator that a config asks for; target-based and target-free look the same from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+from vical_daemon.bus import topics
+from vical_daemon.config.model import Config, ConfigError
+from vical_daemon.config.priors import calibration_options, camera_prior
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
+
+
+class Estimator(Protocol):
+    """What a role needs of an estimator; see `Calibrator`."""
+
+    def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
+        """Take one inertial sample."""
+        ...
+
+    def stamps_known_to(self, sigma_s: float) -> None:
+        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        ...
+
+    def add_points(self, frame: PointsFrame) -> None:
+        """Take the points of one image."""
+        ...
+
+    @property
+    def waiting(self) -> int:
+        """Images taken that have neither been used nor refused yet."""
+        ...
+
+    def process(self) -> Sequence[Any]:
+        """Do what can be done with what has arrived."""
+        ...
+
+    def finish(self) -> Sequence[Any]:
+        """End of the data."""
+        ...
+
+    def estimate(self) -> CalibrationEstimate:
+        """Return what is known now; takes the events since the last call along."""
+        ...
+
+    def trace(self, camera: str) -> list[TracePoint]:
+        """Return how the calibration of one camera developed."""
+        ...
+
+
+def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None) -> Estimator:
+    """Make the estimator of a rig.
+
+    Args:
+        config: The rig.
+        priors: What is known about the cameras; None: what the config says.
+
+    Raises:
+        ConfigError: The target file is missing or wrong.
+    """
+    options = calibration_options(config)
+    if priors is None:
+        priors = {name: camera_prior(config, name) for name in config.calibration_cameras}
+    if options.target_free:
+        return _target_free(options, priors)
+    from vical_daemon.estimation.calibrator import Calibrator
+    from vical_daemon.vision.target import load_target
+
+    assert config.target_path is not None  # `config.load` has seen to it
+    return Calibrator(options, priors, load_target(config.target_path).points_m)
+
+
+def make_watch(config: Config) -> DelayWatch | None:
+    """Make what compares the time shift with that of the rotations alone; None without a target."""
+    if config.target_path is None or config.calibration.mode == "target_free":
+        return None
+    from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
+    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
+    from vical_daemon.vision.target import load_target
+
+    noise = calibration_options(config).imu_noise
+    options = TdIcpOptions(gyro_density=noise.gyro_density, gyro_walk=noise.gyro_walk, gyro_log_sigma=0.7)
+    return DelayWatch(load_target(config.target_path).points_m, config.calibration_cameras, options)
+
+
+def input_keys(config: Config) -> list[str]:
+    """Return the keys that the estimator reads: one IMU and its status, points or tracks of each camera."""
+    key_of = topics.TRACKS.key if config.calibration.mode == "target_free" else topics.POINTS.key
+    imu = topics.IMU.key(config.rig, config.calibration_imu)
+    status = topics.STATUS.key(config.rig, "imu")
+    return [imu, status, *(key_of(config.rig, camera) for camera in config.calibration_cameras)]
+
+
+def _target_free(options: CalibrationOptions, priors: dict[str, CameraPrior]) -> Estimator:
+    from vical_daemon.estimation.target_free import TargetFreeCalibrator
+    from vical_daemon.estimation.target_free_rig import TargetFreeRig
+
+    try:
+        return TargetFreeCalibrator(options, priors) if len(priors) == 1 else TargetFreeRig(options, priors)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error

@@ -1,0 +1,253 @@
+"""Remembers calibrations over restarts, by the serial numbers of the devices, and announces changes.
+
+Serial numbers come from the status of the acquiring roles, so the estimator needs no access to devices. What
+is estimated belongs to the devices that were there when the estimator began. When one of them is replaced,
+nothing more is saved until `begin_again`: else the calibration of one device would be filed under another.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus, Sample
+from vical_daemon.bus.messages import MessageError, decode_diagnostics
+from vical_daemon.config.model import Config
+from vical_daemon.config.paths import state_directory
+from vical_daemon.config.priors import camera_prior
+from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import CameraPrior
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
+from vical_daemon.estimation.wording import event_text
+from vical_daemon.results.store import CalibrationStore, StoredCalibration, StoreError
+from vical_daemon.service import notify
+from vical_daemon.service.device_serials import DeviceSerials
+from vical_daemon.service.wall_clock import WallClock
+
+_log = logging.getLogger(__name__)
+SAVE_EVERY_S = 60.0
+SERIALS_WITHIN_S = 3.0
+SIGMAS = 4.0
+# What nobody needs to be told of, however significant: thermal play of a mount.
+IRRELEVANT_M, IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
+
+
+_JOURNAL_NAMES = {
+    EventKind.DEVICE_REPLACED: "calibration_restarted",
+    EventKind.ESTIMATOR_RESTARTED: "estimator_restarted",
+}
+
+
+class Memory:
+    """The store as one running estimator uses it.
+
+    Args:
+        config: The rig.
+        bus: Where the status of the devices is heard.
+        clock: For the date of what is saved.
+    """
+
+    def __init__(self, config: Config, bus: Bus, clock: WallClock) -> None:
+        folder = Path(config.store.directory) if config.store.directory else state_directory() / "calibration"
+        self._config, self._bus, self._clock = config, bus, clock
+        self._store = CalibrationStore(folder)
+        self._serials = DeviceSerials()
+        self._complete = threading.Event()
+        self._before: dict[str, StoredCalibration] = {}
+        self._compared: set[str] = set()
+        self._saved_s = -float("inf")
+        self._status: Status | None = None
+        self._announced: list[Event] = []
+        pattern = topics.STATUS.pattern
+        self._keys = [pattern.format(rig=config.rig, name=role) for role in ("imu", "camera")]
+        self._subscriptions = [bus.subscribe(key, self._listen) for key in self._keys]
+
+    def priors(self, wait_s: float = SERIALS_WITHIN_S) -> dict[str, CameraPrior]:
+        """Return what is known about each camera: what was stored for these devices, else the config.
+
+        What the config gives for a held parameter stays.
+
+        Args:
+            wait_s: How long to wait for the serial numbers.
+        """
+        for key in self._keys:
+            for sample in self._bus.latest(key):
+                self._listen(sample)
+        self._complete.wait(wait_s)
+        known: dict[str, CameraPrior] = {}
+        for name in self._config.calibration_cameras:
+            known[name] = given = camera_prior(self._config, name)
+            stored = self._load(name)
+            if stored is not None and stored.known.distortion_model == given.distortion_model:
+                self._before[name] = stored
+                known[name] = _merge(given, stored.prior(given.resolution), self._config.calibration.fix)
+        return known
+
+    @property
+    def replaced(self) -> bool:
+        """Whether a device of this calibration was replaced by another one since the estimator began."""
+        return bool(self._serials.replaced)
+
+    def begin_again(self) -> dict[str, CameraPrior]:
+        """Turn to the devices that are there now; return what is known about each camera with them."""
+        for line in self._serials.adopt():
+            said = f"{line}: the calibration begins anew"
+            _log.warning("%s", said)
+            self.announce(Event(EventKind.DEVICE_REPLACED, said=said))
+        self._before.clear()
+        self._compared.clear()
+        self._status, self._saved_s = None, -float("inf")
+        return self.priors()
+
+    @property
+    def stored(self) -> list[str]:
+        """Cameras for which a calibration of these devices is stored."""
+        return list(self._before)
+
+    @property
+    def devices(self) -> dict[str, str]:
+        """Serial numbers of the devices of this calibration by component; empty while one is not certain."""
+        names = self._components()
+        known = {name: serial for name, serial in self._serials.known.items() if name in names}
+        return known if len(known) == len(names) and not self._serials.in_doubt else {}
+
+    def _components(self) -> list[str]:
+        cameras = [f"camera/{name}" for name in self._config.calibration_cameras]
+        return [f"imu/{self._config.calibration_imu}", *cameras]
+
+    def announce(self, event: Event) -> None:
+        """Write an event into the journal now and into the next estimate."""
+        self._journal(event)
+        self._announced.append(event)
+
+    def watch(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
+        """Look at an estimate before it is published: save it when it is good, announce what changed.
+
+        Returns:
+            The estimate, with an event added where the calibration differs from the stored one.
+        """
+        events = list(estimate.events)
+        if estimate.status is Status.CONVERGED:
+            events += self._changes(estimate)
+            if self._status is not Status.CONVERGED:
+                notify.event("converged", f"{self._config.rig}: calibration converged", rig=self._config.rig)
+            if time.monotonic() - self._saved_s > SAVE_EVERY_S:
+                self.save(estimate)
+        for event in events:
+            self._journal(event)
+        self._status = estimate.status
+        events = [*self._announced, *events]
+        self._announced.clear()
+        return replace(estimate, events=events) if events != estimate.events else estimate
+
+    def _journal(self, event: Event) -> None:
+        fields: dict[str, str | float] = {"kind": str(event.kind)}
+        fields |= {"camera": event.camera} if event.camera else {}
+        fields |= {"value": event.value} if event.value is not None else {}
+        fields |= {"sigma": event.sigma} if event.sigma is not None else {}
+        name = "bumped" if event.changed else _JOURNAL_NAMES.get(event.kind, "calibration")
+        notify.event(name, event_text(event), level="warning", rig=self._config.rig, **fields)
+
+    def save(self, estimate: CalibrationEstimate | None) -> None:
+        """Store a converged estimate now (once a minute, and at the end)."""
+        if estimate is None or estimate.status is not Status.CONVERGED or self._serials.in_doubt:
+            return
+        self._saved_s = time.monotonic()
+        for name in estimate.cameras:
+            imu, camera = self._pair(name)
+            if imu and camera:
+                try:
+                    self._store.save(imu, camera, name, estimate, self._clock.now_ns())
+                except StoreError as error:
+                    _log.warning("%s", error)
+
+    def close(self, estimate: CalibrationEstimate | None) -> None:
+        """Save a last time and stop listening."""
+        self.save(estimate)
+        for subscription in self._subscriptions:
+            subscription.close()
+
+    def _changes(self, estimate: CalibrationEstimate) -> list[Event]:
+        found: list[Event] = []
+        for name, stored in self._before.items():
+            if name in estimate.cameras and name not in self._compared:
+                self._compared.add(name)
+                found += differences(name, stored.known, estimate.cameras[name], estimate.duration_s)
+        return found
+
+    def _listen(self, sample: Sample) -> None:
+        try:
+            statuses = decode_diagnostics(sample.payload).statuses
+        except MessageError:
+            return
+        for status in statuses:
+            if status.name in self._components():
+                self._serials.note(status)
+        if all(all(self._pair(name)) for name in self._config.calibration_cameras):
+            self._complete.set()
+
+    def _pair(self, camera: str) -> tuple[str, str]:
+        known = self._serials.known
+        return known.get(f"imu/{self._config.calibration_imu}", ""), known.get(f"camera/{camera}", "")
+
+    def _load(self, camera: str) -> StoredCalibration | None:
+        imu_serial, camera_serial = self._pair(camera)
+        return self._store.load(imu_serial, camera_serial) if imu_serial and camera_serial else None
+
+
+def differences(camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float) -> list[Event]:
+    """Return by how much a mounting differs from an earlier one, beyond both sigmas and what matters.
+
+    Each component is compared with the sum of both variances; rotations as the angle about each axis.
+
+    Args:
+        camera: Name of the camera.
+        before: As stored.
+        now: As estimated.
+        t_s: Time of the comparison, s since the first inertial reading.
+    """
+    old, new = before.T_imu_cam, now.T_imu_cam
+    covariance = np.asarray(old.covariance) + np.asarray(new.covariance)
+    limit = SIGMAS * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    move_m = np.subtract(new.p_m, old.p_m)
+    R_old, R_new = (so3.matrix_from_quat(np.asarray(pose.q_wxyz)) for pose in (old, new))
+    turn_rad = so3.log(R_old.T @ R_new)
+    shift_s = now.timeshift_cam_imu_s - before.timeshift_cam_imu_s
+    found: list[tuple[EventKind, float, float]] = []
+    if np.any(np.abs(move_m) > np.maximum(limit[:3], IRRELEVANT_M)):
+        found.append((EventKind.CAMERA_MOVED, *_length(move_m, covariance[:3, :3])))
+    if np.any(np.abs(turn_rad) > np.maximum(limit[3:], IRRELEVANT_RAD)):
+        found.append((EventKind.CAMERA_TURNED, *_length(turn_rad, covariance[3:, 3:])))
+    sigma_s = math.hypot(before.timeshift_sigma_s, now.timeshift_sigma_s)
+    if abs(shift_s) > max(SIGMAS * sigma_s, IRRELEVANT_S):
+        found.append((EventKind.TIMESHIFT_CHANGED, shift_s, sigma_s))
+    why = Cause.STORED_DIFFERS
+    return [Event(kind, camera, value, sigma, t_s, why) for kind, value, sigma in found]
+
+
+def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Length of a vector, and its standard deviation."""
+    length = float(np.linalg.norm(vector))
+    along = vector / length
+    return length, math.sqrt(max(float(along @ covariance @ along), 0.0))
+
+
+def _merge(given: CameraPrior, stored: CameraPrior, fix: tuple[str, ...]) -> CameraPrior:
+    """Take what was stored, but for what the config holds fixed."""
+    merged = replace(stored, readout_s=given.readout_s or stored.readout_s)
+    if "intrinsics" in fix:
+        merged = replace(merged, intrinsics=given.intrinsics, distortion=given.distortion)
+    if "extrinsics" in fix:
+        merged = replace(merged, T_imu_cam=given.T_imu_cam)
+    if "timeshift" in fix:
+        merged = replace(merged, timeshift_cam_imu_s=given.timeshift_cam_imu_s)
+    return merged

@@ -1,0 +1,208 @@
+"""What the role estimate does, without I/O: messages in, by stamp behind a short lag; messages out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import (
+    DiagnosticsMessage,
+    DiagnosticStatus,
+    ImplausibleError,
+    ImuMessage,
+    Level,
+    MessageError,
+    admit_imu,
+    admit_points,
+    admit_stamp_sigma_s,
+    decode_diagnostics,
+)
+from vical_daemon.bus.outgoing import Message
+from vical_daemon.calibrate.estimators import Estimator
+from vical_daemon.calibrate.predictions import Predictions
+from vical_daemon.calibrate.publications import (
+    calibration_messages,
+    calibration_status,
+    companion_messages,
+    delay_statuses,
+)
+from vical_daemon.calibrate.reorder_buffer import StampOrder
+from vical_daemon.calibrate.stamp_gate import StampGate
+from vical_daemon.config.model import Config
+from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
+
+Keep = Callable[[Sequence[Any]], None]
+Inspect = Callable[[CalibrationEstimate], CalibrationEstimate]
+PUBLISH_S = 0.2
+COMPANION_S = 1.0
+STUCK_S = 10.0
+"""Images that arrive and are neither used nor refused for so long: the estimator is not alive, s. They wait
+for inertial data at most 2 s, and a start on a slow card was seen to take 3 s."""
+
+
+class EstimateRole:
+    """Feeds an estimator with decoded messages in the order of their stamps. No I/O, no clock.
+
+    Args:
+        config: The rig.
+        estimator: What does the arithmetic.
+        period_s: Between two publications; a change shows as soon as the next one.
+        keep: Takes the verdict on every frame (for reports); None: they are dropped.
+        inspect: Sees every estimate before it is published and may add to it.
+        watch: Compares the time shift with that of the rotations alone; None: nobody does.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        estimator: Estimator,
+        period_s: float = PUBLISH_S,
+        *,
+        keep: Keep | None = None,
+        inspect: Inspect | None = None,
+        watch: DelayWatch | None = None,
+    ) -> None:
+        self.config, self.estimator = config, estimator
+        self._period_s, self._keep, self._inspect = period_s, keep, inspect
+        self._watch = watch
+        self._predictions = Predictions(config.rig)
+        self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
+        self._status_key = topics.STATUS.key(config.rig, "imu")
+        self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
+        self._gates: dict[str, StampGate[ImuMessage | PointsFrame]] = {}
+        self._next_s = self._next_companion_s = -float("inf")
+        self._malformed = self._implausible = 0
+        self._images_in_order = 0
+        self.images = 0
+        self.latest: CalibrationEstimate | None = None
+
+    def take(self, sample: Sample) -> None:
+        """Take one message from the bus; what cannot be read, or cannot be, is counted."""
+        try:
+            if sample.key == self._imu_key:
+                imu = admit_imu(sample.payload)
+                self._sort_in(sample.key, imu.stamp_ns, imu)
+            elif sample.key == self._status_key:
+                self._stamps_known(decode_diagnostics(sample.payload))
+            else:
+                self.images += 1
+                frame = admit_points(sample.payload).to_frame()
+                self._sort_in(sample.key, frame.t_cam_ns, frame)
+        except ImplausibleError:
+            self._implausible += 1
+        except MessageError:
+            self._malformed += 1
+
+    def _sort_in(self, key: str, stamp_ns: int, item: ImuMessage | PointsFrame) -> None:
+        """Put an item into its place by stamp, once the stamps of its stream make sense."""
+        gate = self._gates.get(key)
+        if gate is None:
+            gate = self._gates[key] = StampGate()
+        self._pass(gate.push(stamp_ns, item))
+
+    def _pass(self, items: list[tuple[int, ImuMessage | PointsFrame]]) -> None:
+        for stamp_ns, item in items:
+            self._order.push(stamp_ns, item)
+            self._images_in_order += isinstance(item, PointsFrame)
+
+    @property
+    def settled(self) -> int:
+        """Images so far (of `images`) that the estimator has looked at, or that were refused."""
+        return self.images - self._images_in_order - self.estimator.waiting
+
+    def _stamps_known(self, message: DiagnosticsMessage) -> None:
+        """Pass on what the driver says of its device's clock."""
+        for status in message.statuses:
+            if status.name == f"imu/{self.config.calibration_imu}" and "stamp_sigma_us" in status.values:
+                self.estimator.stamps_known_to(admit_stamp_sigma_s(status.values["stamp_sigma_us"]))
+
+    def step(self, now_s: float | None = None) -> list[Message]:
+        """Do what can be done with what was taken and return what is to be published.
+
+        Args:
+            now_s: Any steady clock, for the 5 Hz; None: the time of the data (offline, repeatable).
+        """
+        self._feed(self._order.pop_due())
+        if now_s is None:
+            now_s = (self._order.newest_ns or 0) * 1e-9
+        return self._publications(now_s)
+
+    def finish(self) -> list[Message]:
+        """End of the data: use everything and return the last word."""
+        for gate in self._gates.values():
+            self._pass(gate.flush())
+        self._feed(self._order.pop_all())
+        self._report(self.estimator.finish())
+        self._next_s = self._next_companion_s = -float("inf")
+        return self._publications(0.0)
+
+    def reset(self, estimator: Estimator, watch: DelayWatch | None = None) -> None:
+        """Forget everything and begin anew with a fresh estimator (and watch)."""
+        self._order.pop_all()
+        self._images_in_order = 0
+        self.estimator, self.latest, self._watch = estimator, None, watch
+        self._next_s = self._next_companion_s = -float("inf")
+
+    def _feed(self, items: list[ImuMessage | PointsFrame]) -> None:
+        for item in items:
+            if isinstance(item, ImuMessage):
+                self.estimator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+                if self._watch is not None:
+                    self._watch.add_imu(item.stamp_ns, item.gyro_rps)
+            else:
+                self._images_in_order -= 1
+                if self._watch is not None:
+                    self._watch.add_points(item)
+                self.estimator.add_points(item)
+                self._report(self.estimator.process())
+
+    def _report(self, frames: Sequence[Any]) -> None:
+        self._predictions.take(frames)
+        if self._keep is not None:
+            self._keep(frames)
+
+    def _publications(self, now_s: float) -> list[Message]:
+        if now_s < self._next_s:
+            return []
+        self._next_s = now_s + self._period_s
+        estimate = self.estimator.estimate()
+        self.latest = estimate = self._inspect(estimate) if self._inspect else estimate
+        if self._watch is not None:
+            self._watch.look(estimate)
+        messages = calibration_messages(self.config, estimate) + self._predictions.messages()
+        if now_s >= self._next_companion_s:
+            self._next_companion_s = now_s + COMPANION_S
+            messages += companion_messages(self.config, estimate)
+        return messages
+
+    def statuses(self, dropped: int = 0, stuck_s: float = 0.0) -> list[DiagnosticStatus]:
+        """Return the health of the estimator.
+
+        Args:
+            dropped: Samples that never came here.
+            stuck_s: For how long images have come and none has been used or refused (see `Progress`).
+        """
+        counters = {
+            "queue_depth": str(len(self._order)),
+            "dropped": str(dropped),
+            "late": str(self._order.late),
+            "images_received": str(self.images),
+            "images_waiting": str(self.images - self.settled),
+            "malformed": str(self._malformed),
+            "implausible": str(self._implausible),
+            "stamps_refused": str(sum(gate.refused for gate in self._gates.values())),
+            "stamp_jumps": str(sum(gate.jumps for gate in self._gates.values())),
+        }
+        verdicts = {} if self._watch is None else self._watch.verdicts
+        status = calibration_status(self.latest, counters)
+        if stuck_s > STUCK_S:
+            text = f"stuck: images arrive, none used or refused for {stuck_s:.0f} s"
+            status = replace(status, level=Level.STALE, message=text)
+        return [status, *delay_statuses(verdicts)]

@@ -1,0 +1,187 @@
+"""What is known before the first sample, in the estimator's terms: from the config, or from Kalibr's files.
+
+Kalibr's camchain.yaml (`cam0: intrinsics, T_cam_imu, timeshift_cam_imu, ...`) and imu.yaml keys, at the top
+level or under `imu0`; every key is optional.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+
+from vical_daemon.config import validation as schema
+from vical_daemon.config.cross_checks import coefficients_error, rigid_error
+from vical_daemon.config.model import Config, Focal, LensConfig, Matrix4
+from vical_daemon.config.strict_yaml import ConfigError, Document, Value, read
+from vical_daemon.config.validation import Bound
+from vical_daemon.estimation.geometry.camera_model import RADTAN
+from vical_daemon.estimation.measurements import (
+    CalibrationOptions,
+    CameraPrior,
+    ConvergenceTargets,
+    FloatArray,
+    ImuNoise,
+)
+
+Density = Annotated[float, Bound(above=0, high=10.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class _KalibrCamera:
+    """The keys of one camera in a Kalibr camchain; those below `resolution` are read and not used."""
+
+    camera_model: Literal["pinhole"] = "pinhole"
+    distortion_model: Literal["radtan", "plumb_bob", "equidistant", "none"] = "radtan"
+    intrinsics: tuple[Focal, Focal, float, float] | None = None
+    distortion_coeffs: tuple[float, ...] | None = None
+    T_cam_imu: Matrix4 | None = None
+    timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
+    line_delay: Annotated[float, Bound(low=0, high=1e-3, hint="seconds a line")] | None = None
+    readout_s: Annotated[float, Bound(low=0, high=0.2)] | None = None
+    resolution: tuple[Annotated[int, Bound(low=16)], Annotated[int, Bound(low=16)]] | None = None
+    rostopic: str | None = None
+    cam_overlaps: tuple[int, ...] | None = None
+    T_cn_cnm1: Matrix4 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _KalibrImu:
+    """The keys of one IMU in Kalibr's imu.yaml; those below `rate_hz` are read and not used."""
+
+    gyroscope_noise_density: Density = ImuNoise().gyro_density
+    gyroscope_random_walk: Density = ImuNoise().gyro_walk
+    accelerometer_noise_density: Density = ImuNoise().accel_density
+    accelerometer_random_walk: Density = ImuNoise().accel_walk
+    update_rate: Annotated[float, Bound(low=1, high=10000)] | None = None
+    rate_hz: Annotated[float, Bound(low=1, high=10000)] | None = None
+    rostopic: str | None = None
+    model: str | None = None
+    T_i_b: Matrix4 | None = None
+    time_offset: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Initial:
+    """What an `--initial` file says.
+
+    Attributes:
+        cameras: Prior by camera name; resolution (0, 0) where the file does not give it.
+        imu_noise: None where the file has no IMU keys.
+        imu_rate_hz: None where the file does not say.
+    """
+
+    cameras: dict[str, CameraPrior] = field(default_factory=dict)
+    imu_noise: ImuNoise | None = None
+    imu_rate_hz: float | None = None
+
+
+def read_initial(path: Path | str) -> Initial:
+    """Read a Kalibr camchain, imu.yaml, or both in one file.
+
+    Raises:
+        ConfigError: It cannot be used; one line.
+    """
+    document = read(Path(path))
+    cameras: dict[str, CameraPrior] = {}
+    imu: _KalibrImu | None = None
+    loose: dict[str, Value] = {
+        key: value for key, value in document.root.items() if not isinstance(value, dict)
+    }
+    if loose:  # Kalibr's own imu.yaml has its keys at the top level
+        imu = schema.build(Document(document.name, loose, document.lines), _KalibrImu)
+    for name in document.root:
+        if name in loose:
+            continue
+        if name.startswith("cam"):
+            camera = schema.build(document, _KalibrCamera, name)
+            cameras[name] = _camera_prior(document, name, camera)
+        elif name.startswith("imu"):
+            imu = imu or schema.build(document, _KalibrImu, name)
+        else:
+            raise ConfigError(
+                f"{name}: unknown section; expected cam0, cam1 ... or imu0 ({document.where(name)})"
+            )
+    return Initial(cameras, *(_noise(imu) if imu is not None else (None, None)))
+
+
+def camera_prior(config: Config, name: str) -> CameraPrior:
+    """Return the prior of one camera of a config."""
+    camera = config.cameras[name]
+    lens: LensConfig = camera.lens
+    return CameraPrior(
+        resolution=camera.size,
+        intrinsics=lens.intrinsics,
+        distortion_model=lens.distortion_model,
+        distortion=lens.distortion_coeffs,
+        T_imu_cam=_inverse(lens.T_cam_imu),
+        timeshift_cam_imu_s=lens.timeshift_cam_imu,
+        readout_s=lens.readout_s,
+    )
+
+
+def calibration_options(config: Config) -> CalibrationOptions:
+    """Return the estimator's switches of a config."""
+    calibration = config.calibration
+    wanted = calibration.convergence
+    imu = config.imus[config.calibration_imu] if config.imus else None
+    noise = ImuNoise()
+    if imu is not None:
+        n = imu.noise
+        noise = ImuNoise(n.gyro_density, n.gyro_walk, n.accel_density, n.accel_walk, imu.rate_hz)
+    return CalibrationOptions(
+        fix=frozenset(calibration.fix),
+        estimate=frozenset(calibration.estimate),
+        target_free=calibration.mode == "target_free",
+        gravity_mps2=calibration.gravity_mps2,
+        corner_sigma_px=calibration.corner_sigma_px,
+        imu_noise=noise,
+        targets=ConvergenceTargets(
+            wanted.position_sigma_m, math.radians(wanted.rotation_sigma_deg), wanted.timeshift_sigma_s
+        ),
+    )
+
+
+def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> CameraPrior:
+    model = RADTAN if camera.distortion_model == "none" else camera.distortion_model
+    coefficients = None if camera.distortion_model == "none" else camera.distortion_coeffs
+    if coefficients is not None and (text := coefficients_error(model, coefficients)):
+        raise ConfigError(schema.mistake(document, f"{name}.distortion_coeffs", text))
+    if camera.T_cam_imu is not None and (text := rigid_error(camera.T_cam_imu)):
+        raise ConfigError(schema.mistake(document, f"{name}.T_cam_imu", text))
+    resolution = camera.resolution or (0, 0)
+    readout_s = camera.readout_s or (camera.line_delay or 0.0) * resolution[1]
+    return CameraPrior(
+        resolution=resolution,
+        intrinsics=camera.intrinsics,
+        distortion_model=model,
+        distortion=coefficients,
+        T_imu_cam=_inverse(camera.T_cam_imu),
+        timeshift_cam_imu_s=camera.timeshift_cam_imu,
+        readout_s=readout_s,
+    )
+
+
+def _noise(imu: _KalibrImu) -> tuple[ImuNoise, float | None]:
+    rate_hz = imu.rate_hz or imu.update_rate
+    noise = ImuNoise(
+        imu.gyroscope_noise_density,
+        imu.gyroscope_random_walk,
+        imu.accelerometer_noise_density,
+        imu.accelerometer_random_walk,
+        rate_hz or ImuNoise().rate_hz,
+    )
+    return noise, rate_hz
+
+
+def _inverse(T_cam_imu: Matrix4 | None) -> tuple[FloatArray, FloatArray] | None:
+    """Turn Kalibr's T_cam_imu into (R_imu_cam, p_imu_cam); the rotation is made exactly orthonormal."""
+    if T_cam_imu is None:
+        return None
+    T = np.asarray(T_cam_imu, dtype=np.float64)
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    R_imu_cam = (U @ Vt).T
+    return R_imu_cam, -R_imu_cam @ T[:3, 3]

@@ -1,0 +1,55 @@
+"""Chooses what finds points in images: a detector for the board, or a tracker of natural features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from vical_daemon.config.model import Config
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from vical_daemon.vision.flow_prediction import FlowPredictor
+
+Detect = Callable[[Any, int], "Found | None"]
+"""Image and its stamp (ns) -> the points, or None where nothing was found."""
+
+
+class Found(Protocol):
+    """Points of one image; see `vision.detection.Detection`."""
+
+    @property
+    def ids(self) -> IntArray:
+        """Point or feature ids, shape (n,)."""
+        ...
+
+    @property
+    def uv_px(self) -> FloatArray:
+        """Pixel coordinates, shape (n, 2)."""
+        ...
+
+    @property
+    def sigma_px(self) -> FloatArray | None:
+        """One-sigma per axis, shape (n,), or None."""
+        ...
+
+
+def make_detector(config: Config, predictor: FlowPredictor | None = None) -> Detect:
+    """Make the detector of one camera (it may remember the image before).
+
+    Args:
+        config: The rig.
+        predictor: Foretells the flow of natural features; a board needs none.
+
+    Raises:
+        ConfigError: The target file is missing or wrong.
+    """
+    if config.calibration.mode == "target_free":
+        from vical_daemon.vision.tracks import FeatureTracker
+
+        return FeatureTracker(predictor=predictor).detect
+    from vical_daemon.vision.detector import BoardDetector
+    from vical_daemon.vision.target import load_target
+
+    assert config.target_path is not None  # `config.load` has seen to it
+    return BoardDetector(load_target(config.target_path)).detect

@@ -1,0 +1,234 @@
+"""Role detect: images in, target points (or feature tracks) out; the newest image wins when it is slow."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus, Sample, Subscription
+from vical_daemon.bus.messages import (
+    DiagnosticStatus,
+    Level,
+    MessageError,
+    admit_image,
+    decode_compressed_image,
+    encode_points,
+)
+from vical_daemon.bus.outgoing import Message, publish
+from vical_daemon.config.model import Config
+from vical_daemon.config.paths import make_private, runtime_directory
+from vical_daemon.config.priors import camera_prior
+from vical_daemon.detect.detectors import Detect, make_detector
+from vical_daemon.detect.flow_aid import GyroAid
+from vical_daemon.estimation.measurements import CameraPrior
+from vical_daemon.service import notify
+from vical_daemon.service.health import StatusSender
+from vical_daemon.service.wall_clock import WallClock, shared_clock
+
+QUEUE_DEPTH = 2
+_NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
+JOIN_S = 3.0
+STUCK_S = 20.0
+"""At one image for so long, s: a detection takes 0.1 s; on a slow card OpenCV takes some to load."""
+_SET_BACK_NS = 2e9  # further behind the last image than any queue can bring it
+_NEW_SIZE = 3  # images in a row
+_log = logging.getLogger(__name__)
+
+
+class DetectRole:
+    """Finds the points in the images of one camera. No I/O.
+
+    Args:
+        config: The rig.
+        camera: Name of the camera.
+        detector: Finds points in one image; None: what the config asks for.
+        prior: What is known about the camera; None: what the config says.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        camera: str,
+        detector: Detect | None = None,
+        prior: CameraPrior | None = None,
+    ) -> None:
+        self.camera = camera
+        free = config.calibration.mode == "target_free"
+        self.key = (topics.TRACKS if free else topics.POINTS).key(config.rig, camera)
+        self.aid: GyroAid | None = None
+        if free and config.imus:
+            self.aid = GyroAid(config, camera, prior or camera_prior(config, camera))
+        predictor = self.aid.predictor if self.aid else None
+        self._make: Callable[[], Detect] = lambda: detector or make_detector(config, predictor)
+        self._detect = self._make()
+        self._size: tuple[int, int] | None = None  # of the images of this camera: height, width
+        self._other: tuple[tuple[int, int], int] = ((0, 0), 0)  # another size, and how often in a row
+        self._problem = ""
+        self._period_ns = 1e9 / config.calibration.detect_rate_hz
+        self._next_ns = 0.0
+        self._images = self._found = self._malformed = self._skipped = self._failures = 0
+        self._busy_s = 0.0
+
+    def points(self, sample: Sample) -> list[Message]:
+        """Return the points message of one image (also when nothing was found); [] if it was skipped."""
+        begin_s = time.perf_counter()
+        try:
+            stamp_ns, image = _decode(sample)
+        except (MessageError, ValueError):
+            self._malformed += 1
+            return []
+        if not self._of_usual_size(image.shape[:2]):
+            self._malformed += 1
+            return []
+        if not self._due(stamp_ns):
+            self._skipped += 1
+            return []
+        self._images += 1
+        try:
+            if self.aid is not None:
+                self.aid.prepare()
+            found = self._detect(image, stamp_ns)
+        except Exception as error:  # OpenCV raises on pictures that nobody has thought of
+            self._failed(error)
+            return []
+        height, width = image.shape[:2]
+        points: tuple[Any, Any, Any] = (_NO_IDS, _NO_POINTS, None)
+        if found is not None:
+            self._found += 1
+            points = (found.ids, found.uv_px, found.sigma_px)
+        payload = encode_points(stamp_ns, self.camera, *points, (width, height))
+        self._busy_s += time.perf_counter() - begin_s
+        return [(self.key, payload)]
+
+    def _of_usual_size(self, size: tuple[int, int]) -> bool:
+        """Whether an image is as large as those before; a camera with a new setting is believed soon."""
+        if self._size is None or size == self._size:
+            self._size, self._other = size, ((0, 0), 0)
+            return True
+        self._other = (size, self._other[1] + 1 if size == self._other[0] else 1)
+        if self._other[1] < _NEW_SIZE:
+            return False
+        self._size = size
+        return True
+
+    def _due(self, stamp_ns: int) -> bool:
+        """Whether an image comes so late after the last one as `detect_rate_hz` asks for."""
+        ahead_ns = self._next_ns - stamp_ns
+        if 0.5 * self._period_ns < ahead_ns < _SET_BACK_NS:
+            return False
+        if ahead_ns >= _SET_BACK_NS:  # the clock was set back, or the image before was nonsense
+            self._next_ns = stamp_ns
+        self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
+        return True
+
+    def _failed(self, error: Exception) -> None:
+        """Go on with a fresh detector; each problem is said once."""
+        self._failures += 1
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        if text != self._problem:
+            self._problem = text
+            _log.error("%s: the detector failed and starts again: %s", self.camera, text)
+            told = f"{self.camera}: the detector failed and starts again: {text}"
+            notify.event("detector_restarted", told, level="warning", camera=self.camera)
+        self._detect = self._make()
+
+    def status(self, dropped: int = 0, busy_s: float = 0.0) -> DiagnosticStatus:
+        """Return how it goes.
+
+        Args:
+            dropped: Images that came while it was busy.
+            busy_s: For how long it has been at the present image.
+        """
+        share = self._found / self._images if self._images else 0.0
+        values = {
+            "images": str(self._images),
+            "with_points": str(self._found),
+            "skipped": str(self._skipped),
+            "dropped": str(dropped),
+            "malformed": str(self._malformed),
+            "failures": str(self._failures),
+            "detection_ms": f"{1e3 * self._busy_s / self._images if self._images else 0.0:.2f}",
+        }
+        if busy_s > STUCK_S:
+            text = f"stuck: at one image for {busy_s:.0f} s"
+            return DiagnosticStatus(Level.STALE, f"detect/{self.camera}", text, "", values)
+        message = f"{share:.0%} of {self._images} images show points"
+        level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK
+        return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)
+
+
+def attach_aid(bus: Bus, role: DetectRole) -> list[Subscription]:
+    """Let a role that follows natural features hear gyro and calibration; nothing for the others."""
+    if role.aid is None:
+        return []
+    return [
+        bus.subscribe(role.aid.imu_key, role.aid.take_imu),
+        bus.subscribe(role.aid.calibration_key, role.aid.take_calibration),
+    ]
+
+
+def _decode(sample: Sample) -> tuple[int, Any]:
+    """Return the stamp and the pixels of a raw or compressed image."""
+    parsed = topics.parse_key(sample.key)
+    if parsed is not None and parsed.topic is topics.COMPRESSED:
+        from vical_daemon.vision import image_codec
+
+        message = decode_compressed_image(sample.payload)
+        return message.stamp_ns, image_codec.decode_image(np.frombuffer(message.data, np.uint8))
+    image = admit_image(sample.payload)
+    return image.stamp_ns, image.pixels()
+
+
+def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | None = None) -> None:
+    """Detect in the images of every camera to be calibrated until `stop`.
+
+    Args:
+        config: The rig.
+        bus: Where images come from and points go.
+        stop: Ends the role.
+        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+    """
+    clock = clock or shared_clock(make_private(runtime_directory()))
+    workers = [_Worker(config, name, bus, stop) for name in config.calibration_cameras]
+    for worker in workers:
+        worker.thread.start()
+    StatusSender(config.rig, "detect", bus, clock).run_until(stop, lambda: [w.status() for w in workers])
+    for worker in workers:
+        worker.close()
+
+
+class _Worker:
+    """One camera's thread: takes the newest image, detects, publishes."""
+
+    def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
+        self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
+        self._since_s: float | None = None  # when it began with the present image
+        self._aid = attach_aid(bus, self._role)
+        key = topics.IMAGE.key(config.rig, camera)
+        self.subscription = bus.subscribe(key, depth=QUEUE_DEPTH, newest_wins=True)
+        self.thread = threading.Thread(target=self._run, name=f"detect/{camera}", daemon=True)
+
+    def close(self) -> None:
+        """End the subscriptions and wait for the thread."""
+        for subscription in (self.subscription, *self._aid):
+            subscription.close()
+        self.thread.join(JOIN_S)
+
+    def status(self) -> DiagnosticStatus:
+        since_s = self._since_s
+        busy_s = 0.0 if since_s is None else time.monotonic() - since_s
+        return self._role.status(self.subscription.dropped, busy_s)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            sample = self.subscription.recv(0.2)
+            if sample is not None:
+                self._since_s = time.monotonic()  # stays where the thread ends or hangs
+                publish(self._bus, self._role.points(sample))
+                self._since_s = None

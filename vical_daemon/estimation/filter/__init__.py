@@ -1,0 +1,1 @@
+"""The unscented filter and what feeds it."""

@@ -1,0 +1,395 @@
+"""The filter: square-root sigma-point propagation with the IMU and update with the points of one image.
+
+Equations and derivation: docs/math/filter.md. Nothing here decides *whether* to believe a result; that is
+`judge`. The filter never raises on data: each update returns a verdict.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from vical_daemon.estimation.filter import noise_updates as lessons
+from vical_daemon.estimation.filter.image_update import (
+    corner_gate,
+    curved_share,
+    frame_limit,
+    rows_of,
+    solve,
+)
+from vical_daemon.estimation.filter.linearise import (
+    Image,
+    Linear,
+    Straightness,
+    by_derivatives,
+    by_sigma_points,
+    project_errors,
+)
+from vical_daemon.estimation.filter.propagate import Moved, move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.filter.unobservable_directions import UnshownAxes
+from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.rates import Rates, rates_after
+from vical_daemon.estimation.model.retract import orthonormal, retract
+from vical_daemon.estimation.model.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    MOTION,
+    Layout,
+    MotionStart,
+    State,
+)
+from vical_daemon.estimation.noise.consistency import Consistency, normalised
+from vical_daemon.estimation.noise.corner_noise import CornerNoise
+from vical_daemon.estimation.noise.lens_agreement import LensAgreement
+from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
+from vical_daemon.estimation.noise.target_alternative import TargetDoubt
+
+_EYE = np.eye(3)
+_TINY = 1e-30 * np.eye(9)  # noise densities may be told as zero
+_MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
+
+
+@dataclass(slots=True)
+class CalibrationFilter:
+    """State and covariance with the two steps of the filter.
+
+    Attributes:
+        state: Nominal state at `state.t_s`.
+        layout: Where the errors live.
+        S: Lower-triangular square root of the covariance, shape (n, n).
+        imu_noise: Densities.
+        corner_noise: Measured corner noise by camera.
+        walk: Variance per second added to each error outside the motion model (drift of the time shift,
+            slow change of the mounting), shape (n,).
+        consistency: Measured consistency, by camera.
+        agreement: How far stretches of the data agree about the lens, by camera.
+        shared: Measured errors that the corners of an image share, by camera.
+        doubt: Whether the target is as stated, by camera, where the lens is held; else empty.
+        unshown: After a partial start: axes along which lever arms are not known.
+        drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
+        off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
+        rates: Rates at the state's instant.
+        nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
+        stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
+        began_s: When the data of this filter begin, s.
+    """
+
+    state: State
+    layout: Layout
+    S: FloatArray
+    imu_noise: ImuNoise
+    corner_noise: dict[str, CornerNoise]
+    walk: FloatArray
+    consistency: dict[str, Consistency] = field(default_factory=dict)
+    agreement: dict[str, LensAgreement] = field(default_factory=dict)
+    shared: dict[str, SharedErrors] = field(default_factory=dict)
+    doubt: dict[str, TargetDoubt] = field(default_factory=dict)
+    unshown: UnshownAxes | None = None
+    drifting: set[str] = field(default_factory=set)
+    off: set[str] = field(default_factory=set)
+    rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
+    nis_level: float = 4.0
+    stamp_sigma_s: float = 0.0
+    began_s: float = 0.0
+    _motion_straight: Straightness = field(default_factory=Straightness)
+    _view_straight: dict[str, Straightness] = field(default_factory=dict)
+
+    # ------------------------------------------------------------------ propagation
+    def predict(self, segment: ImuSegment) -> None:
+        """Propagate to the end of a segment that starts at the state's instant."""
+        if len(segment.t_s) < 2 or segment.t_s[-1] <= segment.t_s[0]:
+            self.rates = rates_after(self.state, segment, self.rates)
+            return
+        state = self.state
+        moved, Q = self._moved(segment)
+        self._grow(moved, Q)
+        state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
+        state.t_s = float(segment.t_s[-1])
+        self.rates = rates_after(state, segment, self.rates)
+
+    def _moved(self, segment: ImuSegment) -> tuple[Moved, FloatArray]:
+        """The motion at the end of a segment and the covariance of the noise gathered on the way."""
+        d = self.layout.dynamic
+        S = self.S[:d, :d]
+        sigmas = np.sqrt((S**2).sum(axis=1))
+        straight = self._motion_straight.holds(sigmas)
+        if straight:
+            moved = move_by_derivatives(self.state, self.layout, S, segment)
+        else:
+            moved = move_by_sigma_points(self.state, self.layout, S, segment)
+        Q = moved.influence.noise(self.imu_noise) + _TINY
+        if not straight:
+            share = np.sqrt((moved.curved**2).sum(axis=1) / np.diag(Q)).max()
+            self._motion_straight.measured(sigmas, float(share))
+        return moved, Q
+
+    def _grow(self, moved: Moved, Q: FloatArray) -> None:
+        """Assemble the columns of the new square root and make it triangular."""
+        n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
+        A = np.zeros((n, n + c + 9))
+        A[:, :n] = self.S
+        A[:9, :d] = moved.linear
+        self._drift_shifts(A, moved.seconds)
+        A[:9, n : n + c] = moved.curved
+        A[:9, n + c :] = unscented.root(Q)
+        self.S = unscented.lower_root(np.concatenate([A, self._random_walk(moved.seconds)], axis=1))
+
+    # ------------------------------------------------------------------ update
+    def update(self, image: Image) -> FrameReport:
+        """Correct the state with the points of one image; the verdict says what became of it."""
+        noise = self.corner_noise[image.camera]
+        lin = self._linearise(image)
+        innovation = image.uv - lin.z
+        predicted = np.where(lin.valid[:, None], lin.z, np.nan)
+        keep = lin.valid & corner_gate(image, innovation, lin)
+        if keep.sum() < 4:
+            return self._refused(image, innovation, predicted, "too few corners pass the gate")
+        fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
+        level = fit.nis / max(fit.dof, 1)
+        if fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level):
+            self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
+            return self._refused(
+                image,
+                innovation,
+                predicted,
+                f"innovation of the image is {level:.1f} times what it should be",
+            )
+        self.nis_level += 0.05 * (level - self.nis_level)
+        lessons.learn(self, image, lin, fit)
+        self._accept(fit.S, fit.dx)
+        self._pay_for_jitter(image.camera)
+        noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
+        keep = fit.keep
+        residual = fit.left * image.sigma_px[:, None]
+        self.consistency[image.camera].learn(
+            lin.z[keep], innovation[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
+        )
+        return FrameReport(
+            image.t_ns,
+            image.camera,
+            image.ids,
+            image.uv,
+            residual,
+            keep,
+            True,
+            fit.nis,
+            fit.dof,
+            noise.sigma_px,
+            predicted_px=predicted,
+        )
+
+    def _with_shared(self, image: Image, lin: Linear) -> Linear:
+        """The linearised image with the noise that its corners share."""
+        shared = self.shared.get(image.camera)
+        if shared is not None and (shared.jitter_s or shared.shift_px):
+            lin.shared = lin.by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas)
+        return lin
+
+    def _pay_for_jitter(self, camera: str) -> None:
+        """Take back what the images of before, used with less jitter than is known by now, told too much."""
+        index, shared = self.layout.cameras[camera].timeshift, self.shared.get(camera)
+        owed = shared.owed() if index is not None and shared is not None else 0.0
+        if owed:
+            column = np.zeros(self.layout.size)
+            column[index] = np.sqrt(owed)
+            self.loosen(column)
+
+    def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
+        """Put a measurement together with the noise it has at present."""
+        sigma = self.corner_noise[frame.camera].sigmas(frame.sigma_px, len(frame.ids))
+        sigma = sigma * np.sqrt(self.consistency[frame.camera].scale)
+        return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma)
+
+    @staticmethod
+    def _refused(image: Image, residual: FloatArray, predicted: FloatArray, why: str) -> FrameReport:
+        none = np.zeros(len(image.ids), dtype=bool)
+        return FrameReport(
+            image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why, predicted
+        )
+
+    def surprise(self, image: Image) -> float | None:
+        """Mean squared innovation of an image in the smooth modes, over its prediction."""
+        lin = self._linearise(image)
+        keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)
+        if keep.sum() < len(keep) // 2:
+            return 36.0
+        normal = normalised(
+            lin.z[keep], (image.uv - lin.z)[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
+        )
+        return None if normal is None else float(normal @ normal) / len(normal)
+
+    def predict_pixels(self, camera: str, t_cam_s: float, points: FloatArray) -> FloatArray:
+        """Where points should appear with the nominal state, px, shape (n, 2)."""
+        nominal = np.zeros((1, self.layout.size))
+        uv: FloatArray = project_errors(
+            self.state, self.layout, self.rates, camera, t_cam_s, points, None, nominal
+        )[0]
+        return uv
+
+    def _linearise(self, image: Image) -> Linear:
+        """The image about the nominal state, with the spread of the prior."""
+        where, known = self.layout.cameras[image.camera], self.state.cameras[image.camera]
+        rolling = where.readout is not None or known.readout_s != 0.0
+        straight = self._view_straight.setdefault(image.camera, Straightness())
+        sigmas = self.sigmas()
+        if not rolling and straight.holds(sigmas):
+            return self._with_shared(
+                image, by_derivatives(self.state, self.layout, self.rates, image, self.S)
+            )
+        lin = self._by_points(image, np.zeros(self.layout.size), self.S)
+        straight.measured(sigmas, curved_share(image, lin, lin.valid))
+        return lin
+
+    def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
+        lin = by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
+        return self._with_shared(image, lin)
+
+    def _accept(self, S: FloatArray, dx: FloatArray) -> None:
+        """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
+        self.S = S
+        turned = [ATTITUDE] + [c.rotation for c in self.layout.cameras.values() if c.rotation is not None]
+        if max(float(np.abs(dx[s]).max()) for s in turned) > 1e-4:
+            for s in turned:
+                half = 0.5 * dx[s]
+                J = np.eye(3) + np.array(
+                    [[0, half[2], -half[1]], [-half[2], 0, half[0]], [half[1], -half[0], 0]]
+                )
+                self.S[s] = J @ self.S[s]
+            self.S = unscented.lower_root(self.S)
+        self.state = retract(self.state, self.layout, dx)
+
+    def plausible(self) -> bool:
+        """Whether the state is one that a rig can have: finite, arm below 3 m, speed below 30 m/s."""
+        state = self.state
+        if not (np.isfinite(self.S).all() and float(np.abs(state.v_world_imu).max()) < _MAX_SPEED_MPS):
+            return False
+        return all(
+            float(np.abs(c.p_imu_cam).max()) < _MAX_ARM_M
+            and 0.2 < float(c.intrinsics[0]) / c.resolution[0] < 10.0
+            and abs(c.timeshift_s) < _MAX_SHIFT_S
+            for c in state.cameras.values()
+        )
+
+    def forget(self, index: int, sigma: float) -> None:
+        """Take one error as known to `sigma` only, whatever the rest says about it."""
+        self.S[index] = 0.0
+        self.reopen(index, sigma)
+
+    def reopen(self, index: int, sigma: float) -> None:
+        """Add independent uncertainty to one error: what was known about it is in doubt."""
+        column = np.zeros(self.layout.size)
+        column[index] = sigma
+        self.loosen(column)
+
+    def loosen(self, columns: FloatArray) -> None:
+        """Add the covariance `columns columns'`: directions of the errors, shape (n,) or (n, k), in doubt."""
+        added = columns.reshape(self.layout.size, -1)
+        self.S = unscented.lower_root(np.concatenate([self.S, added], axis=1))
+
+    def restart_motion(self, motion: MotionStart) -> None:
+        """Take the motion from elsewhere and keep the calibration, which ages until then.
+
+        Args:
+            motion: Where the rig is, independent of all that the filter knows.
+        """
+        state, dt = self.state, motion.elapsed_s
+        A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, 9))], axis=1)
+        self._drift_shifts(A, dt)
+        A[MOTION] = 0.0
+        A[MOTION, -9:] = np.diag(motion.sigmas)
+        self.S = unscented.lower_root(A)
+        state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
+        state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
+        for consistency in self.consistency.values():
+            consistency.settle()
+
+    def _random_walk(self, dt: float) -> FloatArray:
+        """Columns that biases and what else wanders gain in `dt` seconds, shape (n, k)."""
+        drift = np.flatnonzero(self.walk)
+        columns = np.zeros((self.layout.size, 6 + len(drift)))
+        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * _EYE
+        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * _EYE
+        columns[drift, 6 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
+        return columns
+
+    def _drift_shifts(self, A: FloatArray, dt: float) -> None:
+        """Let time shifts drift for `dt` seconds: nominal values, and their rows of the square root `A`."""
+        n = self.layout.size
+        for name, where in self.layout.cameras.items():
+            if where.timeshift is not None and where.skew is not None:
+                A[where.timeshift, :n] += dt * self.S[where.skew]
+                self.state.cameras[name].timeshift_s += dt * self.state.cameras[name].skew
+
+    def keep_from(self, known: CalibrationFilter) -> None:
+        """After a change of the mounting: take all from an earlier filter but what the change may have moved.
+
+        Found anew, and left as they are here, are motion, gravity in the target's frame, mountings, lever
+        arms and time shifts.
+
+        Args:
+            known: A filter of the same layout.
+        """
+        anew: list[slice] = [MOTION, GRAVITY]
+        for where in self.layout.cameras.values():
+            anew += [s for s in (where.position, where.rotation) if s is not None]
+            anew += [] if where.timeshift is None else [slice(where.timeshift, where.timeshift + 1)]
+        kept = np.ones(self.layout.size, dtype=bool)
+        for block in anew:
+            kept[block] = False
+        elapsed_s = max(self.state.t_s - known.state.t_s, 0.0)
+        old = np.concatenate([known.S, known._random_walk(elapsed_s)], axis=1)
+        rows = kept[:, None]
+        self.S = unscented.lower_root(
+            np.concatenate([np.where(rows, old, 0.0), np.where(rows, 0.0, self.S)], axis=1)
+        )
+        here, there = self.state, known.state
+        self.state = replace(
+            there,
+            t_s=here.t_s,
+            R_world_imu=here.R_world_imu,
+            p_world_imu=here.p_world_imu,
+            v_world_imu=here.v_world_imu,
+            gravity=here.gravity,
+            tilt=here.tilt,
+            cameras={
+                name: replace(
+                    camera,
+                    R_imu_cam=here.cameras[name].R_imu_cam,
+                    p_imu_cam=here.cameras[name].p_imu_cam,
+                    timeshift_s=here.cameras[name].timeshift_s,
+                )
+                for name, camera in there.cameras.items()
+            },
+        )
+        self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
+        self.agreement, self.doubt, self.walk = known.agreement, known.doubt, known.walk
+        self.drifting, self.off, self.began_s = known.drifting, known.off, known.began_s
+        for consistency in self.consistency.values():
+            consistency.settle()
+
+    def copy(self) -> CalibrationFilter:
+        """A filter that can be run ahead of this one; what is measured about the noise stays shared."""
+        return replace(
+            self,
+            state=deepcopy(self.state),
+            S=self.S.copy(),
+            _motion_straight=Straightness(),
+            _view_straight={},
+        )
+
+    def sigmas(self) -> FloatArray:
+        """Standard deviation of every error, shape (n,)."""
+        return np.asarray(np.sqrt((self.S**2).sum(axis=1)))
+
+    def covariance(self, rows: list[int]) -> FloatArray:
+        """Covariance of chosen errors, shape (k, k)."""
+        part = self.S[rows]
+        return np.asarray(part @ part.T)

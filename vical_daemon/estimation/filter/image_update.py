@@ -1,0 +1,166 @@
+"""The linear algebra of one image's correction: gates, compression, and iteration while far from straight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import chdtri
+
+from vical_daemon.estimation.filter.linearise import Image, Linear
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.model import unscented
+
+_ITERATIONS = 5
+_LEAST = 4  # points for a correction
+_CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
+_CORNER_GATE = float(chdtri(2, 1e-4))
+_RESIDUAL_GATE = float(chdtri(2, 2e-5))
+_FRAME_GATE_P = 1e-9
+_ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
+
+Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
+
+
+@lru_cache(maxsize=256)
+def frame_limit(dof: int) -> float:
+    """Chi-square limit of a whole frame (scipy takes half a millisecond for it)."""
+    return float(chdtri(dof, _FRAME_GATE_P))
+
+
+@dataclass(slots=True)
+class ImageFit:
+    """Outcome of a correction.
+
+    Attributes:
+        S: New square root of the covariance, shape (c, c).
+        dx: State step, shape (c,).
+        nis: Normalised innovation squared of what the state can explain.
+        dof: Its degrees of freedom.
+        keep: Which points took part, shape (n,).
+        rest: Sum of squares that no state error explains, whitened.
+        dof_rest: Its degrees of freedom.
+        left: Whitened residuals after the correction, shape (n, 2).
+        ways: The ways of the kept rows, whitened and compressed: sums over the rows stay, shape (m, k).
+        r: Their innovation, shape (m,).
+    """
+
+    S: FloatArray
+    dx: FloatArray
+    nis: float
+    dof: int
+    keep: BoolArray
+    rest: float
+    dof_rest: int
+    left: FloatArray
+    ways: FloatArray
+    r: FloatArray
+
+
+def rows_of(keep: BoolArray) -> BoolArray | slice:
+    """The two rows of each point kept; a slice where that is all of them, which copies nothing."""
+    return slice(None) if keep.all() else np.repeat(keep, 2)
+
+
+def whitened(image: Image, lin: Linear, keep: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """The ways of the kept corners and their innovation over the corner noise, shapes (2n, k), (2n,)."""
+    sigma = image.sigma_px[keep]
+    ways = lin.ways[rows_of(keep)] / np.repeat(sigma, 2)[:, None]
+    return ways, ((image.uv - lin.z)[keep] / sigma[:, None]).ravel()
+
+
+def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
+    """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
+    moves = lin.moves
+    size = len(moves)
+    moved = lin.ways @ (unscented.lower_root(moves) if moves.shape[1] > size else moves)
+    var = np.einsum("ij,ij->i", moved, moved)
+    if lin.curved.size:
+        var += np.einsum("ij,ij->i", lin.curved, lin.curved)
+    var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]
+    passed: BoolArray = (innovation**2 / var).sum(axis=1) < _CORNER_GATE
+    return passed
+
+
+def curved_share(image: Image, lin: Linear, keep: BoolArray) -> float:
+    """Largest second-order standard deviation of a corner over its noise."""
+    if not lin.curved.size or not keep.any():
+        return 0.0
+    share = np.sqrt((lin.curved**2).sum(axis=1)).reshape(-1, 2).max(axis=1) / image.sigma_px
+    return float(share[keep].max())
+
+
+def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, linearise: Linearise) -> ImageFit:
+    """Iterated posterior linearisation (once is enough when the prior is tight).
+
+    Args:
+        image: The points.
+        prior: Square root of the covariance, shape (c, c).
+        lin: The image linearised about the prior.
+        keep: Points that passed the gate, shape (n,).
+        linearise: Linearises anew about a step and a spread.
+
+    Returns:
+        The fit. [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
+    """
+    S, dx = prior, np.zeros(len(prior))
+    spread, offset = lin.spread, np.zeros(2 * len(image.ids))
+    weight = 1.0 / np.repeat(image.sigma_px, 2)
+    for step in range(_ITERATIONS):
+        if step:
+            lin = linearise(dx, S)
+            if (keep & lin.valid).sum() < _LEAST:  # about this step most points are behind the camera
+                break
+            keep = keep & lin.valid
+            # the innovation refers to the prior mean
+            spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
+        r = ((image.uv - lin.z).ravel() + offset) * weight
+        fit = _correct(prior, spread, r, lin, weight, keep)
+        if curved_share(image, lin, fit.keep) < _CURVED:
+            break
+        step_size = unscented.solve_lower(fit.S, fit.dx - dx)
+        S, dx, keep = fit.S, fit.dx, fit.keep
+        if step and float(np.linalg.norm(step_size)) < 0.05:
+            break
+    return fit
+
+
+def _correct(
+    prior: FloatArray, spread: FloatArray, r: FloatArray, lin: Linear, weight: FloatArray, keep: BoolArray
+) -> ImageFit:
+    """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
+    ways = lin.ways * weight[:, None]
+    k = ways.shape[1]
+    if lin.curved.size:
+        curved = lin.curved * weight[:, None]
+        if float((curved**2).sum(axis=1).max(initial=0.0)) > 1e-4:
+            ways = np.concatenate([ways, curved], axis=1)
+    for _ in range(3):
+        rows = rows_of(keep)
+        R, r_small, rest, dof_rest = unscented.compress(ways[rows], r[rows])
+        small = np.concatenate([R[:, :k] @ spread, R[:, :k] @ lin.shared, R[:, k:]], axis=1)
+        c = unscented.correct(prior, small, r_small)
+        e, shared, bent = np.split(c.solution, np.cumsum([len(prior), lin.shared.shape[1]]))
+        left = (r - ways @ np.concatenate([spread @ e + lin.shared @ shared, bent])).reshape(-1, 2)
+        bad = keep & ((left**2).sum(axis=1) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
+        if not bad.any() or (keep & ~bad).sum() < _LEAST:
+            break
+        keep = keep & ~bad
+    # Rows that no state moves are residuals like the rest, and say nothing about whether the innovations fit.
+    alone = np.einsum("ij,ij->i", small, small) < _ALONE if dof_rest else np.zeros(len(r_small), bool)
+    apart = float((r_small[alone] ** 2).sum())
+    count = int(alone.sum())
+    return ImageFit(
+        c.S,
+        c.dx,
+        max(c.nis - apart, 0.0),
+        max(len(r_small) - count, 1),
+        keep,
+        rest + apart,
+        dof_rest + count,
+        left,
+        R[:, :k],
+        r_small,
+    )

@@ -1,0 +1,249 @@
+"""How an image depends on the state: by sigma points, or by derivatives where the spread is small.
+
+Sigma points see the second-order part of the model. Once that part is far below the corner noise, they cost
+fifty projections and say what one derivative says: then the derivative is taken. Which of the two holds is
+*measured*, and measured again when a sigma has grown or some time has passed. [docs/math/filter.md, eq. (11)]
+
+An image can move in few ways only: six with the pose of the camera, some with its lens. So the derivatives by
+forty errors of the state are kept as a product, rows by ways times ways by errors, and whatever goes through
+all rows of an image goes through fourteen columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.inertial.imu_model import cross
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
+from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.model.rates import Rates
+from vical_daemon.estimation.model.retract import camera_points, pose_points
+from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, Layout, State
+from vical_daemon.estimation.model.target_modes import MODES
+from vical_daemon.estimation.model.target_view import view
+
+_FLAT = 0.02  # second-order part over corner noise below which the model is straight
+_GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
+_FAR_PX = 1e5  # pixels of a point beside the camera, not before it
+_TRUST = 100  # images for which a measurement of the second-order part holds
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """One image as the update sees it.
+
+    Attributes:
+        camera: Camera name.
+        t_ns: Stamp for the report, camera clock, ns.
+        t_cam_s: The same, s since the base.
+        ids: Point ids, shape (n,).
+        points: Their places in the world, m, shape (n, 3).
+        uv: Measured pixels, shape (n, 2).
+        sigma_px: White noise of each corner per axis, px, shape (n,).
+    """
+
+    camera: str
+    t_ns: int
+    t_cam_s: float
+    ids: IntArray
+    points: FloatArray
+    uv: FloatArray
+    sigma_px: FloatArray
+
+
+@dataclass(slots=True)
+class Linear:
+    """One image linearised: z + ways (spread e + shared c) + curved u, in pixels; e, c, u ~ N(0, I).
+
+    Attributes:
+        z: Mean of the predicted pixels, shape (n, 2).
+        ways: How pixels move in each of the k ways in which the image can move, shape (2n, k).
+        by_error: The ways by the errors of the state: the derivatives are H = ways @ by_error; shape (k, c).
+        spread: `by_error` S, shape (k, c).
+        curved: Square root of the second-order covariance, shape (2n, q); q = 0 where it is negligible.
+        valid: Points in front of the camera, shape (n,).
+        shared: Square root of the noise that all corners share, in the same ways (a late stamp moves them
+            all), shape (k, r).
+    """
+
+    z: FloatArray
+    ways: FloatArray
+    by_error: FloatArray
+    spread: FloatArray
+    curved: FloatArray
+    valid: BoolArray
+    shared: FloatArray
+
+    @property
+    def moves(self) -> FloatArray:
+        """What moves the image beside the corners' own noise: states and what corners share, (k, c + r)."""
+        return np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
+
+
+def project_errors(
+    state: State,
+    layout: Layout,
+    rates: Rates,
+    camera: str,
+    t_cam_s: float,
+    points: FloatArray,
+    uv: FloatArray | None,
+    errors: FloatArray,
+) -> FloatArray:
+    """Pixels of target points for a batch of state errors.
+
+    Args:
+        state: Nominal state.
+        layout: Where the errors live.
+        rates: Rates at the state's instant.
+        camera: Name.
+        t_cam_s: Image stamp, s since the base.
+        points: Points of the target, m, shape (n, 3).
+        uv: Measured pixels (rows of a rolling shutter), shape (n, 2); None: as a global shutter sees them.
+        errors: Shape (S, size).
+
+    Returns:
+        Pixels, shape (S, n, 2).
+    """
+    where, known = layout.cameras[camera], state.cameras[camera]
+    motion = pose_points(state, errors)
+    cam = camera_points(known, layout, camera, errors)
+    world: FloatArray = points * state.target_scale
+    if layout.target_scale is not None:
+        world = points * (state.target_scale + errors[:, layout.target_scale])[:, None, None]
+    if layout.target_modes is not None and layout.target_shape is not None:
+        shapes = state.target_shape + errors[:, layout.target_shape]
+        world = world + np.einsum("npm,sm->snp", layout.target_modes.fields(points), shapes)
+    ahead = t_cam_s - state.t_s
+    rows = None
+    if where.readout is not None or known.readout_s != 0.0:
+        if uv is None:
+            uv = view(world, motion, cam, rates, ahead, known.distortion_model)[0]
+        rows = uv[:, 1] / known.resolution[1] - 0.5
+    return view(world, motion, cam, rates, ahead, known.distortion_model, rows)
+
+
+def by_sigma_points(
+    state: State, layout: Layout, rates: Rates, image: Image, dx: FloatArray, S: FloatArray
+) -> Linear:
+    """Statistical linearisation about `dx` with spread S (all in the chart of the prior)."""
+    errors = dx + unscented.offsets(S)
+    pixels = project_errors(state, layout, rates, image.camera, image.t_cam_s, image.points, image.uv, errors)
+    with np.errstate(invalid="ignore"):  # nan is behind the camera
+        valid: BoolArray = np.asarray((np.abs(pixels) < _FAR_PX).all(axis=(0, 2)))
+    flat = np.where(valid[None, :, None], pixels, 0.0).reshape(len(pixels), -1)
+    m = unscented.moments(flat[1:] - flat[0])
+    # the columns of S are the ways
+    by_error = unscented.solve_lower(S, np.eye(len(S)))
+    unit, none = np.eye(len(S)), np.zeros((len(S), 0))
+    return Linear((flat[0] + m.shift).reshape(-1, 2), m.linear, by_error, unit, m.curved, valid, none)
+
+
+def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
+    """The same to first order, about the nominal state; global shutter only."""
+    uv, ways, by_error = view_derivatives(state, layout, rates, image)
+    valid: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
+    if not valid.all():
+        uv, ways = np.where(valid[:, None], uv, 0.0), np.where(np.repeat(valid, 2)[:, None], ways, 0.0)
+    k = len(by_error)
+    return Linear(uv, ways, by_error, by_error @ S, np.zeros((len(ways), 0)), valid, np.zeros((k, 0)))
+
+
+def view_derivatives(
+    state: State, layout: Layout, rates: Rates, image: Image
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How the pixels move with the camera and its lens, and those with the errors of the state.
+
+    The ways are: the camera turns by phi and moves by tau (in its own frame), d x_cam = x_cam x phi - tau;
+    its lens; the size of the target and its shape. Global shutter.
+    [docs/math/filter.md, eq. (7); derivatives tested against differences]
+
+    Returns:
+        Pixels (n, 2); their derivatives in the k ways, shape (2n, k); the ways by the errors of the state,
+        shape (k, size).
+    """
+    where, cam = layout.cameras[image.camera], state.cameras[image.camera]
+    ahead_s = image.t_cam_s + cam.timeshift_s - state.t_s
+    turn = so3.exp_one(rates.omega * ahead_s)
+    R = state.R_world_imu @ turn
+    p = state.p_world_imu + ahead_s * (state.v_world_imu + (0.5 * ahead_s) * rates.accel)
+    place = image.points * state.target_scale
+    if layout.target_modes is not None and layout.target_shape is not None:
+        place = place + layout.target_modes.fields(image.points) @ state.target_shape
+    arm = place - p
+    x_cam = (arm @ R - cam.p_imu_cam) @ cam.R_imu_cam
+    with np.errstate(all="ignore"):
+        uv, J, J_lens = project_jacobians(x_cam, cam.intrinsics, cam.distortion, cam.distortion_model)
+    J = J.reshape(-1, 3)
+    by_error = _pose_by_error(state, layout, rates, image.camera, ahead_s, turn)
+    ways = np.empty((len(J), len(by_error)))
+    ways[:, :3] = cross(J, np.repeat(x_cam, 2, axis=0))  # j' (x x phi) = (j x x)' phi
+    ways[:, 3:6] = -J
+    if where.intrinsics is not None and where.distortion is not None:
+        n = J_lens.shape[-1]
+        ways[:, 6 : 6 + n] = J_lens.reshape(-1, n)
+        by_error[6 : 6 + n, where.intrinsics.start : where.distortion.stop] = np.eye(n)
+    at = len(by_error) - MODES * (layout.target_shape is not None)
+    if layout.target_scale is not None:
+        grown = image.points @ (R @ cam.R_imu_cam)
+        ways[:, at - 1] = np.einsum("ij,ij->i", J, np.repeat(grown, 2, axis=0))
+        by_error[at - 1, layout.target_scale] = 1.0
+    if layout.target_modes is not None and layout.target_shape is not None:
+        moved = (R @ cam.R_imu_cam).T @ layout.target_modes.fields(image.points)
+        ways[:, at:] = (J.reshape(-1, 2, 3) @ moved).reshape(-1, MODES)
+        by_error[at:, layout.target_shape] = np.eye(MODES)
+    return uv, ways, by_error
+
+
+def _pose_by_error(
+    state: State, layout: Layout, rates: Rates, camera: str, ahead_s: float, turn: FloatArray
+) -> FloatArray:
+    """Turn and move of the camera (first six rows) by the errors of the state; rows of lens and scale are 0.
+
+    A rig that turns by a (imu frame, at the image) turns its camera by phi = R_imu_cam' a and moves it by
+    tau = R_imu_cam' (a x p_imu_cam).
+    """
+    where, cam = layout.cameras[camera], state.cameras[camera]
+    lens = 4 + len(cam.distortion) if where.intrinsics is not None else 0
+    rows = 6 + lens + (layout.target_scale is not None) + MODES * (layout.target_shape is not None)
+    out = np.zeros((rows, layout.size))
+    to_cam = cam.R_imu_cam.T
+    arm = -to_cam @ so3.hat(cam.p_imu_cam)
+    out[0:3, ATTITUDE], out[3:6, ATTITUDE] = to_cam @ turn.T, arm @ turn.T
+    from_world = to_cam @ (state.R_world_imu @ turn).T
+    out[3:6, POSITION], out[3:6, VELOCITY] = from_world, ahead_s * from_world
+    if where.position is not None and where.rotation is not None:
+        out[3:6, where.position] = to_cam
+        out[0:3, where.rotation] = np.eye(3)
+    if where.timeshift is not None:
+        out[0:3, where.timeshift] = to_cam @ rates.omega
+        speed = state.v_world_imu + ahead_s * rates.accel
+        out[3:6, where.timeshift] = arm @ rates.omega + from_world @ speed
+    return out
+
+
+@dataclass(slots=True)
+class Straightness:
+    """Remembers down to which sigmas a model was seen to be straight.
+
+    Attributes:
+        limits: Sigmas up to which it is; empty: not known to be.
+        left: Uses for which that holds.
+    """
+
+    limits: FloatArray = field(default_factory=lambda: np.zeros(0))
+    left: int = 0
+
+    def holds(self, sigmas: FloatArray) -> bool:
+        """Whether derivatives will do for this spread; counts down."""
+        self.left -= 1
+        return self.left > 0 and len(self.limits) == len(sigmas) and bool((sigmas <= self.limits).all())
+
+    def measured(self, sigmas: FloatArray, share: float) -> None:
+        """Take a measurement: second-order part over noise at these sigmas."""
+        self.limits = _GROWN * sigmas if share < _FLAT else np.zeros(0)
+        self.left = _TRUST

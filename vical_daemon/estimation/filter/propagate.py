@@ -1,0 +1,113 @@
+"""How inertial readings move the motion and its spread: by sigma points, or derivatives where these agree."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
+from vical_daemon.estimation.inertial.imu_model import Influence, Motion, compose, influence, strapdown
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.model.imu_scale import by_entries
+from vical_daemon.estimation.model.retract import motion_points
+from vical_daemon.estimation.model.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    POSITION,
+    VELOCITY,
+    Layout,
+    State,
+    grp_from_rotation,
+    rotation_from_grp,
+)
+
+_BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
+_EYE = np.eye(3)
+
+
+class Moved(NamedTuple):
+    """Motion at the end of a segment.
+
+    Attributes:
+        R, p, v: Mean.
+        linear: F S of [attitude, position, velocity], shape (9, d).
+        curved: Square root of the second-order covariance, shape (9, k); k = 0 by derivatives.
+        influence: What errors of the readings do to it.
+        seconds: Length of the segment.
+    """
+
+    R: FloatArray
+    p: FloatArray
+    v: FloatArray
+    linear: FloatArray
+    curved: FloatArray
+    influence: Influence
+    seconds: float
+
+
+def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
+    """Statistical linearisation of the strapdown equations over one segment; S of the dynamic errors."""
+    points = motion_points(state, layout, unscented.offsets(S))
+    relative = strapdown(
+        segment,
+        points.gyro_bias,
+        points.accel_bias,
+        points.gyro_matrix,
+        points.accel_matrix,
+        points.accel_lag_s,
+    )
+    end = compose(Motion(points.R, points.p, points.v), relative, points.gravity)
+    values = np.concatenate(
+        [grp_from_rotation(end.R[0].T @ end.R[1:]), end.p[1:] - end.p[0], end.v[1:] - end.v[0]], axis=1
+    )
+    m = unscented.moments(values)
+    return Moved(
+        end.R[0] @ rotation_from_grp(m.shift[ATTITUDE]),
+        end.p[0] + m.shift[POSITION],
+        end.v[0] + m.shift[VELOCITY],
+        m.linear,
+        m.curved,
+        influence(state.R_world_imu, relative),
+        float(relative.t_s[-1]),
+    )
+
+
+def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
+    """The same to first order about the nominal state."""
+    entries = layout.gyro_matrix is not None and layout.accel_matrix is not None
+    M_g, M_a = (state.gyro_matrix[None], state.accel_matrix[None]) if entries else (None, None)
+    lag_s = None if layout.accel_lag is None else np.array([state.accel_lag_s])
+    relative = strapdown(segment, state.gyro_bias[None], state.accel_bias[None], M_g, M_a, lag_s)
+    T = float(relative.t_s[-1])
+    dR, dv, dp = relative.dR[0, -1], relative.dv[0, -1], relative.dp[0, -1]
+    R, g = state.R_world_imu, state.gravity
+    errors = influence(R, relative)
+    F = np.zeros((9, len(S)))
+    tilt = -so3.hat(g) @ state.tilt
+    F[ATTITUDE, ATTITUDE] = dR.T
+    F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ so3.hat(dp), -R @ so3.hat(dv)
+    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = _EYE
+    F[POSITION, VELOCITY] = T * _EYE
+    F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        bias = np.concatenate([state.gyro_bias, state.accel_bias])
+        by = by_entries(errors, segment, bias, state.gyro_matrix, state.accel_matrix)
+        F[:, _BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
+    else:
+        F[:, _BIASES] = errors.by_bias()
+    if layout.accel_lag is not None and segment.accel_slope is not None:
+        F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)
+    return Moved(
+        R @ dR,
+        state.p_world_imu + T * state.v_world_imu + (0.5 * T * T) * g + R @ dp,
+        state.v_world_imu + T * g + R @ dv,
+        F @ S,
+        np.zeros((9, 0)),
+        errors,
+        T,
+    )

@@ -1,0 +1,95 @@
+"""Turns the filter's state into the plain numbers of an estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
+from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+
+
+def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float) -> CameraEstimate:
+    """One camera as it is known now.
+
+    Sigmas are the filter's times the square root of the measured correlation factor: errors that last for
+    several images count less than the filter thinks (see `consistency`); those of the lens at least as
+    much as stretches of the data disagree about it (see `lens_agreement`), and as detectors allow
+    (`lens_limit`).
+    """
+    camera, where = f.state.cameras[name], f.layout.cameras[name]
+    spread = float(np.sqrt(f.consistency[name].factor))
+    sigma = spread * f.sigmas()
+    lens_sigma = _lens_sigmas(f, name, spread)
+    q = so3.quat_from_matrix(camera.R_imu_cam)
+    return CameraEstimate(
+        PoseEstimate(
+            camera.p_imu_cam.tolist(),
+            q.tolist(),
+            (spread**2 * pose_covariance(f, where)).tolist(),
+        ),
+        float(camera.timeshift_s),
+        _timeshift_sigma(f, sigma, where),
+        camera.intrinsics.tolist(),
+        lens_sigma[:4].tolist(),
+        camera.distortion_model,
+        camera.distortion.tolist(),
+        lens_sigma[4:].tolist(),
+        float(reprojection_rms_px),
+        float(f.corner_noise[name].sigma_px),
+        [],
+        float(camera.readout_s),
+        float(sigma[where.readout]) if where.readout is not None else 0.0,
+        [int(size) for size in camera.resolution],
+    )
+
+
+def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
+    """Of fx fy cx cy and the distortion, shape (n,); zeros where held."""
+    camera, where, agreement = f.state.cameras[name], f.layout.cameras[name], f.agreement[name]
+    if where.intrinsics is None or where.distortion is None:
+        return np.zeros(4 + len(camera.distortion))
+    raw = f.sigmas()
+    filtered = np.maximum(np.sqrt(agreement.factors), spread) * np.concatenate(
+        [raw[where.intrinsics], raw[where.distortion]]
+    )
+    return np.asarray(np.sqrt(filtered**2 + agreement.moved**2 + lens_limit(camera) ** 2))
+
+
+def _timeshift_sigma(f: CalibrationFilter, sigma: FloatArray, where: CameraSlices) -> float:
+    if where.timeshift is None:
+        return 0.0
+    return float(np.hypot(sigma[where.timeshift], f.unshown.timeshift_sigma_s if f.unshown else 0.0))
+
+
+def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
+    """Biases and, where asked for, the matrices."""
+    sigma = f.sigmas()
+    return ImuEstimate(
+        f.state.gyro_bias.tolist(),
+        f.state.accel_bias.tolist(),
+        sigma[GYRO_BIAS].tolist(),
+        sigma[ACCEL_BIAS].tolist(),
+        f.state.gyro_matrix.tolist() if matrices else [],
+        f.state.accel_matrix.tolist() if matrices else [],
+    )
+
+
+def pose_covariance(f: CalibrationFilter, where: CameraSlices) -> FloatArray:
+    """What is not known of T_imu_cam, order [px py pz rx ry rz], shape (6, 6).
+
+    The filter's covariance and what it holds; zeros where all is fixed.
+    """
+    if where.position is None or where.rotation is None:
+        return np.zeros((6, 6))
+    rows = [
+        *range(where.position.start, where.position.stop),
+        *range(where.rotation.start, where.rotation.stop),
+    ]
+    covariance = f.covariance(rows)
+    if f.unshown is not None:
+        covariance += f.unshown.covariance()
+    return covariance

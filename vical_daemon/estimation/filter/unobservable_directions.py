@@ -1,0 +1,139 @@
+"""What the motion shows nothing of: held in the filter, unknown in what is said.
+
+Where an axis `a` of the imu keeps its direction R a in the world, a lever arm longer by `a` and an imu that
+stands back by `R a` give the same images: the motion shows nothing of it, and whatever it is assumed to be,
+the rest comes out the same. A filter that lets it float sees `R a` in slightly different directions at each
+image and takes that for information (as SLAM filters do; Huang et al. 2010): its sigma collapses while it
+runs off. So it is held, its variance is added where the estimate leaves, and the first real turn of the
+axis releases it.
+
+Where the rig turns at one rate about one axis all the time, another delay is another angle about that axis,
+and whatever that angle is assumed to be, gravity follows; a longer lever arm is another bias of the
+accelerometer. So all of these are held, until another motion starts all anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import POSITION, CameraSlices
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+
+STILL_RAD = 0.05
+"""RMS turn of an axis below which it has shown nothing of a lever arm along it."""
+HELD_M = 1e-3
+"""Sigma with which a lever arm is held at zero along such an axis, m."""
+UNKNOWN_M = 0.3
+"""Sigma of a lever arm that nothing is known of, m: a robot's, not a telephone's."""
+BENT_M = 1e-3
+"""By how much holding one axis bends the others, m: the axis is known to a milliradian, what is held along it
+is wrong by centimetres, and the filter's own sigmas come out below the bound (errors of 1 to 1.5 mm seen)."""
+UNKNOWN_S = 0.3
+"""Sigma of a delay that nothing is known of, s."""
+UNKNOWN_RAD = float(np.pi / np.sqrt(3.0))
+"""Sigma of an angle that nothing is known of: any is as likely."""
+_HELD_S, _HELD_SKEW, _HELD_RAD = 1e-6, 1e-9, 1e-6
+_EVERY_S = 1.0
+
+
+@dataclass(slots=True)
+class UnshownAxes:
+    """Follows the attitude of a filter from its partial start on.
+
+    Attributes:
+        axes: Of the imu, along which lever arms are held, unit length, shape (k, 3).
+        turn_axis_cam: Of a rig that turns about it at one rate all the time, camera frame, unit length,
+            shape (3,): the delay and the mounting about it are held, with all lever arms; None: they are not.
+    """
+
+    axes: FloatArray
+    turn_axis_cam: FloatArray | None = None
+    _mean: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    _count: int = 0
+    _next_s: float = float("-inf")
+
+    def hold(self, root: FloatArray, where: CameraSlices) -> None:
+        """Make the sigmas of a filter that begins small where the motion shows nothing.
+
+        Args:
+            root: Its square root of the covariance, diagonal; changed in place.
+            where: Of the camera.
+        """
+        if where.position is not None:
+            held = self.projector
+            root[where.position, where.position] = UNKNOWN_M * (np.eye(3) - held) + HELD_M * held
+        if self.turn_axis_cam is None:
+            return
+        if where.rotation is not None:
+            held = np.outer(self.turn_axis_cam, self.turn_axis_cam)
+            free = root[where.rotation, where.rotation]
+            root[where.rotation, where.rotation] = free @ (np.eye(3) - held) + _HELD_RAD * held
+        if where.timeshift is not None and where.skew is not None:
+            root[where.timeshift, where.timeshift] = _HELD_S
+            root[where.skew, where.skew] = _HELD_SKEW
+
+    def follow(self, f: CalibrationFilter) -> None:
+        """Look at the filter after an image, and release what has turned by now."""
+        if self.turn_axis_cam is not None:
+            return
+        self._count += 1
+        self._mean += (f.state.R_world_imu - self._mean) / self._count
+        if f.state.t_s < self._next_s:
+            return
+        self._next_s = f.state.t_s + _EVERY_S
+        length = np.linalg.norm(self._mean @ self.axes.T, axis=0)
+        turned = 1.0 - length**2 > STILL_RAD**2
+        for axis in self.axes[turned]:
+            self._release(f, axis)
+        self.axes = self.axes[~turned]
+
+    @staticmethod
+    def _release(f: CalibrationFilter, axis: FloatArray) -> None:
+        column = np.zeros(f.layout.size)
+        column[POSITION] = -UNKNOWN_M * (f.state.R_world_imu @ axis)
+        for where in f.layout.cameras.values():
+            if where.position is not None:
+                column[where.position] = UNKNOWN_M * axis
+        f.loosen(column)
+
+    @property
+    def projector(self) -> FloatArray:
+        """Onto the axes, shape (3, 3)."""
+        out: FloatArray = self.axes.T @ self.axes
+        return out
+
+    def covariance(self) -> FloatArray:
+        """What is not known of a T_imu_cam beyond the filter's covariance, [p r], m, rad, shape (6, 6)."""
+        out, held = np.zeros((6, 6)), self.projector
+        if held.any():
+            out[:3, :3] = held_covariance(held)
+        if self.turn_axis_cam is not None:
+            out[3:, 3:] = UNKNOWN_RAD**2 * np.outer(self.turn_axis_cam, self.turn_axis_cam)
+        return out
+
+    @property
+    def timeshift_sigma_s(self) -> float:
+        """What is not known of a delay beyond the filter's own sigma, s."""
+        return 0.0 if self.turn_axis_cam is None else UNKNOWN_S
+
+
+def has_turned(R_world_imu: FloatArray, axis: FloatArray) -> bool:
+    """Whether an axis of the imu (3,) left its direction in a stretch of attitudes (n, 3, 3)."""
+    mean = R_world_imu.mean(axis=0) @ axis
+    return bool(1.0 - mean @ mean > STILL_RAD**2)
+
+
+def held_covariance(projector: FloatArray) -> FloatArray:
+    """What holding a lever arm along some axes leaves unknown of it, m^2, shape (3, 3).
+
+    Args:
+        projector: Onto the axes, imu frame, shape (3, 3).
+    """
+    out: FloatArray = UNKNOWN_M**2 * projector + BENT_M**2 * (np.eye(3) - projector)
+    return out

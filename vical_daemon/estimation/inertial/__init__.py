@@ -1,0 +1,1 @@
+"""Inertial readings: intake, buffer, integration."""

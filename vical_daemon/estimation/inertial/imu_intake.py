@@ -1,0 +1,146 @@
+"""Where inertial readings enter an estimator: in order, on one even axis, without repetitions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
+from vical_daemon.estimation.inertial.stamp_steps import StampSteps
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
+
+_LEARN = 20  # readings by which the usual interval is known
+_MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
+_AGAIN = 1.5  # times the interval before: the next one confirms it
+
+
+class Reading(NamedTuple):
+    """One inertial reading: stamp as it came, ns; rad/s; m/s^2."""
+
+    t_imu_ns: int
+    gyro_rps: FloatArray
+    specific_force_mps2: FloatArray
+
+
+class ImuIntake:
+    """Fills the buffer of inertial readings from one stream.
+
+    A device or driver that hangs repeats its last reading bit by bit. Six noisy channels never do that by
+    themselves, so such readings are left out: what remains is a gap like any other.
+
+    A reading after a gap, or one older than the newest, is held until the next one. If that continues the
+    readings before, the held one had a wrong stamp, or came out of order, and is dropped. If it continues the
+    held one, time has jumped: forwards it is a gap; backwards the clock has been set back.
+
+    Attributes:
+        buffer: The readings, s since the first stamp; None before the first one.
+        base_ns: First stamp, ns.
+        refused: Readings left out: out of order, no possible values, or with a wrong stamp.
+        repeated: Readings left out because they repeat the one before, bit by bit.
+        gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
+    """
+
+    def __init__(self) -> None:
+        self.buffer: ImuBuffer | None = None
+        self.base_ns = 0
+        self.refused = 0
+        self.repeated = 0
+        self.gap_end_s = -np.inf
+        self._steps = StampSteps()
+        self._set_back_s = 0.0  # by how much the clock has been set back in all
+        self._newest_s = -np.inf  # stamp as it came, plus what the clock has been set back
+        self._held: tuple[float, Reading] | None = None
+        self._last = np.full(6, np.nan)
+        self._repeats = 0  # of the newest reading
+        self._news: list[Event] = []
+
+    @property
+    def shift_s(self) -> float:
+        """Time shift by the stamps as they come now, minus the time shift by the even axis, s."""
+        return self._steps.total_s - self._set_back_s
+
+    def take(
+        self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]
+    ) -> list[Reading]:
+        """Take one reading.
+
+        Args:
+            t_imu_ns: Stamp in the imu's clock, ns.
+            gyro_rps: Measured rate, rad/s.
+            specific_force_mps2: Measured specific force, m/s^2.
+
+        Returns:
+            The readings added: none, this one, or the one held before and this one.
+        """
+        reading = Reading(t_imu_ns, np.array(gyro_rps, np.float64), np.array(specific_force_mps2, np.float64))
+        six = np.concatenate([reading.gyro_rps, reading.specific_force_mps2])
+        if not (np.abs(six) <= _MOST).all():  # NaN is not, either
+            self.refused += 1
+            return []
+        if (six == self._last).all():
+            self.repeated += 1
+            self._repeats += 1
+            return []
+        self._last = six
+        if self.buffer is None:
+            self.base_ns = t_imu_ns
+            self.buffer = ImuBuffer(t_imu_ns)
+        t_s = (t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
+        added = self._in_order(self.buffer, t_s, reading)
+        if added:
+            self._repeats = 0
+        return added
+
+    def _in_order(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> list[Reading]:
+        """Add a reading, hold it, or add it after the one held."""
+        interval_s = t_s - self._newest_s
+        if self._bridged(buffer, interval_s):
+            self._held = None
+            self._add(buffer, t_s, reading)
+            return [reading]
+        if self._held is not None:
+            held_s, held = self._held
+            jump_s = abs(held_s - self._newest_s)
+            if 0.0 < t_s - held_s <= max(GAP_S, buffer.usual_gap_s, _AGAIN * jump_s):
+                self.refused -= 1
+                return self._jump(buffer, held_s, held, t_s, reading)
+        self._held = t_s, reading
+        self.refused += 1
+        return []
+
+    def _bridged(self, buffer: ImuBuffer, interval_s: float) -> bool:
+        """Whether a reading follows the newest so closely that interpolation will do."""
+        if interval_s <= 0.0:
+            return False
+        return interval_s <= GAP_S or len(buffer) < _LEARN or interval_s <= buffer.usual_gap_s
+
+    def _jump(
+        self, buffer: ImuBuffer, held_s: float, held: Reading, t_s: float, reading: Reading
+    ) -> list[Reading]:
+        """Two readings agree that time has jumped."""
+        self._held = None
+        if held_s <= self._newest_s:
+            back_s = self._newest_s + (t_s - held_s) - held_s
+            self._set_back_s += back_s
+            self._news.append(Event(EventKind.IMU_CLOCK_SET_BACK, value=back_s))
+            held_s, t_s = held_s + back_s, t_s + back_s
+        else:
+            kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
+            self._news.append(Event(kind, value=held_s - self._newest_s))
+        self._add(buffer, held_s, held)
+        self.gap_end_s = buffer.newest_s
+        self._add(buffer, t_s, reading)
+        return [held, reading]
+
+    def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> None:
+        self._newest_s = t_s
+        buffer.append(self._steps.even(t_s), reading.gyro_rps, reading.specific_force_mps2)
+
+    def news(self) -> list[Event]:
+        """What happened to the stream since the last call."""
+        news, self._news = self._news + self._steps.news(), []
+        return news

@@ -1,0 +1,227 @@
+"""Strapdown integration of inertial readings for a batch of biases, its derivatives and its noise.
+
+Between two samples the measured rate and specific force are cubic in time (Hermite, slopes by central
+differences), with the coning term for the attitude; velocity and position are integrated exactly for a
+specific force that is cubic in the *start* frame. Averaging two samples as if both lay in one frame would
+bias the time shift by tenths of a millisecond; straight lines between samples would shorten a 3 Hz shake by
+0.3 % at 100 Hz, which ends up in the lever arm, always in the same direction (see docs/math/filter.md).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise
+
+
+class Motion(NamedTuple):
+    """Attitude, position and velocity of the imu in the world, a batch of S; and the two rates at the end.
+
+    Attributes:
+        R: R_world_imu, shape (S, 3, 3).
+        p: p_world_imu, m, shape (S, 3).
+        v: Velocity in the world, m/s, shape (S, 3).
+    """
+
+    R: FloatArray
+    p: FloatArray
+    v: FloatArray
+
+
+class Strapdown(NamedTuple):
+    """Relative motion over a segment for a batch of biases, before gravity and the start pose enter.
+
+    Attributes:
+        dR: Rotation from each node to the start, shape (S, n + 1, 3, 3): R_start_node.
+        dv: Integral of the specific force in the start frame, m/s, shape (S, n + 1, 3).
+        dp: Double integral, m, shape (S, n + 1, 3).
+        t_s: Node times since the start, s, shape (n + 1,).
+    """
+
+    dR: FloatArray
+    dv: FloatArray
+    dp: FloatArray
+    t_s: FloatArray
+
+
+def strapdown(
+    segment: ImuSegment,
+    gyro_bias: FloatArray,
+    accel_bias: FloatArray,
+    gyro_matrix: FloatArray | None = None,
+    accel_matrix: FloatArray | None = None,
+    accel_lag_s: FloatArray | None = None,
+) -> Strapdown:
+    """Integrate a segment for a batch of biases (strapdown mechanisation in the start frame).
+
+    omega = M_g (omega_m - b_g), f = M_a (f_m + lag f_m' - b_a);  R' = R hat(omega), v' = R f, p' = v.
+
+    Args:
+        segment: Readings.
+        gyro_bias: rad/s, shape (S, 3).
+        accel_bias: m/s^2, shape (S, 3).
+        gyro_matrix: Scale and misalignment M_g, shape (S, 3, 3); None: identity.
+        accel_matrix: The same for the accelerometer.
+        accel_lag_s: How late its readings are, s, shape (S,); None: not.
+
+    Returns:
+        The relative motion at every node.
+    """
+    dt = segment.t_s[1:] - segment.t_s[:-1]
+    omega = segment.gyro - gyro_bias[:, None, :]
+    force = segment.accel - accel_bias[:, None, :]
+    if accel_lag_s is not None and segment.accel_slope is not None:
+        force = force + accel_lag_s[:, None, None] * segment.accel_slope
+    if gyro_matrix is not None:
+        omega = omega @ gyro_matrix.swapaxes(-1, -2)
+    if accel_matrix is not None:
+        force = force @ accel_matrix.swapaxes(-1, -2)
+    turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
+    if turn_slope is not None and gyro_matrix is not None:
+        turn_slope = turn_slope @ gyro_matrix[0].T
+    steps = rotation_steps(omega, dt, turn_slope)
+    dR = np.empty((len(omega), len(dt) + 1, 3, 3))
+    dR[:, 0] = np.eye(3)
+    for k in range(len(dt)):
+        np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
+    f_start = np.matmul(dR, force[..., None])[..., 0]
+    before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
+    dv, dp = np.zeros_like(f_start), np.zeros_like(f_start)
+    gained = (before + after) * (0.5 * h)
+    moved = (2.0 * before + after) * (h * h / 6.0)
+    if force_slope is not None:
+        # slope of R f: R (omega x f + f'); hardly depends on the bias: the first of the batch stands for all
+        slope = cross(omega[0], force[0]) + (
+            force_slope if accel_matrix is None else force_slope @ accel_matrix[0].T
+        )
+        slope = np.matmul(dR[0], slope[..., None])[..., 0]
+        bend = slope[:-1] - slope[1:]
+        gained = gained + bend * (h * h / 12.0)
+        moved = h * h * (0.35 * before + 0.15 * after) + (0.05 * slope[:-1] - slope[1:] / 30.0) * (h * h * h)
+    np.cumsum(gained, axis=1, out=dv[:, 1:])
+    np.cumsum(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
+    return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0])
+
+
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product over the last axis; a fifth of the time of numpy's for small batches."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
+def rotation_steps(omega: FloatArray, dt: FloatArray, slope: FloatArray | None = None) -> FloatArray:
+    """Rotation over each interval for a rate linear (or cubic) in time, with the coning term.
+
+    Exp(dt (w0 + w1)/2 + dt^2/12 (w0' - w1') + dt^2/12 w0 x w1) (Magnus expansion).
+
+    Args:
+        omega: Rates at the nodes, rad/s, shape (S, n + 1, 3).
+        dt: Interval lengths, s, shape (n,).
+        slope: Derivatives of the rates at the nodes, rad/s^2, shape (n + 1, 3); None: straight lines.
+
+    Returns:
+        Rotations, shape (S, n, 3, 3).
+    """
+    w0, w1 = omega[:, :-1], omega[:, 1:]
+    half = 0.5 * dt[:, None]
+    # The coning term hardly depends on the bias: the first of the batch stands for all.
+    coning = cross(w0[:1], w1[:1])
+    if slope is not None:
+        coning = coning + (slope[:-1] - slope[1:])
+    coning = coning * (dt * dt / 12.0)[:, None]
+    return so3.exp((w0 + w1) * half + coning)
+
+
+def compose(start: Motion, relative: Strapdown, gravity: FloatArray) -> Motion:
+    """Apply the relative motion of the last node to start poses under gravity.
+
+    Args:
+        start: Poses at the start, batch of S.
+        relative: Output of `strapdown`, same batch.
+        gravity: Acceleration of free fall in the world, m/s^2, shape (S, 3).
+
+    Returns:
+        Poses at the end of the segment.
+    """
+    T = relative.t_s[-1]
+    p = start.p + T * start.v + (0.5 * T * T) * gravity
+    p += np.matmul(start.R, relative.dp[:, -1, :, None])[..., 0]
+    v = start.v + T * gravity + np.matmul(start.R, relative.dv[:, -1, :, None])[..., 0]
+    return Motion(np.matmul(start.R, relative.dR[:, -1]), p, v)
+
+
+class Influence(NamedTuple):
+    """What errors of the readings, made at each node of a segment, do to its end.
+
+    Attributes:
+        at: [rotation (local, right) 3, position 3, velocity 3] at the end by a rate error (three columns) and
+            a force error (three) that act for a second, shape (n + 1, 9, 6).
+        weights: Duration that each node stands for (trapezoids), s, shape (n + 1,).
+        beyond: By how much trapezoids exaggerate the integral of the squared time to the end, s^3.
+    """
+
+    at: FloatArray
+    weights: FloatArray
+    beyond: float
+
+    def by_bias(self) -> FloatArray:
+        """Return the end by constant biases [gyro 3, accel 3], shape (9, 6); Forster et al. 2017, (69)."""
+        return -(self.weights @ self.at.reshape(-1, 54)).reshape(9, 6)
+
+    def by_force(self, force: FloatArray) -> FloatArray:
+        """Return the end by a force error, m/s^2 at each node, shape (n + 1, 3), in shape (9,)."""
+        return np.asarray(np.einsum("k,kij,kj->i", self.weights, self.at[:, :, 3:6], force))
+
+    def noise(self, noise: ImuNoise) -> FloatArray:
+        """Covariance of the end that white noise of the readings brings, shape (9, 9)."""
+        roots = np.sqrt(self.weights)[:, None] * _densities(noise)
+        G = (self.at * roots[:, None, :]).transpose(1, 0, 2).reshape(9, -1)
+        covariance = G @ G.T
+        covariance[_PLACE, _PLACE] -= noise.accel_density**2 * self.beyond
+        return covariance
+
+
+_PLACE = np.arange(3, 6)
+
+
+def _densities(noise: ImuNoise) -> FloatArray:
+    return np.array([noise.gyro_density] * 3 + [noise.accel_density] * 3)
+
+
+def influence(R_start: FloatArray, relative: Strapdown) -> Influence:
+    """Follow an error of rate or force from where it is made to the end of the segment, in closed form.
+
+    A turn d theta at s (imu frame) turns all specific force integrated after it:
+    d v_end = -hat(V_end - V(s)) R(s) d theta, d p_end = -hat(P_end - P(s) - V(s) (T - s)) R(s) d theta.
+    (tested against a Monte Carlo of the integration, and against differences)
+
+    Args:
+        R_start: R_world_imu at the start, shape (3, 3); positions and velocities come out in its world.
+        relative: Strapdown of the nominal, batch of 1 (index 0 is used).
+
+    Returns:
+        The influence of each node.
+    """
+    t = relative.t_s
+    dt = t[1:] - t[:-1]
+    left = (t[-1] - t)[:, None]
+    R = R_start @ relative.dR[0]
+    V = relative.dv[0] @ R_start.T
+    P = relative.dp[0] @ R_start.T
+    at = np.zeros((len(t), 9, 6))
+    at[:, 0:3, 0:3] = R[-1].T @ R
+    at[:, 3:6, 0:3] = so3.hat(P + V * left - P[-1]) @ R
+    at[:, 6:9, 0:3] = so3.hat(V - V[-1]) @ R
+    at[:, 3:6, 3:6] = R * left[..., None]
+    at[:, 6:9, 3:6] = R
+    weights = np.zeros(len(t))
+    weights[1:] = 0.5 * dt
+    weights[:-1] += 0.5 * dt
+    return Influence(at, weights, float((dt * dt) @ dt) / 6.0)

@@ -1,0 +1,207 @@
+"""Mounting and delay from accelerations, for motion that turns too little to show them by rotation alone.
+
+Second derivatives of the camera's path are compared with the specific force, over short windows:
+
+    a_cam = M(d) vec(R_cam_imu) + g + L l_cam - N b_cam
+
+M: specific force rotated by vision into the target frame and averaged with the kernel by which the window's
+quadratic fit weighs accelerations; L, N: the same for a lever arm and a bias fixed in the camera. All but
+R_cam_imu and the shift d enter linearly and are eliminated; turns of gyro and camera add their own evidence
+(Wahba). What is left is a small quadratic form in R_cam_imu, minimised on SO(3) from a grid, for each d.
+[docs/math/filter.md (14)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.init.accel_evidence import PRIORS, CameraPath, Evidence, gather
+from vical_daemon.estimation.measurements import FloatArray
+
+_COARSE_S, _FINE_S = 0.02, 0.004
+_APART_S = 0.25  # another delay this far away must fit worse by the contrast
+_MIN_CONTRAST = 4.0
+_MAX_ROTATION_SIGMA_RAD = np.deg2rad(1.0)
+_MAX_SHIFT_SIGMA_S = 2e-3
+_DESCENTS = 12
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The best mounting and delay by accelerations and turns together.
+
+    Attributes:
+        R_imu_cam: Mounting, shape (3, 3).
+        timeshift_s: t_imu - t_cam, s.
+        gyro_bias_rps: rad/s, shape (3,).
+        rotation_sigma_rad: Of the least known direction, rad (by least squares, no curvature of windows).
+        timeshift_sigma_s: Likewise, s.
+        contrast: Cost of the best delay more than a quarter of a second away over the cost here.
+    """
+
+    R_imu_cam: FloatArray
+    timeshift_s: float
+    gyro_bias_rps: FloatArray
+    rotation_sigma_rad: float
+    timeshift_sigma_s: float
+    contrast: float
+
+    @property
+    def trusted(self) -> bool:
+        """Whether a filter may start from it."""
+        return (
+            self.contrast > _MIN_CONTRAST
+            and self.rotation_sigma_rad < _MAX_ROTATION_SIGMA_RAD
+            and self.timeshift_sigma_s < _MAX_SHIFT_SIGMA_S
+        )
+
+
+def align(path: CameraPath, imu_rows: FloatArray, shifts_s: tuple[float, float]) -> Alignment | None:
+    """Find mounting and delay from a path of the camera and inertial readings.
+
+    Args:
+        path: Of the camera.
+        imu_rows: Columns t_s, gyro xyz (rad/s), specific force xyz (m/s^2), shape (m, 7).
+        shifts_s: Lowest and highest time shift to look at, s.
+
+    Returns:
+        The alignment, or None where there are too few poses in a row.
+    """
+    evidence = gather(path)
+    if evidence is None:
+        return None
+    imu_rows = _with_angles(imu_rows)
+    coarse = np.arange(shifts_s[0], shifts_s[1] + 1e-9, _COARSE_S)
+    costs, _ = _costs(evidence, imu_rows, coarse)
+    best = int(np.argmin(costs))
+    apart = np.abs(coarse - coarse[best]) > _APART_S
+    contrast = float(np.min(costs[apart]) / max(costs[best], 1e-9)) if apart.any() else 1.0
+    fine = coarse[best] + np.arange(-10, 11) * _FINE_S
+    costs, Rs = _costs(evidence, imu_rows, fine)
+    at = int(np.clip(np.argmin(costs), 1, len(fine) - 2))
+    low, middle, high = costs[at - 1 : at + 2]
+    bend = max(float(low - 2.0 * middle + high) / _FINE_S**2, 1e-9)
+    shift = float(fine[at] + np.clip((low - high) / (2.0 * bend * _FINE_S), -_FINE_S, _FINE_S))
+    scale = max(float(middle) / evidence.dof, 1.0)
+    shift_sigma = float(np.sqrt(2.0 * scale / bend))
+    return _alignment(evidence, imu_rows, Rs[at], scale, np.eye(3), (shift, shift_sigma, contrast))
+
+
+def align_at(
+    path: CameraPath, imu_rows: FloatArray, shift_s: float, axis_cam: FloatArray
+) -> Alignment | None:
+    """Find a mounting, but for a turn about an axis of the camera (3,), with a delay taken for known.
+
+    For a rig that turns about this axis at one rate all the time, see `align`.
+    """
+    evidence = gather(path)
+    if evidence is None:
+        return None
+    imu_rows = _with_angles(imu_rows)
+    costs, Rs = _costs(evidence, imu_rows, np.array([shift_s]))
+    scale = max(float(costs[0]) / evidence.dof, 1.0)
+    across = np.linalg.svd(axis_cam[None])[2][1:].T
+    return _alignment(evidence, imu_rows, Rs[0], scale, across, (shift_s, 0.0, np.inf))
+
+
+def _alignment(
+    evidence: Evidence,
+    rows: FloatArray,
+    R: FloatArray,
+    scale: float,
+    asked: FloatArray,
+    shift: tuple[float, float, float],
+) -> Alignment:
+    """The mounting R (cam from imu), known about the axes `asked`, (3, k); delay, its sigma and contrast."""
+    problem = _Reduced.at(evidence, rows, shift[0])
+    J = _tangent(R) @ asked
+    worst = float(np.linalg.eigvalsh(J.T @ problem.A @ J / scale)[0])
+    bias = R.T @ problem.turn_bias(R.ravel())
+    return Alignment(R.T, shift[0], bias, 1.0 / np.sqrt(max(worst, 1e-3)), shift[1], shift[2])
+
+
+def _with_angles(rows: FloatArray) -> FloatArray:
+    """Append the integral of the rates, rad, as three columns: over a fifth of a second nearly the turn."""
+    steps = np.diff(rows[:, 0])[:, None]
+    angle = np.cumsum(0.5 * (rows[1:, 1:4] + rows[:-1, 1:4]) * steps, axis=0)
+    return np.hstack([rows, np.vstack([np.zeros(3), angle])])
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """Cost r' A r - 2 b' r + c of r = vec(R_cam_imu) at one delay, all that is linear eliminated."""
+
+    A: FloatArray
+    b: FloatArray
+    c: float
+    _D: FloatArray
+    _y: FloatArray
+    _others: FloatArray
+
+    @classmethod
+    def at(cls, e: Evidence, rows: FloatArray, shift_s: float) -> _Reduced:
+        """Set it up.
+
+        Args:
+            e: What vision says.
+            rows: Inertial readings, see `align`.
+            shift_s: The delay.
+        """
+        t = rows[:, 0]
+        force = np.stack([np.interp(e.grid_s + shift_s, t, rows[:, 4 + m]) for m in range(3)], axis=1)
+        outer = (e.R_target_cam[:, :, :, None] * force[:, None, None, :]).reshape(-1, 27)
+        by_force = (e.kernels @ outer).reshape(-1, 3, 9) / e.accel_sigma[:, None, None]
+        turned = np.stack([np.interp(e.turn_span_s + shift_s, t, rows[:, 7 + m]) for m in range(3)], axis=-1)
+        turn = (turned[1] - turned[0]) / e.turn_sigma[:, None]
+        by_turn = (np.eye(3)[None, :, :, None] * turn[:, None, None, :]).reshape(-1, 9)
+        D = np.vstack([by_force.reshape(-1, 9), by_turn, np.zeros((PRIORS, 9))])
+        PD, Py = e.project(D), e.project(e.seen)
+        return cls(PD.T @ PD, PD.T @ Py, float(Py @ Py), D, e.seen, e.others)
+
+    def turn_bias(self, r: FloatArray) -> FloatArray:
+        """The gyro's bias in the camera frame that goes with r, rad/s, shape (3,)."""
+        found = np.linalg.lstsq(self._others, self._y - self._D @ r, rcond=None)[0]
+        return np.asarray(found[9:], dtype=np.float64)
+
+
+def _costs(e: Evidence, rows: FloatArray, shifts_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least cost over all mountings for each shift, shape (s,), and R_cam_imu there, shape (s, 3, 3)."""
+    problems = [_Reduced.at(e, rows, float(d)) for d in shifts_s]
+    A, b = np.array([p.A for p in problems]), np.array([p.b for p in problems])
+    R = np.broadcast_to(_STARTS, (len(shifts_s), *_STARTS.shape)).copy()
+    for _ in range(_DESCENTS):
+        J = _tangent(R)
+        r = R.reshape(*R.shape[:2], 9)
+        gradient = np.einsum("skij,ski->skj", J, np.einsum("sij,skj->ski", A, r) - b[:, None])
+        H = np.einsum("skia,sij,skjb->skab", J, A, J)
+        damping = 1e-6 + 0.02 * np.einsum("skaa->sk", H)
+        step = -np.linalg.solve(H + damping[:, :, None, None] * np.eye(3), gradient[..., None])[..., 0]
+        R = so3.exp(step) @ R
+    r = R.reshape(*R.shape[:2], 9)
+    cost = np.einsum("ski,sij,skj->sk", r, A, r) - 2.0 * np.einsum("si,ski->sk", b, r)
+    at, each = np.argmin(cost, axis=1), np.arange(len(shifts_s))
+    return cost[each, at] + np.array([p.c for p in problems]), R[each, at]
+
+
+def _tangent(R: FloatArray) -> FloatArray:
+    """Derivative of vec(exp(w) R) by w at 0, shape (..., 9, 3)."""
+    generators = so3.hat(np.eye(3))
+    return np.stack([(generators[m] @ R).reshape(*R.shape[:-2], 9) for m in range(3)], axis=-1)
+
+
+def _cube_rotations() -> FloatArray:
+    """The 24 rotations of a cube, shape (24, 3, 3): any rotation is within 63 degrees of one."""
+    found = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            R = np.eye(3)[list(order)] * np.array(signs)
+            if np.linalg.det(R) > 0.0:
+                found.append(R)
+    return np.array(found)
+
+
+_STARTS = _cube_rotations()

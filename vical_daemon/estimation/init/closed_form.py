@@ -1,0 +1,216 @@
+"""One attempt to start from what was seen so far: a state that the filter can begin with, or why not.
+
+Mounting and delay come from rotations (TD-ICP); where the motion turns too little for that, and only then,
+from accelerations (`accel_alignment`), as a *partial* start: some of it stays unknown, and sigmas say so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.accel_alignment import Alignment, align, align_at
+from vical_daemon.estimation.init.accel_evidence import CameraPath
+from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
+from vical_daemon.estimation.init.linear_start import still_axes
+from vical_daemon.estimation.init.readout_start import readout
+from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
+from vical_daemon.estimation.init.target_poses import Lens, PoseCache, SeenPose
+from vical_daemon.estimation.init.velocity_gravity_init import StartResult, motion_start
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.model.state import CameraState, Layout
+from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp_refusals import at_one_rate
+
+_SHIFT_SIGMA_S = 1.0e-3
+_PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
+_ROTATION_SIGMA_RAD = np.deg2rad(1.0)
+_PARTIAL_STRETCH_S = 8.0
+_PARTIAL_MIN_S = 6.0
+_PARTIAL_SHIFTS_S = (-1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class StartData:
+    """What an attempt works on.
+
+    Attributes:
+        buffer: Inertial readings.
+        frames: By camera: (stamp in s, points), in order.
+        priors: By camera.
+        options: Switches.
+        layout: Which blocks are estimated.
+        target: Points of the target, m, shape (n, 3).
+        caches: Poses found in earlier attempts, by camera.
+    """
+
+    buffer: ImuBuffer
+    frames: dict[str, list[tuple[float, PointsFrame]]]
+    priors: dict[str, CameraPrior]
+    options: CalibrationOptions
+    layout: Layout
+    target: FloatArray
+    caches: dict[str, PoseCache]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rough:
+    """One camera before its lever arm is known."""
+
+    camera: CameraState
+    poses: list[SeenPose]
+    gyro_bias_rps: FloatArray
+
+
+def attempt(data: StartData) -> StartResult:
+    """Try to start with everything known; see `StartData`.
+
+    Returns:
+        A state at the first usable frame, or the reason why not.
+    """
+    rough: dict[str, _Rough] = {}
+    for name in data.priors:
+        lens, poses = _poses(data, name)
+        needed = 20 if data.layout.cameras[name].intrinsics is None else 30
+        if len(poses) < needed:
+            return StartResult(
+                None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
+            )
+        found = _timing(data.buffer, poses, lens)
+        long = poses[-1].t_cam_s - poses[0].t_cam_s > _PATIENCE_S
+        why = found.reason or _not_sure_yet(found, (2.0 if long else 1.0) * _SHIFT_SIGMA_S)
+        if why:
+            return StartResult(None, f"{name}: {why}", motion_missing=True)
+        camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_cam_imu_s)
+        rough[name] = _Rough(camera, poses, found.gyro_bias_rps)
+    return _with_motion(data, rough)
+
+
+def partial_attempt(data: StartData, reason: str) -> StartResult:
+    """Try to start where rotations alone do not show the mounting: accelerations may.
+
+    Args:
+        data: See `StartData`.
+        reason: What `attempt` said; it stays true, whatever is found here.
+
+    Returns:
+        A state that is a guess where the motion shows nothing, or the reason again.
+    """
+    rough: dict[str, _Rough] = {}
+    turn_axis_cam: FloatArray | None = None
+    refused = StartResult(None, reason, motion_missing=True)
+    for name in data.priors:
+        lens, poses = _poses(data, name, data.frames[name][-1][0] - _PARTIAL_STRETCH_S)
+        if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < _PARTIAL_MIN_S:
+            return refused
+        path = CameraPath(
+            np.array([p.t_cam_s for p in poses]),
+            np.array([p.R_target_cam for p in poses]),
+            np.array([p.p_target_cam for p in poses]),
+            np.maximum([p.sigma_m for p in poses], 2e-4),
+            _attitude_sigmas(poses, lens),
+        )
+        found = align(path, data.buffer.rows, _PARTIAL_SHIFTS_S)
+        if found is not None and not found.trusted and len(data.priors) == 1:
+            found, turn_axis_cam = _steady(data, name, path)
+        if found is None or not found.trusted:
+            return refused
+        camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_s)
+        rough[name] = _Rough(camera, poses, found.gyro_bias_rps)
+    result = _with_motion(data, rough, partial=True, turn_axis_cam=turn_axis_cam)
+    return refused if result.state is None else replace(result, reason=reason)
+
+
+def _steady(data: StartData, name: str, path: CameraPath) -> tuple[Alignment | None, FloatArray | None]:
+    """For a rig that turns at one rate about one axis: a mounting with the delay as given; the axis, camera.
+
+    Which way gravity points is not known either, so the angle about that axis is as unknown as the delay.
+    """
+    shift_s = data.priors[name].timeshift_cam_imu_s or 0.0
+    rows = data.buffer.rows
+    during = (rows[:, 0] > path.t_cam_s[0] + shift_s) & (rows[:, 0] < path.t_cam_s[-1] + shift_s)
+    if np.count_nonzero(during) < 100 or not at_one_rate(rows[during, 0], rows[during, 1:4]):
+        return None, None
+    axes = still_axes(path.R_target_cam.mean(axis=0))
+    return (align_at(path, rows, shift_s, axes[0]), axes[0]) if len(axes) == 1 else (None, None)
+
+
+def _with_motion(
+    data: StartData,
+    rough: dict[str, _Rough],
+    *,
+    partial: bool = False,
+    turn_axis_cam: FloatArray | None = None,
+) -> StartResult:
+    return motion_start(
+        data.buffer,
+        {name: r.poses for name, r in rough.items()},
+        {name: r.camera for name, r in rough.items()},
+        {name: r.gyro_bias_rps for name, r in rough.items()},
+        data.options,
+        partial=partial,
+        turn_axis_cam=turn_axis_cam,
+    )
+
+
+def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, list[SeenPose]]:
+    """Lens of a camera, as known or estimated, and its poses since a stamp."""
+    lens, readout_s = Lens.from_prior(data.priors[name]), data.priors[name].readout_s
+    rows = lens.resolution[1]
+    if data.layout.cameras[name].readout is not None:
+        readout_s = readout(data.frames[name], lens, data.target, readout_s)
+    frames = at_middle_row(data.frames[name], readout_s, rows)
+    if data.layout.cameras[name].intrinsics is not None:
+        estimate_intrinsics(lens, [f for _, f in frames], data.target)
+    cache = data.caches.setdefault(name, PoseCache())
+    lens.readout_s = readout_s
+    return lens, cache.poses(frames, lens, data.target, since_s)
+
+
+def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift_s: float) -> CameraState:
+    """A camera whose lever arm is still to be found; what is held fixed is as it was given."""
+    prior, fix = data.priors[name], data.options.fix
+    p_imu_cam = np.zeros(3)
+    if "timeshift" in fix and prior.timeshift_cam_imu_s is not None:
+        shift_s = prior.timeshift_cam_imu_s
+    if "extrinsics" in fix and prior.T_imu_cam is not None:
+        R_imu_cam, p_imu_cam = prior.T_imu_cam[0].copy(), prior.T_imu_cam[1].copy()
+    return CameraState(
+        R_imu_cam,
+        p_imu_cam,
+        shift_s,
+        lens.intrinsics,
+        lens.distortion,
+        lens.model,
+        lens.resolution,
+        lens.readout_s,
+    )
+
+
+def _attitude_sigmas(poses: list[SeenPose], lens: Lens) -> FloatArray:
+    """Of the poses as stated, but at least a fifth of a pixel, rad, shape (n,)."""
+    return np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0]))
+
+
+def _timing(buffer: ImuBuffer, poses: list[SeenPose], lens: Lens) -> TdIcpResult:
+    rows = buffer.rows
+    return td_icp(
+        rows[:, 0],
+        rows[:, 1:4],
+        np.array([p.t_cam_s for p in poses]),
+        np.array([p.R_target_cam for p in poses]),
+        _attitude_sigmas(poses, lens),
+    )
+
+
+def _not_sure_yet(result: TdIcpResult, most_s: float) -> str:
+    """Why TD-ICP's answer does not do yet, with time shifts known to `most_s`; empty when it does."""
+    if result.timeshift_sigma_s > most_s:
+        known = 1e3 * result.timeshift_sigma_s
+        return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
+    if float(np.max(result.rotation_sigma_rad)) > _ROTATION_SIGMA_RAD:
+        worst = np.rad2deg(float(np.max(result.rotation_sigma_rad)))
+        return f"mounting rotation known to {worst:.1f} deg so far: turn the rig about a second axis"
+    return ""

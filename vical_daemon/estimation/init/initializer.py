@@ -1,0 +1,161 @@
+"""The first seconds: what was seen is kept, and a start is tried from it, ever less often."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init import closed_form as start
+from vical_daemon.estimation.init.initial_filter import wide_filter
+from vical_daemon.estimation.init.readout_start import looks_rolling
+from vical_daemon.estimation.init.relinearisation import Frames, Step, rehearsed
+from vical_daemon.estimation.init.target_poses import Lens, PoseCache
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.model.state import Layout
+
+_MIN_SPAN_S = 3.0
+_MAX_FRAMES = 500
+_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must cost little
+_LOOK_S = 2.0  # a look takes 0.2 to 0.3 s of CPU
+LATE_S = 2e-3
+"""An image this little before the state is used by moving the pose back, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """What an attempt gave.
+
+    Attributes:
+        filter: Ready to take `frames`, or None.
+        frames: Those it begins with, in order of the imu's time.
+        reason: Why there is none, or what the motion does not show.
+        motion_missing: It is motion that is missing, not time.
+        rolling: Name of a camera that has a rolling shutter of which nothing was said.
+        size: See `Rehearsed`.
+    """
+
+    filter: CalibrationFilter | None
+    frames: Frames
+    reason: str
+    motion_missing: bool = False
+    rolling: str = ""
+    size: float | None = None
+
+
+class Starting:
+    """Collects the images of the first seconds and tries to start from them.
+
+    Args:
+        options: Switches.
+        layout: Which blocks are estimated.
+        target: Points of the target, m, shape (n, 3).
+        step: Propagates a filter to an image and corrects it.
+    """
+
+    def __init__(self, options: CalibrationOptions, layout: Layout, target: FloatArray, step: Step) -> None:
+        self._options, self._layout, self._target, self._step = options, layout, target, step
+        self._frames: dict[str, Frames] = {name: [] for name in layout.cameras}
+        self._caches: dict[str, PoseCache] = {}
+        self.anew()
+
+    def anew(self) -> None:
+        """Forget what was seen and try often again."""
+        self._next_s, self._every_s = -np.inf, _ATTEMPT_FIRST_S
+        self._next_look_s = -np.inf
+        self._caches.clear()
+        for frames in self._frames.values():
+            frames.clear()
+
+    def take(self, items: Sequence[tuple[float, PointsFrame]]) -> None:
+        """Keep images (stamp in the camera's clock in s, points); of too many, the older half is dropped."""
+        for t_cam_s, frame in items:
+            frames = self._frames[frame.camera]
+            frames.append((t_cam_s, frame))
+            if len(frames) > _MAX_FRAMES:
+                del frames[: len(frames) // 2]
+
+    @property
+    def oldest_s(self) -> float:
+        """Stamp of the oldest image kept, s; infinite when there is none."""
+        return min((f[0][0] for f in self._frames.values() if f), default=np.inf)
+
+    def due(self, newest_s: float) -> bool:
+        """Whether it is time for another attempt."""
+        if newest_s < self._next_s:
+            return False
+        self._next_s = newest_s + self._every_s
+        self._every_s = min(1.25 * self._every_s, _ATTEMPT_MOST_S)
+        return True
+
+    def attempt(self, buffer: ImuBuffer, priors: dict[str, CameraPrior], *, may_be_partial: bool) -> Attempt:
+        """Try to start from what was seen.
+
+        Args:
+            buffer: Inertial readings.
+            priors: By camera.
+            may_be_partial: A start with guesses is welcome where the motion shows no more.
+        """
+        spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
+        if len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S:
+            return _none("collecting the first seconds: move the rig, keep the target in view")
+        data = start.StartData(
+            buffer, self._frames, priors, self._options, self._layout, self._target, self._caches
+        )
+        rolling = self._rolling(buffer.newest_s, priors)
+        if rolling:
+            return Attempt(None, [], "", rolling=rolling)
+        result = start.attempt(data)
+        if result.state is None and result.motion_missing and may_be_partial:
+            result = start.partial_attempt(data, result.reason)
+        if result.state is None:
+            return _none(result.reason, result.motion_missing)
+        begin_s = result.state.t_s
+        shifts = {name: c.timeshift_s for name, c in result.state.cameras.items()}
+        frames = [
+            (t, f)
+            for kept in self._frames.values()
+            for t, f in kept
+            if t + shifts[f.camera] > begin_s - LATE_S
+        ]
+        frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
+        make = partial(
+            wide_filter,
+            layout=self._layout,
+            options=self._options,
+            still_axes=result.still_axes,
+            turn_axis_cam=result.turn_axis_cam,
+        )
+        found = rehearsed(result.state, frames, make, self._step)
+        if found is None:
+            why = "the first seconds do not fit together yet: keep the board in view and moving"
+            return _none(result.reason or why, result.still_axes is not None)
+        if found.size is not None:
+            return Attempt(None, [], "", size=found.size)
+        return Attempt(found.filter, frames, result.reason)
+
+    def go_on_with(self, layout: Layout, target: FloatArray, off: Collection[str] = ()) -> None:
+        """Keep what was seen, for another target or with other unknowns; `off`: known not to be as stated."""
+        self._layout, self._target = layout, target
+        self._options = replace(self._options, estimate=self._options.estimate | set(off))
+        self._caches.clear()
+
+    def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> str:
+        """Name of a camera whose images a rolling shutter has bent, though nobody said so; or empty."""
+        if newest_s < self._next_look_s:
+            return ""
+        self._next_look_s = newest_s + _LOOK_S
+        for name, where in self._layout.cameras.items():
+            if where.readout is None and priors[name].readout_s == 0.0:
+                lens = Lens.from_prior(priors[name])
+                if looks_rolling(self._frames[name], lens, self._target):
+                    return name
+        return ""
+
+
+def _none(reason: str, motion_missing: bool = False) -> Attempt:
+    return Attempt(None, [], reason, motion_missing)

@@ -1,0 +1,198 @@
+"""Rough intrinsics from the first views of a planar target: Zhang's closed form, then a small bundle.
+
+Only a start: the filter estimates the same eight numbers with everything else.
+[Zhang, "A flexible new technique for camera calibration", 2000, section 3]
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.geometry.planar_pose import belonging, planar_pose
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.model.camera_rays import unproject
+
+if TYPE_CHECKING:
+    from vical_daemon.estimation.init.target_poses import Lens
+
+MOST_VIEWS = 24
+_FEWEST, _LEAST_POINTS = 6, 12
+_STEPS = 15
+_Poses = list[tuple[FloatArray, FloatArray]]
+# relative to fx for the first four; four for the distortion, and radtan's fifth
+_PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])
+
+
+def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArray) -> float:
+    """Improve a lens in place by a bundle adjustment over spread-out views (Gauss-Newton, Levenberg damping).
+
+    Args:
+        lens: Start values; overwritten.
+        frames: Views of the target.
+        target: Its points, m, shape (n, 3).
+
+    Returns:
+        RMS residual, px; not-a-number when too few views show a pose (the lens is then left alone).
+    """
+    fit = fit_lens([frames[k] for k in spread(frames, lens)], lens, target)
+    if fit is None:
+        return float("nan")
+    if np.isfinite(fit.rms_px) and 0.3 * lens.intrinsics[0] < fit.theta[0] < 3.0 * lens.intrinsics[0]:
+        lens.intrinsics, lens.distortion = fit.theta[:4], fit.theta[4:]
+    return fit.rms_px
+
+
+class LensFit(NamedTuple):
+    """A lens and poses adjusted to views.
+
+    Attributes:
+        theta: fx fy cx cy and the distortion, shape (4 + d,).
+        poses: R_cam_target and p_cam_target, m, of each view that shows one.
+        rms_px: RMS residual, px.
+        views: These views, with the corners that belong.
+        which: Their places among the views given.
+    """
+
+    theta: FloatArray
+    poses: _Poses
+    rms_px: float
+    views: list[PointsFrame]
+    which: list[int]
+
+
+def fit_lens(views: list[PointsFrame], lens: Lens, target: FloatArray) -> LensFit | None:
+    """Adjust lens and poses to chosen views, then to their corners that belong; None: too few show a pose."""
+    which, poses = _poses(views, lens, target)
+    if len(which) < _FEWEST:
+        return None
+    views = [views[k] for k in which]
+    theta, poses, rms_px = adjusted(views, poses, lens, target)
+    cleaned = [
+        _without_outliers(v, *pose, target, theta, lens.model) for v, pose in zip(views, poses, strict=True)
+    ]
+    if any(len(new.ids) < len(old.ids) for new, old in zip(cleaned, views, strict=True)):
+        theta, poses, rms_px = adjusted(cleaned, poses, lens, target)
+    return LensFit(theta, poses, rms_px, cleaned, which)
+
+
+def adjusted(
+    views: list[PointsFrame], poses: _Poses, lens: Lens, target: FloatArray
+) -> tuple[FloatArray, _Poses, float]:
+    """Lens (4 + d,), poses and RMS residual in px after the adjustment, from a lens and poses."""
+    theta = np.concatenate([lens.intrinsics, lens.distortion])
+    n = len(theta)
+    scale = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(n - 4)]) * _PRIOR[:n]
+    prior, cost, damping = theta.copy(), np.inf, 1e-3
+    best = (theta, poses)
+    for _ in range(_STEPS):
+        normal = _normal(views, poses, target, theta, lens.model)
+        if normal is None:
+            break
+        new_cost = normal.cost + float((((theta - prior) / scale) ** 2).sum())
+        if new_cost < cost:
+            done = cost - new_cost < 1e-6 * new_cost
+            best, cost, damping = (theta, poses), new_cost, damping * 0.3
+            if done:
+                break
+            last = normal
+        else:
+            damping *= 10.0
+        dtheta, dposes = last.solve((prior - best[0]) / scale**2, 1.0 / scale**2, damping)
+        theta = best[0] + dtheta
+        poses = [(R @ so3.exp(d[3:]), p + d[:3]) for (R, p), d in zip(best[1], dposes, strict=True)]
+    count = sum(2 * len(v.ids) for v in views)
+    return best[0], best[1], float(np.sqrt(cost / max(count, 1)))
+
+
+def _without_outliers(
+    view: PointsFrame, R: FloatArray, p: FloatArray, target: FloatArray, theta: FloatArray, model: str
+) -> PointsFrame:
+    """The view without the corners that do not belong."""
+    uv = project_jacobians(target[view.ids] @ R.T + p, theta[:4], theta[4:], model)[0]
+    far = np.linalg.norm(view.uv_px - uv, axis=1)
+    good = belonging(far)
+    if good.all() or good.sum() < _LEAST_POINTS:
+        return view
+    return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])
+
+
+def spread(frames: list[PointsFrame], lens: Lens) -> list[int]:
+    """Choose views with many points that differ most in where the board lies in the image, 24 at most."""
+    usable = [k for k, f in enumerate(frames) if len(f.ids) >= _LEAST_POINTS]
+    if len(usable) <= MOST_VIEWS:
+        return usable
+    good = [frames[k] for k in usable]
+    width, height = lens.resolution
+    features = np.array(
+        [np.concatenate([f.uv_px.mean(0), f.uv_px.std(0) * 2, f.uv_px[-1] - f.uv_px[0]]) for f in good]
+    ) / np.array([width, height, width, height, width, height])
+    chosen = [int(np.argmax([len(f.ids) for f in good]))]
+    distance = np.linalg.norm(features - features[chosen[0]], axis=1)
+    while len(chosen) < MOST_VIEWS:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
+    return sorted(usable[i] for i in chosen)
+
+
+def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> tuple[list[int], _Poses]:
+    """Which views show a pose, and these."""
+    poses, which = [], []
+    for k, v in enumerate(views):
+        rays, ok = unproject(v.uv_px, lens.intrinsics, lens.distortion, lens.model)
+        found = planar_pose(target[v.ids[ok]], rays[ok, :2] / rays[ok, 2:])
+        if found.candidates:
+            poses.append((found.candidates[0].R_cam_target, found.candidates[0].p_cam_target))
+            which.append(k)
+    return which, poses
+
+
+class _Normal:
+    """Normal equations with the poses eliminated (Schur complement)."""
+
+    def __init__(self, lens: int) -> None:
+        self.A = np.zeros((lens, lens))
+        self.b = np.zeros(lens)
+        self.views: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self.cost = 0.0
+
+    def add(self, J_lens: FloatArray, J_pose: FloatArray, r: FloatArray) -> None:
+        self.A += J_lens.T @ J_lens
+        self.b += J_lens.T @ r
+        self.views.append((J_pose.T @ J_pose, J_pose.T @ J_lens, J_pose.T @ r))
+        self.cost += float(r @ r)
+
+    def solve(self, b0: FloatArray, a0: FloatArray, damping: float) -> tuple[FloatArray, list[FloatArray]]:
+        A, b = self.A + np.diag(a0), self.b + b0
+        A += damping * np.diag(np.diag(A))
+        inverses = []
+        for P, C, c in self.views:
+            inverse = np.linalg.inv(P + damping * np.diag(np.diag(P)))
+            A -= C.T @ inverse @ C
+            b -= C.T @ inverse @ c
+            inverses.append(inverse)
+        d: FloatArray = np.linalg.solve(A, b).astype(np.float64)
+        return d, [i @ (c - C @ d) for i, (_, C, c) in zip(inverses, self.views, strict=True)]
+
+
+def _normal(
+    views: list[PointsFrame],
+    poses: _Poses,
+    target: FloatArray,
+    theta: FloatArray,
+    model: str,
+) -> _Normal | None:
+    n = len(theta)
+    out = _Normal(n)
+    for view, (R, p) in zip(views, poses, strict=True):
+        X = target[view.ids]
+        x = X @ R.T + p
+        uv, J_point, J_lens = project_jacobians(x, theta[:4], theta[4:], model)
+        if not np.isfinite(uv).all():
+            return None
+        J_pose = np.concatenate([J_point, J_point @ (-R @ so3.hat(X))], axis=-1)
+        out.add(J_lens.reshape(-1, n), J_pose.reshape(-1, 6), (view.uv_px - uv).ravel())
+    return out

@@ -1,0 +1,132 @@
+"""The motion anew from a few images, with the calibration as it is known: after gaps and lost poses.
+
+Pose from the target; velocity linear in positions, p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a: the closed
+form of `initialise.linear_start` with everything but p_0 and v_0 known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.linear_start import integrate_twice
+from vical_daemon.estimation.init.target_poses import Lens, SeenPose, pose_of
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.model.state import (
+    ATTITUDE,
+    POSITION,
+    VELOCITY,
+    CameraState,
+    Layout,
+    MotionStart,
+    State,
+)
+
+_LEAST_IMAGES = 3
+_LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
+WIDE_RAD = 0.03
+"""Sigma of attitude up to which images are near to linear, rad."""
+WIDE_SHARE = 0.03
+"""Likewise of position, of the distance to the target."""
+_WIDE_MPS = 0.3  # of velocity: ten times what the images give
+_CALIBRATION = 5.0  # sigmas of the calibration the pose is made with: the data count again by 4 % at most
+
+
+class MotionRestart:
+    """Collects images until the motion can start anew from them.
+
+    Args:
+        target: Points of the target, m, shape (n, 3).
+        before_ns: Stamp of the last image used before, by camera, ns.
+    """
+
+    def __init__(self, target: FloatArray, before_ns: Mapping[str, int]) -> None:
+        self._target = target
+        self._before_ns = dict(before_ns)
+        self.frames: list[tuple[float, PointsFrame]] = []
+        self._seen: list[SeenPose | None] = []
+
+    def take(self, frame: PointsFrame, t_cam_s: float, state: State, buffer: ImuBuffer) -> None:
+        """Add an image; where readings are missing since the one before, only the new one counts.
+
+        Args:
+            frame: The image.
+            t_cam_s: Its stamp, s.
+            state: With the calibration as it is known.
+            buffer: Inertial readings.
+        """
+        if self.frames:
+            before_s = self.frames[-1][0] + _camera(state, self.frames[-1][1]).timeshift_s
+        t_s = t_cam_s + _camera(state, frame).timeshift_s
+        if self.frames and (t_s < before_s or buffer.gap_within(before_s, t_s)):
+            self.frames, self._seen = [], []
+        if t_s < buffer.oldest_s or buffer.gap_within(t_s, t_s):
+            return
+        seen = pose_of(frame, t_cam_s, _lens(_camera(state, frame)), self._target)
+        if seen is None and not self.frames:
+            return
+        self.frames.append((t_cam_s, frame))
+        self._seen.append(seen)
+
+    def motion(
+        self, state: State, layout: Layout, sigmas: FloatArray, buffer: ImuBuffer
+    ) -> MotionStart | None:
+        """Motion at the first image collected; None while the images do not suffice.
+
+        Args:
+            state: With the calibration as it is known.
+            layout: Where the errors live.
+            sigmas: Of all errors, shape (n,).
+            buffer: Inertial readings.
+        """
+        seen = [s for s in self._seen if s is not None]
+        if len(seen) < _LEAST_IMAGES or seen[-1].t_cam_s - seen[0].t_cam_s < _LEAST_S:
+            return None
+        cameras = [_camera(state, s.frame) for s in seen]
+        t_s = np.array([s.t_cam_s + c.timeshift_s for s, c in zip(seen, cameras, strict=True)])
+        R = np.array([s.R_target_cam @ c.R_imu_cam.T for s, c in zip(seen, cameras, strict=True)])
+        p = np.array([s.p_target_cam for s in seen]) - np.einsum(
+            "nij,nj->ni", R, np.array([c.p_imu_cam for c in cameras])
+        )
+        integrals = integrate_twice(buffer, t_s, R, state.gyro_bias)
+        if integrals is None:
+            return None
+        D, B = integrals
+        T = t_s - t_s[0]
+        y = p - D + B @ state.accel_bias - 0.5 * (T * T)[:, None] * state.gravity
+        start, velocity = np.linalg.lstsq(np.stack([np.ones_like(T), T], axis=1), y, rcond=None)[0]
+        wide = self._sigmas(seen[0], layout, sigmas, float(T[-1]))
+        elapsed_s = self._elapsed_s(seen[0].frame, float(t_s[0]) - state.t_s)
+        return MotionStart(float(t_s[0]), R[0], start, velocity, wide, elapsed_s)
+
+    def _elapsed_s(self, frame: PointsFrame, by_imu_s: float) -> float:
+        """Time since the motion was lost: the less of what both clocks say, for either may have been set."""
+        before_ns = self._before_ns.get(frame.camera)
+        by_camera_s = np.inf if before_ns is None else 1e-9 * (frame.t_cam_ns - before_ns)
+        return max(min(by_imu_s, by_camera_s), 0.0)
+
+    def _sigmas(self, seen: SeenPose, layout: Layout, sigmas: FloatArray, span_s: float) -> FloatArray:
+        """Many times what the images give, which will be used once more to correct the motion."""
+        where = layout.cameras[seen.frame.camera]
+        turn = float(sigmas[where.rotation].max()) if where.rotation is not None else 0.0
+        arm = float(sigmas[where.position].max()) if where.position is not None else 0.0
+        out = np.empty(9)
+        out[ATTITUDE] = max(WIDE_RAD, _CALIBRATION * turn)
+        out[POSITION] = max(WIDE_SHARE * distance_m(seen.p_target_cam), _CALIBRATION * arm)
+        out[VELOCITY] = max(_WIDE_MPS, _CALIBRATION * arm / span_s)
+        return out
+
+
+def distance_m(p_target_cam: FloatArray) -> float:
+    """Distance of a camera to the origin of the target, m."""
+    return float(np.sqrt(p_target_cam @ p_target_cam))
+
+
+def _camera(state: State, frame: PointsFrame) -> CameraState:
+    return state.cameras[frame.camera]
+
+
+def _lens(camera: CameraState) -> Lens:
+    return Lens(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)

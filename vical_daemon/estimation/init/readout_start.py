@@ -1,0 +1,95 @@
+"""The readout of a rolling shutter to start with: the one with which a board in motion is flattest.
+
+A board that moves is bent by a rolling shutter as no pose and no lens bends it. Images turned upside down are
+read from below: their readout is negative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vical_daemon.estimation.init.intrinsics_start import (
+    MOST_VIEWS,
+    adjusted,
+    estimate_intrinsics,
+    fit_lens,
+    spread,
+)
+from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
+from vical_daemon.estimation.init.target_poses import Lens
+from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+
+_TRIED_S = 0.008 * np.arange(6)
+_SIGNIFICANT = 25.0
+_SHORT_S = 0.004
+_BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 34
+
+
+def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> float:
+    """The readout to start with, s: as given unless the board is significantly flatter with another one.
+
+    Args:
+        frames: (stamp in s, points), in order.
+        lens: A guess.
+        target: Points of the target, m, shape (n, 3).
+        given_s: First row to last, s.
+    """
+    above, below = (_bent(frames, lens, target, float(r)) for r in (_TRIED_S[1], -_TRIED_S[1]))
+    tried = np.unique([given_s, *(_TRIED_S if above <= below else -_TRIED_S)])
+    squares = np.array([_bent(frames, lens, target, float(r)) for r in tried]) ** 2
+    least = int(np.argmin(squares))
+    was = squares[int(np.searchsorted(tried, given_s))]
+    if not was - squares[least] > _SIGNIFICANT * squares[least] / _numbers(frames):
+        return given_s
+    if not 0 < least < len(tried) - 1:
+        return float(tried[least])
+    around = slice(least - 1, least + 2)
+    a, b, _ = np.polyfit(tried[around] - tried[least], squares[around], 2)
+    return float(tried[least] - 0.5 * b / a)
+
+
+def looks_rolling(frames: Frames, lens: Lens, target: FloatArray) -> bool:
+    """Whether the board is flatter beyond doubt if rows are read over 4 ms than if all are taken at once.
+
+    It is where the readout is longer than 2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as
+    for `readout`. The same corners are compared, each time from lens and poses that a first adjustment found.
+    """
+    ways = [_upright(frames, r, lens) for r in (0.0, _SHORT_S, -_SHORT_S)]
+    chosen = spread(ways[0], lens)
+    fit = fit_lens([ways[0][k] for k in chosen], lens, target)
+    if fit is None:
+        return False
+    found = replace(lens, intrinsics=fit.theta[:4], distortion=fit.theta[4:])
+    squares = []
+    for way in ways:
+        views = [_only(way[chosen[k]], v.ids) for k, v in zip(fit.which, fit.views, strict=True)]
+        squares.append(adjusted(views, fit.poses, found, target)[2] ** 2)
+    flattest, numbers = min(squares[1:]), 2.0 * sum(len(v.ids) for v in fit.views)
+    return bool(squares[0] - flattest > _BEYOND_DOUBT * flattest / numbers)
+
+
+def _only(frame: PointsFrame, ids: IntArray) -> PointsFrame:
+    kept = np.isin(frame.ids, ids)
+    return PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[kept], frame.uv_px[kept])
+
+
+def _numbers(frames: Frames) -> float:
+    """How many numbers an adjustment over some of the frames has to explain."""
+    sizes = [len(frame.ids) for _, frame in frames]
+    return 2.0 * sum(sizes) * min(1.0, MOST_VIEWS / max(len(sizes), 1))
+
+
+def _bent(frames: Frames, lens: Lens, target: FloatArray, readout_s: float) -> float:
+    """RMS by which the images miss a flat board, px, if their rows are read like that."""
+    return estimate_intrinsics(replace(lens), _upright(frames, readout_s, lens), target)
+
+
+def _upright(frames: Frames, readout_s: float, lens: Lens) -> list[PointsFrame]:
+    """Images as if their rows had been taken at once; always without the first and the last.
+
+    `at_middle_row` does not know how corners move there.
+    """
+    found = at_middle_row(frames, readout_s, lens.resolution[1]) if readout_s else frames[1:-1]
+    return [frame for _, frame in found]

@@ -1,0 +1,150 @@
+"""The moving half of a start: lever arms, velocity, gravity and biases, once mounting and delay are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.linear_start import LinearStart, linear_start, still_axes
+from vical_daemon.estimation.init.target_poses import SeenPose
+from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.model.state import CameraState, State
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+
+_STRETCH_S = 10.0
+_DRIFT_M = 5e-3  # of the double integral over the stretch; with little motion it counts
+
+
+@dataclass(slots=True)
+class StartResult:
+    """What one attempt gave: a state, or the reason why there is none yet.
+
+    Attributes:
+        state: Where the filter can start.
+        reason: Why it cannot, or what the motion does not show, in words.
+        motion_missing: It is motion that is missing, not time.
+        still_axes: Of a partial start: axes of the imu along which lever arms are guessed, shape (k, 3);
+            None: everything is known.
+        turn_axis_cam: Of a rig that turned about it at one rate all the time, camera frame, shape (3,): the
+            delay and the mounting about this axis are guessed, too; None: not so.
+    """
+
+    state: State | None
+    reason: str
+    motion_missing: bool = False
+    still_axes: FloatArray | None = None
+    turn_axis_cam: FloatArray | None = None
+
+
+def motion_start(
+    buffer: ImuBuffer,
+    seen: dict[str, list[SeenPose]],
+    cameras: dict[str, CameraState],
+    gyro_bias_rps: dict[str, FloatArray],
+    options: CalibrationOptions,
+    partial: bool = False,
+    turn_axis_cam: FloatArray | None = None,
+) -> StartResult:
+    """Lever arms, velocity and gravity; the state stands at the first pose of the first camera.
+
+    Args:
+        buffer: Inertial readings.
+        seen: Poses by camera, in order.
+        cameras: By camera; mounting and time shift are used, lever arms are set.
+        gyro_bias_rps: As found with each camera, shape (3,).
+        options: Switches.
+        partial: The motion need not show the lever arms; what it does not show is taken as zero.
+        turn_axis_cam: Of a partial start of a rig that turns at one rate, see `StartResult`: it shows none.
+
+    Returns:
+        The state, or the reason why not.
+    """
+    state: State | None = None
+    size, still = 0.0, None
+    for name, poses in seen.items():
+        camera = cameras[name]
+        # Only the latest stretch: the double integral drifts, and what was long ago costs more than it gives.
+        since = max(buffer.oldest_s, poses[-1].t_cam_s + camera.timeshift_s - _STRETCH_S)
+        inside = [p for p in poses if since < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
+        if len(inside) < 15:
+            return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
+        held = None if turn_axis_cam is None else np.eye(3)
+        linear, axes = _linear(buffer, inside, camera, gyro_bias_rps[name], partial, held)
+        invisible = linear is not None and float(np.max(linear.sigma_p_imu_cam)) > 0.1
+        if linear is None or (invisible and not partial):
+            why = f"{name}: lever arm not yet visible: turn the rig about two axes"
+            return StartResult(None, why, motion_missing=True)
+        if "extrinsics" not in options.fix:
+            camera.p_imu_cam = linear.p_imu_cam
+        if state is None:
+            size = float(np.linalg.norm(linear.gravity))
+            still = axes
+            state = _state_at(inside[0], camera, linear, gyro_bias_rps[name], cameras, options)
+    if not 0.7 * options.gravity_mps2 < size < 1.3 * options.gravity_mps2:
+        why = (
+            f"gravity comes out as {size:.2f} m/s^2 instead of {options.gravity_mps2:.2f}: "
+            "check the target's size in its YAML and the unit of the accelerometer"
+        )
+        return StartResult(None, why)
+    return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam)
+
+
+def _linear(
+    buffer: ImuBuffer,
+    poses: list[SeenPose],
+    camera: CameraState,
+    gyro_bias: FloatArray,
+    partial: bool,
+    held: FloatArray | None,
+) -> tuple[LinearStart | None, FloatArray | None]:
+    """The linear start, and the axes along which a partial one guesses: `held`, or those that are still."""
+    R = np.array([p.R_target_cam for p in poses]) @ camera.R_imu_cam.T
+    p = np.array([p.p_target_cam for p in poses])
+    sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
+    t = np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
+    if not partial:
+        return linear_start(buffer, t, R, p, gyro_bias, sigma), None
+    R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
+    axes = still_axes(R.mean(axis=0)) if held is None else held
+    return linear_start(buffer, t, R, p, gyro_bias, sigma, axes), axes
+
+
+def _smooth(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bias: FloatArray) -> FloatArray:
+    """Attitudes by the gyro, bent slowly onto those of vision.
+
+    Noise of attitudes, times gravity, integrated twice, is centimetres: with little motion to hold them in
+    place, biases and gravity would be bent to explain it.
+    """
+    rows = buffer.rows
+    curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], gyro_bias)
+    by_gyro = so3.matrix_from_quat(curve.quaternion(t_s))
+    by_gyro = R_world_imu[0] @ by_gyro[0].T @ by_gyro
+    miss = so3.log(R_world_imu @ np.swapaxes(by_gyro, 1, 2))
+    slow = np.vander(t_s - t_s[0], 3)
+    bent: FloatArray = so3.exp(slow @ np.linalg.lstsq(slow, miss, rcond=None)[0]) @ by_gyro
+    return bent
+
+
+def _state_at(
+    seen: SeenPose,
+    camera: CameraState,
+    linear: LinearStart,
+    gyro_bias: FloatArray,
+    cameras: dict[str, CameraState],
+    options: CalibrationOptions,
+) -> State:
+    R = seen.R_target_cam @ camera.R_imu_cam.T
+    gravity = linear.gravity * (options.gravity_mps2 / np.linalg.norm(linear.gravity))
+    return State(
+        seen.t_cam_s + camera.timeshift_s,
+        R,
+        seen.p_target_cam - R @ camera.p_imu_cam,
+        linear.v_world_imu,
+        gyro_bias.copy(),
+        linear.accel_bias.copy(),
+        gravity,
+        cameras,
+    )

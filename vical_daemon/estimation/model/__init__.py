@@ -1,0 +1,1 @@
+"""The measurement model: state, cameras, targets, what goes in and what comes out."""

@@ -1,0 +1,57 @@
+"""Scale and misalignment of an IMU as fifteen numbers, and the lag of its accelerometer as the sixteenth.
+
+omega = M_g (omega_m - b_g), f = M_a (f_m - b_a). Of M_a only the lower triangle: a full matrix could be
+traded against the mounting of the camera. Entries are those of M_g - I, row by row, and of M_a - I.
+The lag, s, is by how much the accelerometer is later than the gyro.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
+from vical_daemon.estimation.inertial.imu_model import Influence
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import LOWER
+
+ENTRIES = 15
+NUMBERS = ENTRIES + 1
+
+
+def matrices(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """M_g and M_a of their entries (the lag may follow), shapes (3, 3)."""
+    accel = np.eye(3)
+    accel[LOWER[:, 0], LOWER[:, 1]] += numbers[9:ENTRIES]
+    return np.eye(3) + numbers[:9].reshape(3, 3), accel
+
+
+def by_entries(
+    errors: Influence,
+    segment: ImuSegment,
+    bias: FloatArray,
+    gyro_matrix: FloatArray,
+    accel_matrix: FloatArray,
+) -> FloatArray:
+    """Derivatives of the end of a segment by biases and entries.
+
+    An error of M_g acts as an error of the rate, dM_g (omega_m - b_g), at each reading; one of the bias as
+    -M_g db_g; the accelerometer alike. (tested against differences)
+
+    Args:
+        errors: What errors of rate and force do to the end.
+        segment: Readings.
+        bias: [gyro, accel], shape (6,).
+        gyro_matrix: M_g in force.
+        accel_matrix: M_a in force.
+
+    Returns:
+        By [bias 6, entries 15], rows as in `Influence`, shape (9, 21).
+    """
+    at = errors.weights[:, None, None] * errors.at
+    turned, forced = at[:, :, :3], at[:, :, 3:]
+    rate, force = segment.gyro - bias[:3], segment.accel - bias[3:]
+    out, by_bias = np.empty((9, 6 + ENTRIES)), errors.by_bias()
+    out[:, :3], out[:, 3:6] = by_bias[:, :3] @ gyro_matrix, by_bias[:, 3:] @ accel_matrix
+    out[:, 6:15] = np.einsum("nai,nj->aij", turned, rate).reshape(9, 9)
+    out[:, 15:] = np.einsum("nai,nj->aij", forced, force)[:, LOWER[:, 0], LOWER[:, 1]]
+    return out

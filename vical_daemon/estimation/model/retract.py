@@ -1,0 +1,156 @@
+"""Apply errors to the state: one at a time (`retract`) and a whole set of sigma points at once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.inertial.imu_model import Motion
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    GRAVITY,
+    GYRO_BIAS,
+    LOWER,
+    POSITION,
+    VELOCITY,
+    CameraSlices,
+    CameraState,
+    Layout,
+    State,
+    rotation_from_grp,
+    rotation_of_grp,
+    tilted_gravity,
+)
+
+
+class MotionPoints(NamedTuple):
+    """Sigma points of what moves the imu; batch of S (see `State` for meanings and units)."""
+
+    R: FloatArray
+    p: FloatArray
+    v: FloatArray
+    gyro_bias: FloatArray
+    accel_bias: FloatArray
+    gravity: FloatArray
+    gyro_matrix: FloatArray | None
+    accel_matrix: FloatArray | None
+    accel_lag_s: FloatArray | None = None
+
+
+class CameraPoints(NamedTuple):
+    """Sigma points of one camera; batch of S."""
+
+    R_imu_cam: FloatArray
+    p_imu_cam: FloatArray
+    timeshift_s: FloatArray
+    intrinsics: FloatArray
+    distortion: FloatArray
+    readout_s: FloatArray
+
+
+def motion_points(state: State, layout: Layout, errors: FloatArray) -> MotionPoints:
+    """Apply errors (S, >= dynamic) to the motion, biases, gravity and imu matrices."""
+    gyro_matrix = accel_matrix = None
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        gyro_matrix = state.gyro_matrix + errors[:, layout.gyro_matrix].reshape(-1, 3, 3)
+        accel_matrix = np.repeat(state.accel_matrix[None], len(errors), axis=0)
+        accel_matrix[:, LOWER[:, 0], LOWER[:, 1]] += errors[:, layout.accel_matrix]
+    return MotionPoints(
+        state.R_world_imu @ rotation_from_grp(errors[:, ATTITUDE]),
+        state.p_world_imu + errors[:, POSITION],
+        state.v_world_imu + errors[:, VELOCITY],
+        state.gyro_bias + errors[:, GYRO_BIAS],
+        state.accel_bias + errors[:, ACCEL_BIAS],
+        tilted_gravity(state.gravity, state.tilt, errors[:, GRAVITY]),
+        gyro_matrix,
+        accel_matrix,
+        None if layout.accel_lag is None else state.accel_lag_s + errors[:, layout.accel_lag],
+    )
+
+
+def pose_points(state: State, errors: FloatArray) -> Motion:
+    """Apply errors (S, >= 9) to attitude, position and velocity only (what an image depends on)."""
+    return Motion(
+        state.R_world_imu @ rotation_from_grp(errors[:, ATTITUDE]),
+        state.p_world_imu + errors[:, POSITION],
+        state.v_world_imu + errors[:, VELOCITY],
+    )
+
+
+def camera_points(camera: CameraState, layout: Layout, name: str, errors: FloatArray) -> CameraPoints:
+    """Apply errors (S, n) to one camera; what is not estimated keeps a batch of 1 and broadcasts."""
+    where = layout.cameras[name]
+    R, p = camera.R_imu_cam[None], camera.p_imu_cam[None]
+    shift, readout = np.array([camera.timeshift_s]), np.array([camera.readout_s])
+    K, D = camera.intrinsics[None], camera.distortion[None]
+    if where.rotation is not None and where.position is not None:
+        R = R @ rotation_from_grp(errors[:, where.rotation])
+        p = p + errors[:, where.position]
+    if where.timeshift is not None:
+        shift = shift + errors[:, where.timeshift]
+    if where.intrinsics is not None and where.distortion is not None:
+        K = K + errors[:, where.intrinsics]
+        D = D + errors[:, where.distortion]
+    if where.readout is not None:
+        readout = readout + errors[:, where.readout]
+    return CameraPoints(R, p, shift, K, D, readout)
+
+
+def retract(state: State, layout: Layout, dx: FloatArray) -> State:
+    """Return the state moved by one error vector, shape (n,). The argument is not changed."""
+    gyro_matrix, accel_matrix = state.gyro_matrix, state.accel_matrix
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        gyro_matrix = gyro_matrix + dx[layout.gyro_matrix].reshape(3, 3)
+        accel_matrix = accel_matrix.copy()
+        accel_matrix[LOWER[:, 0], LOWER[:, 1]] += dx[layout.accel_matrix]
+    lag_s = state.accel_lag_s
+    if layout.accel_lag is not None:
+        lag_s += float(dx[layout.accel_lag])
+    scale = state.target_scale
+    if layout.target_scale is not None:
+        scale += float(dx[layout.target_scale])
+    shape = state.target_shape
+    if layout.target_shape is not None:
+        shape = shape + dx[layout.target_shape]
+    tilted = rotation_of_grp(state.tilt @ dx[GRAVITY])
+    return State(
+        state.t_s,
+        orthonormal(state.R_world_imu @ rotation_of_grp(dx[ATTITUDE])),
+        state.p_world_imu + dx[POSITION],
+        state.v_world_imu + dx[VELOCITY],
+        state.gyro_bias + dx[GYRO_BIAS],
+        state.accel_bias + dx[ACCEL_BIAS],
+        tilted @ state.gravity,
+        {name: _moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
+        gyro_matrix,
+        accel_matrix,
+        lag_s,
+        scale,
+        shape,
+        tilted @ state.tilt,
+    )
+
+
+def _moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> CameraState:
+    R, p, K, D = camera.R_imu_cam, camera.p_imu_cam, camera.intrinsics, camera.distortion
+    shift, readout, skew = camera.timeshift_s, camera.readout_s, camera.skew
+    if where.rotation is not None and where.position is not None:
+        R, p = orthonormal(R @ rotation_of_grp(dx[where.rotation])), p + dx[where.position]
+    if where.timeshift is not None:
+        shift += float(dx[where.timeshift])
+    if where.skew is not None:
+        skew += float(dx[where.skew])
+    if where.intrinsics is not None and where.distortion is not None:
+        K, D = K + dx[where.intrinsics], D + dx[where.distortion]
+    if where.readout is not None:
+        readout += float(dx[where.readout])
+    return CameraState(R, p, shift, K, D, camera.distortion_model, camera.resolution, readout, skew)
+
+
+def orthonormal(R: FloatArray) -> FloatArray:
+    """One Newton step towards the nearest rotation: rounding never accumulates, however long it runs."""
+    out: FloatArray = 1.5 * R - 0.5 * R @ (R.T @ R)
+    return out

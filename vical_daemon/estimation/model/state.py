@@ -1,0 +1,283 @@
+"""The estimator's state: nominal values with names, and where each error lives in the covariance.
+
+Attitude errors are generalised Rodrigues parameters with a = 1, f = 4 (four times the modified Rodrigues
+parameters; equal to the rotation vector for small angles), local (right): R = R_nominal * delta.
+[Crassidis & Markley, "Unscented filtering for spacecraft attitude estimation", 2003, eq. (33)-(35)]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.target_modes import MODES, TargetModes
+
+MOTION = slice(0, 9)  # attitude rad, position m, velocity m/s: what moves
+ATTITUDE = slice(0, 3)  # rad, local (right) error of R_world_imu
+POSITION = slice(3, 6)  # m, p_world_imu
+VELOCITY = slice(6, 9)  # m/s, in world
+GYRO_BIAS = slice(9, 12)  # rad/s
+ACCEL_BIAS = slice(12, 15)  # m/s^2
+GRAVITY = slice(15, 17)  # rad, tilt of the direction of gravity
+_CORE = 17
+
+LOWER = np.array([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)])  # entries of the accelerometer matrix
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSlices:
+    """Where one camera's errors live; None: not estimated."""
+
+    position: slice | None  # m, p_imu_cam
+    rotation: slice | None  # rad, local (right) error of R_imu_cam
+    timeshift: int | None  # s
+    skew: int | None  # s/s, drift of the time shift
+    intrinsics: slice | None  # px, fx fy cx cy
+    distortion: slice | None  # 4 coefficients, or 5
+    readout: int | None  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Order of the error state: [core 17 | imu matrices | accel lag | cameras | target scale | target shape].
+
+    Attributes:
+        size: Length of the error state.
+        dynamic: Number of leading errors that enter the propagation (core, imu matrices and lag).
+        gyro_matrix: 9 entries, row-major, of M_g - I; None: not estimated.
+        accel_matrix: 6 entries (lower triangle) of M_a - I; the lower triangle fixes the gauge, since a
+            full matrix could be traded against R_imu_cam.
+        accel_lag: How late the accelerometer's readings are against the gyro's, s, index or None.
+        cameras: By name.
+        target_scale: Relative size of the board, index or None.
+        target_shape: How far the board is off in each of its modes, m; None: as stated.
+        target_modes: The ways in which it may be off; None: no target.
+    """
+
+    size: int
+    dynamic: int
+    gyro_matrix: slice | None
+    accel_matrix: slice | None
+    accel_lag: int | None
+    cameras: dict[str, CameraSlices]
+    target_scale: int | None
+    target_shape: slice | None = None
+    target_modes: TargetModes | None = None
+
+
+def make_layout(
+    models: Mapping[str, str],
+    *,
+    fix: frozenset[str],
+    estimate: frozenset[str],
+    target_m: FloatArray | None = None,
+) -> Layout:
+    """Lay the error state out.
+
+    Args:
+        models: Distortion model by camera.
+        fix: Names as in `CalibrationOptions`.
+        estimate: Likewise.
+        target_m: Points of the target, m, shape (n, 3); None: no target.
+    """
+    at = _CORE
+    gyro_matrix = accel_matrix = None
+    if "imu_intrinsics" in estimate:
+        gyro_matrix, accel_matrix = slice(at, at + 9), slice(at + 9, at + 15)
+        at += 15
+    accel_lag = at if "accel_lag" in estimate else None
+    at += accel_lag is not None
+    dynamic = at
+    blocks: dict[str, CameraSlices] = {}
+
+    def take(wanted: bool, n: int) -> slice | None:
+        nonlocal at
+        if not wanted:
+            return None
+        at += n
+        return slice(at - n, at)
+
+    for name, model in models.items():
+        position, rotation = take("extrinsics" not in fix, 3), take("extrinsics" not in fix, 3)
+        shift, skew = take("timeshift" not in fix, 1), take("timeshift" not in fix, 1)
+        lens = "intrinsics" not in fix
+        intrinsics, distortion = take(lens, 4), take(lens, len(COEFFICIENTS[model]))
+        readout = take("readout" in estimate, 1)
+        blocks[name] = CameraSlices(
+            position,
+            rotation,
+            shift.start if shift else None,
+            skew.start if skew else None,
+            intrinsics,
+            distortion,
+            readout.start if readout else None,
+        )
+    scale = take("target_scale" in estimate, 1)
+    modes = None if target_m is None else TargetModes.of(target_m)
+    shape = take(modes is not None and "target_shape" in estimate, MODES)
+    return Layout(
+        at,
+        dynamic,
+        gyro_matrix,
+        accel_matrix,
+        accel_lag,
+        blocks,
+        scale.start if scale else None,
+        shape,
+        modes,
+    )
+
+
+@dataclass(slots=True)
+class CameraState:
+    """Nominal values of one camera (see `CameraEstimate`); `skew` is the drift of the time shift, s/s."""
+
+    R_imu_cam: FloatArray
+    p_imu_cam: FloatArray
+    timeshift_s: float
+    intrinsics: FloatArray
+    distortion: FloatArray
+    distortion_model: str
+    resolution: tuple[int, int]
+    readout_s: float = 0.0
+    skew: float = 0.0
+
+
+@dataclass(slots=True)
+class State:
+    """Nominal state at `t_s` (the imu's clock).
+
+    Attributes:
+        t_s: Instant of the motion state, s since the base.
+        R_world_imu: Attitude, shape (3, 3).
+        p_world_imu: Position, m.
+        v_world_imu: Velocity, m/s.
+        gyro_bias: rad/s.
+        accel_bias: m/s^2.
+        gravity: Acceleration of free fall in the world, m/s^2; its length never changes.
+        gyro_matrix: M_g in omega = M_g (omega_m - b_g).
+        accel_matrix: M_a in f = M_a (f_m - b_a), lower triangular.
+        cameras: By name.
+        accel_lag_s: The specific force stamped t is that of t - accel_lag_s; the gyro's stamps are right.
+        target_scale: True size of the board over its stated size.
+        target_shape: How far the board is off in each of `Layout.target_modes`, m, shape (11,).
+        tilt: Two unit vectors across gravity, shape (3, 2): the errors of its direction are turns about them.
+            They turn with it: a basis worked out anew from each gravity must jump somewhere, and the
+            covariance would not jump with it.
+    """
+
+    t_s: float
+    R_world_imu: FloatArray
+    p_world_imu: FloatArray
+    v_world_imu: FloatArray
+    gyro_bias: FloatArray
+    accel_bias: FloatArray
+    gravity: FloatArray
+    cameras: dict[str, CameraState]
+    gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    accel_lag_s: float = 0.0
+    target_scale: float = 1.0
+    target_shape: FloatArray = field(default_factory=lambda: np.zeros(MODES))
+    tilt: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        if not len(self.tilt):
+            self.tilt = tilt_basis(self.gravity)
+
+
+class MotionStart(NamedTuple):
+    """Motion at one instant, known independently of the calibration.
+
+    Attributes:
+        t_s: Instant, imu clock, s.
+        R_world_imu: Attitude, shape (3, 3).
+        p_world_imu: Position, m.
+        v_world_imu: Velocity, m/s.
+        sigmas: Of attitude (rad), position (m), velocity (m/s), shape (9,).
+        elapsed_s: Since the state's instant; stamps may have stepped.
+    """
+
+    t_s: float
+    R_world_imu: FloatArray
+    p_world_imu: FloatArray
+    v_world_imu: FloatArray
+    sigmas: FloatArray
+    elapsed_s: float
+
+
+def rotation_from_grp(p: FloatArray) -> FloatArray:
+    """Rotation matrices of attitude errors (a = 1, f = 4), rational: no trigonometry.
+
+    With s = |p|^2/16: R = I + 2/(1+s)^2 * (2 (1-s) hat(p)/4 + 4 hat(p)^2 / 16) [Schaub & Junkins (3.152)].
+
+    Args:
+        p: Errors, shape (..., 3).
+
+    Returns:
+        Rotations, shape (..., 3, 3).
+    """
+    m = 0.25 * p
+    s = np.einsum("...i,...i->...", m, m)
+    d = 1.0 / (1.0 + s) ** 2
+    a, b = 4.0 * (1.0 - s) * d, 8.0 * d
+    out: FloatArray = (b[..., None] * m)[..., :, None] * m[..., None, :]
+    diagonal = 1.0 - b * s
+    am = a[..., None] * m
+    out[..., 0, 0] += diagonal
+    out[..., 1, 1] += diagonal
+    out[..., 2, 2] += diagonal
+    out[..., 2, 1] += am[..., 0]
+    out[..., 1, 2] -= am[..., 0]
+    out[..., 0, 2] += am[..., 1]
+    out[..., 2, 0] -= am[..., 1]
+    out[..., 1, 0] += am[..., 2]
+    out[..., 0, 1] -= am[..., 2]
+    return out
+
+
+def rotation_of_grp(p: FloatArray) -> FloatArray:
+    """`rotation_from_grp` of one error, shape (3,), in plain numbers: numpy takes ten times as long."""
+    x, y, z = (0.25 * p).tolist()
+    s = x * x + y * y + z * z
+    d = 1.0 / (1.0 + s) ** 2
+    a, b = 4.0 * (1.0 - s) * d, 8.0 * d
+    w = 1.0 - b * s
+    return np.array(
+        [
+            [w + b * x * x, b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, w + b * y * y, b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, w + b * z * z],
+        ]
+    )
+
+
+def grp_from_rotation(R: FloatArray) -> FloatArray:
+    """Attitude errors (a = 1, f = 4) of rotations below 180 degrees, shape (..., 3)."""
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    w = 0.5 * np.sqrt(np.maximum(1.0 + trace, 1e-12))
+    v = np.stack(
+        (R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), axis=-1
+    )
+    out: FloatArray = v / (w * (1.0 + w))[..., None]
+    return out
+
+
+def tilt_basis(gravity: FloatArray) -> FloatArray:
+    """Two unit vectors across gravity to begin with, shape (3, 2): the directions in which it can tilt."""
+    x, y, z = gravity / np.sqrt(gravity @ gravity)
+    # Householder frame of the nearer half
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
+
+
+def tilted_gravity(gravity: FloatArray, basis: FloatArray, tilt: FloatArray) -> FloatArray:
+    """Turn gravity by small angles about `basis` keeping its length; tilt shape (..., 2), rad."""
+    return (rotation_from_grp(tilt @ basis.T) @ gravity[:, None])[..., 0]

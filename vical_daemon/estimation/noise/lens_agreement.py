@@ -1,0 +1,93 @@
+"""Do stretches of the data agree about the lens, and is it of its model? How much larger its sigmas must be.
+
+A lens model never fits quite, and what it gets wrong depends on where in the image and at which slant the
+target is seen. Each stretch therefore says what it would have the lens be (see `stretches`), and the
+variances of the lens are as much larger as stretches disagree. What all stretches get wrong alike no
+comparison shows. So the model's next power of the radius is estimated beside: where it is there beyond
+doubt, the parameters are known no better than they would move with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RADTAN
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.noise.block_jackknife import Stretches
+
+_STRETCH_S = 5.0
+_BEYOND_DOUBT = 4.0  # sigmas of the next power of the radius: by chance once in 16000
+_WEAK = 0.1  # of the focal length: as good as nothing known
+_WEAK_DISTORTION = 0.5
+# the two highest powers of the radius among fx fy cx cy and the distortion
+_RADIAL = {RADTAN: (4, 5), PLUMB_BOB: (5, 8), EQUIDISTANT: (6, 7)}
+
+
+@dataclass(slots=True)
+class LensAgreement:
+    """Running agreement of one camera's lens.
+
+    Args:
+        model: radtan, plumb_bob or equidistant.
+
+    Attributes:
+        factors: Multiply the variances of fx fy cx cy and the distortion coefficients, >= 1, shape (n,).
+        moved: How far those would move with one more power of the radius, where that is there beyond doubt;
+            else zeros; px and -, shape (n,).
+    """
+
+    model: str
+    factors: FloatArray = field(init=False)
+    moved: FloatArray = field(init=False)
+    _stretches: Stretches = field(default_factory=lambda: Stretches(_STRETCH_S))
+
+    def __post_init__(self) -> None:
+        n = 4 + len(COEFFICIENTS[self.model])
+        self.factors, self.moved = np.ones(n), np.zeros(n)
+
+    def learn(
+        self, t_s: float, innovation: FloatArray, by_pose: FloatArray, by_lens: FloatArray, lens: FloatArray
+    ) -> None:
+        """Take in one image before it is used.
+
+        Args:
+            t_s: Its instant, s.
+            innovation: Measured minus predicted, over the corner noise, shape (2k,).
+            by_pose: Derivatives of the whitened pixels by attitude and position, shape (2k, 6).
+            by_lens: By fx fy cx cy and the distortion, shape (2k, n).
+            lens: Present values, shape (n,).
+        """
+        by = with_next_power(by_lens, self.model)
+        if not self._stretches.learn(t_s, innovation, by_pose, by, np.append(lens, 0.0)):
+            return
+        weak = lens_sigmas(lens[0], len(lens) + 1)
+        n = len(lens)
+        self.factors = self._stretches.compared(weak[:n]).factors
+        free = self._stretches.compared(weak)
+        power, variance = free.values[n], free.covariance[n, n]
+        doubt = _BEYOND_DOUBT**2 * free.factors[n] * variance
+        there = power if power**2 > doubt else 0.0
+        self.moved = free.covariance[:n, n] * (there / variance)
+
+
+def lens_sigmas(focal_px: float, n: int) -> FloatArray:
+    """Standard deviations of fx fy cx cy and n - 4 coefficients of which as good as nothing is known."""
+    return np.array([_WEAK * focal_px] * 4 + [_WEAK_DISTORTION] * (n - 4))
+
+
+def with_next_power(by_lens: FloatArray, model: str) -> FloatArray:
+    """Add the derivative by the coefficient that a distortion model would have next.
+
+    Args:
+        by_lens: Derivatives by fx fy cx cy and the distortion, shape (2k, n).
+        model: radtan, plumb_bob or equidistant.
+
+    Returns:
+        Shape (2k, n + 1).
+    """
+    below, highest = (by_lens[:, k].reshape(-1, 2) for k in _RADIAL[model])
+    size = np.maximum((below**2).sum(axis=1), 1e-30)  # each power is the one below times radius squared
+    power = (highest * ((below * highest).sum(axis=1) / size)[:, None]).ravel()
+    return np.column_stack([by_lens, power])

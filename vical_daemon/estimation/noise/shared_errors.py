@@ -1,0 +1,139 @@
+"""Errors that all corners of an image share, measured: a late stamp, and a shift of the whole image.
+
+A stamp that is late by e moves every corner by e times its speed in the image; a camera that shakes, or a
+detector that is drawn to one side, moves all alike. How much one image moved in these ways is known as well
+as corners and predicted pose are; how much images vary beyond that are the variances here. Both are
+estimated together, since each can be taken for the other, and each is 0 until it is significant: good images
+pay nothing.
+[docs/math/filter.md, eq. (12)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
+from vical_daemon.estimation.noise.variance_components import Observed, variances
+
+_MEMORY = 400  # images
+_LEAST = 20
+_LEAST_ASSUMED = 10
+_EVERY = 5  # images between two looks at all that is remembered
+_SELDOM_FROM, _SELDOM = 100, 4  # later it changes little: one look in so many
+_SIGNIFICANT = 5.0  # standard deviations above what images without such errors would give
+_STILL_SIGNIFICANT = 1.0  # to go on with what was found
+_FLOOR = np.array([2e-5, 5e-3])  # s, px
+_GROWN = 1.5  # the variance; less is scatter
+WAYS = 3  # late, to the side, down
+
+
+@dataclass(slots=True)
+class SharedErrors:
+    """Running estimate of one camera.
+
+    Attributes:
+        jitter_s: Standard deviation of a stamp, s; 0 while it cannot be told from none.
+        shift_px: Standard deviation by which a whole image is off, per axis, px; 0 likewise.
+        images: Images taken in.
+    """
+
+    jitter_s: float = 0.0
+    shift_px: float = 0.0
+    images: int = 0
+    _A: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
+    _C: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
+    _b: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS)))
+    _allowed: FloatArray = field(default_factory=lambda: np.zeros(_MEMORY))  # s^2, when the image was used
+    _counts: BoolArray = field(default_factory=lambda: np.zeros(_MEMORY, dtype=bool))
+    _assumed: bool = False
+
+    @classmethod
+    def assumed(cls, jitter_s: float) -> SharedErrors:
+        """A jitter that is allowed for until `begin` puts in its place what the images said."""
+        return cls(jitter_s, _assumed=True)
+
+    def begin(self) -> None:
+        """Go on with what was learnt, in a filter that has used none of these images."""
+        if self._assumed:
+            self.jitter_s = self.shift_px = 0.0
+            if self.images >= _LEAST_ASSUMED:
+                self._look(0.0, 0.0)
+            self._assumed = False
+        self._counts[:] = False
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations in the three ways, shape (3,)."""
+        return np.array([self.jitter_s, self.shift_px, self.shift_px])
+
+    def learn(self, innovation: FloatArray, ways: FloatArray, state: FloatArray, level: float = 1.0) -> None:
+        """Take in one image before it is used.
+
+        Args:
+            innovation: Measured minus predicted, over the corner noise, shape (m,).
+            ways: Derivatives of the whitened pixels by a late stamp (1/s; zeros where the time shift is
+                held) and by shifts (1/px), shape (m, 3).
+            state: `ways`' times H S of the whitened pixels (what states add to the sums), shape (3, c).
+            level: By how much innovations of any kind exceed their variances: where the model does not fit,
+                that in these ways is nothing of its own.
+        """
+        A = ways.T @ ways
+        if not A.any():
+            return
+        place = self.images % _MEMORY
+        self._A[place], self._b[place] = A, innovation @ ways
+        self._C[place] = level * (A + state @ state.T)
+        self._allowed[place], self._counts[place] = self.jitter_s**2, True
+        self.images += 1
+        every = _EVERY * (_SELDOM if self.images > _SELDOM_FROM else 1)
+        if not self._assumed and self.images >= _LEAST and self.images % every == 0:
+            jitters, shifts = self.jitter_s > 0.0, self.shift_px > 0.0
+            self._look(
+                _STILL_SIGNIFICANT if jitters else _SIGNIFICANT,
+                _STILL_SIGNIFICANT if shifts else _SIGNIFICANT,
+            )
+
+    def _look(self, jitter_needs: float, shift_needs: float) -> None:
+        """Estimate both from all that is remembered."""
+        n = min(self.images, _MEMORY)
+        observed = Observed(self._b[:n], self._A[:n], self._C[:n])
+        sigma = np.sqrt(variances(observed, (jitter_needs, shift_needs)))
+        self.jitter_s, self.shift_px = np.where(sigma > _FLOOR, sigma, 0.0).tolist()
+
+    def owed(self) -> float:
+        """Variance, s^2, by which the time shift is known less well than a filter thinks; asked once.
+
+        Images used with less jitter than is known by now weighed too much: the variance of their weighted
+        mean is sum w^2 (variance + jitter^2) / (sum w)^2, and not 1 / sum w.
+        """
+        counts, variance = self._counts & (self._A[:, 0, 0] > 0.0), self.jitter_s**2
+        short = counts & (variance > _GROWN * self._allowed)
+        if not short.any():
+            return 0.0
+        usual = self._C[counts, 0, 0] / self._A[counts, 0, 0] ** 2
+        weight = 1.0 / (usual + self._allowed[counts])
+        lacking = np.where(short[counts], variance - self._allowed[counts], 0.0)
+        self._allowed[short] = variance
+        return float(weight**2 @ lacking / weight.sum() ** 2)
+
+
+def shared_ways(state: State, layout: Layout, camera: str) -> FloatArray:
+    """Errors of the state that move an image as a late stamp (by the second) and shifts (by the px) do.
+
+    A shift is an error of the principal point; where the lens is held, nearly a small turn.
+
+    Returns:
+        Shape (size, 3).
+    """
+    where, known = layout.cameras[camera], state.cameras[camera]
+    ways = np.zeros((layout.size, WAYS))
+    if where.timeshift is not None:
+        ways[where.timeshift, 0] = 1.0
+    if where.intrinsics is not None:
+        ways[range(where.intrinsics.start + 2, where.intrinsics.stop), [1, 2]] = 1.0
+    else:
+        ways[ATTITUDE, 1:] = known.R_imu_cam[:, [1, 0]] / known.intrinsics[:2]
+    return ways

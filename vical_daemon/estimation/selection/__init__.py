@@ -1,0 +1,1 @@
+"""Which model of the rig the data support."""

@@ -1,0 +1,129 @@
+"""Do the clocks of camera and imu run alike? Both answers are kept, each as likely as the data make it.
+
+Most cameras are stamped by the clock that stamps the imu, and to ask them for a drift would double the sigma
+of their time shift; some run on a crystal of their own, 100 ppm off, and whoever takes those as constant is
+ten sigmas wrong after ten seconds. So the filter always has the drift as a state. That it is zero is a
+hypothesis beside it: its Gaussian is the filter's own, conditioned on no drift, and its odds come from how
+far the estimated drift lies from zero (Savage-Dickey density ratio). What is published are mean and
+covariance of the mixture. [docs/math/filter.md, eq. (16)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.retract import retract
+
+SKEW_SIGMA = 1e-4
+"""Drift of clocks that do not run alike, s/s, one sigma; two poor crystals."""
+CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
+SKEW_WALK = 1e-8
+"""How such a drift wanders (temperature), s/s per sqrt(s)."""
+_APART = 0.05  # share of rigs whose clocks do not run alike
+_LEAST_S = 1.0
+SURE = 0.99
+"""Probability from which on a drift is announced."""
+
+
+def apart(f: CalibrationFilter, camera: str) -> float:
+    """Probability that this camera's clock drifts against the imu's; 1 where that was announced."""
+    return 1.0 if camera in f.drifting else probability(_evidence(f, camera))
+
+
+def evidence(skew: float, variance: float) -> float:
+    """Return how much more likely data are if a clock drifts than if it does not (Bayes factor).
+
+    Args:
+        skew: Drift as estimated with a prior of `SKEW_SIGMA`, s/s.
+        variance: Of that estimate.
+    """
+    return float(np.sqrt(variance) / SKEW_SIGMA * np.exp(0.5 * min(skew**2 / variance, 200.0)))
+
+
+def probability(bayes_factor: float) -> float:
+    """Return the probability of a drift."""
+    odds = _APART / (1.0 - _APART) * bayes_factor
+    return odds / (1.0 + odds)
+
+
+def _evidence(f: CalibrationFilter, camera: str) -> float:
+    index = f.layout.cameras[camera].skew
+    if index is None:
+        return 0.0
+    variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index]) + stamps_variance(
+        f.stamp_sigma_s, f.state.t_s - f.began_s
+    )
+    return evidence(f.state.cameras[camera].skew, variance)
+
+
+def stamps_variance(stamp_sigma_s: float, elapsed_s: float) -> float:
+    """Variance of the drift that errors of the imu's stamps look like, (s/s)^2.
+
+    An error that changes once by one sigma, about halfway, has a slope of two sigmas over the whole time.
+
+    Args:
+        stamp_sigma_s: How well the driver knows its device's clock, s.
+        elapsed_s: Length of the data, s.
+    """
+    return (2.0 * stamp_sigma_s / max(elapsed_s, _LEAST_S)) ** 2
+
+
+def in_doubt(f: CalibrationFilter, camera: str) -> bool:
+    """Whether the data speak for a drift, though not yet surely: nothing to call converged."""
+    return camera not in f.drifting and _evidence(f, camera) > 1.0
+
+
+def surely_apart(f: CalibrationFilter, camera: str) -> bool:
+    """Whether the drift is beyond doubt."""
+    return apart(f, camera) > SURE
+
+
+def let_drift(f: CalibrationFilter, camera: str, *, anew: bool) -> Event:
+    """From now on the clock of this camera drifts (`anew`: and not as it did before); the announcement."""
+    where = f.layout.cameras[camera]
+    assert where.timeshift is not None
+    assert where.skew is not None
+    f.drifting.add(camera)
+    f.walk[where.skew] = SKEW_WALK**2
+    if anew:
+        f.reopen(where.skew, SKEW_SIGMA)
+        f.reopen(where.timeshift, SKEW_SIGMA * 10.0)
+    kind = EventKind.CLOCK_WANDER if anew else EventKind.CLOCK_DRIFT
+    return Event(kind, camera, float(f.state.cameras[camera].skew), float(np.linalg.norm(f.S[where.skew])))
+
+
+def averaged(f: CalibrationFilter) -> CalibrationFilter:
+    """Return the filter as it is to be told: mean and covariance over both hypotheses, for each camera."""
+    for name in f.layout.cameras:
+        f = _mixed(f, name, apart(f, name))
+    return f
+
+
+def as_if_alike(f: CalibrationFilter, camera: str) -> CalibrationFilter:
+    """Return the filter on the assumption that this camera's clock does not drift."""
+    return _mixed(f, camera, 0.0)
+
+
+def _mixed(f: CalibrationFilter, camera: str, p: float) -> CalibrationFilter:
+    """The mixture: with probability `p` what the filter says, else that conditioned on no drift.
+
+    With k = P e / sigma the column of the drift and z = drift / sigma, conditioning moves the mean by -k z
+    and takes k k' off P; the mixture goes (1 - p) of that way, and its covariance is
+    P - (1 - p)(1 - p z^2) k k'.
+    """
+    index = f.layout.cameras[camera].skew
+    if index is None or p == 1.0:
+        return f
+    sigma = float(np.sqrt(f.S[index] @ f.S[index]))
+    u = f.S[index] / sigma
+    k = f.S @ u
+    z = f.state.cameras[camera].skew / sigma
+    square = z * z / f.consistency[camera].factor  # of what is told, which is `factor` times P
+    less = (1.0 - p) * (1.0 - p * square)
+    S: FloatArray = f.S - (1.0 - np.sqrt(1.0 - less)) * np.outer(k, u)
+    return replace(f, state=retract(f.state, f.layout, -(1.0 - p) * z * k), S=S)

@@ -1,0 +1,100 @@
+"""What turned out not to be as stated is announced; no hypothesis that it is stands beside it any longer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.noise.lens_agreement import LensAgreement
+from vical_daemon.estimation.selection.model_selection import (
+    IMU,
+    LAG,
+    SIZE,
+    SURE,
+    TARGET,
+    Block,
+    blocks,
+    factor,
+    not_zero,
+    weights,
+)
+
+KNOWN_OFF_SIGMA = 1e-2
+"""Prior of the entries of an IMU that is known to be off, or where its matrices are asked for."""
+KNOWN_SIZE_SIGMA = 0.1
+"""Of the size of a target that is known to be off, or where it is asked for, relative."""
+_EVERY_S = 1.0
+_MEASURED = 400  # images
+_KINDS = {
+    IMU: EventKind.IMU_INTRINSICS,
+    LAG: EventKind.ACCEL_LAG,
+    SIZE: EventKind.TARGET_SIZE,
+    TARGET: EventKind.TARGET_SHAPE,
+}
+
+
+def known_off(block: str, values: FloatArray, sigmas: FloatArray) -> Event:
+    """The announcement for a block of `hypotheses` that is off, with the entry that is most surely so.
+
+    Args:
+        block: Its name.
+        values: Its states; for `SIZE` relative, for `LAG` s, for `TARGET` m at the edges.
+        sigmas: Their standard deviations.
+    """
+    surest = int(np.argmax(np.abs(values) / sigmas))
+    value = float(values[surest])
+    signed = block in (SIZE, LAG)
+    return Event(_KINDS[block], value=value if signed else abs(value), sigma=float(sigmas[surest]))
+
+
+def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
+    """Take the prior of a block back, but for that of one which is known to be off.
+
+    With c what the prior's information falls by and E the entries:
+    (P^-1 - c E E')^-1 = P + P E (I/c - E' P E)^-1 E' P, and the mean moves by P E (I/c - E' P E)^-1 E' x.
+    """
+    entries = f.S[block.where]
+    c = block.sigma**-2.0 - sigma**-2.0
+    L = root(np.eye(len(entries)) / c - entries @ entries.T)
+    W = solve_lower(L, entries @ f.S.T).T
+    dx = W @ solve_lower(L, block.values)
+    f.loosen(W)
+    f.state = retract(f.state, f.layout, dx)
+
+
+_KNOWN_SIGMA = {IMU: KNOWN_OFF_SIGMA, SIZE: KNOWN_SIZE_SIGMA}
+
+
+@dataclass(slots=True)
+class BeyondDoubt:
+    """Asks once a second what is known not to be as stated."""
+
+    _next_s: float = -np.inf
+
+    def look(self, f: CalibrationFilter) -> dict[str, Event]:
+        """Return what is to be announced, by the name of the block."""
+        if f.state.t_s < self._next_s:
+            return {}
+        self._next_s = f.state.t_s + _EVERY_S
+        shares = weights(f)
+        # a lag is small beside what images that do not fit do: only once that is measured is it known
+        early = {LAG} if max(c.images for c in f.consistency.values()) < _MEASURED else set()
+        known = [n for n in blocks(f) if n not in f.off | early and not_zero(shares, n) > SURE]
+        return {name: _off(f, name) for name in known}
+
+
+def _off(f: CalibrationFilter, name: str) -> Event:
+    """Let a block stand by itself; return the announcement."""
+    f.off.add(name)
+    if name in _KNOWN_SIGMA:
+        _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
+    if name == TARGET:  # what stretches said of the lens, they said with the target as stated
+        f.agreement = {camera: LensAgreement(agreement.model) for camera, agreement in f.agreement.items()}
+    block = blocks(f)[name]
+    return known_off(name, block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])

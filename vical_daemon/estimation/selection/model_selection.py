@@ -1,0 +1,190 @@
+"""Which of the things taken for true are not? All answers are kept, each as likely as the data make it.
+
+To ask every rig for size and shape of its board, the matrices of its IMU and the lag of its accelerometer
+would make the answer up to three times less certain; to take those that are a little off for true puts it ten
+stated sigmas off. So the filter always has them among its states. That some of them, or all, are zero are
+hypotheses beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how
+far the states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the
+mixture.
+[docs/math/filter.md, eq. (18)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.model.state import LOWER
+from vical_daemon.estimation.model.unscented import root, solve_lower
+
+IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
+ENTRY_SIGMA = 2e-3
+"""Scale or alignment of an IMU that is not as it says, one sigma of each entry."""
+IN_DOUBT = {
+    IMU: "sigmas are small; whether the imu's scale and alignment are true is not sure yet",
+    SIZE: "sigmas are small; whether the target is as large as stated is not sure yet",
+    TARGET: "sigmas are small; whether the target is as stated is not sure yet",
+}
+SIZE_SIGMA = 0.02
+"""Of a target that is not as large as stated, relative, one sigma; pages fitted to the paper: 3 to 6 %."""
+LAG_SIGMA_S = 3e-4
+"""By how much the delays of accelerometer and gyro differ in an IMU where they do, one sigma, s."""
+OFF = 0.05
+"""Share of rigs of which any one of these is not as stated, to begin with."""
+SURE = 0.99
+"""Probability from which on a block is known to be off."""
+_MOST = 300.0  # of a logarithm
+_NEGLIGIBLE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """States that are zero where what they describe is as stated.
+
+    Attributes:
+        where: Among the errors.
+        values: As estimated, shape (n,).
+        sigma: Of their prior, each.
+    """
+
+    where: slice
+    values: FloatArray
+    sigma: float
+
+
+def blocks(f: CalibrationFilter) -> dict[str, Block]:
+    """What a filter estimates beside the calibration, by its name in `CalibrationOptions.estimate`."""
+    layout, state = f.layout, f.state
+    found: dict[str, Block] = {}
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        off = state.accel_matrix - np.eye(3)
+        entries = np.concatenate([(state.gyro_matrix - np.eye(3)).ravel(), off[LOWER[:, 0], LOWER[:, 1]]])
+        found[IMU] = Block(slice(layout.gyro_matrix.start, layout.accel_matrix.stop), entries, ENTRY_SIGMA)
+    if layout.accel_lag is not None:
+        where = slice(layout.accel_lag, layout.accel_lag + 1)
+        found[LAG] = Block(where, np.array([state.accel_lag_s]), LAG_SIGMA_S)
+    if layout.target_scale is not None:
+        where = slice(layout.target_scale, layout.target_scale + 1)
+        found[SIZE] = Block(where, np.array([state.target_scale - 1.0]), SIZE_SIGMA)
+    if layout.target_shape is not None and layout.target_modes is not None:
+        found[TARGET] = Block(layout.target_shape, state.target_shape, layout.target_modes.sigma_m)
+    return found
+
+
+def log_bayes_factor(values: FloatArray, covariance: FloatArray, factor: float) -> float:
+    """Logarithm of how much more likely the data are if the values are not zero.
+
+    Args:
+        values: As estimated, over the sigmas of their prior, shape (n,).
+        covariance: Of them, shape (n, n).
+        factor: What was learnt beyond the prior is worth so many times less than the covariance says.
+    """
+    unit = np.eye(len(values))
+    information = np.linalg.inv(covariance)
+    tempered = unit + (information - unit) / factor
+    weighted = information @ values / factor
+    fits = float(weighted @ np.linalg.solve(tempered, weighted))
+    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(tempered)[1])
+
+
+def factor(f: CalibrationFilter) -> float:
+    """By how much the variances of all that is told exceed the filter's own (see `consistency`)."""
+    return max((c.factor for c in f.consistency.values()), default=1.0)
+
+
+def misfit(f: CalibrationFilter) -> float:
+    """By how much images miss by more than their noise although all blocks are free.
+
+    Then it is the images (a lens that is held and wrong), and what they say of imu and target is worth less
+    by as much again.
+    """
+    return max((c.scale for c in f.consistency.values()), default=1.0)
+
+
+def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
+    """Probability of each hypothesis; a hypothesis is named by the blocks that are as stated."""
+    doubtful = {name: block for name, block in blocks(f).items() if name not in f.off}
+    if not doubtful:
+        return {(): 1.0}
+    rows = np.concatenate([f.S[b.where] / b.sigma for b in doubtful.values()])
+    values = {name: b.values / b.sigma for name, b in doubtful.items()}
+    return posterior(values, rows @ rows.T, factor(f) * misfit(f))
+
+
+def posterior(
+    values: dict[str, FloatArray], covariance: FloatArray, less: float
+) -> dict[tuple[str, ...], float]:
+    """Probability of each hypothesis, named by the blocks that are zero; each is in nineteen rigs of twenty.
+
+    Args:
+        values: Of each block, as estimated, over the sigma of its prior.
+        covariance: Of all of them, in order, shape (n, n).
+        less: As the factor of `log_bayes_factor`.
+    """
+    ends = np.cumsum([len(x) for x in values.values()])
+    places = {name: np.arange(end - len(x), end) for (name, x), end in zip(values.items(), ends, strict=True)}
+    logs = {}
+    for true in (c for n in range(len(values) + 1) for c in combinations(values, n)):
+        logs[true] = len(true) * np.log(1.0 - OFF) + (len(values) - len(true)) * np.log(OFF)
+        if true:
+            at = np.concatenate([places[name] for name in true])
+            zero = np.concatenate([values[name] for name in true])
+            logs[true] -= log_bayes_factor(zero, covariance[np.ix_(at, at)], less)
+    most = max(logs.values())
+    total = sum(np.exp(x - most) for x in logs.values())
+    return {true: float(np.exp(x - most) / total) for true, x in logs.items()}
+
+
+def not_zero(shares: dict[tuple[str, ...], float], name: str) -> float:
+    """Probability that a block is not zero; 1 where that is none of the hypotheses."""
+    return sum(p for true, p in shares.items() if name not in true)
+
+
+def off(f: CalibrationFilter, name: str) -> float:
+    """Probability that a block is not zero; 1 where that was announced, or it was asked for."""
+    return not_zero(weights(f), name)
+
+
+def in_doubt(f: CalibrationFilter, name: str, *, converged: bool = False) -> bool:
+    """Whether the data speak for a block that is not zero, though not yet surely: they soon will.
+
+    Images that do not fit may never decide it; what is told covers both then. What has `converged` stays so
+    until the block is more likely off than not: of many looks, one sees 5 % by chance.
+    """
+    doubtful = name in blocks(f) and name not in f.off and misfit(f) == 1.0
+    return doubtful and off(f, name) > (0.5 if converged else OFF)
+
+
+def averaged(f: CalibrationFilter) -> CalibrationFilter:
+    """Return the filter as it is to be told: mean and covariance over all hypotheses.
+
+    With U the orthonormal rows of S that move the blocks which are zero, and d = S U' U S^-1 x, conditioning
+    takes S U' U S' off P and moves the mean by -d.
+    """
+    every = blocks(f)
+    n = f.layout.size
+    columns, shifts, shares = [], [], []
+    for true, p in weights(f).items():
+        if p < _NEGLIGIBLE:
+            continue
+        S, d = f.S, np.zeros(n)
+        if true:
+            rows = np.concatenate([f.S[every[name].where] for name in true])
+            L = root(rows @ rows.T)
+            U = solve_lower(L, rows)
+            d = f.S @ (U.T @ solve_lower(L, np.concatenate([every[name].values for name in true])))
+            S = f.S - (f.S @ U.T) @ U
+        columns.append(np.sqrt(p) * S)
+        shifts.append(d)
+        shares.append(p)
+    if len(shares) == 1 and not shifts[0].any():
+        return f
+    share, d = np.array(shares) / sum(shares), np.array(shifts)
+    mean = share @ d
+    apart = (np.sqrt(share / factor(f))[:, None] * (d - mean)).T  # of what is told, which is `factor` times P
+    return replace(f, state=retract(f.state, f.layout, -mean), S=np.concatenate([*columns, apart], axis=1))

@@ -1,0 +1,303 @@
+"""Inertial bundle adjustment of one window: motion, landmarks, biases and calibration at once.
+
+Levenberg-Marquardt on whitened errors; landmarks are eliminated by the Schur complement. Pixel noise, and how
+long its errors last, are measured on the way. [docs/math/target_free.md]
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotrs
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.carry import (
+    FULL,
+    INERTIAL,
+    Carry,
+    calibration_difference,
+    carried_out,
+    moved,
+    tangents,
+)
+from vical_daemon.estimation.smoother.inertial import links_left
+from vical_daemon.estimation.smoother.inertial_links import Links
+from vical_daemon.estimation.smoother.normal import Normal, Problem
+from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
+from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
+
+_OUT = 4.5  # sigmas; an observation beyond is taken out
+_DONE = 1.0  # a step that promises less than this of the sum of squares is the last
+_DAMPING = 1e-12
+"""Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
+of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
+_SMALL = 0.1  # of the sum of squares: where a step promises no more, outliers stand out
+_STUCK = 0.02  # of the sum of squares: where a step brought no more, outliers may be why
+
+
+class Fit(NamedTuple):
+    """How a window came out.
+
+    Attributes:
+        carry: What goes on from its last image.
+        squares: Sum of squared whitened pixel errors of the observations kept.
+        dof: Their degrees of freedom.
+        inertial: Squared whitened errors of the links over their number of rows.
+        sigma_px: Pixel noise that was found.
+        spread: Square root of the images that share an error.
+        jitter_s: Standard deviation of the images' stamps, s; 0 where none is seen.
+        steps: Iterations done.
+        settled: The last of them changed nothing to speak of.
+        used, refused: Observations.
+        change: Calibration found minus the one carried in, at the first image; active errors, shape (k,).
+        landmarks: How many.
+        parallax_deg: Typical angle under which a landmark's rays cross.
+    """
+
+    carry: Carry
+    squares: float
+    dof: int
+    inertial: float
+    sigma_px: float
+    spread: float
+    jitter_s: float
+    steps: int
+    settled: bool
+    used: int
+    refused: int
+    change: FloatArray
+    landmarks: int
+    parallax_deg: float
+
+
+class _Step(NamedTuple):
+    states: FloatArray
+    landmarks: FloatArray  # (L, 3)
+    promise: float  # by how much the sum of squares should fall
+
+
+_Saved = tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray]
+
+
+class Bundle:
+    """Adjusts one window.
+
+    Args:
+        window: Is changed in place.
+        carry: What was known before.
+        sigma_px: Pixel noise, first guess.
+        spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
+        jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
+    """
+
+    def __init__(
+        self, window: Window, carry: Carry, sigma_px: float, spread: float = 1.0, jitter_s: float = 0.0
+    ) -> None:
+        self.window, self.carry = window, carry
+        self.problem = Problem(window, carry, sigma_px, spread, jitter_s)
+        self.seen: Seen | None = None
+
+    # ------------------------------------------------------------------ the loop
+    def solve(self, buffer: ImuBuffer, most: int) -> Fit | None:
+        """Iterate until nothing changes or `most` steps are done; None where it does not hold together."""
+        w = self.window
+        seen = w.observe()
+        if len(seen.begin) < 8:
+            return None
+        lam, steps, gain = _DAMPING, 0, np.inf
+        cleaned = settled = False
+        links = w.stacked()
+        normal = self.problem.normal(seen, links)
+        while steps < most:
+            steps += 1
+            step = self._step(normal, lam)
+            if step is None:
+                return None
+            if cleaned and step.promise < _DONE and lam > _DAMPING:
+                lam = max(0.01 * lam, _DAMPING)  # damped, a step promises little
+                continue
+            if cleaned and step.promise < _DONE:
+                self._apply(step)
+                settled = not self._doubts_stamps(seen, links)
+                if settled:
+                    break
+                w.bad.clear()  # late images had looked like outliers
+                seen, cleaned, gain = w.observe(), False, np.inf
+            elif not cleaned and (step.promise < _SMALL * normal.cost or gain < _STUCK * normal.cost):
+                # close enough to tell what does not belong; or stuck, because of it
+                self._apply(step)
+                cleaned = True
+                self._learn_noise(seen)
+                if self._refuse(seen):
+                    seen = w.observe()
+                    if len(seen.begin) < 8:
+                        return None
+            else:
+                saved = self._save()
+                self._apply(step)
+                trial = self.problem.normal(seen, links)
+                if not np.isfinite(trial.cost) or trial.cost > normal.cost:
+                    self._restore(saved)
+                    lam *= 100.0
+                    if lam > 1e6:
+                        break
+                    continue
+                gain = normal.cost - trial.cost
+                normal, lam = trial, max(0.01 * lam, _DAMPING)
+                if not w.stale():
+                    continue
+            if w.stale():
+                if not w.relink(buffer):
+                    return None
+                links = w.stacked()
+            normal = self.problem.normal(seen, links)
+        return self._result(seen, links, normal, steps, settled)
+
+    def _save(self) -> _Saved:
+        w = self.window
+        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu
+
+    def _restore(self, s: _Saved) -> None:
+        w = self.window
+        w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu = s
+
+    # ------------------------------------------------------------------ step
+    def _reduced(self, normal: Normal, lam: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Normal matrix without landmarks, gradient, and what brings the landmarks back."""
+        order = self.problem.order()
+        F = len(self.window.frames)
+        tiny = 1e-10 * np.trace(normal.V, axis1=1, axis2=2)
+        V = normal.V * (1.0 + lam * np.eye(3)) + tiny[:, None, None] * np.eye(3)
+        root = np.linalg.cholesky(V)
+        inverse = np.linalg.inv(root)
+        L = len(V)
+        Y = np.matmul(inverse, normal.W).reshape(3 * L, -1)
+        u = np.matmul(inverse, normal.gl[..., None]).reshape(-1)
+        S = Y.T @ Y
+        s = Y.T @ u
+        H, g = normal.H.copy(), normal.g.copy()
+        at = np.concatenate([order.frames[:, :6].reshape(6 * F), order.calib])
+        n, m = 9 * (F - 1), 6 * (F - 1)  # by a view where unknowns lie evenly: a fifth of the time
+        H[:n, :n].reshape(F - 1, 9, F - 1, 9)[:, :6, :, :6] -= S[:m, :m].reshape(F - 1, 6, F - 1, 6)
+        H[np.ix_(at[m:], at)] -= S[m:]
+        H[np.ix_(at[:m], at[m:])] -= S[:m, m:]
+        g[at] -= s
+        return H, g, inverse, at
+
+    def _step(self, normal: Normal, lam: float) -> _Step | None:
+        """Step of states and landmarks; None where the matrix is not positive."""
+        for _ in range(6):
+            try:
+                H, g, inverse, at = self._reduced(normal, lam)
+            except np.linalg.LinAlgError:  # a landmark without any depth
+                lam = max(10.0 * lam, 1e-6)
+                continue
+            H[np.diag_indices_from(H)] *= 1.0 + lam
+            root, info = dpotrf(H, lower=1, overwrite_a=1)
+            if info == 0:
+                dx = -dpotrs(root, g, lower=1)[0]
+                right = normal.gl + np.matmul(normal.W, dx[at])
+                own = np.matmul(inverse, normal.gl[..., None])
+                dl = -np.matmul(np.swapaxes(inverse, 1, 2), np.matmul(inverse, right[..., None]))[..., 0]
+                return _Step(dx, dl, float((own**2).sum() - g @ dx))
+            lam = max(10.0 * lam, 1e-6)
+        return None
+
+    def _apply(self, step: _Step) -> None:
+        dx, dl = step.states, step.landmarks
+        w, order = self.window, self.problem.order()
+        d = dx[order.frames]
+        w.R = orthonormal_all(w.R @ so3.exp(d[:, :3]))
+        w.p, w.v = w.p + d[:, 3:6], w.v + d[:, 6:]
+        w.bias = w.bias + dx[order.knots]
+        full = np.zeros(FULL)
+        full[self.problem.active] = dx[order.calib]
+        w.camera, w.imu = moved(w.camera, full), w.imu + full[INERTIAL][: len(w.imu)]
+        m = w.landmarks
+        bearing = m.bearing + np.matmul(tangents(m.bearing), dl[:, :2, None])[..., 0]
+        bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
+        inverse = np.clip(m.inverse + dl[:, 2], 0.2 * m.inverse, 5.0 * m.inverse + 0.01)
+        w.landmarks = Landmarks(m.ids, m.anchor, bearing, inverse)
+
+    # ------------------------------------------------------------------ noise, outliers, result
+    def _doubts_stamps(self, seen: Seen, links: Links) -> bool:
+        """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
+        if self.problem.jitter_s:
+            return False
+        self.problem.jitter_s = self.problem.stamps_doubted(seen, links)
+        return self.problem.jitter_s > 0.0
+
+    def _learn_noise(self, seen: Seen) -> None:
+        """Pixel noise such that the kept errors have the size that they should have."""
+        e, ok, _ = self.problem.pixel_errors(seen)
+        size = np.sqrt((e[ok] ** 2).sum(axis=1))
+        if not len(size):
+            return
+        # median of a Rayleigh variable is 1.1774 sigma; degrees of freedom used up by the fit
+        share = np.sqrt(max(self._dof(seen) / max(2 * int(ok.sum()), 1), 0.05))
+        self.problem.sigma_px = float(
+            np.clip(self.problem.sigma_px * np.median(size) / 1.1774 / share, 0.02, 20.0)
+        )
+        self.problem.spread = float(np.sqrt(correlation(np.where(ok[:, None], e, 0.0), seen)))
+
+    def _dof(self, seen: Seen) -> int:
+        return 2 * len(seen.frame) - 3 * len(seen.begin) - 2 * len(self.window.frames)
+
+    def _refuse(self, seen: Seen) -> int:
+        """Take observations out that do not fit, and whole landmarks of which a third does not."""
+        e, ok, _ = self.problem.pixel_errors(seen)
+        out = ~ok | ((e**2).sum(axis=1) > _OUT**2)
+        count = np.add.reduceat(np.ones(len(out)), seen.begin)
+        share = np.add.reduceat(out.astype(float), seen.begin) / count
+        out |= (share > 0.34)[seen.landmark]
+        w = self.window
+        for n in np.flatnonzero(out):
+            w.bad.add((w.frames[seen.frame[n]][1].t_cam_ns, int(w.landmarks.ids[seen.landmark[n]])))
+        return int(out.sum())
+
+    def _result(self, seen: Seen, links: Links, normal: Normal, steps: int, settled: bool) -> Fit | None:
+        w, order = self.window, self.problem.order()
+        try:
+            H = self._reduced(normal, 0.0)[0]
+        except np.linalg.LinAlgError:
+            return None
+        root, info = dpotrf(H, lower=1, overwrite_a=1)
+        if info:
+            return None
+        tail = order.tail
+        L22 = np.tril(root[tail:, tail:])
+        try:
+            covariance = np.linalg.inv(L22 @ L22.T)
+        except np.linalg.LinAlgError:
+            return None
+        e, ok, _ = self.problem.pixel_errors(seen)
+        self.seen = seen
+        inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
+        good = ok & ((e**2).sum(axis=1) <= _OUT**2)
+        squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
+        change = calibration_difference(w, self.carry)[self.problem.active]
+        return Fit(
+            carried_out(w, covariance, self.carry.active),
+            squares,
+            max(self._dof(seen), 1),
+            inertial,
+            self.problem.sigma_px,
+            self.problem.spread,
+            jitter_s,
+            steps,
+            settled,
+            int(good.sum()),
+            int((~good).sum()) + len(w.bad),
+            change,
+            len(seen.begin),
+            parallax_deg(w, seen),
+        )
+
+
+def orthonormal_all(R: FloatArray) -> FloatArray:
+    """One Newton step towards the nearest rotation for each of a batch (`retract.orthonormal`)."""
+    return np.asarray(1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R))

@@ -1,0 +1,180 @@
+"""What one window of images hands on to the next: tilt, speed, biases, calibration, and how well known.
+
+In coordinates that do not know where the world's origin and heading are, so that no information about them
+can arise from nothing. [docs/math/target_free.md, eq. (9)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.model.imu_scale import NUMBERS
+from vical_daemon.estimation.model.retract import orthonormal
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.window import Window
+
+# Of the calibration's errors; the time shift is that at the first image, and drifts from there on.
+ARM, TURN, SHIFT, LENS, DRIFT, READOUT, IMU = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15, 16, slice(17, 32)
+LAG = slice(32, 33)
+INERTIAL = slice(IMU.start, LAG.stop)
+FULL = LAG.stop
+_HELD_M = 1e-4
+CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
+
+
+@dataclass(slots=True)
+class Carry:
+    """What is known at the first image of a window before its own data.
+
+    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of `FULL`).
+
+    Attributes:
+        R: Attitude there; only its tilt matters.
+        speed: Velocity in the imu frame, m/s, shape (3,).
+        bias: [gyro, accel], shape (6,).
+        camera: Calibration.
+        root: W with W^T W = information of the errors, shape (d, d).
+        active: Which of the calibration errors are estimated, shape (FULL,).
+        t_cam_s: Stamp of that image, s.
+        imu: What is not as stated of the imu, see `Window`.
+    """
+
+    R: FloatArray
+    speed: FloatArray
+    bias: FloatArray
+    camera: CameraState
+    root: FloatArray
+    active: BoolArray
+    t_cam_s: float
+    imu: FloatArray
+
+    def covariance(self) -> FloatArray:
+        """Covariance of the errors, shape (d, d)."""
+        inverse = np.linalg.inv(self.root)
+        return np.asarray(inverse @ inverse.T)
+
+    def at(self, t_cam_s: float) -> Carry:
+        """The same at another stamp of the camera's clock: its drift moves the time shift."""
+        seconds = t_cam_s - self.t_cam_s
+        camera = replace(self.camera, timeshift_s=self.camera.timeshift_s + self.camera.skew * seconds)
+        root = self.root.copy()
+        root[:, CALIBRATION:] = root[:, CALIBRATION:] @ later(self.active, -seconds)
+        return replace(self, camera=camera, root=root, t_cam_s=t_cam_s)
+
+    def calibration(self) -> FloatArray:
+        """Covariance of the calibration's errors, zero where not estimated, shape (FULL, FULL)."""
+        full = np.zeros((FULL, FULL))
+        at = np.flatnonzero(self.active)
+        full[np.ix_(at, at)] = self.covariance()[CALIBRATION:, CALIBRATION:]
+        return full
+
+
+def later(active: BoolArray, seconds: float) -> FloatArray:
+    """Active calibration errors some seconds later, by those now: the drift carries into the time shift."""
+    G = np.eye(FULL)
+    G[SHIFT, DRIFT] = seconds
+    at = np.flatnonzero(active)
+    return np.asarray(G[np.ix_(at, at)])
+
+
+def camera_difference(now: CameraState, then: CameraState) -> FloatArray:
+    """Errors [arm, turn (local), shift, lens 8, drift, readout] from `then` to `now`, shape (17,)."""
+    return np.concatenate(
+        [
+            now.p_imu_cam - then.p_imu_cam,
+            so3.log(then.R_imu_cam.T @ now.R_imu_cam),
+            [now.timeshift_s - then.timeshift_s],
+            now.intrinsics - then.intrinsics,
+            now.distortion - then.distortion,
+            [now.skew - then.skew, now.readout_s - then.readout_s],
+        ]
+    )
+
+
+def calibration_difference(window: Window, carry: Carry) -> FloatArray:
+    """Errors of the calibration that lead from what was carried in to the window's, shape (FULL,)."""
+    imu = window.imu - carry.imu if len(window.imu) else np.zeros(NUMBERS)
+    return np.concatenate([camera_difference(window.camera, carry.camera), imu])
+
+
+def moved(camera: CameraState, d: FloatArray) -> CameraState:
+    """The camera with errors of the calibration applied, shape (FULL,)."""
+    return replace(
+        camera,
+        R_imu_cam=orthonormal(camera.R_imu_cam @ so3.exp(d[TURN])),
+        p_imu_cam=camera.p_imu_cam + d[ARM],
+        timeshift_s=camera.timeshift_s + float(d[SHIFT]),
+        intrinsics=camera.intrinsics + d[7:11],
+        distortion=camera.distortion + d[11:15],
+        skew=camera.skew + float(d[DRIFT]),
+        readout_s=camera.readout_s + float(d[READOUT]),
+    )
+
+
+def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
+    """Next to nothing known: wide sigmas around a start.
+
+    Args:
+        window: Started window; its camera is the centre of the prior.
+        active: Which of the calibration errors are estimated, shape (FULL,).
+        sigmas: Of the calibration errors, shape (FULL,).
+    """
+    wide = np.concatenate([[1.0] * 2, [5.0] * 3, [0.02] * 3, [0.3] * 3, sigmas[np.flatnonzero(active)]])
+    R, t_s = window.R[0], window.frames[0][0]
+    root, speed = np.diag(1.0 / wide), R.T @ window.v[0]
+    return Carry(R.copy(), speed, np.zeros(6), window.camera, root, active, t_s, window.imu)
+
+
+def held_along(carry: Carry, axis: FloatArray) -> Carry:
+    """The same with the lever arm as good as known along an axis of the imu (unit, shape (3,))."""
+    if not carry.active[:3].all():
+        return carry
+    row = np.zeros((1, len(carry.root)))
+    row[0, CALIBRATION : CALIBRATION + 3] = axis / _HELD_M
+    stacked = np.vstack([carry.root, row])
+    return replace(carry, root=np.linalg.qr(stacked)[1])
+
+
+def tangents(bearing: FloatArray) -> FloatArray:
+    """Two directions across each unit vector, shape (n, 3, 2); smooth but at one pole."""
+    x, y, z = bearing[:, 0], bearing[:, 1], bearing[:, 2]
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    out = np.empty((len(bearing), 3, 2))
+    out[:, :, 0] = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    out[:, :, 1] = np.stack([b, sign + y * y * a, -y], axis=1)
+    return out
+
+
+def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Carry:
+    """Turn the marginal at a window's last image into coordinates without origin and heading.
+
+    Args:
+        window: Adjusted.
+        covariance: Of [last image 9, last knot 6, active calibration errors].
+        active: Which of the calibration errors are estimated, shape (FULL,).
+    """
+    k = int(np.count_nonzero(active))
+    span_s, camera = window.span_s, window.camera
+    camera = replace(camera, timeshift_s=camera.timeshift_s + camera.skew * span_s)
+    R, v = window.last_at(camera.timeshift_s)
+    J = np.zeros((CALIBRATION + k, 15 + k))
+    speed = R.T @ v
+    J[:2, :3] = tangents(R[2][None])[0].T
+    J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R.T
+    J[5:11, 9:15] = np.eye(6)
+    J[11:, 15:] = later(active, span_s)
+    root = root_of(J @ covariance @ J.T)
+    return Carry(R, speed, window.bias[-1].copy(), camera, root, active, window.frames[-1][0], window.imu)
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """W with W^T W = inverse of a covariance."""
+    scale = np.sqrt(np.diag(covariance))  # pixels beside microseconds
+    root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-14 * np.eye(len(scale)))
+    return np.asarray(np.linalg.inv(root) / scale)

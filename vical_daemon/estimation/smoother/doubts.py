@@ -1,0 +1,137 @@
+"""What a target-free calibration asks beside: do clocks drift, is the imu off, does the shutter roll?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection.clock_drift import (
+    CLOCKS_IN_DOUBT,
+    SURE,
+    evidence,
+    probability,
+    stamps_variance,
+)
+from vical_daemon.estimation.selection.model_acceptance import KNOWN_OFF_SIGMA, known_off
+from vical_daemon.estimation.smoother.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, Carry
+from vical_daemon.estimation.smoother.snapshot import Doubts
+
+_SURELY_ROLLING = 5.0  # sigmas
+_SHORTEST_S = 1e-3  # of a readout that is worth a word
+_WHERE = {hypotheses.IMU: np.arange(FULL)[IMU], hypotheses.LAG: np.arange(FULL)[LAG]}
+_SIGMA = {hypotheses.IMU: hypotheses.ENTRY_SIGMA, hypotheses.LAG: hypotheses.LAG_SIGMA_S}
+
+Weights = dict[tuple[str, ...], float]
+
+
+class FreeDoubts:
+    """Follows what the windows say about clocks, imu and shutter.
+
+    Args:
+        camera: Name of the camera.
+        asked: What is asked for (`CalibrationOptions.estimate`): estimated whatever the evidence.
+        rolling: The shutter is said to be a rolling one, or its readout is asked for.
+
+    Attributes:
+        drifting: The camera's clock is known to run apart from the imu's.
+        imu_asked: The imu's matrices are asked for.
+        imu_sigma: Prior of the entries of the imu's matrices.
+        rolling: The shutter is known to be a rolling one.
+        stamp_sigma_s: How well the imu's driver knows its device's clock, s.
+    """
+
+    def __init__(self, camera: str, *, asked: frozenset[str], rolling: bool) -> None:
+        self._camera = camera
+        self._off = asked & set(_WHERE)
+        self.imu_asked = hypotheses.IMU in asked
+        self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else hypotheses.ENTRY_SIGMA
+        self.drifting = False
+        self.rolling = rolling
+        self.stamp_sigma_s = 0.0
+        self._began_s = np.inf
+
+    def watch(self, carry: Carry, factor: float, compared: bool) -> list[Event]:
+        """Announce what has got beyond doubt.
+
+        Args:
+            carry: What is known.
+            factor: Measured variance over the stated one.
+            compared: Windows could be compared; before, what looks like the imu may as well be the images.
+        """
+        events: list[Event] = []
+        if not self.drifting and probability(self._drift(carry, factor)) >= SURE:
+            self.drifting = True
+            sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
+            events.append(Event(EventKind.CLOCK_DRIFT, self._camera, float(carry.camera.skew), sigma))
+        sigmas = np.sqrt(factor * np.diag(carry.calibration()))
+        if not self.rolling:
+            readout_s, sigma_s = carry.camera.readout_s, float(sigmas[READOUT])
+            self.rolling = abs(readout_s) > max(_SURELY_ROLLING * sigma_s, _SHORTEST_S)
+            if self.rolling:
+                events.append(Event(EventKind.ROLLING_SHUTTER, self._camera, float(readout_s), sigma_s))
+        if compared:
+            weights = self._weights(carry, factor)
+            known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > hypotheses.SURE}
+            news = [(name, _WHERE[name]) for name in sorted(known - self._off)]
+            events += [known_off(name, _numbers(carry)[at], sigmas[at]) for name, at in news]
+            self._off |= known
+        return events
+
+    def reason(self, carry: Carry, factor: float, *, converged: bool) -> str:
+        """What may not be as it is taken to be, in words; empty where nothing speaks for it.
+
+        For `converged` see `hypotheses.in_doubt`.
+        """
+        imu, enough = hypotheses.IMU, 0.5 if converged else hypotheses.OFF
+        if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > enough:
+            return hypotheses.IN_DOUBT[imu]
+        if not self.drifting and self._drift(carry, factor) > 1.0:
+            return CLOCKS_IN_DOUBT
+        return ""
+
+    def weighed(self, carry: Carry, factor: float, compared: bool) -> Doubts:
+        """How likely each is, for what is told; arguments as for `watch`."""
+        weights = self._weights(carry, factor)
+        every = max(weights, key=len)
+        if not compared and weights[every] < 0.5:
+            others = 0.5 / max(1.0 - weights[every], 1e-300)
+            weights = {true: 0.5 if true == every else others * p for true, p in weights.items()}
+        stated = tuple(
+            (p, np.concatenate([np.zeros(0, np.intp), *(_WHERE[name] for name in true)]))
+            for true, p in weights.items()
+        )
+        return Doubts(factor, self.drifting, stated, gyro_frame=not self.imu_asked, rolling=self.rolling)
+
+    def _drift(self, carry: Carry, factor: float) -> float:
+        """How much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated."""
+        if not carry.active[DRIFT]:
+            return 0.0
+        self._began_s = min(self._began_s, carry.t_cam_s)
+        variance = factor * float(carry.calibration()[DRIFT, DRIFT])
+        variance += stamps_variance(self.stamp_sigma_s, carry.t_cam_s - self._began_s)
+        return evidence(carry.camera.skew, variance)
+
+    def _weights(self, carry: Carry, factor: float) -> Weights:
+        """Probability of each hypothesis about the imu, named by what is as stated.
+
+        Where windows disagree although all is free, it is the images, and what they say about the imu is
+        worth less by as much again.
+        """
+        doubtful = [name for name in _WHERE if name not in self._off]
+        if not doubtful:
+            return {(): 1.0}
+        numbers = _numbers(carry)
+        at = np.concatenate([_WHERE[name] for name in doubtful])
+        sigma = np.concatenate([np.full(len(_WHERE[name]), _SIGMA[name]) for name in doubtful])
+        covariance = carry.calibration()[np.ix_(at, at)] / np.outer(sigma, sigma)
+        values = {name: numbers[_WHERE[name]] / _SIGMA[name] for name in doubtful}
+        return hypotheses.posterior(values, covariance, factor**2)
+
+
+def _numbers(carry: Carry) -> FloatArray:
+    """What is not as stated of the imu, at its place among the errors, shape (FULL,)."""
+    out = np.zeros(FULL)
+    out[INERTIAL] = carry.imu
+    return out

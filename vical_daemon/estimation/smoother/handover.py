@@ -1,0 +1,82 @@
+"""What a window of the target-free calibration hands to the next: knowledge, aged a little, and an image."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.selection.clock_drift import SKEW_WALK
+from vical_daemon.estimation.smoother.carry import (
+    CALIBRATION,
+    DRIFT,
+    SHIFT,
+    Carry,
+    first_carry,
+    held_along,
+    root_of,
+)
+from vical_daemon.estimation.smoother.starter import start_sigmas
+from vical_daemon.estimation.smoother.window import KNOT_S, Landmarks, Window
+
+_SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
+_GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2 = 4e-4, 5e-3  # by which biases may have walked while nothing was seen
+
+
+def afresh(
+    window: Window, known: Carry | None, active: BoolArray, held: FloatArray | None, imu_sigma: float
+) -> Carry:
+    """Prior of a window that starts from nothing: wide, or with the calibration and biases known before.
+
+    Args:
+        window: As the start left it; takes the known time shift along.
+        known: What was known, or None.
+        active: Which calibration errors are estimated, shape (FULL,).
+        held: Axis along which the lever arm is held, see `Starter`.
+        imu_sigma: Of the entries of the imu's matrices, where nothing is known.
+    """
+    wide = first_carry(window, active, start_sigmas(window.camera, imu_sigma))
+    if known is None:
+        return wide if held is None else held_along(wide, held)
+    known = known.at(wide.t_cam_s)
+    keep = known.covariance()[5:, 5:]
+    keep[:3, :3] += _GYRO_BIAS_RPS**2 * np.eye(3)
+    keep[3:6, 3:6] += _ACCEL_BIAS_MPS2**2 * np.eye(3)
+    covariance = np.diag(np.diag(wide.root) ** -2.0)
+    covariance[5:, 5:] = keep
+    window.camera = replace(window.camera, timeshift_s=known.camera.timeshift_s)
+    return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
+
+
+def aged(carry: Carry, noise: ImuNoise, active: BoolArray, span_s: float, *, drifting: bool) -> Carry:
+    """Let biases and delay walk a little before the next window."""
+    P = carry.covariance()
+    P[range(5, 8), range(5, 8)] += noise.gyro_walk**2 * KNOT_S
+    P[range(8, 11), range(8, 11)] += noise.accel_walk**2 * KNOT_S
+    for error, walk in ((SHIFT, _SHIFT_WALK), (DRIFT, SKEW_WALK if drifting else 0.0)):
+        if active[error]:
+            place = CALIBRATION + int(active[:error].sum())
+            P[place, place] += walk**2 * span_s
+    return replace(carry, root=root_of(P))
+
+
+def next_window(window: Window, carry: Carry) -> Window:
+    """A window that begins at the last image of this one, which has told what it had to tell."""
+    t, last = window.frames[-1]
+    none = PointsFrame(last.camera, last.t_cam_ns, last.ids[:0], last.uv_px[:0])
+    empty = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    return Window(
+        carry.camera,
+        window.noise,
+        [(t, none)],
+        carry.R[None],
+        np.zeros((1, 3)),
+        (carry.R @ carry.speed)[None],
+        carry.bias[None].copy(),
+        [],
+        carry.camera.timeshift_s,
+        empty,
+        gravity=window.gravity,
+        imu=window.imu,
+    )

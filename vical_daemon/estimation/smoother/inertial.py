@@ -1,0 +1,137 @@
+"""The inertial side of a window: links between images, biases that walk, stamps that jitter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.smoother.inertial_links import Links
+from vical_daemon.estimation.smoother.jitter import Lateness
+from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
+
+_LEAST_JITTER_S = 3e-5
+
+
+class Order:
+    """Places of the unknowns: images but the last, knots but the last, last image, last knot, calibration.
+
+    Args:
+        F: Images.
+        K: Knots.
+        k: Calibration errors.
+        imu: How many of them, the last ones, are numbers of the imu (`imu_scale`).
+    """
+
+    def __init__(self, F: int, K: int, k: int, imu: int = 0) -> None:
+        self.size = 9 * F + 6 * K + k
+        self.tail = 9 * (F - 1) + 6 * (K - 1)
+        frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
+        knots = 9 * (F - 1) + np.arange(6 * (K - 1)).reshape(K - 1, 6)
+        self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
+        self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
+        self.calib = self.tail + 15 + np.arange(k)
+        self.imu = self.calib[k - imu :]
+
+    def of_links(self, knots: IntArray) -> IntArray:
+        """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 40)."""
+        entries = np.broadcast_to(self.imu, (len(knots), len(self.imu)))
+        return np.concatenate([self.frames[:-1], self.frames[1:], self.knots[knots], entries], axis=1)
+
+
+def link_errors(window: Window, links: Links) -> tuple[FloatArray, FloatArray]:
+    """Whitened errors (F - 1, 9) of the links about the present values; derivatives (F - 1, 9, 24 or 40)."""
+    w = window
+    return links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
+
+
+def add_links(
+    window: Window, links: Links, jitter_s: float, order: Order, H: FloatArray, g: FloatArray
+) -> float:
+    """Add the links and the walk of the biases to the normal equations, in place.
+
+    Args:
+        window: Present values.
+        links: Of the window.
+        jitter_s: Standard deviation of the images' stamps, s; 0: exact.
+        order: Places of the unknowns.
+        H: Normal matrix, shape (n, n).
+        g: Gradient, shape (n,).
+
+    Returns:
+        Their sum of squares.
+    """
+    knots = window.knots()
+    e, J = link_errors(window, links)
+    JT = np.swapaxes(J, 1, 2)
+    A, b = JT @ J, np.matmul(JT, e[..., None])[..., 0]
+    # neighbours share an image and many links a knot: even and odd links, then the knots one by one
+    for first in (0, 1):
+        at = np.concatenate([order.frames[first:-1:2], order.frames[first + 1 :: 2]], axis=1)
+        H[at[:, :, None], at[:, None, :]] += A[first::2, :18, :18]
+        g[at] += b[first::2, :18]
+    for knot in range(len(window.bias)):
+        own = np.flatnonzero(knots == knot)
+        rows = order.knots[knot]
+        H[rows[:, None], rows] += A[own, 18:24, 18:24].sum(axis=0)
+        g[rows] += b[own, 18:24].sum(axis=0)
+        for first in (0, 9):
+            at = order.frames[own + first // 9].reshape(-1)
+            _add_side(H, at, rows, A[own, first : first + 9, 18:24].reshape(-1, 6))
+        if len(order.imu):
+            _add_side(H, rows, order.imu, A[own, 18:24, 24:].sum(axis=0))
+    if len(order.imu):
+        H[order.imu[:, None], order.imu] += A[:, 24:, 24:].sum(axis=0)
+        g[order.imu] += b[:, 24:].sum(axis=0)
+        for first, frames in ((0, order.frames[:-1]), (9, order.frames[1:])):
+            side = A[:, first : first + 9, 24:].reshape(-1, len(order.imu))
+            _add_side(H, frames.reshape(-1), order.imu, side)
+    cost = float((e**2).sum()) + _add_walk(window, order, H, g)
+    if jitter_s:
+        late = Lateness(window, e, J, jitter_s)
+        late.eliminate(H, g, J, order.of_links(knots))
+        cost -= late.explained()
+    return cost
+
+
+def _add_side(H: FloatArray, rows: IntArray, columns: IntArray, block: FloatArray) -> None:
+    """Add a block beside the diagonal, and its mirror image."""
+    H[rows[:, None], columns] += block
+    H[columns[:, None], rows] += block.T
+
+
+def _add_walk(window: Window, order: Order, H: FloatArray, g: FloatArray) -> float:
+    """Biases walk from knot to knot."""
+    noise, cost = window.noise, 0.0
+    information = np.repeat([noise.gyro_walk**-2, noise.accel_walk**-2], 3) / KNOT_S
+    for m in range(len(window.bias) - 1):
+        a, c = order.knots[m], order.knots[m + 1]
+        off = window.bias[m + 1] - window.bias[m]
+        H[a, a] += information
+        H[c, c] += information
+        H[a, c] -= information
+        H[c, a] -= information
+        g[a] -= information * off
+        g[c] += information * off
+        cost += float(information @ off**2)
+    return cost
+
+
+def links_left(
+    window: Window, links: Links, jitter_s: float, order: Order, root: FloatArray
+) -> tuple[float, float]:
+    """Mean squared error of the links, and the jitter of the stamps that they show, s.
+
+    Args:
+        window: Adjusted.
+        links: Of the window.
+        jitter_s: Jitter that was allowed for.
+        order: Places of the unknowns.
+        root: Lower Cholesky factor of the normal matrix.
+    """
+    e, J = link_errors(window, links)
+    if not jitter_s:
+        return float((e**2).mean()), 0.0
+    late = Lateness(window, e, J, jitter_s)
+    shown_s = float(np.sqrt(late.mean_square(J, order.of_links(window.knots()), root)))
+    left = (float((e**2).sum()) - late.explained()) / e.size
+    return left, shown_s if shown_s > _LEAST_JITTER_S else 0.0

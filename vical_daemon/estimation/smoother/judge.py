@@ -1,0 +1,348 @@
+"""Says how far to trust a target-free calibration: fits, agreement of windows, status, words."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.special import chdtri
+
+from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
+from vical_daemon.estimation.guidance import WeakDirection
+from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
+from vical_daemon.estimation.model.trace import Trace
+from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
+from vical_daemon.estimation.result import (
+    CalibrationEstimate,
+    CameraEstimate,
+    Status,
+    TracePoint,
+)
+from vical_daemon.estimation.smoother.bundle import Fit
+from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, Carry
+from vical_daemon.estimation.smoother.doubts import FreeDoubts
+from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
+from vical_daemon.estimation.status.excitation import (
+    ALL_WAYS,
+    RunningMotion,
+    excitation_advice,
+    weak_directions,
+)
+from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
+from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
+
+_PATIENCE_S = 15.0
+_LOST = 3.0
+_ENOUGH_WINDOWS = 2
+_MOST_SIGMA_PX = 3.0
+_MOST_INERTIAL = 2.5
+_MOST_REFUSED = 0.4
+_DOUBT = 1e-5  # chance of a window that disagrees this much
+_LEARNING = 4  # windows
+_MOST_FACTOR = 100.0
+_MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
+_BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
+_PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
+
+
+class FreeJudge:
+    """Watches what goes in and out of the windows.
+
+    Args:
+        options: Switches and targets.
+        camera: Name of the camera.
+        active: Which of the calibration errors are estimated, shape (FULL,).
+        rolling: The camera is said to have a rolling shutter, or its readout is asked for.
+    """
+
+    def __init__(
+        self, options: CalibrationOptions, camera: str, active: BoolArray, *, rolling: bool = False
+    ) -> None:
+        self.options, self.camera, self.active = options, camera, active
+        self._motion = RunningMotion()
+        self.imu_samples = self.imu_refused = self.frames_ignored = self.frames_seen = 0
+        self._steady = SteadyStatus()
+        self._events = EventLog()
+        self.misfit: tuple[Cause, float] = Cause.NONE, 0.0
+        self._contradiction: list[Event] = []
+        self._reason, self._motion_missing = "", False
+        self._first_ns = self._newest_ns = 0
+        self._first_frame_s: float | None = None
+        self._started_s: float | None = None
+        self._now_s = 0.0
+        self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
+        self._windows = 0
+        self._squares: deque[tuple[float, int]] = deque(maxlen=10)
+        self._refused: deque[tuple[int, int]] = deque(maxlen=10)
+        self._sigma_px = self.jitter_s = 0.0
+        self._trace = Trace()
+        self._ever_converged = False
+        self._bumped = Cause.NONE
+        self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
+        self._given_up: tuple[Cause, float | None] = Cause.NONE, None
+        self.doubts = FreeDoubts(camera, asked=options.estimate, rolling=rolling)
+        self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
+
+    # ------------------------------------------------------------------ what happens
+    def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
+        """Count one inertial reading."""
+        self._motion.add((t_ns - (self._first_ns or t_ns)) * 1e-9, gyro)
+        if not self.imu_samples:
+            self._first_ns = t_ns
+        self.imu_samples += 1
+        self._newest_ns = t_ns
+        self._events.now_s = self._elapsed_s
+
+    def saw_points(self, t_s: float, count: int) -> None:
+        """Count one image with `count` tracks."""
+        if count >= 4:
+            self.frames_seen += 1
+            if self._first_frame_s is None:
+                self._first_frame_s = t_s
+
+    def waiting(self, why: str, motion_missing: bool) -> None:
+        """No start yet; `motion_missing`: more motion, not more time, would help."""
+        before = "" if motion_missing or not self._given_up[0] else f"{cause_text(*self._given_up)}; "
+        self._reason, self._motion_missing = before + why, motion_missing
+
+    def started(self, t_s: float) -> None:
+        """A window runs from `t_s` on."""
+        self._reason = ""
+        if self._started_s is None:
+            self._started_s = t_s
+        if self._bumped:
+            self._announce(EventKind.STARTED_ANEW)
+            self._bumped = Cause.NONE
+        if self._quiet[0]:
+            cause, value = self._quiet
+            self._announce(EventKind.WENT_ON, cause=cause, cause_value=value)
+            self._quiet = Cause.NONE, None
+
+    def lost(self, why: Cause, value: float | None, kept: Carry | None) -> None:
+        """The window was given up; `kept`: the calibration that stays."""
+        self._reason, self._motion_missing = cause_text(why, value), False
+        if kept is not None and not self._quiet[0]:
+            self._quiet = why, value
+        if kept is None:
+            self._started_s, self._windows, self._given_up = None, 0, (why, value)
+            self._agreement.clear()
+
+    def changed(self) -> None:
+        """The rig is not what it was: windows contradict what was known."""
+        why = Cause.CALIBRATION_CONTRADICTED
+        self._announce(EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER, cause=why)
+        self.announce_all(self._contradiction)
+        self._bumped, self._quiet, self.doubts.drifting = why, (Cause.NONE, None), False
+        self._started_s, self._windows = None, 0
+        self._agreement.clear()
+
+    def announce_all(self, events: Iterable[Event]) -> None:
+        """Put events into the next estimate."""
+        for event in events:
+            self._events.add(event)
+
+    def _announce(
+        self,
+        kind: EventKind,
+        value: float | None = None,
+        *,
+        once: str = "",
+        cause: Cause = Cause.NONE,
+        cause_value: float | None = None,
+    ) -> None:
+        event = Event(kind, self.camera, value, cause=cause, cause_value=cause_value)
+        self._events.add(event, once)
+
+    @property
+    def status(self) -> Status:
+        """Where the calibration stands, as of the last estimate."""
+        return self._steady.status
+
+    @property
+    def _elapsed_s(self) -> float:
+        return (self._newest_ns - self._first_ns) * 1e-9
+
+    # ------------------------------------------------------------------ windows
+    def fits(self, fit: Fit, *, first: bool = False) -> bool:
+        """Whether a window holds together at all; `misfit` says why not, with the figure."""
+        share = fit.refused / max(fit.used + fit.refused, 1)
+        usual = _MOST_SIGMA_PX if first or not self._sigma_px else max(_MOST_SIGMA_PX, 3.0 * self._sigma_px)
+        self.misfit = Cause.NONE, 0.0
+        if fit.sigma_px > usual:
+            self.misfit = Cause.FEATURES_MISS, float(fit.sigma_px)
+        elif fit.inertial > _MOST_INERTIAL:
+            self.misfit = Cause.INERTIAL_MISFIT, float(fit.inertial)
+        elif share > _MOST_REFUSED:
+            self.misfit = Cause.SCENE_MOVES, float(share)
+        return not self.misfit[0]
+
+    def saw_fit(self, fit: Fit, t_s: float) -> None:
+        """Take the result of an adjustment."""
+        self._now_s, self._sigma_px, self.jitter_s = t_s, fit.sigma_px, fit.jitter_s
+        self._squares.append((fit.squares, fit.dof))
+        self._refused.append((fit.refused, fit.used + fit.refused))
+        self.announce_all(self.doubts.watch(fit.carry, self.factor(), bool(self._agreement)))
+        if self._trace.due(t_s):
+            self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
+
+    def closed(self) -> None:
+        """A window is complete and agreed."""
+        self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
+        if self.jitter_s >= ANNOUNCED_S:
+            self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter")
+
+    def agrees(self, fit: Fit, carry: Carry) -> bool:
+        """Compare how far a window moved the calibration with how far its own data may move it.
+
+        For consistent sigmas, cov(new - old) = P_old - P_new.
+        """
+        P_old = carry.covariance()[CALIBRATION:, CALIBRATION:]
+        # at the first image, where the change was taken
+        P_new = fit.carry.at(carry.t_cam_s).covariance()[CALIBRATION:, CALIBRATION:]
+        scale = np.sqrt(np.diag(P_old))
+        values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
+        told = values > 0.02  # directions in which the window had something to say
+        if not told.any():
+            return True
+        d = vectors.T @ (fit.change / scale)
+        statistic, dof = float((d[told] ** 2 / values[told]).sum()), int(told.sum())
+        factor = self.factor()
+        limit = float(chdtri(dof, _DOUBT)) * factor
+        if self._windows < _LEARNING:  # not enough seen yet to tell a poor model from a changed rig
+            limit *= 50.0
+        doubtful = statistic > limit and (factor < _MODEL_FITS or self._matters(fit.change))
+        self._agreement.append((min(statistic, limit), dof))
+        if doubtful:
+            self._contradiction = _changes(self.camera, fit.change, self.active)
+        return not doubtful
+
+    def _matters(self, change: FloatArray) -> bool:
+        """Whether a change is large enough to be a changed rig where the model itself fits poorly."""
+        full = np.zeros(FULL)
+        full[np.flatnonzero(self.active)] = change
+        arm, turn, shift = np.linalg.norm(full[:3]), np.linalg.norm(full[3:6]), abs(full[6])
+        return bool(arm > _BIG_M or turn > _BIG_RAD or shift > _BIG_S)
+
+    def factor(self) -> float:
+        """Measured variance over the stated one, at least 1 (a prior of a few windows says 1)."""
+        dof = float(np.count_nonzero(self.active)) - float(self.active[DRIFT])
+        total = sum(s for s, _ in self._agreement) + _PRIOR_WINDOWS * dof
+        return max(1.0, total / (sum(n for _, n in self._agreement) + _PRIOR_WINDOWS * dof))
+
+    # ------------------------------------------------------------------ what is said
+    def trace(self) -> list[TracePoint]:
+        """The development of the calibration."""
+        return list(self._trace.points)
+
+    def nis_per_dof(self) -> float:
+        """Agreement of the windows: squared change over what it should be; 1 when consistent."""
+        dof = sum(n for _, n in self._agreement)
+        return sum(s for s, _ in self._agreement) / dof if dof else 0.0
+
+    def estimate(self, carry: Carry | None, *, running: bool, gravity: list[float]) -> CalibrationEstimate:
+        """Put everything together."""
+        camera = None if carry is None else self._camera(carry)
+        missing = [] if camera is None or carry is None else self._missing(camera, carry)
+        converged = self.status == Status.CONVERGED
+        doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), converged=converged)
+        verdict = self._decide(camera is not None, running, missing, doubt)
+        if verdict.guidance and carry is not None:
+            advice = excitation_advice(self._motion, carry.camera.R_imu_cam, carry.bias[:3])
+            verdict = verdict._replace(guidance=advice or verdict.guidance)
+        _, reason, advice = self._steady.follow(verdict, self._elapsed_s)
+        self._ever_converged |= self.status == Status.CONVERGED
+        if camera is not None and self.status == Status.DEGENERATE:
+            camera.withheld.extend(m for m in missing if m.excess > _LOST)
+            camera.unobservable.extend(direction_line(m) for m in camera.withheld)
+        refused, seen = (sum(x) for x in zip(*self._refused, strict=True)) if self._refused else (0, 0)
+        return CalibrationEstimate(
+            self._newest_ns,
+            self.status,
+            reason,
+            self._progress(camera is not None, missing),
+            guidance_text(advice),
+            self._elapsed_s,
+            self.frames_seen,
+            self.imu_samples,
+            {} if camera is None else {self.camera: camera},
+            None if carry is None else imu_estimate(carry, matrices_told=self.doubts.imu_asked),
+            gravity,
+            self.nis_per_dof(),
+            refused / max(seen, 1),
+            self._events.take(),
+            advice,
+        )
+
+    def _camera(self, carry: Carry) -> CameraEstimate:
+        squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
+        rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
+        doubts = self.doubts.weighed(carry, self.factor(), bool(self._agreement))
+        return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
+
+    def _missing(self, e: CameraEstimate, carry: Carry) -> list[WeakDirection]:
+        covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
+        return weak_directions(
+            covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, carry.bias[:3]
+        )
+
+    def _decide(self, known: bool, running: bool, missing: list[WeakDirection], doubt: str) -> Verdict:
+        """By the data up to now; `doubt`: what may not be as it is taken to be, or nothing."""
+        if not known:
+            return self._before_start()
+        if not running and self._windows == 0:
+            return Verdict(Status.INITIALISING, self._reason)
+        pause = "" if running else f" (paused: {self._reason or cause_text(*self._quiet)})"
+        missing = self._steady.counted(missing)
+        if not missing:
+            if self._windows < _ENOUGH_WINDOWS:
+                return Verdict(Status.CONVERGING, CONFIRMING + pause)
+            if self.factor() > _MOST_FACTOR:
+                return Verdict(
+                    Status.INCONSISTENT, "stretches of the data disagree more than their sigmas say"
+                )
+            if doubt:
+                return Verdict(Status.CONVERGING, doubt + pause)
+            return Verdict(Status.CONVERGED, pause.strip(" ()"))
+        worst = missing[0]
+        if self._now_s - (self._started_s or 0.0) > _PATIENCE_S and worst.excess > _LOST:
+            names = "; ".join(direction_sigma(g) for g in missing[:3])
+            return Verdict(Status.DEGENERATE, f"the motion does not show: {names}" + pause, worst.guidance)
+        return Verdict(Status.CONVERGING, direction_sigma(worst) + pause, worst.guidance)
+
+    def _before_start(self) -> Verdict:
+        if self._bumped:
+            why = cause_text(self._bumped)
+            return Verdict(Status.INCONSISTENT, f"{why}; calibrating anew: {self._reason}")
+        if not self.imu_samples:
+            return Verdict(Status.WAITING, "no inertial data yet")
+        if self._first_frame_s is None:
+            return Verdict(
+                Status.WAITING, "no features have been followed yet: is the picture dark or blurred?"
+            )
+        seen_for = self._elapsed_s - self._first_frame_s
+        if self._motion_missing and seen_for > _PATIENCE_S:
+            advice = excitation_advice(self._motion, None) or ALL_WAYS
+            return Verdict(Status.DEGENERATE, self._reason, advice)
+        return Verdict(Status.INITIALISING, self._reason or "collecting the first seconds")
+
+    def _progress(self, known: bool, missing: list[WeakDirection]) -> float:
+        if self.status == Status.CONVERGED:
+            return 1.0
+        if not known:
+            return min(0.1, 0.001 * self.frames_seen)
+        worst = max((g.excess for g in missing), default=1.0)
+        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
+
+
+def _changes(camera: str, change: FloatArray, active: BoolArray) -> list[Event]:
+    """A change of the calibration as events: what moved by how much."""
+    full = np.zeros(FULL)
+    full[np.flatnonzero(active)] = change
+    found = []
+    if active[0]:
+        found.append((EventKind.CAMERA_MOVED, float(np.linalg.norm(full[:3]))))
+        found.append((EventKind.CAMERA_TURNED, float(np.linalg.norm(full[3:6]))))
+    if active[6]:
+        found.append((EventKind.TIMESHIFT_CHANGED, float(full[6])))
+    return [Event(kind, camera, value) for kind, value in found]

@@ -1,0 +1,278 @@
+"""Normal equations of one window: pixels, inertial links and what was carried in; landmarks kept apart."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.inertial.imu_model import cross
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.noise.stamp_jitter import excess
+from vical_daemon.estimation.smoother.carry import (
+    ARM,
+    DRIFT,
+    FULL,
+    LENS,
+    READOUT,
+    SHIFT,
+    TURN,
+    Carry,
+    calibration_difference,
+    tangents,
+)
+from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
+from vical_daemon.estimation.smoother.inertial_links import Links
+from vical_daemon.estimation.smoother.jitter import first_guess
+from vical_daemon.estimation.smoother.window import IntArray, Seen, Window
+
+HUBER = 2.5  # sigmas (of the two axes together)
+_GAUGE = 1e10
+_INVERSE_SIGMA = 5.0  # 1/m: next to nothing is known about the depth of a new landmark
+
+
+class Normal(NamedTuple):
+    """Normal equations about the present values.
+
+    Attributes:
+        H: Of the states, ordered as `Order`, shape (n, n).
+        g: Gradient, shape (n,).
+        V: Blocks of the landmarks, shape (L, 3, 3).
+        W: Coupling of landmarks to [turn, position] of the images and to the calibration, (L, 3, 6 F + k).
+        gl: Gradient of the landmarks, shape (L, 3).
+        cost: Sum of the (robust) squares.
+    """
+
+    H: FloatArray
+    g: FloatArray
+    V: FloatArray
+    W: FloatArray
+    gl: FloatArray
+    cost: float
+
+
+class Problem:
+    """Whitened errors of a window and their derivatives.
+
+    Args:
+        window: Present values.
+        carry: What was known before.
+        sigma_px: Pixel noise.
+        spread: Square root of how many neighbouring images share an error of the pixels.
+        jitter_s: Standard deviation of the images' stamps, s.
+    """
+
+    def __init__(
+        self, window: Window, carry: Carry, sigma_px: float, spread: float, jitter_s: float = 0.0
+    ) -> None:
+        self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
+        self.jitter_s = jitter_s
+        self.active = np.flatnonzero(carry.active)
+
+    def order(self) -> Order:
+        """Places of the unknowns."""
+        w = self.window
+        return Order(len(w.frames), len(w.bias), len(self.active), len(w.imu))
+
+    # ------------------------------------------------------------------ pixels
+    def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Landmarks in the camera frame at their observations, scaled by rho; and parts for derivatives."""
+        w, cam = self.window, self.window.camera
+        rates = w.rates()
+        late = cam.timeshift_s - w.shift_s + cam.skew * self._since()
+        if cam.readout_s:  # each row has an instant of its own
+            late, frame = late[seen.frame] + cam.readout_s * seen.row, seen.frame
+            rates = rates[frame]
+            alpha, accel = w.accelerations()
+            half = 0.5 * (late * late)[:, None]
+            R = w.R[frame] @ so3.exp(rates * late[:, None] + half * alpha[frame])
+            p = w.p[frame] + w.v[frame] * late[:, None] + half * accel[frame]
+        else:
+            R = (w.R @ so3.exp(rates * late[:, None]))[seen.frame]
+            p = (w.p + w.v * late[:, None])[seen.frame]
+            rates = rates[seen.frame]
+        marks = w.landmarks
+        rho = marks.inverse[seen.landmark]
+        X = marks.bearing[seen.landmark] + rho[:, None] * (marks.anchor[seen.landmark] - p)
+        x_imu = np.einsum("nji,nj->ni", R, X)
+        y = (x_imu - rho[:, None] * cam.p_imu_cam) @ cam.R_imu_cam
+        return y, x_imu, R, rates
+
+    def _since(self) -> FloatArray:
+        """Seconds from the first image to each, shape (F,)."""
+        stamps = np.array([t for t, _ in self.window.frames])
+        return np.asarray(stamps - stamps[0])
+
+    def pixel_errors(self, seen: Seen) -> tuple[FloatArray, BoolArray, FloatArray]:
+        """Whitened errors (N, 2), which are valid, and Huber weights."""
+        y = self._rays(seen)[0]
+        cam = self.window.camera
+        with np.errstate(all="ignore"):
+            uv = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)[0]
+        return self._weigh(seen, uv)
+
+    def _weigh(self, seen: Seen, uv: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
+        ok: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
+        e = np.where(ok[:, None], (np.where(ok[:, None], uv, 0.0) - seen.uv) / self.sigma_px, 0.0)
+        size = np.sqrt((e**2).sum(axis=1))
+        weight = np.where(ok, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
+        return e, ok, weight
+
+    def normal(self, seen: Seen, links: Links) -> Normal:
+        """Normal equations with landmarks kept apart."""
+        w, cam = self.window, self.window.camera
+        y, x_imu, R, rates = self._rays(seen)
+        with np.errstate(all="ignore"):
+            uv, Jy, Jlens = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)
+        e, ok, weight = self._weigh(seen, uv)
+        root = np.sqrt(weight) / (self.sigma_px * self.spread)
+        Jy = np.where(ok[:, None, None], Jy, 0.0) * root[:, None, None]
+        Jlens = np.where(ok[:, None, None], Jlens, 0.0) * root[:, None, None]
+        e = e * np.sqrt(weight)[:, None]
+        cost = self._robust_cost(e, weight) / self.spread**2
+        e = e / self.spread
+        marks = w.landmarks
+        rho = marks.inverse[seen.landmark][:, None, None]
+        Rt = np.ascontiguousarray(np.swapaxes(R, 1, 2))  # three times as fast below
+        JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
+        JW = JR @ Rt  # by the point in the world
+        Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
+        Jc = np.zeros((len(e), 2, FULL))
+        Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, cross(Jy, y[:, None])
+        Jc[:, :, SHIFT] = self._by_shift(seen, JR, R, x_imu, rates)
+        Jc[:, :, LENS] = Jlens
+        Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
+        Jc[:, :, READOUT] = Jc[:, :, SHIFT] * seen.row[:, None]
+        Jc = Jc[:, :, self.active]
+        basis = tangents(marks.bearing)[seen.landmark]
+        away = marks.anchor[seen.landmark] - w.p[seen.frame]
+        by_rho = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
+        Jl = np.concatenate([JW @ basis, by_rho[..., None]], axis=2)
+        return self._assemble(seen, links, e, Jf, Jc, Jl, cost)
+
+    def _by_shift(
+        self, seen: Seen, JR: FloatArray, R: FloatArray, x_imu: FloatArray, rates: FloatArray
+    ) -> FloatArray:
+        """How pixels move with the time of the exposure: the imu turns and moves on, shape (N, 2)."""
+        rho = self.window.landmarks.inverse[seen.landmark]
+        forward = np.einsum("nj,nji->ni", self.window.v[seen.frame], R)  # speed in the imu frame
+        moved = cross(x_imu, rates) - rho[:, None] * forward
+        return np.asarray(np.einsum("nij,nj->ni", JR, moved))
+
+    def pixels_late(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
+        """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""
+        cam = self.window.camera
+        y, x_imu, R, rates = self._rays(seen)
+        with np.errstate(all="ignore"):
+            uv, Jy, _ = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)
+        e, ok, weight = self._weigh(seen, uv)
+        JR = (np.where(ok[:, None, None], Jy, 0.0).reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)
+        by_shift = self._by_shift(seen, JR, R, x_imu, rates) * (np.sqrt(weight) / self.sigma_px)[:, None]
+        F = len(self.window.frames)
+        size = np.bincount(seen.frame, (by_shift**2).sum(axis=1), F)
+        late = np.bincount(seen.frame, (by_shift * e * np.sqrt(weight)[:, None]).sum(axis=1), F)
+        shown = size > 0.0
+        return late[shown] / size[shown], self.spread**2 / size[shown]
+
+    def _robust_cost(self, e: FloatArray, weight: FloatArray) -> float:
+        """Sum of the Huber losses (e is weighted already: weight * size^2)."""
+        square = (e**2).sum(axis=1)
+        inner = square
+        outer = 2.0 * HUBER * np.sqrt(square / np.maximum(weight, 1e-12)) - HUBER**2
+        return float(np.where(weight < 1.0, outer, inner).sum()) + 1e4 * float((weight == 0.0).sum())
+
+    def _assemble(
+        self,
+        seen: Seen,
+        links: Links,
+        e: FloatArray,
+        Jf: FloatArray,
+        Jc: FloatArray,
+        Jl: FloatArray,
+        cost: float,
+    ) -> Normal:
+        w = self.window
+        F, k, L = len(w.frames), len(self.active), len(seen.begin)
+        order = self.order()
+        H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
+        begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
+        Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
+        sorted_J = Jall[by]
+        blocks = _products(sorted_J[:, :, :6], sorted_J, fb)
+        pose = order.frames[:, :6]
+        at = pose[fw]
+        H[at[:, :, None], at[:, None, :]] += blocks[:, :, :6]
+        H[at[:, :, None], order.calib] += blocks[:, :, 6:-1]
+        H[order.calib[:, None], at.reshape(1, -1)] += blocks[:, :, 6:-1].reshape(-1, k).T
+        g[at] += blocks[:, :, -1]
+        flat = Jc.reshape(-1, k)
+        H[order.calib[:, None], order.calib] += flat.T @ flat
+        g[order.calib] += flat.T @ e.reshape(-1)
+        own = _products(Jl, np.concatenate([Jl, Jall[:, :, 6:]], axis=2), begin)
+        V = own[:, :, :3].copy()
+        V[:, 2, 2] += _INVERSE_SIGMA**-2
+        gl = own[:, :, -1].copy()
+        gl[:, 2] += w.landmarks.inverse * _INVERSE_SIGMA**-2
+        cost += float((w.landmarks.inverse**2).sum()) * _INVERSE_SIGMA**-2
+        W = np.zeros((L, 3, 6 * F + k))
+        W[:, :, 6 * F :] = own[:, :, 3:-1]
+        by_frame = W[:, :, : 6 * F].reshape(L, 3, F, 6)  # the same memory
+        by_frame[seen.landmark, :, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf  # seen once in an image
+        cost += add_links(w, links, self.jitter_s, order, H, g)
+        cost += self._add_prior(H, g, order)
+        return Normal(H, g, V, W, gl, cost)
+
+    def stamps_doubted(self, seen: Seen, links: Links) -> float:
+        """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
+
+        A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.
+        """
+        by_links = first_guess(self.window, *link_errors(self.window, links))
+        late, variance = self.pixels_late(seen)
+        return float(np.hypot(by_links, excess(late**2, variance)))
+
+    # ------------------------------------------------------------------ prior
+    def _prior_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Errors (d,) of the carried knowledge and derivatives (d, 9 + 6 + k)."""
+        w, c = self.window, self.carry
+        R0, v0 = w.R[0], w.v[0]
+        up, now = c.R[2], R0[2]
+        B = tangents(up[None])[0]
+        speed = R0.T @ v0
+        calibration = calibration_difference(w, c)[self.active]
+        e = np.concatenate([B.T @ np.cross(now, up), speed - c.speed, w.bias[0] - c.bias, calibration])
+        J = np.zeros((len(e), 15 + len(self.active)))
+        J[:2, :3] = B.T
+        J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R0.T
+        J[5:11, 9:15] = np.eye(6)
+        J[11:, 15:] = np.eye(len(self.active))
+        return c.root @ e, c.root @ J
+
+    def _add_prior(self, H: FloatArray, g: FloatArray, order: Order) -> float:
+        e, J = self._prior_errors()
+        at = np.concatenate([order.frames[0], order.knots[0], order.calib])
+        H[at[:, None], at] += J.T @ J
+        g[at] += J.T @ e
+        # where the origin lies and which way is north cannot be seen: held, at no cost
+        turn, place = order.frames[0][:3], order.frames[0][3:6]
+        up = self.window.R[0][2]
+        H[turn[:, None], turn] += _GAUGE * np.outer(up, up)
+        H[place, place] += _GAUGE
+        return float(e @ e)
+
+
+def _products(A: FloatArray, B: FloatArray, begin: IntArray) -> FloatArray:
+    """Sums of A_n^T B_n over groups of rows, (N, 2, a) and (N, 2, b) to (groups, a, b).
+
+    One product of long matrices a group: numpy takes three times as long for many small ones.
+    """
+    a, b = A.shape[2], B.shape[2]
+    A, B = A.reshape(-1, a), B.reshape(-1, b)
+    out = np.empty((len(begin), a, b))
+    edges = [*(2 * begin).tolist(), len(A)]
+    for k, (low, high) in enumerate(pairwise(edges)):
+        np.matmul(A[low:high].T, B[low:high], out=out[k])
+    return out

@@ -1,0 +1,129 @@
+"""Turns what is carried from window to window into the plain numbers of an estimate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.filter.gyro_frame import turn
+from vical_daemon.estimation.filter.unobservable_directions import held_covariance
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.estimation.model.imu_scale import matrices
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+from vical_daemon.estimation.selection.clock_drift import evidence, probability
+from vical_daemon.estimation.smoother.carry import (
+    ARM,
+    DRIFT,
+    FULL,
+    IMU,
+    INERTIAL,
+    LENS,
+    READOUT,
+    SHIFT,
+    TURN,
+    Carry,
+    moved,
+)
+
+_GYRO = slice(IMU.start, IMU.start + 9)
+
+
+class Doubts(NamedTuple):
+    """How what is carried is to be told.
+
+    Attributes:
+        factor: Measured variance over the stated one; multiplies what is told.
+        drifting: The camera's clock is known to run apart from the imu's.
+        stated: Probabilities, each with the errors that are zero then: what of the imu is as stated.
+        gyro_frame: The camera is told in the frame in which the gyro's matrix is symmetric.
+        rolling: The shutter is known to be a rolling one: its readout is told.
+    """
+
+    factor: float = 1.0
+    drifting: bool = False
+    stated: tuple[tuple[float, IntArray], ...] = ((1.0, np.zeros(0, np.intp)),)
+    gyro_frame: bool = False
+    rolling: bool = True
+
+
+def camera_estimate(
+    carry: Carry, doubts: Doubts, sigma_px: float, rms_px: float, held: FloatArray | None = None
+) -> CameraEstimate:
+    """The camera as it is known.
+
+    Args:
+        carry: What is known.
+        doubts: See there.
+        sigma_px: Pixel noise.
+        rms_px: RMS of the residuals.
+        held: Axis of the imu along which the lever arm is not known, unit, shape (3,); None: there is none.
+    """
+    camera, covariance = _told(carry, doubts)
+    if held is not None:
+        covariance[:3, :3] += held_covariance(np.outer(held, held))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
+    q = so3.quat_from_matrix(camera.R_imu_cam)
+    return CameraEstimate(
+        PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), covariance[:6, :6].tolist()),
+        float(camera.timeshift_s),
+        float(sigma[SHIFT]),
+        camera.intrinsics.tolist(),
+        sigma[LENS][:4].tolist(),
+        camera.distortion_model,
+        camera.distortion.tolist(),
+        sigma[LENS][4:].tolist(),
+        rms_px,
+        sigma_px,
+        [],
+        float(camera.readout_s) if doubts.rolling else 0.0,
+        float(sigma[READOUT]) if doubts.rolling else 0.0,
+    )
+
+
+def _told(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray]:
+    """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `hypotheses`."""
+    camera, numbers, P = _over_imu(carry, doubts)
+    if doubts.gyro_frame:
+        camera, P = _in_gyro_frame(camera, numbers, P)
+    if doubts.drifting or not carry.active[DRIFT]:
+        return camera, P
+    p = probability(evidence(camera.skew, float(P[DRIFT, DRIFT])))
+    sigma = float(np.sqrt(P[DRIFT, DRIFT]))
+    k, z = P[:, DRIFT] / sigma, camera.skew / sigma
+    return moved(camera, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(k, k)
+
+
+def _over_imu(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
+    """Camera, what is not as stated of the imu, and covariance over the hypotheses about these."""
+    P, numbers = carry.calibration() * doubts.factor, np.zeros(FULL)
+    numbers[INERTIAL] = carry.imu
+    mean, mixed = np.zeros(FULL), np.zeros((FULL, FULL))
+    for p, at in doubts.stated:
+        gain = np.linalg.solve(P[np.ix_(at, at)], P[at]).T
+        d = -gain @ numbers[at]
+        mean += p * d
+        mixed += p * (P - gain @ P[at] + np.outer(d, d))
+    return moved(carry.camera, mean), carry.imu + mean[INERTIAL], mixed - np.outer(mean, mean)
+
+
+def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> tuple[CameraState, FloatArray]:
+    """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries."""
+    J = np.eye(FULL)
+    by_entries = turn(np.eye(9).reshape(3, 3, 9))
+    J[TURN, _GYRO] = -camera.R_imu_cam.T @ by_entries
+    J[ARM, _GYRO] = so3.hat(camera.p_imu_cam) @ by_entries
+    back = so3.exp(-turn(numbers[:9].reshape(3, 3)))
+    camera = replace(camera, R_imu_cam=back @ camera.R_imu_cam, p_imu_cam=back @ camera.p_imu_cam)
+    return camera, J @ P @ J.T
+
+
+def imu_estimate(carry: Carry, *, matrices_told: bool) -> ImuEstimate:
+    """Biases and their sigmas; where asked for, the matrices."""
+    sigma = np.sqrt(np.diag(carry.covariance())[5:11])
+    told = [m.tolist() for m in matrices(carry.imu)] if matrices_told else [[], []]
+    bias = carry.bias
+    return ImuEstimate(bias[:3].tolist(), bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist(), *told)

@@ -1,0 +1,237 @@
+"""Velocity, gravity, lever arm and structure from tracks and an IMU, linearly, once rotations are known.
+
+With attitudes from the gyro, every camera centre is linear in z = (v0, gravity, lever arm, accel bias):
+c_i = q_i + A_i z, and a landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes from
+the accelerometer, so that the system is inhomogeneous; gravity's size is known and its direction is
+linearised anew each round. Squares are divided by the distances found in the round before, or near points
+would draw everything towards the camera. [Martinelli, "Closed-form solution of visual-inertial structure
+from motion", 2014; Dong-Si & Mourikis, "Estimator initialization in vision-aided inertial navigation with
+unknown camera-IMU calibration", 2012]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.inertial_links import Link, make_link
+from vical_daemon.estimation.smoother.window import Landmarks, Window, rays_of
+
+_ROUNDS = 8
+_MIN_FEATURES = 15
+_BIAS_SIGMA, _MAX_ARM_M = 0.2, 1.5
+_HELD_M = 1e-4
+_MOST_BEHIND = 0.3  # share of the observations
+_RAY_SIGMA = 2e-3
+_NEAR, _FAR = 0.1, 100.0
+
+
+class NoStartError(Exception):
+    """Why the stretch does not do for a start, in words for a person."""
+
+
+@dataclass(frozen=True)
+class ArmPrior:
+    """What is known of the lever arm before a start.
+
+    Attributes:
+        p_imu_cam: Lever arm, m, shape (3,).
+        sigma_m: How far it may be off.
+        held: Direction in the imu frame along which it stays as it is, unit, shape (3,); None: none.
+    """
+
+    p_imu_cam: FloatArray
+    sigma_m: float = 0.2
+    held: FloatArray | None = None
+
+    def information(self) -> FloatArray:
+        """Of z = (v0, gravity, lever arm, accel bias), shape (12, 12)."""
+        out = np.diag([0.0] * 6 + [self.sigma_m**-2] * 3 + [_BIAS_SIGMA**-2] * 3)
+        if self.held is not None:
+            out[6:9, 6:9] += np.outer(self.held, self.held) / _HELD_M**2
+        return out
+
+
+class _Linear(NamedTuple):
+    z: FloatArray  # v0, change of gravity, lever arm, accel bias
+    gravity: FloatArray
+    misfit: float  # median angle by which rays miss their points, rad
+
+
+class LinearStart:
+    """A stretch of tracks whose rotations are known, ready to be solved for one mounting or many.
+
+    Args:
+        buffer: Inertial readings.
+        frames: (stamp in the camera's clock in s, tracks), in order.
+        camera: Time shift and lens must be roughly right.
+        imu: Biases, and numbers of `imu_scale` where they are estimated, see `Link`, shape (6,) or (22,).
+        noise: Densities.
+        gravity_mps2: Magnitude of gravity.
+
+    Raises:
+        NoStartError: Inertial data do not reach, or too few features can be followed.
+    """
+
+    def __init__(
+        self,
+        buffer: ImuBuffer,
+        frames: list[tuple[float, PointsFrame]],
+        camera: CameraState,
+        imu: FloatArray,
+        noise: ImuNoise,
+        gravity_mps2: float,
+    ) -> None:
+        shift = camera.timeshift_s
+        links: list[Link] = []
+        for (t0, _), (t1, _) in pairwise(frames):
+            link = make_link(buffer, t0 + shift, t1 + shift, imu, noise)
+            if link is None:
+                raise NoStartError("inertial data do not cover the images")
+            links.append(link)
+        self.camera, self._gravity_mps2 = camera, gravity_mps2
+        self._R, self._q, self._A = _centres(links)
+        none = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        zero = np.zeros((len(frames), 3))
+        window = Window(
+            camera, noise, list(frames), self._R, zero, zero, np.zeros((1, 6)), links, shift, none
+        )
+        window.bias[:, :3], window.imu = imu[:3], imu[6:]
+        window.fit_knots()
+        self._seen = window.observe()
+        if len(self._seen.begin) < _MIN_FEATURES:
+            raise NoStartError(
+                f"only {len(self._seen.begin)} features can be followed:"
+                " more texture or slower motion is needed"
+            )
+        self._rays, self._ok = rays_of(self._seen.uv, camera)
+        window.landmarks = none
+        self._window = window
+
+    def misfit(self, R_imu_cam: FloatArray, arm: ArmPrior, rounds: int) -> float:
+        """How badly features' rays meet with this mounting: median angle, rad; infinite without solution."""
+        found = self._solve(R_imu_cam, arm, rounds)
+        return np.inf if found is None else found.misfit
+
+    def window(self, arm: ArmPrior) -> Window:
+        """Return the window that a bundle adjustment can start from: world z up, first image at the origin.
+
+        The camera's lever arm is set to what was found.
+
+        Args:
+            arm: What is known of it before.
+
+        Raises:
+            NoStartError: Speed, scale or lever arm do not show.
+        """
+        found = self._solve(self.camera.R_imu_cam, arm, _ROUNDS)
+        if found is None:
+            raise NoStartError(
+                "speed and scale are not visible yet: move the rig to and fro while turning it"
+            )
+        z, gravity = found.z, found.gravity
+        if not np.isfinite(z).all() or float(np.abs(z[6:9]).max()) > _MAX_ARM_M:
+            raise NoStartError(
+                "the lever arm is not visible yet: turn the rig about two axes while moving it"
+            )
+        window = self._window
+        T = np.concatenate([[0.0], np.cumsum([x.dt_s for x in window.links])])
+        world = _upright(gravity / self._gravity_mps2)
+        motion = self._q + T[:, None] * z[:3] + 0.5 * (T * T)[:, None] * gravity + self._A[:, :, 9:] @ z[9:]
+        window.p = motion @ world.T
+        window.R = world @ self._R
+        # the velocity by differences of positions would be coarse: it is carried along the links
+        v = [z[:3]]
+        for k, link in enumerate(window.links):
+            v.append(v[-1] + link.dt_s * gravity + self._R[k] @ link.dv)
+        window.v = np.array(v) @ world.T
+        self.camera.p_imu_cam = z[6:9].copy()
+        window.bias[:, 3:] = z[9:]
+        window.gravity = np.array([0.0, 0.0, -self._gravity_mps2])
+        return window
+
+    def _solve(self, R_imu_cam: FloatArray, arm: ArmPrior, rounds: int) -> _Linear | None:
+        """Iteratively reweighted least squares; None without a solution."""
+        seen, q, A = self._seen, self._q, self._A
+        d = np.matmul(self._R[seen.frame] @ R_imu_cam, self._rays[..., None])[..., 0]
+        P = np.eye(3) - d[:, :, None] * d[:, None, :]
+        weight = self._ok / (2.0 * _RAY_SIGMA) ** 2
+        prior, wanted = arm.information(), np.concatenate([np.zeros(6), arm.p_imu_cam, np.zeros(3)])
+        # over seconds the speed changes little against g T: force is mostly gravity's opposite
+        gravity = -q[-1] * (self._gravity_mps2 / float(np.linalg.norm(q[-1])))
+        z, misfit = np.zeros(12), np.inf
+        for _ in range(rounds):
+            reduced = _tangent_map(gravity)
+            q_now, A_now = q + A[:, :, 3:6] @ gravity, A @ reduced
+            WP = P * weight[:, None, None]
+            PA, Pq = WP @ A_now[seen.frame], np.matmul(WP, q_now[seen.frame][..., None])
+            N = np.add.reduceat(WP, seen.begin) + 1e-6 * np.eye(3)
+            B = np.add.reduceat(np.concatenate([PA, Pq], axis=2), seen.begin)
+            inner = np.linalg.solve(N, B)  # X = inner_q + inner_A z
+            At, Bt = np.swapaxes(A_now[seen.frame], 1, 2), np.swapaxes(B[..., :-1], 1, 2)
+            H = (At @ PA).sum(axis=0) - (Bt @ inner[..., :-1]).sum(axis=0)
+            g = (At @ Pq).sum(axis=0)[:, 0] - (Bt @ inner[..., -1:]).sum(axis=0)[:, 0]
+            try:
+                y = np.linalg.solve(H + reduced.T @ prior @ reduced, reduced.T @ prior @ wanted - g)
+            except np.linalg.LinAlgError:
+                return None
+            z = reduced @ y
+            X = inner[..., -1] + inner[..., :-1] @ y
+            away = X[seen.landmark] - q_now[seen.frame] - A_now[seen.frame] @ y
+            ahead = (away * d).sum(axis=1)
+            depth = np.clip(ahead, _NEAR, _FAR)
+            off = np.linalg.norm(np.matmul(P, away[..., None])[..., 0], axis=1) / depth
+            spread = 1.4826 * float(np.median(off)) + 1e-6
+            # a mounting turned by half a circle sees everything behind itself
+            misfit = spread if np.mean(ahead < 0.0) < _MOST_BEHIND else np.inf
+            weight = self._ok / (_RAY_SIGMA * depth) ** 2 / (1.0 + (off / (3.0 * spread)) ** 2) ** 2
+            gravity = gravity + z[3:6]
+            gravity *= self._gravity_mps2 / float(np.linalg.norm(gravity))
+        return _Linear(z, gravity, misfit)
+
+
+def _centres(links: list[Link]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Attitudes R_i, and positions q_i + A_i z without the lever arm, in the first image's imu frame."""
+    R, P, V = np.eye(3), np.zeros(3), np.zeros(3)
+    PB, VB, T = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
+    all_R, all_q, all_A = [R], [P], [np.zeros((3, 12))]
+    all_A[0][:, 6:9] = np.eye(3)
+    for x in links:
+        P = P + x.dt_s * V + R @ x.dp
+        PB = PB + x.dt_s * VB + R @ x.by_imu[6:9, 3:6]
+        V = V + R @ x.dv
+        VB = VB + R @ x.by_imu[3:6, 3:6]
+        R = R @ x.dR
+        T += x.dt_s
+        A = np.concatenate([T * np.eye(3), 0.5 * T * T * np.eye(3), R, PB], axis=1)
+        all_R.append(R)
+        all_q.append(P)
+        all_A.append(A)
+    return np.array(all_R), np.array(all_q), np.array(all_A)
+
+
+def _tangent_map(gravity: FloatArray) -> FloatArray:
+    """From (v0, two tilts of gravity, lever arm, accel bias) to z, shape (12, 11)."""
+    out = np.zeros((12, 11))
+    out[:3, :3] = np.eye(3)
+    basis = np.linalg.svd(gravity[None])[2][1:]
+    out[3:6, 3:5] = basis.T * float(np.linalg.norm(gravity))
+    out[6:9, 5:8] = out[9:, 8:] = np.eye(3)
+    return out
+
+
+def _upright(down: FloatArray) -> FloatArray:
+    """Least rotation that turns `down` into -z."""
+    target = np.array([0.0, 0.0, -1.0])
+    axis = np.cross(down, target)
+    cosine = float(down @ target)
+    if cosine < -0.999999:
+        return np.diag([1.0, -1.0, -1.0])
+    hat = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + hat + hat @ hat / (1.0 + cosine))

@@ -1,0 +1,309 @@
+"""Attempts to start a target-free calibration from the tracks and inertial data of the last seconds."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.selection.clock_drift import SKEW_SIGMA
+from vical_daemon.estimation.selection.model_selection import LAG_SIGMA_S
+from vical_daemon.estimation.smoother.carry import Carry
+from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
+from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart, NoStartError
+from vical_daemon.estimation.smoother.window import Window
+from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
+from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.track_orientations import track_orientations
+
+Frames = list[tuple[float, PointsFrame]]
+
+
+class _Found(NamedTuple):
+    """What rotations say, or what was known before."""
+
+    camera: CameraState
+    imu: FloatArray  # biases, and numbers of `imu_scale`, see `Link`
+    arm_sigma_m: float
+    about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
+
+
+_SPAN_S, _LONG_SPAN_S = 5.0, 8.0
+_LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
+_PARTIAL_S = 6.0  # before, a second axis may come yet
+_EVERY_S, _EVERY_MOST_S = 1.0, 4.0
+_ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
+_SHIFT_SIGMA_S = 4e-3
+_READOUT_SIGMA_S = 0.015
+_MIN_TRACKS = 12
+_MOST_IMAGES = 120  # of a start: its cost grows with the cube
+_FULL_FITS = 2
+_ROUGH_STEPS = 8
+_APART_RAD = float(np.deg2rad(2.0))
+_MAX_HOLE_S = 0.5
+_STILL_PX = 1.0  # median travel of a feature over half a second
+
+
+class Starter:
+    """Decides when to try, and tries.
+
+    Args:
+        options: Switches and noise.
+        prior: What is known about the camera.
+
+    Attributes:
+        motion_missing: What the last attempt lacked was motion, not time.
+        held: Axis of the imu along which the lever arm is not known and stays as it is, unit, shape (3,): the
+            last start was a partial one. None: all of it shows.
+    """
+
+    def __init__(self, options: CalibrationOptions, prior: CameraPrior) -> None:
+        self.options, self.prior = options, prior
+        self.motion_missing = False
+        self.held: FloatArray | None = None
+        self._next_s = -np.inf
+        self._every_s = _EVERY_S
+
+    def again(self) -> None:
+        """Start over: try soon."""
+        self._next_s, self._every_s = -np.inf, _EVERY_S
+
+    def attempt(
+        self, buffer: ImuBuffer, frames: Frames, end_s: float, known: Carry | None, *, last: bool
+    ) -> Window | str | None:
+        """Try when it is time to.
+
+        Args:
+            buffer: Inertial readings.
+            frames: Images that wait, in order.
+            end_s: Inertial data cover images up to about here, s.
+            known: Calibration and biases of before, where there are any.
+            last: End of the data: try now.
+
+        Returns:
+            A window to adjust; why there is none; or None when it is not time to try.
+        """
+        if end_s < self._next_s and not last:
+            return None
+        shift = known.camera.timeshift_s if known else self.prior.timeshift_cam_imu_s or 0.0
+        span = _LONG_SPAN_S if self._every_s > 1.5 * _EVERY_S else _SPAN_S
+        usable = _last_stretch(
+            frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), span
+        )
+        if not usable or usable[-1][0] - usable[0][0] < (_LEAST_KNOWN_S if known else _LEAST_S) - 0.1:
+            self.motion_missing = False
+            return "collecting the first seconds: move the rig, keep textured things in view"
+        self._next_s = end_s + self._every_s
+        self._every_s = min(1.3 * self._every_s, _EVERY_MOST_S)
+        self.motion_missing = True
+        if _still(usable):
+            return "the camera stands still: move the rig to and fro while turning it"
+        if known is None:
+            self.held = None
+        found = self._rotations(buffer, usable) if known is None else _known(known)
+        if isinstance(found, str):
+            return found
+        return self._structure(buffer, usable, found)
+
+    def _structure(self, buffer: ImuBuffer, frames: Frames, found: _Found) -> Window | str:
+        """Speed, scale, lever arm and points; after turns about one axis the mounting about it, too."""
+        camera = found.camera
+        frames = [x for x in frames if buffer.oldest_s < x[0] + camera.timeshift_s < buffer.newest_s - 5e-3]
+        if len(frames) < 20:
+            return "inertial data do not cover the images: are both stamped by the same clock?"
+        noise, gravity = self.options.imu_noise, self.options.gravity_mps2
+        held = self.held if found.about is None else found.about
+        arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, held)
+        try:
+            start = LinearStart(buffer, frames, camera, found.imu, noise, gravity)
+            if found.about is not None:
+                camera.R_imu_cam = mounting_about(start, found.about, camera.R_imu_cam, arm)
+            window = start.window(arm)
+        except NoStartError as error:
+            return str(error)
+        self.held = held
+        return window
+
+    def _rotations(self, buffer: ImuBuffer, frames: Frames) -> _Found | str:
+        """Mounting, delay, lens and gyro bias from the epipolar constraint; or why not."""
+        camera = starting_camera(self.prior)
+        rows = buffer.rows
+        reach = (rows[:, 0] > frames[0][0] - 2.0) & (rows[:, 0] < frames[-1][0] + 2.0)
+        t, gyro = rows[reach, 0], rows[reach, 1:4]
+        given = self.prior.T_imu_cam if "extrinsics" in self.options.fix else None
+        inside = (t > frames[0][0]) & (t < frames[-1][0])
+        one_axis = still_axis(t[inside], gyro[inside], np.zeros(3)) is not None
+        if one_axis and given is None and frames[-1][0] - frames[0][0] < _PARTIAL_S:
+            return "the rig turns about one axis only so far: turn it about a second one"
+        seeds, reason = self._seeds(t, gyro, frames, camera, look_around=not one_axis)
+        lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
+        free_lens = "intrinsics" not in self.options.fix
+        if free_lens and len(seeds) > _FULL_FITS:  # look around with the lens as given: three times quicker
+            rough = [epipolar_fit(t, gyro, frames, lens, R, s, most=_ROUGH_STEPS) for R, s in seeds]
+            seeds = _best_apart([f for f in rough if f is not None])
+        fits = [epipolar_fit(t, gyro, frames, lens, R, s, fit_lens=free_lens) for R, s in seeds]
+        good = [f for f in fits if f is not None]
+        if not good:
+            return (
+                reason or "too few features are followed from image to image: more texture or light is needed"
+            )
+        best = min(good, key=_misfit)
+        about = None
+        why = _not_sure_yet(best, mounting_known=given is not None)
+        if why and frames[-1][0] - frames[0][0] > _PARTIAL_S:
+            inside = (t > frames[0][0] + best.timeshift_s) & (t < frames[-1][0] + best.timeshift_s)
+            about = _only_unsure_about(best, still_axis(t[inside], gyro[inside], best.gyro_bias))
+        if why and about is None:
+            return reason or why
+        camera.R_imu_cam, camera.timeshift_s = best.R_imu_cam, best.timeshift_s
+        camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
+        sigma = 0.2
+        if given is not None:
+            camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in given)
+            sigma = 1e-4
+        if self.prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
+            camera.timeshift_s = self.prior.timeshift_cam_imu_s
+        return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + NUMBERS)]), sigma, about)
+
+    def _seeds(
+        self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState, *, look_around: bool
+    ) -> tuple[list[tuple[FloatArray, float]], str]:
+        """Places from which to start the fit, and what TD-ICP has to say against its own."""
+        seeds: list[tuple[FloatArray, float]] = []
+        if self.prior.T_imu_cam is not None:
+            seeds.append((self.prior.T_imu_cam[0].copy(), self.prior.timeshift_cam_imu_s or 0.0))
+        chains = track_orientations(
+            (f for _, f in frames), camera.intrinsics, camera.distortion, camera.distortion_model
+        )
+        if not chains:
+            return seeds, ""
+        chain = max(chains, key=lambda c: len(c.t_cam_ns))
+        t_cam = np.array([s for s, f in frames if f.t_cam_ns in set(chain.t_cam_ns.tolist())])
+        result = td_icp(t, gyro, t_cam, chain.R_world_cam, chain.covariance)
+        if result.timeshift_cam_imu_s is None or result.R_imu_cam is None or result.status == "refused":
+            return seeds, result.reason
+        R, shift = result.R_imu_cam, result.timeshift_cam_imu_s
+        seeds.append((R, shift))
+        if self.prior.T_imu_cam is not None:
+            seeds.append((self.prior.T_imu_cam[0].copy(), shift))
+        if result.status != "ok" and look_around:  # one axis may be off by far
+            tilt = np.deg2rad(20.0)
+            seeds += [(R @ so3.exp(s * tilt * axis), shift) for axis in np.eye(3) for s in (-1.0, 1.0)]
+        return seeds, ""
+
+
+def starting_camera(prior: CameraPrior) -> CameraState:
+    """Camera as given; a lens of 60 degrees across where nothing is."""
+    width, height = prior.resolution
+    guess = (0.87 * width, 0.87 * width, 0.5 * (width - 1), 0.5 * (height - 1))
+    R, p = (np.eye(3), np.zeros(3)) if prior.T_imu_cam is None else prior.T_imu_cam
+    return CameraState(
+        np.array(R, np.float64),
+        np.array(p, np.float64),
+        prior.timeshift_cam_imu_s or 0.0,
+        np.array(prior.intrinsics if prior.intrinsics is not None else guess, np.float64),
+        prior.coefficients(),
+        prior.distortion_model,
+        prior.resolution,
+        prior.readout_s,
+    )
+
+
+def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
+    """How far each calibration error may be off at a start: many times what it is worth; shape (FULL,).
+
+    Args:
+        camera: Its focal length counts.
+        imu_sigma: Of the entries of the imu's matrices.
+    """
+    f = float(camera.intrinsics[0])
+    lens = [0.05 * f, 0.05 * f, 0.03 * f, 0.03 * f]
+    distortion = [0.1, 0.1, 0.01, 0.01] if camera.distortion_model == "radtan" else [0.05] * 4
+    imu = [imu_sigma] * ENTRIES + [LAG_SIGMA_S]
+    return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA, _READOUT_SIGMA_S] + imu)
+
+
+def _known(known: Carry) -> _Found:
+    c = known.camera
+    copy = CameraState(
+        c.R_imu_cam.copy(),
+        c.p_imu_cam.copy(),
+        c.timeshift_s,
+        c.intrinsics.copy(),
+        c.distortion.copy(),
+        c.distortion_model,
+        c.resolution,
+        c.readout_s,
+        c.skew,
+    )
+    return _Found(copy, np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
+
+
+def _misfit(fit: EpipolarFit) -> float:
+    return fit.error / max(fit.inliers, 0.1)
+
+
+def _best_apart(fits: list[EpipolarFit]) -> list[tuple[FloatArray, float]]:
+    """Where the best fits ended that did not end in the same place, as seeds."""
+    out: list[tuple[FloatArray, float]] = []
+    for fit in sorted(fits, key=_misfit):
+        turns = [float(np.linalg.norm(so3.log(R.T @ fit.R_imu_cam))) for R, _ in out]
+        if len(out) < _FULL_FITS and min(turns, default=np.inf) > _APART_RAD:
+            out.append((fit.R_imu_cam, fit.timeshift_s))
+    return out
+
+
+def _only_unsure_about(fit: EpipolarFit, axis: FloatArray | None) -> FloatArray | None:
+    """The axis of the imu that kept its direction, where the mounting is known but for a turn about it."""
+    if axis is None or fit.timeshift_sigma_s > _SHIFT_SIGMA_S:
+        return None
+    along = fit.R_imu_cam.T @ axis
+    across = np.eye(3) - np.outer(along, along)
+    worst = np.sqrt(np.linalg.eigvalsh(across @ fit.rotation_covariance @ across)[-1])
+    return axis if worst < _ROTATION_SIGMA_RAD else None
+
+
+def _not_sure_yet(fit: EpipolarFit, *, mounting_known: bool) -> str:
+    worst = float(np.sqrt(np.max(np.diag(fit.rotation_covariance))))
+    if worst > _ROTATION_SIGMA_RAD and not mounting_known:
+        return (
+            f"mounting rotation known to {np.rad2deg(worst):.1f} deg so far: turn the rig about a second axis"
+        )
+    if fit.timeshift_sigma_s > _SHIFT_SIGMA_S:
+        known = 1e3 * fit.timeshift_sigma_s
+        return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
+    return ""
+
+
+def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -> Frames:
+    """The last images without a hole between them; of very many every second or third."""
+    out: Frames = []
+    for t, frame in reversed(frames):
+        if t > end_s or len(frame.ids) < _MIN_TRACKS:
+            continue
+        if t < begin_s or (out and (out[-1][0] - t > _MAX_HOLE_S or out[0][0] - t > span_s)):
+            break
+        out.append((t, frame))
+    every = max(1, math.ceil(len(out) / _MOST_IMAGES))
+    return out[::every][::-1]
+
+
+def _still(frames: Frames) -> bool:
+    """Whether features hardly move over half a second, all along."""
+    t = np.array([s for s, _ in frames])
+    ahead = np.searchsorted(t, t + 0.5)
+    travels = []
+    for i in range(0, len(t), 3):
+        if ahead[i] >= len(t):
+            break
+        a, b = frames[i][1], frames[int(ahead[i])][1]
+        _, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+        if len(ka):
+            travels.append(float(np.median(np.linalg.norm(a.uv_px[ka] - b.uv_px[kb], axis=1))))
+    return bool(travels) and float(np.median(travels)) < _STILL_PX

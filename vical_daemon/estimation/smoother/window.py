@@ -1,0 +1,288 @@
+"""A stretch of images without a target: motion at each image, landmarks, and who saw what.
+
+A landmark is kept as a bearing and an inverse distance from a fixed point of the world, so that far points
+are no special case: X = c + m / rho. [Civera et al., "Inverse depth parametrization for monocular SLAM",
+2008, with a fixed anchor instead of one that is estimated]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.imu_scale import matrices
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.inertial_links import Link, Links, make_link
+
+KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
+MAX_LANDMARKS = 220
+_MIN_SEEN = 4
+_NEAREST_M, _FARTHEST_M = 0.1, 200.0
+
+IntArray = npt.NDArray[np.intp]
+
+
+class Seen(NamedTuple):
+    """Observations of a window, sorted by landmark; N of them.
+
+    Attributes:
+        frame: Index of the image, shape (N,).
+        landmark: Index of the landmark, shape (N,).
+        uv: Pixels, shape (N, 2).
+        row: Its row from the middle one, over their number: by as much of the readout it is late, shape (N,).
+        begin: First observation of each landmark, shape (L,).
+        by_frame: Order that sorts the observations by image.
+        frame_begin: First of each image in that order; only images with observations.
+        frames_with: Those images.
+    """
+
+    frame: IntArray
+    landmark: IntArray
+    uv: FloatArray
+    row: FloatArray
+    begin: IntArray
+    by_frame: IntArray
+    frame_begin: IntArray
+    frames_with: IntArray
+
+
+@dataclass(slots=True)
+class Landmarks:
+    """Points by row; `ids` names their tracks.
+
+    Attributes:
+        ids: Track ids, shape (L,).
+        anchor: c, m, shape (L, 3).
+        bearing: m, unit, shape (L, 3).
+        inverse: rho, 1/m, shape (L,).
+    """
+
+    ids: npt.NDArray[np.int64]
+    anchor: FloatArray
+    bearing: FloatArray
+    inverse: FloatArray
+
+
+@dataclass(slots=True)
+class Window:
+    """Images of a stretch and what is believed about them.
+
+    Attributes:
+        camera: Calibration in force.
+        noise: Inertial densities.
+        frames: (stamp in the camera's clock in s, tracks), in order.
+        R, p, v: Attitude, position (m) and velocity (m/s) of the imu in the world at each image.
+        bias: [gyro, accel] by knot, shape (K, 6).
+        links: Inertial constraints between neighbours.
+        shift_s: Time shift for which instants and links hold; the camera's own differs from it by little.
+        landmarks: What has been placed so far.
+        gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
+        bad: (frame stamp in ns, track id) of observations refused.
+        imu: What is not as stated of the imu (`imu_scale`) where it is estimated, shape (16,); else empty.
+    """
+
+    camera: CameraState
+    noise: ImuNoise
+    frames: list[tuple[float, PointsFrame]]
+    R: FloatArray
+    p: FloatArray
+    v: FloatArray
+    bias: FloatArray
+    links: list[Link]
+    shift_s: float
+    landmarks: Landmarks
+    gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
+    bad: set[tuple[int, int]] = field(default_factory=set)
+    imu: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def span_s(self) -> float:
+        """From the first image to the last."""
+        return self.frames[-1][0] - self.frames[0][0]
+
+    def knots(self) -> IntArray:
+        """Knot in force on each link, shape (F - 1,)."""
+        t = np.array([s for s, _ in self.frames])
+        last = max(round(float(t[-1] - t[0]) / KNOT_S), 1) - 1
+        return np.asarray(np.minimum(((t[:-1] - t[0]) / KNOT_S).astype(np.intp), last), np.intp)
+
+    def fit_knots(self) -> None:
+        """Give every second of the window a knot; new ones start where the last one is."""
+        wanted = int(self.knots()[-1]) + 1 if len(self.frames) > 1 else 1
+        if len(self.bias) < wanted:
+            more = np.repeat(self.bias[-1:], wanted - len(self.bias), axis=0)
+            self.bias = np.concatenate([self.bias, more])
+
+    def rates(self) -> FloatArray:
+        """Angular rate at each image, bias removed, rad/s, shape (F, 3)."""
+        raw = np.array([self.links[0].rate_begin, *(x.rate_end for x in self.links)])
+        knots = self.knots()
+        rates = np.asarray(raw - self.bias[np.concatenate([knots[:1], knots]), :3])
+        return rates @ matrices(self.imu)[0].T if len(self.imu) else rates
+
+    def imu_by_link(self) -> FloatArray:
+        """Bias in force on each link, and entries of the matrices, shape (F - 1, 6) or (F - 1, 21)."""
+        bias = self.bias[self.knots()]
+        return np.concatenate([bias, np.broadcast_to(self.imu, (len(bias), len(self.imu)))], axis=1)
+
+    def accelerations(self) -> tuple[FloatArray, FloatArray]:
+        """Angular (imu frame) and linear (world) acceleration at each image, shapes (F, 3)."""
+        if len(self.frames) < 2:
+            return np.zeros_like(self.v), np.zeros_like(self.v)
+        t = np.array([s for s, _ in self.frames])
+        return np.gradient(self.rates(), t, axis=0), np.gradient(self.v, t, axis=0)
+
+    def extend(self, buffer: ImuBuffer, frames: list[tuple[float, PointsFrame]]) -> int:
+        """Add images, carrying the motion on by inertial data; return how many could be added."""
+        R, p, v = [self.R], [self.p], [self.v]
+        at = (self.R[-1], self.p[-1], self.v[-1])
+        added = 0
+        for t, frame in frames:
+            before = self.frames[-1][0] + self.shift_s
+            imu = np.concatenate([self.bias[-1], self.imu])
+            link = make_link(buffer, before, t + self.shift_s, imu, self.noise)
+            if link is None:
+                break
+            at = carried(link, *at, self.gravity)
+            for store, value in zip((R, p, v), at, strict=True):
+                store.append(value[None])
+            self.links.append(link)
+            self.frames.append((t, frame))
+            added += 1
+        self.R, self.p, self.v = np.concatenate(R), np.concatenate(p), np.concatenate(v)
+        self.fit_knots()
+        return added
+
+    def relink(self, buffer: ImuBuffer) -> bool:
+        """Integrate anew at the present time shift and biases; False where inertial data do not reach."""
+        shift_s = self.camera.timeshift_s
+        d = shift_s - self.shift_s
+        links: list[Link] = []
+        for ((t0, _), (t1, _)), imu in zip(pairwise(self.frames), self.imu_by_link(), strict=True):
+            link = make_link(buffer, t0 + shift_s, t1 + shift_s, imu, self.noise)
+            if link is None:
+                return False
+            links.append(link)
+        rates = self.rates()
+        self.p = self.p + d * self.v
+        self.R = self.R @ so3.exp(d * rates)
+        if len(self.v) > 1:
+            t = np.array([s for s, _ in self.frames])
+            self.v = self.v + d * np.gradient(self.v, t, axis=0)
+        self.links, self.shift_s = links, self.camera.timeshift_s
+        return True
+
+    def last_at(self, shift_s: float) -> tuple[FloatArray, FloatArray]:
+        """Attitude and velocity at the last image for a time shift a little beside that of the links."""
+        d = shift_s - self.shift_s
+        if len(self.frames) < 2:
+            return self.R[-1].copy(), self.v[-1].copy()
+        step_s = self.frames[-1][0] - self.frames[-2][0]
+        turned = self.R[-1] @ so3.exp(d * self.rates()[-1])
+        return turned, self.v[-1] + (d / step_s) * (self.v[-1] - self.v[-2])
+
+    def stale(self) -> bool:
+        """Whether the links hold for another time shift or other biases than are believed now."""
+        off = np.abs(self.imu_by_link() - np.array([x.imu for x in self.links]))
+        return (
+            abs(self.camera.timeshift_s - self.shift_s) > 3e-4
+            or float(off[:, :3].max()) > 5e-3
+            or float(off[:, 3:6].max()) > 0.5
+            or float(off[:, 6:].max(initial=0.0)) > 5e-3
+        )
+
+    def stacked(self) -> Links:
+        """The links for batched arithmetic."""
+        return Links.stack(self.links)
+
+    # ------------------------------------------------------------------ landmarks
+    def observe(self) -> Seen:
+        """Choose the landmarks, place new ones, and list the observations."""
+        ids = np.concatenate([f.ids for _, f in self.frames])
+        frame = np.repeat(np.arange(len(self.frames)), [len(f.ids) for _, f in self.frames])
+        uv = np.concatenate([f.uv_px for _, f in self.frames])
+        if self.bad:
+            stamps = np.array([f.t_cam_ns for _, f in self.frames])[frame]
+            good = np.array(
+                [key not in self.bad for key in zip(stamps.tolist(), ids.tolist(), strict=True)], dtype=bool
+            )
+            ids, frame, uv = ids[good], frame[good], uv[good]
+        names, inverse, counts = np.unique(ids, return_inverse=True, return_counts=True)
+        chosen = np.flatnonzero(counts >= _MIN_SEEN)
+        if len(chosen) > MAX_LANDMARKS:
+            chosen = np.sort(chosen[np.argsort(-counts[chosen], kind="stable")[:MAX_LANDMARKS]])
+        row = np.full(len(names), -1)
+        row[chosen] = np.arange(len(chosen))
+        landmark = row[inverse]
+        keep = np.flatnonzero(landmark >= 0)
+        order = keep[np.lexsort((frame[keep], landmark[keep]))]
+        seen = _listed(frame[order], landmark[order], uv[order], self.camera)
+        self._place(names[chosen], seen)
+        return seen
+
+    def _place(self, ids: npt.NDArray[np.int64], seen: Seen) -> None:
+        """Keep known landmarks, and place the new ones where their rays meet."""
+        anchor, bearing, inverse = place(seen, self.R, self.p, self.camera, len(ids))
+        known = {int(i): k for k, i in enumerate(self.landmarks.ids)}
+        old = self.landmarks
+        for k, name in enumerate(ids.tolist()):
+            at = known.get(name)
+            if at is not None:
+                anchor[k], bearing[k], inverse[k] = old.anchor[at], old.bearing[at], old.inverse[at]
+        self.landmarks = Landmarks(ids, anchor, bearing, inverse)
+
+
+def _listed(frame: IntArray, landmark: IntArray, uv: FloatArray, camera: CameraState) -> Seen:
+    begin = np.flatnonzero(np.diff(landmark, prepend=-1))
+    by_frame = np.argsort(frame, kind="stable")
+    sorted_frames = frame[by_frame]
+    frame_begin = np.flatnonzero(np.diff(sorted_frames, prepend=-1))
+    row = uv[:, 1] / camera.resolution[1] - 0.5
+    return Seen(frame, landmark, uv, row, begin, by_frame, frame_begin, sorted_frames[frame_begin])
+
+
+def carried(
+    link: Link, R: FloatArray, p: FloatArray, v: FloatArray, gravity: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Motion at the end of a link."""
+    T = link.dt_s
+    return R @ link.dR, p + T * v + 0.5 * T * T * gravity + R @ link.dp, v + T * gravity + R @ link.dv
+
+
+def rays_of(uv: FloatArray, camera: CameraState) -> tuple[FloatArray, BoolArray]:
+    """Unit rays in the camera frame, shape (n, 3), and which are valid."""
+    rays, ok = unproject(uv, camera.intrinsics, camera.distortion, camera.distortion_model)
+    return np.where(ok[:, None], rays, [0.0, 0.0, 1.0]), ok
+
+
+def place(
+    seen: Seen, R: FloatArray, p: FloatArray, camera: CameraState, count: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Anchor, bearing, inverse distance where the rays of each landmark meet; a guess where they do not."""
+    if not count:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    rays, ok = rays_of(seen.uv, camera)
+    d = np.matmul(R[seen.frame] @ camera.R_imu_cam, rays[..., None])[..., 0]
+    c = (p + R @ camera.p_imu_cam)[seen.frame]
+    first = seen.begin
+    anchor = c[first]
+    P = (np.eye(3) - d[:, :, None] * d[:, None, :]) * ok[:, None, None]
+    N = np.add.reduceat(P, first) + 1e-6 * np.eye(3)
+    X = np.linalg.solve(N, np.add.reduceat(np.matmul(P, (c - anchor[seen.landmark])[..., None]), first))[
+        ..., 0
+    ]
+    # the middle observation gives the bearing of those whose rays hardly cross
+    distance = np.linalg.norm(X, axis=1)
+    along = (X * d[first]).sum(axis=1) / np.maximum(distance, 1e-9)
+    fine = (along > 0.9) & (distance > _NEAREST_M) & (distance < _FARTHEST_M)
+    usual = float(np.median(1.0 / distance[fine])) if fine.any() else 0.3
+    bearing = np.where(fine[:, None], X / np.maximum(distance, 1e-9)[:, None], d[first])
+    return anchor, bearing, np.where(fine, 1.0 / np.maximum(distance, 1e-9), usual)

@@ -1,0 +1,115 @@
+"""Decides when the rig is no longer what the filter learnt, and what to do about it.
+
+A strong jump makes images unusable (they are refused); a weaker one raises the innovations (CUSUM in
+`Consistency`); a drift shows in the estimates themselves (`DriftWatch`). A lost pose looks like a jump, too,
+so the pose is taken anew first; only if images still do not fit is the calibration itself in doubt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, auto
+
+from vical_daemon.estimation.events import Cause
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.selection.clock_drift import as_if_alike, surely_apart
+from vical_daemon.estimation.status.drift_watch import DriftWatch
+
+_REFUSED_POSE = 10  # images in a row before the pose is taken anew
+_REFUSED_CHANGED = 8  # images in a row, soon after that, before the calibration is
+_SOON_S = 4.0
+_LOOK_CLOSER = 10  # images after an alarm: what has changed shows only in those after it
+_SETTLE_S = 3.0  # after a start the innovations still move
+_DRIFT_FLOOR_S = 30e-6
+_DRIFT_AFTER_S = 2.0
+
+
+class Action(Enum):
+    """What is to be done after an image."""
+
+    NONE = auto()
+    POSE = auto()
+    RESTART = auto()
+    SKEW = auto()
+    WANDER = auto()
+
+
+@dataclass(slots=True)
+class ChangeWatch:
+    """Follows the verdicts on the images of all cameras.
+
+    Attributes:
+        why: Cause of the last restart.
+    """
+
+    why: Cause = Cause.NONE
+    _refused: int = 0
+    _closer: int = 0  # images until what has changed is decided; 0: nothing has
+    _pose_taken_s: float = float("-inf")
+    _started_s: float = float("inf")
+    _drift: dict[str, DriftWatch] = field(default_factory=dict)
+
+    def started(self, t_s: float) -> None:
+        """A filter starts at `t_s`."""
+        self._refused = self._closer = 0
+        self._pose_taken_s, self._started_s = float("-inf"), t_s
+        self._drift.clear()
+
+    def motion_restarted(self, t_s: float) -> None:
+        """The motion was taken from images at `t_s`: if images do not fit now, it is not the pose."""
+        self._refused, self._pose_taken_s = 0, t_s
+
+    def shift_reopened(self) -> None:
+        """A time shift is to be found anew: what is known of its drift says nothing now."""
+        self._refused = self._closer = 0
+        self._drift.clear()
+
+    @property
+    def doubtful(self) -> bool:
+        """A time shift may be drifting: too early to say so, too likely to ignore."""
+        return any(w.doubtful for w in self._drift.values())
+
+    def look(self, report: FrameReport, f: CalibrationFilter) -> Action:
+        """Say what is to be done after this image."""
+        t = f.state.t_s
+        self._refused = 0 if report.used else self._refused + 1
+        soon = t < self._pose_taken_s + _SOON_S
+        if self._refused >= (_REFUSED_CHANGED if soon else _REFUSED_POSE):
+            self._refused = 0
+            self.why = Cause.IMAGES_REFUSED
+            if soon:
+                return Action.RESTART
+            self._pose_taken_s = t
+            return Action.POSE
+        consistency = f.consistency[report.camera]
+        if consistency.alarmed:
+            consistency.alarm = 0.0
+            if t > self._started_s + _SETTLE_S and not self._closer:
+                self._closer = _LOOK_CLOSER
+        if self._closer:
+            self._closer -= 1
+            if not self._closer:
+                self.why = Cause.IMAGES_DISAGREE
+                return Action.RESTART
+        return self._look_for_drift(report.camera, f)
+
+    def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
+        """See once a second whether the clocks run apart, or the time shift moves in another way."""
+        index, t_s = f.layout.cameras[camera].timeshift, f.state.t_s
+        if index is None or camera in f.drifting or t_s < self._started_s + _DRIFT_AFTER_S:
+            return Action.NONE
+        watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
+        watch.floor = max(_DRIFT_FLOOR_S, f.stamp_sigma_s)
+        if not watch.due(t_s):
+            return Action.NONE
+        if surely_apart(f, camera):
+            self._drift.pop(camera)
+            return Action.SKEW
+        alike = as_if_alike(f, camera)
+        variance = float(alike.S[index] @ alike.S[index])
+        value = alike.state.cameras[camera].timeshift_s
+        if not watch.drifts(t_s, value, variance, f.consistency[camera].factor):
+            return Action.NONE
+        self._drift.pop(camera)
+        return Action.WANDER

@@ -1,0 +1,72 @@
+"""The held-back check: now and then a copy of the filter predicts an image by the IMU alone.
+
+What the filter learnt from its images is tested on one it has not used, some tenths of a second ahead: a
+calibration that only explains its own data fails here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+
+_EVERY_S = 1.5
+_AHEAD_S = 0.3
+_ENOUGH = 20  # predictions before the imu's noise is judged by them
+_WORSE, _BETTER = 1.5, 0.55  # mean squared error over its prediction: 4 standard deviations of chance
+_CLIP = 10.0
+_FITS = 2.0  # corner scale above which it is the images that do not fit
+
+
+@dataclass(slots=True)
+class HeldBack:
+    """Takes a copy of the filter every 1.5 s and asks it 0.3 s later what it would have expected."""
+
+    _copy: CalibrationFilter | None = None
+    _next_s: float = float("-inf")
+
+    def follow(
+        self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float, target: FloatArray, buffer: ImuBuffer
+    ) -> float | None:
+        """Look at one image after the filter has used it.
+
+        Returns:
+            Mean squared error of the prediction over its predicted variance, when one was due; else None.
+        """
+        if self._copy is None:
+            if f.state.t_s >= self._next_s:
+                self._copy = f.copy()
+            return None
+        held = self._copy
+        t_s = t_cam_s + held.state.cameras[frame.camera].timeshift_s
+        if t_s < held.state.t_s + _AHEAD_S or len(frame.ids) < 8:
+            return None
+        self._copy, self._next_s = None, t_s + _EVERY_S
+        segment = buffer.segment(held.state.t_s, t_s)
+        if segment is None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
+            return None
+        held.predict(segment)
+        return held.surprise(held.image(frame, t_cam_s, target[frame.ids]))
+
+
+def imu_noise_error(ratios: Sequence[float], scale: float) -> float | None:
+    """What held-back predictions say about the imu's noise densities; None: they agree.
+
+    Args:
+        ratios: What `HeldBack.follow` returned of late.
+        scale: `Consistency.scale` of the camera: with images that do not fit nothing can be said.
+
+    Returns:
+        Errors of the predictions over the expected ones (1: as expected), where they differ.
+    """
+    if len(ratios) < _ENOUGH or scale > _FITS:
+        return None
+    mean = float(np.mean(np.minimum(ratios, _CLIP)))
+    if _BETTER <= mean <= _WORSE:
+        return None
+    return float(np.sqrt(mean))

@@ -1,0 +1,106 @@
+"""What an estimator remembers of the last seconds, to tell what has changed when images no longer fit."""
+
+from __future__ import annotations
+
+from collections import deque
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.image_intake import SEARCHED_S
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.target_poses import Lens, pose_of
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+from vical_daemon.estimation.temporal.shift_step import Orientations, ShiftFit, find_shift, level_at
+
+_EVERY_S = 1.0
+_BEFORE_S = 3.0  # a change is noticed within
+_STRETCHES = (10, 15, 30)  # images in which a step is looked for
+_LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
+_BEFORE_IMAGES = 30  # that show how well orientations usually fit
+_CORNER_PX = 0.2  # orientations are never better than a corner's position over the focal length
+_MOST = 200  # images kept, a camera
+
+
+@dataclass(slots=True)
+class RecentPast:
+    """Images of the last seconds by camera, and copies of the filter from before."""
+
+    _frames: dict[str, deque[tuple[float, PointsFrame, bool]]] = field(default_factory=dict)
+    _copies: deque[CalibrationFilter] = field(default_factory=deque)
+
+    def saw(self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float) -> None:
+        """Remember an image, whether it was used, and once a second the filter."""
+        frames = self._frames.setdefault(frame.camera, deque(maxlen=_MOST))
+        frames.append((t_cam_s, frame, report.used))
+        while self._copies and self._copies[0].state.t_s < f.state.t_s - _BEFORE_S - _EVERY_S:
+            self._copies.popleft()
+        if not self._copies or f.state.t_s >= self._copies[-1].state.t_s + _EVERY_S:
+            self._copies.append(deepcopy(f))
+
+    def filter(self, f: CalibrationFilter) -> CalibrationFilter:
+        """The filter as it was before a change that is noticed now, or as long ago as it is remembered."""
+        return deepcopy(self._copies[0] if self._copies else f)
+
+    def find_shift(
+        self, f: CalibrationFilter, camera: str, buffer: ImuBuffer, target: FloatArray
+    ) -> ShiftFit | None:
+        """Whether the latest images fit the gyro at another time shift, and only there.
+
+        Nobody knows when it stepped: the shortest stretch that gives an answer is as good as any.
+        """
+        frames = [(t, frame) for t, frame, _ in self._frames.get(camera, ())]
+        for count in _STRETCHES:
+            if len(frames) < count:
+                break
+            fit = self.shift_of(frames[-count:-_LATE_IMAGES], f, buffer, target)
+            if fit is not None and fit.stepped:
+                return fit
+        return None
+
+    def shift_of(
+        self,
+        frames: list[tuple[float, PointsFrame]],
+        f: CalibrationFilter,
+        buffer: ImuBuffer,
+        target: FloatArray,
+    ) -> ShiftFit | None:
+        """Whether images of one camera fit the gyro at one time shift, and only there.
+
+        Args:
+            frames: Stamp, s, and points.
+            f: With the calibration as it is known.
+            buffer: Inertial readings.
+            target: Points of the target, m, shape (n, 3).
+        """
+        seen = _orientations(frames, f, target)
+        if seen is None or len(buffer) < 2:
+            return None
+        known, rows = f.state.cameras[frames[0][1].camera], buffer.rows
+        curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
+        used = [(t, frame) for t, frame, ok in self._frames.get(frames[0][1].camera, ()) if ok]
+        before = _orientations([x for x in used if x[0] < frames[0][0]][-_BEFORE_IMAGES:], f, target)
+        level = 1.0 if before is None else level_at(curve, before, known.R_imu_cam, known.timeshift_s)
+        return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
+
+
+def _orientations(
+    frames: list[tuple[float, PointsFrame]], f: CalibrationFilter, target: FloatArray
+) -> Orientations | None:
+    """What the camera's orientations are by the target alone; None where no image shows one."""
+    if not frames:
+        return None
+    known = f.state.cameras[frames[0][1].camera]
+    lens = Lens(known.intrinsics, known.distortion, known.distortion_model, known.resolution)
+    poses = [p for t, frame in frames if (p := pose_of(frame, t, lens, target)) is not None]
+    if not poses:
+        return None
+    return Orientations(
+        np.array([p.t_cam_s for p in poses]),
+        np.array([p.R_target_cam for p in poses]),
+        np.maximum([p.sigma_rad for p in poses], _CORNER_PX / float(known.intrinsics[0])),
+    )

@@ -1,0 +1,337 @@
+"""Says how far to trust the filter: status, reasons in words, progress, withheld directions."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
+from vical_daemon.estimation.filter.snapshot import camera_estimate, imu_estimate
+from vical_daemon.estimation.geometry.camera_model import RADTAN
+from vical_daemon.estimation.guidance import WeakDirection
+from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.state import Layout
+from vical_daemon.estimation.model.trace import Trace
+from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
+from vical_daemon.estimation.selection import clock_drift
+from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.status.excitation import (
+    ALL_WAYS,
+    RunningMotion,
+    excitation_advice,
+    weak_directions,
+)
+from vical_daemon.estimation.status.holdout_check import imu_noise_error
+from vical_daemon.estimation.status.image_coverage import Cover
+from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
+from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
+
+_ENOUGH_FRAMES = 60
+_ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
+_PATIENCE_S = 15.0
+_LOST = 3.0  # a direction this far above its target after the patience is called unobservable
+_NIS_BAD = 4.0
+_HELD_BACK_BAD = 9.0
+_RECENT = 60
+
+
+class Judge:
+    """Watches what goes in and out of the filter.
+
+    Args:
+        options: Switches and targets.
+        layout: Where the errors live.
+    """
+
+    def __init__(self, options: CalibrationOptions, layout: Layout) -> None:
+        self.options = options
+        self.layout = layout
+        self._imu_asked = "imu_intrinsics" in options.estimate
+        self._motion = RunningMotion()
+        self.imu_samples = 0
+        self.imu_refused = 0
+        self.frames = 0
+        self.frames_seen = 0
+        self.frames_ignored = 0
+        self.frames_refused = 0
+        self._events = EventLog()
+        self._steady = SteadyStatus()
+        self.bumped = Cause.NONE
+        self.in_doubt = ""
+        self._ever_converged = False
+        self._start_reason = ""
+        self._motion_missing = False
+        self._partial = ""
+        self._first_ns = self._newest_ns = 0
+        self._first_frame_s: float | None = None
+        self._started_s: float | None = None
+        self._reopened_s = -np.inf
+        self._points = [0, 0]
+        self._nis: deque[tuple[float, int]] = deque(maxlen=300)
+        self._recent_used: deque[bool] = deque(maxlen=_RECENT)
+        self._held_back: deque[float] = deque(maxlen=40)
+        self._square: dict[str, deque[tuple[float, int]]] = {}
+        self._trace: dict[str, Trace] = {}
+        self._size: deque[float] = deque(maxlen=400)
+        self._cover = Cover()
+
+    # ------------------------------------------------------------------ what happens
+    def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
+        """Count one inertial reading."""
+        if not self.imu_samples:
+            self._first_ns = t_ns
+        self.imu_samples += 1
+        self._newest_ns = t_ns
+        self._events.now_s = (t_ns - self._first_ns) * 1e-9
+        self._motion.add((t_ns - self._first_ns) * 1e-9, gyro)
+        if self.imu_samples % 16 == 1:
+            self._size.append(float(np.sqrt(accel @ accel)))
+
+    def saw_points(self, t_s: float, count: int) -> None:
+        """Count one image with `count` points in it."""
+        if count >= 4:
+            self.frames_seen += 1
+            if self._first_frame_s is None:
+                self._first_frame_s = t_s
+
+    def waiting(self, why: str, motion_missing: bool = False) -> None:
+        """The start is not possible yet; `motion_missing`: more motion, not more time, would help."""
+        self._start_reason, self._motion_missing = why, motion_missing
+
+    def started(self, t_s: float, partial: str = "") -> None:
+        """The filter runs from `t_s` on; `partial`: what the motion did not show, and was guessed."""
+        self._start_reason, self._started_s, self._partial = "", t_s, partial
+        self._recent_used.clear()
+        self._nis.clear()
+        self._held_back.clear()
+        if self.bumped:
+            self.announce(Event(EventKind.STARTED_ANEW))
+            self.bumped = Cause.NONE
+
+    def reopened(self, t_s: float) -> None:
+        """Something that was known has to be found anew: patience begins again at `t_s`."""
+        self._reopened_s = t_s
+        self._steady.reset(min(self.status, Status.CONVERGING, key=list(Status).index))
+
+    def announce(self, event: Event, once: str = "") -> None:
+        """Put an event into the next estimate; of those with the same `once` only the first."""
+        self._events.add(event, once)
+
+    def announce_all(self, events: Iterable[Event]) -> None:
+        """Put events into the next estimate."""
+        for event in events:
+            self._events.add(event)
+
+    def changed(self, why: Cause) -> None:
+        """The rig is not what it was: the calibration is being taken anew."""
+        self.bumped = why
+        kind = EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER
+        self.announce(Event(kind, cause=why))
+        self._started_s = None
+        self._steady.reset(Status.INCONSISTENT)
+
+    @property
+    def status(self) -> Status:
+        """Where the calibration stands, as of the last estimate."""
+        return self._steady.status
+
+    def held_back(self, ratio: float, scale: float) -> None:
+        """Take in how well the imu alone foretold an image.
+
+        Args:
+            ratio: Squared error over its predicted variance.
+            scale: `Consistency.scale` of the camera.
+        """
+        self._held_back.append(ratio)
+        error = imu_noise_error(self._held_back, scale)
+        if error is not None:
+            self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
+
+    def saw_frame(self, report: FrameReport, f: CalibrationFilter) -> None:
+        """Take the verdict of one frame."""
+        self._points[0] += int((~report.accepted).sum())
+        self._points[1] += len(report.accepted)
+        self._recent_used.append(report.used)
+        if not report.used:
+            self.frames_refused += 1
+            return
+        self.frames += 1
+        self._nis.append((report.nis, report.dof))
+        square = self._square.setdefault(report.camera, deque(maxlen=400))
+        good = report.residual_px[report.accepted]
+        square.append((float((good**2).sum()), 2 * len(good)))
+        self._maybe_trace(report.camera, f)
+        self._cover.saw(report, f)
+        jitter_s = f.shared[report.camera].jitter_s
+        if jitter_s >= ANNOUNCED_S:
+            event = Event(EventKind.STAMP_JITTER, report.camera, float(jitter_s))
+            self.announce(event, once=f"jitter {report.camera}")
+        lens = f.agreement[report.camera]
+        if lens.model == RADTAN and lens.moved.any():
+            self.announce(Event(EventKind.LENS_TERM_MISSING, report.camera), once=f"lens {report.camera}")
+
+    def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
+        trace = self._trace.setdefault(camera, Trace())
+        if trace.due(f.state.t_s):
+            trace.add(f.state.t_s, self._camera(camera, self.weighed(f)), self.nis_per_dof(), self.status)
+
+    # ------------------------------------------------------------------ what is said
+    def nis_per_dof(self) -> float:
+        """Mean normalised innovation squared per degree of freedom over the last frames."""
+        dof = sum(d for _, d in self._nis)
+        return sum(n for n, _ in self._nis) / dof if dof else 0.0
+
+    def trace(self, camera: str) -> list[TracePoint]:
+        """The development of one camera."""
+        return list(self._trace[camera].points) if camera in self._trace else []
+
+    def estimate(
+        self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
+    ) -> CalibrationEstimate:
+        """Put everything together; `stale`: what was known before a change, shown while starting anew."""
+        f, stale = (None if x is None else self.weighed(x) for x in (f, stale))
+        shown = f or stale
+        cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
+        missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
+        verdict = self._decide(f, missing)
+        if verdict.guidance and f is not None:
+            first = next(iter(f.state.cameras.values()))
+            advice = excitation_advice(self._motion, first.R_imu_cam, f.state.gyro_bias)
+            verdict = verdict._replace(guidance=advice or verdict.guidance)
+        _, reason, advice = self._steady.follow(verdict, self._now_s)
+        if not advice and f is not None and self.status != Status.INCONSISTENT:
+            advice = self._cover.advice()
+        self._ever_converged |= self.status == Status.CONVERGED
+        if f is not None and (self.status == Status.DEGENERATE or f.unshown is not None):
+            cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
+        return CalibrationEstimate(
+            self._newest_ns,
+            self.status,
+            reason,
+            self._progress(missing),
+            guidance_text(advice),
+            self._now_s,
+            self.frames,
+            self.imu_samples,
+            cameras,
+            None if shown is None else imu_estimate(shown, matrices=self._imu_asked),
+            [] if shown is None else shown.state.gravity.tolist(),
+            self.nis_per_dof(),
+            self._points[0] / max(self._points[1], 1),
+            self._events.take(),
+            advice,
+        )
+
+    @property
+    def _now_s(self) -> float:
+        return (self._newest_ns - self._first_ns) * 1e-9
+
+    def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
+        """The filter as it is told: over all hypotheses about imu, target and clocks."""
+        f = hypotheses.averaged(f)
+        return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
+
+    def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
+        square = self._square.get(name, ())
+        count = sum(n for _, n in square)
+        rms = float(np.sqrt(sum(s for s, _ in square) / count)) if count else 0.0
+        return camera_estimate(f, name, rms)
+
+    def _missing(self, e: CameraEstimate, name: str, f: CalibrationFilter) -> list[WeakDirection]:
+        where = self.layout.cameras[name]
+        if where.position is None and where.timeshift is None:
+            return []
+        covariance, R = np.array(e.T_imu_cam.covariance), f.state.cameras[name].R_imu_cam
+        return weak_directions(
+            covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, f.state.gyro_bias
+        )
+
+    @staticmethod
+    def _withheld(e: CameraEstimate, missing: list[WeakDirection]) -> CameraEstimate:
+        lost = [m for m in missing if m.excess > _LOST]
+        return replace(e, unobservable=[direction_line(m) for m in lost], withheld=lost)
+
+    def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[WeakDirection]]) -> Verdict:
+        """Status, reason and guidance by the data up to now."""
+        if f is None:
+            return self._before_start()
+        trouble = self._trouble()
+        if trouble:
+            return Verdict(Status.INCONSISTENT, trouble)
+        span = f.state.t_s - (self._started_s or 0.0)
+        weak = sorted((g for gs in missing.values() for g in gs), key=lambda g: -g.excess)
+        lacking = self._steady.counted(weak)
+        if not lacking:
+            if self._partial:
+                return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)
+            if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
+                return Verdict(Status.CONVERGING, CONFIRMING)
+            if self.in_doubt:
+                return Verdict(Status.CONVERGING, self.in_doubt)
+            if not self._held_back_fine():
+                return Verdict(
+                    Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet"
+                )
+            return Verdict(Status.CONVERGED)
+        worst = lacking[0]
+        patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > _PATIENCE_S
+        if patient and worst.excess > _LOST:
+            names = "; ".join(direction_sigma(g) for g in lacking[:3])
+            return Verdict(Status.DEGENERATE, f"the motion does not show: {names}", worst.guidance)
+        return Verdict(Status.CONVERGING, direction_sigma(worst), worst.guidance)
+
+    def _before_start(self) -> Verdict:
+        if self.bumped:
+            why = cause_text(self.bumped)
+            return Verdict(Status.INCONSISTENT, f"{why}; calibrating anew: {self._start_reason}")
+        if not self.imu_samples:
+            return Verdict(Status.WAITING, "no inertial data yet")
+        unit = self._unit_trouble()
+        if unit:
+            return Verdict(Status.INCONSISTENT, unit)
+        if self._first_frame_s is None:
+            return Verdict(
+                Status.WAITING, "the target has not been seen yet: show the whole board to the camera"
+            )
+        seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
+        if self._motion_missing and seen_for > _PATIENCE_S:
+            advice = excitation_advice(self._motion, None) or ALL_WAYS
+            return Verdict(Status.DEGENERATE, self._start_reason, advice)
+        return Verdict(Status.INITIALISING, self._start_reason or "collecting the first seconds")
+
+    def _unit_trouble(self) -> str:
+        if len(self._size) < 20:
+            return ""
+        size = float(np.median(self._size))
+        if 0.7 < size < 1.4:
+            return (
+                f"specific force has a median size of {size:.2f}: is the accelerometer in g instead of m/s^2?"
+            )
+        return ""
+
+    def _trouble(self) -> str:
+        """Why the filter cannot be believed at present; empty when it can."""
+        refused = self._recent_used.count(False)
+        if len(self._recent_used) >= 20 and refused > len(self._recent_used) // 3:
+            return f"{refused} of the last {len(self._recent_used)} images do not fit the motion"
+        if len(self._nis) >= 40 and self.nis_per_dof() > _NIS_BAD:
+            return f"innovations are {self.nis_per_dof():.1f} times what they should be"
+        return ""
+
+    def _held_back_fine(self) -> bool:
+        return len(self._held_back) >= 2 and float(np.median(self._held_back)) < _HELD_BACK_BAD
+
+    def _progress(self, missing: dict[str, list[WeakDirection]]) -> float:
+        if self.status == Status.CONVERGED:
+            return 1.0
+        if not missing:
+            return min(0.1, 0.001 * self.frames_seen)
+        worst = max((g.excess for gs in missing.values() for g in gs), default=1.0)
+        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))

@@ -1,0 +1,1 @@
+"""Offline tools: Allan deviation, IMU calibration at rest, observability."""

@@ -1,0 +1,239 @@
+"""Which parameters a given motion makes observable: the Gramian of the linearised system along a trajectory.
+
+Without process noise the whole trajectory is a function of the first state and of constant parameters. The
+derivative of every measurement by those numbers, summed up as information, says what the motion can
+determine: its null space are the directions lost, and its inverse bounds from below how well the rest can be
+known. All integrals of the error equations are running sums over the imu's samples, so nothing is integrated
+twice.
+
+Errors: attitude (world frame, left), position, velocity, gyro and accelerometer bias, gravity; mounting
+(local, right), lever arm, time shift; and optional blocks. `observability_model`
+asks the same of the model itself, for motions that excite everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.tools.observability_setup import UNITS, Motion, Setup, block_layout
+
+__all__ = [
+    "Direction",
+    "Motion",
+    "Observability",
+    "Setup",
+    "block_layout",
+    "covariance_of",
+    "gramian",
+    "judge",
+    "lost_in_block",
+    "pose_sensitivities",
+]
+
+FloatArray = npt.NDArray[np.float64]
+
+_LOST = 1e-7  # singular value (in the units above, relative to the largest) below which a direction is lost
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A direction in the space of unknowns that the motion leaves open (or nearly so).
+
+    Attributes:
+        parts: Share of each block in it, largest first, as (block, share 0 to 1).
+        vector: In the scaled unknowns, unit length, shape (p,).
+        strength: Singular value relative to the largest.
+    """
+
+    parts: list[tuple[str, float]]
+    vector: FloatArray
+    strength: float
+
+
+@dataclass(frozen=True)
+class Observability:
+    """The verdict.
+
+    Attributes:
+        blocks: Name of each block and its columns.
+        rank: Directions determined.
+        unknowns: How many there are.
+        lost: Directions that are not.
+        sigma: Bound on each unknown's standard deviation (inf in a lost direction), SI units, shape (p,).
+        information: Of the unknowns in their own units, shape (p, p).
+    """
+
+    blocks: dict[str, slice]
+    rank: int
+    unknowns: int
+    lost: list[Direction]
+    sigma: FloatArray
+    information: FloatArray
+    units: FloatArray = field(repr=False, default_factory=lambda: np.ones(0))
+
+
+def _running(dt: FloatArray, values: FloatArray) -> FloatArray:
+    """Running integral over time (trapezoids) of values (m, ...)."""
+    out = np.zeros_like(values)
+    shape = (len(dt),) + (1,) * (values.ndim - 1)
+    np.cumsum(0.5 * dt.reshape(shape) * (values[:-1] + values[1:]), axis=0, out=out[1:])
+    return out
+
+
+def pose_sensitivities(
+    motion: Motion, layout: dict[str, slice], p: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Derivatives of attitude, velocity and position at all times by the unknowns, each (m, 3, p).
+
+    theta' = -R (db + dS w), v' = -hat(R f) theta - R (da + dA f) + dg, p' = v: [world frame, left attitude
+    error]
+    """
+    m = len(motion.t_s)
+    dt = np.diff(motion.t_s)
+    R, w, f = motion.R_world_imu, motion.rate_rps, motion.specific_force_mps2
+    eye = np.eye(3)
+    theta = np.zeros((m, 3, p))
+    theta[:, :, layout["attitude"]] = eye
+    theta[:, :, layout["gyro_bias"]] = -_running(dt, R)
+    if "gyro_matrix" in layout:
+        flow = (R[:, :, :, None] * w[:, None, None, :]).reshape(m, 3, 9)
+        theta[:, :, layout["gyro_matrix"]] = -_running(dt, flow)
+    force = (R @ f[..., None])[..., 0]
+    slope = -so3.hat(force) @ theta
+    slope[:, :, layout["accel_bias"]] -= R
+    slope[:, :, layout["gravity"]] += eye
+    if "accel_matrix" in layout:
+        rows, columns = np.tril_indices(3)
+        slope[:, :, layout["accel_matrix"]] -= R[:, :, rows] * f[:, None, columns]
+    velocity = _running(dt, slope)
+    velocity[:, :, layout["velocity"]] += eye
+    position = _running(dt, velocity)
+    position[:, :, layout["position"]] += eye
+    return theta, velocity, position
+
+
+def gramian(motion: Motion, setup: Setup, frames: Sequence[int] | npt.NDArray[np.intp]) -> Observability:
+    """Judge a motion.
+
+    Args:
+        motion: The motion.
+        setup: Camera and points.
+        frames: Samples of the motion at which an image is taken.
+
+    Returns:
+        What can be determined and what cannot.
+    """
+    layout = block_layout(setup)
+    p = max(s.stop for s in layout.values())
+    theta, _, position = pose_sensitivities(motion, layout, p)
+    information = np.zeros((p, p))
+    for k in frames:
+        J = _frame_jacobian(motion, setup, layout, int(k), theta[k], position[k])
+        information += J.T @ J
+    information /= setup.corner_sigma_px**2
+    return judge(information, layout)
+
+
+def _frame_jacobian(
+    motion: Motion, setup: Setup, layout: dict[str, slice], k: int, theta: FloatArray, position: FloatArray
+) -> FloatArray:
+    """Derivative of all visible pixels of one image by the unknowns, shape (2 n, p)."""
+    R, p0 = motion.R_world_imu[k], motion.p_world_imu[k]
+    arm = setup.landmarks_m - p0
+    in_imu = arm @ R
+    in_cam = (in_imu - setup.p_imu_cam) @ setup.R_imu_cam
+    uv, J_point, J_lens = project_jacobians(in_cam, setup.intrinsics, setup.distortion, setup.model)
+    width, height = setup.resolution
+    with np.errstate(invalid="ignore"):
+        seen = (uv >= -0.5).all(axis=1) & (uv[:, 0] < width - 0.5) & (uv[:, 1] < height - 0.5)
+    ids = np.flatnonzero(seen & (in_cam[:, 2] > 0.01))
+    R_cam_world = setup.R_imu_cam.T @ R.T
+    by_theta = R_cam_world @ so3.hat(arm[ids])
+    dX = by_theta @ theta - R_cam_world @ position
+    dX[:, :, layout["rotation"]] += so3.hat(in_cam[ids])
+    dX[:, :, layout["lever_arm"]] -= setup.R_imu_cam.T
+    flow = by_theta @ (R @ motion.rate_rps[k]) - R_cam_world @ motion.v_world_imu[k]
+    dX[:, :, layout["timeshift"]] += flow[:, :, None]
+    if "readout" in layout:
+        row = uv[ids, 1] / height - 0.5
+        dX[:, :, layout["readout"]] += (flow * row[:, None])[:, :, None]
+    if "target_scale" in layout:
+        dX[:, :, layout["target_scale"]] += (setup.landmarks_m[ids] @ R_cam_world.T)[:, :, None]
+    if setup.target_free:
+        first = layout["landmark"].start
+        for i, point in enumerate(ids):
+            dX[i, :, first + 3 * point : first + 3 * point + 3] += R_cam_world
+    J = J_point[ids] @ dX
+    if "intrinsics" in layout:
+        J[:, :, layout["intrinsics"]] += J_lens[ids, :, :4]
+        J[:, :, layout["distortion"]] += J_lens[ids, :, 4:]
+    return np.asarray(J.reshape(2 * len(ids), -1), dtype=np.float64)
+
+
+def judge(information: FloatArray, layout: dict[str, slice], lost: float = _LOST) -> Observability:
+    """Split the unknowns into what an information matrix determines and what it does not.
+
+    Args:
+        information: In the unknowns' own units, shape (p, p).
+        layout: Columns of each block.
+        lost: Relative singular value (of the measurements' derivative) below which a direction is lost.
+    """
+    p = len(information)
+    units = np.ones(p)
+    for name, columns in layout.items():
+        units[columns] = UNITS[name]
+    values, vectors = np.linalg.eigh(information * np.outer(units, units))
+    strength = np.sqrt(np.maximum(values, 0.0) / max(float(values[-1]), 1e-300))
+    # squaring loses digits: what the eigenvalues cannot resolve (1e-16 of the largest) is lost as well
+    gone = strength < max(lost, 3e-8)
+    keep = ~gone
+    variance = np.einsum("ij,j->i", vectors[:, keep] ** 2, 1.0 / values[keep]) if keep.any() else np.zeros(p)
+    touched = np.sqrt(np.sum(vectors[:, gone] ** 2, axis=1)) if gone.any() else np.zeros(p)
+    sigma = np.where(touched > 1e-4, np.inf, units * np.sqrt(variance))
+    directions = [
+        Direction(_parts(vectors[:, i], layout), vectors[:, i], float(strength[i]))
+        for i in np.flatnonzero(gone)
+    ]
+    return Observability(layout, int(keep.sum()), p, directions, sigma, information, units)
+
+
+def _parts(vector: FloatArray, layout: dict[str, slice]) -> list[tuple[str, float]]:
+    shares = [(name, float(np.linalg.norm(vector[columns]))) for name, columns in layout.items()]
+    return sorted(((n, s) for n, s in shares if s > 0.05), key=lambda part: -part[1])
+
+
+def covariance_of(result: Observability, prior: float = 1e3) -> FloatArray:
+    """Return the covariance of all unknowns with next to no prior, so that lost directions stay finite.
+
+    Args:
+        result: The verdict.
+        prior: Sigma of the prior in the units that make unknowns comparable (1e3: a radian, ten metres, a
+            second).
+
+    Returns:
+        In the unknowns' own units, shape (p, p).
+    """
+    u = result.units
+    values, vectors = np.linalg.eigh(result.information * np.outer(u, u))
+    half = vectors / np.sqrt(np.maximum(values, 0.0) + prior**-2)
+    return np.asarray((half @ half.T) * np.outer(u, u), dtype=np.float64)
+
+
+def lost_in_block(result: Observability, block: str) -> FloatArray:
+    """Return an orthonormal basis of what is lost within one block, shape (k, size), strongest first.
+
+    The lost directions span a space; this is its shadow on the block: for the lever arm under rotation about
+    one axis, that axis.
+    """
+    columns = result.blocks[block]
+    if not result.lost:
+        return np.zeros((0, columns.stop - columns.start))
+    shadow = np.stack([d.vector[columns] for d in result.lost])
+    _, s, Vt = np.linalg.svd(shadow, full_matrices=False)
+    return np.asarray(Vt[s > 1e-3], dtype=np.float64)

@@ -1,0 +1,79 @@
+"""Recordings of every kind, as messages in order of their stamps, ready for a bus.
+
+`open_recording` takes an MCAP of ours or of ROS 2, a folder of MCAP segments, a ROS 2 bag folder, a
+ROS 1 bag or an ASL/EuRoC folder, checks that units and rates can be right, and returns a `Recording`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from vical_daemon.logs.asl import AslRecording
+from vical_daemon.logs.bags import BagRecording
+from vical_daemon.logs.checks import check_camera, check_imu
+from vical_daemon.logs.model import ImuArrays, Kind, Recording, RecordingError, Stream
+from vical_daemon.logs.recorded_logs import McapRecording
+
+__all__ = ["ImuArrays", "Kind", "Recording", "RecordingError", "Stream", "check_recording", "open_recording"]
+
+
+def open_recording(
+    path: Path | str,
+    *,
+    topics: Collection[str] | None = None,
+    cameras: Collection[str] = (),
+    check: bool = True,
+) -> Recording:
+    """Open a recording of any kind.
+
+    Args:
+        path: File or folder.
+        topics: Topics, or names of imus and cameras, to take; None: all that are of use.
+        cameras: Of the cameras only these, where there is one of them: files of an ASL folder that belong to
+            others may be as broken as they like.
+        check: Refuse wrong units, rates and clocks (`check_recording`).
+
+    Raises:
+        RecordingError: It cannot be used; the message is one line that says what to try.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist; check the path")
+    recording = _open(path, topics, cameras)
+    if check:
+        check_recording(recording)
+    return recording
+
+
+def check_recording(recording: Recording) -> None:
+    """Judge units, rates and overlap; adds to `recording.warnings`.
+
+    Raises:
+        RecordingError: Something cannot be right, or imu or camera are missing.
+    """
+    if not recording.imus:
+        raise RecordingError(f"{recording.path} holds no imu data; `vical info` shows what is in it")
+    for name in recording.imus:
+        recording.warnings.extend(check_imu(name, recording.imu_arrays(name)))
+    for stream in recording.cameras.values():
+        recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
+
+
+def _open(path: Path, topics: Collection[str] | None, cameras: Collection[str]) -> Recording:
+    if path.is_dir():
+        if any(path.glob("*.mcap")):  # also of a ROS 2 bag folder: our reader bears damage
+            return McapRecording(path, topics)
+        if (path / "metadata.yaml").is_file():
+            return BagRecording(path, topics)
+        return AslRecording(path, topics, cameras)
+    if path.suffix == ".bag":
+        return BagRecording(path, topics)
+    if path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
+        return McapRecording(path, topics)
+    if path.suffix == ".db3" and (path.parent / "metadata.yaml").is_file():
+        return BagRecording(path.parent, topics)
+    raise RecordingError(
+        f"{path} is no recording: expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder "
+        "(with mav0/imu0/data.csv)"
+    )

@@ -1,0 +1,359 @@
+"""Reads ASL/EuRoC folders: ``mav0/imu0/data.csv`` and ``mav0/cam0/`` with images, corners or tracks."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import re
+import struct
+import zlib
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from vical_drivers.user_files import open_file, read_file, read_text
+
+from vical_daemon.bus.messages import encode_compressed_image, encode_imu, encode_points
+from vical_daemon.bus.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
+from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
+from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.logs.model import (
+    ImuArrays,
+    Kind,
+    Recording,
+    RecordingError,
+    Stream,
+    stream_statistics,
+)
+
+RIG = "rig0"
+_IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
+_POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
+_IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
+_IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
+_SMALL = 2**25  # bytes; so much a packed table may always unpack to
+_SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A stream, its sorted stamps, and how to build its i-th message."""
+
+    stream: Stream
+    t_ns: IntArray
+    build: Callable[[int], bytes]
+
+
+class AslRecording(Recording):
+    """An ASL folder; numbers are kept bit for bit as the text says them."""
+
+    def __init__(
+        self, folder: Path, names: Collection[str] | None = None, cameras: Collection[str] = ()
+    ) -> None:
+        """Parse the tables (images are read later, one by one).
+
+        Args:
+            folder: With `mav0`, or that itself.
+            names: Imus and cameras to read; None: all. Files of others are not looked at.
+            cameras: Of the cameras only these, if the folder has one of them.
+
+        Raises:
+            RecordingError: No imu or no camera there, or a table that cannot be read.
+        """
+        self.path = folder
+        self.rig = RIG
+        self.warnings = []
+        self.imu_tables: dict[str, ImuArrays] = {}
+        root = folder / "mav0" if (folder / "mav0").is_dir() else folder
+        self._sources: list[_Source] = []
+        for table in sorted(root.glob("imu*/data.csv")):
+            if names is not None and table.parent.name not in names:
+                continue
+            self._sources.append(self._read_imu(table))
+        folders = sorted(path for path in root.glob("cam*") if path.is_dir())
+        wanted = [path for path in folders if path.name in cameras] or folders
+        for camera in wanted:
+            if names is not None and camera.name not in names:
+                continue
+            source = self._read_camera(camera)
+            if source is not None:
+                self._sources.append(source)
+        self.streams = tuple(source.stream for source in self._sources)
+        if not self.streams and names is not None and list(root.glob("imu*/data.csv")):
+            raise RecordingError(f"{folder} holds none of {', '.join(sorted(names))}")
+        if not self.streams:
+            raise RecordingError(
+                f"{folder} is no ASL folder, and holds neither .mcap files nor a ROS 2 bag: expected "
+                "mav0/imu0/data.csv and mav0/cam0/ with data.csv, corners.csv[.gz] or tracks.csv[.gz]"
+            )
+
+    def imu_arrays(self, name: str) -> ImuArrays:
+        """See `Recording.imu_arrays`."""
+        return self.imu_tables[name]
+
+    def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]:
+        sources = sorted(
+            (s for s in self._sources if s.stream.key in keys),
+            key=lambda s: (s.stream.kind != "imu", s.stream.key),
+        )
+        if not sources:
+            return
+        stamps = np.concatenate([source.t_ns for source in sources])
+        owner = np.concatenate([np.full(len(s.t_ns), i) for i, s in enumerate(sources)])
+        index = np.concatenate([np.arange(len(source.t_ns)) for source in sources])
+        order = np.lexsort((index, owner, stamps))
+        for which, i in zip(owner[order].tolist(), index[order].tolist(), strict=True):
+            source = sources[which]
+            yield source.stream.key, source.build(i)
+
+    def _read_imu(self, path: Path) -> _Source:
+        name = path.parent.name
+        rows = self._load(path, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
+        finite = np.isfinite(rows["values"]).all(axis=1)
+        rows = self._sorted(rows[finite], name, drop_equal=True)
+        if not finite.all():
+            self.warnings.append(f"{name}: {int((~finite).sum())} samples that are not finite left out")
+        gyro = np.ascontiguousarray(rows["values"][:, :3])
+        force = np.ascontiguousarray(rows["values"][:, 3:])
+        t_ns = np.ascontiguousarray(rows["t"])
+        self.imu_tables[name] = ImuArrays(t_ns, gyro, force)
+        stamps, gyro_rows, force_rows = t_ns.tolist(), gyro.tolist(), force.tolist()
+
+        def build(i: int) -> bytes:
+            return encode_imu(stamps[i], name, gyro_rows[i], force_rows[i])
+
+        return _Source(self._stream("imu", name, path, t_ns), t_ns, build)
+
+    def _read_camera(self, folder: Path) -> _Source | None:
+        kinds: tuple[tuple[str, Kind], ...] = (("corners", "points"), ("tracks", "tracks"))
+        for stem, kind in kinds:
+            for path in (folder / f"{stem}.csv", folder / f"{stem}.csv.gz"):
+                if path.is_file():
+                    return self._read_points(path, folder.name, kind)
+        path = folder / "data.csv"
+        return self._read_images(path, folder) if path.is_file() else None
+
+    def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
+        rows = self._load(path, _POINT_ROW, "timestamp [ns], id, u and v columns")
+        finite = np.isfinite(rows["uv"]).all(axis=1)
+        if not finite.all():
+            self.warnings.append(f"{name}: {int((~finite).sum())} points that are not finite left out")
+        rows = self._sorted(rows[finite], name, drop_equal=False)
+        rows = self._without_twins(rows, name)
+        t_ns, begins = np.unique(rows["t"], return_index=True)
+        ends = np.append(begins[1:], len(rows)).tolist()
+        ids, uv = np.ascontiguousarray(rows["id"]), np.ascontiguousarray(rows["uv"])
+        first, stamps = begins.tolist(), t_ns.tolist()
+        stream = self._stream(kind, name, path, t_ns)
+        size = stream.resolution or (0, 0)
+
+        def build(i: int) -> bytes:
+            part = slice(first[i], ends[i])
+            return encode_points(stamps[i], name, ids[part], uv[part], image_size=size)
+
+        return _Source(stream, t_ns, build)
+
+    def _read_images(self, table: Path, folder: Path) -> _Source:
+        stamps, files, lost = _image_list(table, folder)
+        if lost and not stamps:
+            raise RecordingError(
+                f"{table} line 1: there is no image {lost[0]} beside it, nor any other listed"
+            )
+        if lost:
+            self.warnings.append(f"{folder.name}: {len(lost)} images listed but not there, first {lost[0]}")
+        if not stamps:
+            raise RecordingError(f"{table}: no images listed")
+        order = np.argsort(np.array(stamps, dtype=np.int64), kind="stable")
+        t_ns = np.array(stamps, dtype=np.int64)[order]
+        files = [files[i] for i in order.tolist()]
+
+        def build(i: int) -> bytes:
+            path = files[i]
+            try:
+                data = read_file(path, _IMAGE_LIMIT)
+            except OSError as error:
+                raise RecordingError(f"{path}: {error.strerror}") from None
+            return encode_compressed_image(
+                int(t_ns[i]), folder.name, _IMAGE_SUFFIXES[path.suffix.lower()], data
+            )
+
+        return _Source(self._stream("compressed", folder.name, table, t_ns), t_ns, build)
+
+    def _load(self, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
+        """Parse a table, plain or gzipped; a last line that was cut off while it was written is left out."""
+        text = _read_text(path)
+        whole = _without_cut_line(text, _width(dtype))
+        if len(whole) < len(text):
+            self.warnings.append(
+                f"{path.parent.name}: the last line of {path.name} is cut off; 1 line left out"
+            )
+        title = text[: text.find(b"\n")].decode("utf-8", "replace") if dtype == _IMU_ROW else ""
+        if _accelerometer_first(title):
+            raise RecordingError(
+                f"{path}: its title names the accelerometer before the gyro; {columns} are expected in this "
+                "order: swap the columns"
+            )
+        return _load(whole, path, dtype, columns)
+
+    def _sorted(self, rows: npt.NDArray[Any], name: str, *, drop_equal: bool) -> npt.NDArray[Any]:
+        """Return the rows in order of their stamps."""
+        if (np.diff(rows["t"]) < 0).any():
+            self.warnings.append(f"{name}: rows were not in order of their stamps; sorted")
+            rows = rows[np.argsort(rows["t"], kind="stable")]
+        if drop_equal and len(rows):
+            fresh = np.append(True, np.diff(rows["t"]) > 0)
+            if not fresh.all():
+                self.warnings.append(f"{name}: {int((~fresh).sum())} samples with a repeated stamp left out")
+                rows = rows[fresh]
+        return rows
+
+    def _without_twins(self, rows: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+        """Keep the first of several points with one id in one image."""
+        order = np.lexsort((rows["id"], rows["t"]))
+        ordered = rows[order]
+        twin = np.append(False, (np.diff(ordered["t"]) == 0) & (np.diff(ordered["id"]) == 0))
+        if not twin.any():
+            return rows
+        self.warnings.append(f"{name}: {int(twin.sum())} points with an id seen twice in one image left out")
+        kept: npt.NDArray[Any] = rows[np.sort(order[~twin])]
+        return kept
+
+    def _stream(self, kind: Kind, name: str, path: Path, t_ns: IntArray) -> Stream:
+        keys = {"imu": IMU, "points": POINTS, "tracks": TRACKS, "compressed": COMPRESSED}
+        if not len(t_ns):
+            raise RecordingError(f"{path}: no data")
+        try:
+            key = keys[kind].key(RIG, name)
+        except TopicError as error:
+            raise RecordingError(f"{path}: {error}") from None
+        resolution = None if kind == "imu" else _resolution(path.parent)
+        return Stream(key, kind, name, str(path), *stream_statistics(t_ns), resolution)
+
+
+def _without_cut_line(text: bytes, columns: int) -> bytes:
+    """Return a table without its last line where that has no end and too few columns."""
+    kept, newline, last = text.rpartition(b"\n")
+    if not newline or not last.strip() or last.lstrip().startswith(b"#"):
+        return text
+    cells = last.split(b",")
+    return text if len(cells) >= columns and all(cell.strip() for cell in cells[:columns]) else kept + newline
+
+
+def _load(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
+    """Parse a table of numbers; stamps as integers, no digit is lost."""
+    begin = _first_data_row(text)
+    try:
+        rows: npt.NDArray[Any] = np.loadtxt(
+            io.BytesIO(text[begin:]),
+            dtype=dtype,
+            delimiter=",",
+            comments="#",
+            ndmin=1,
+            usecols=range(_width(dtype)),
+        )
+    except (ValueError, OverflowError, UnicodeDecodeError) as error:
+        reason = str(error).split(";")[0].rstrip(".")
+        raise RecordingError(f"{path}: {reason}; expected {columns}") from None
+    return rows
+
+
+def _accelerometer_first(title: str) -> bool:
+    """Whether a table's title says that the accelerometer's columns stand in front of the gyro's."""
+    names = [name.strip().lower() for name in title.lstrip("# ").split(",")]
+    accel = [i for i, name in enumerate(names) if re.match(r"a(?![a-z]*(ng|tt))|lin|spec|force|f_", name)]
+    gyro = [i for i, name in enumerate(names) if re.match(r"w(_|x|y|z)|gyr|ang|omega|rot", name)]
+    return len(accel) >= 3 and len(gyro) >= 3 and accel[0] < gyro[0]
+
+
+def _width(dtype: np.dtype[Any]) -> int:
+    names = dtype.names or ()
+    return sum(int(np.prod(dtype[name].shape)) for name in names)
+
+
+def _read_text(path: Path) -> bytes:
+    try:
+        text = _unpacked(path) if path.suffix == ".gz" else read_file(path, TABLE_LIMIT)
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        raise RecordingError(f"{path} is no sound gzip file; unpack or download it again") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from None
+    if not text or text.isspace():
+        raise RecordingError(f"{path} is empty")
+    return text
+
+
+def _unpacked(path: Path) -> bytes:
+    """Unpack a table, no further than a table of this size can be.
+
+    Raises:
+        RecordingError: It goes on.
+    """
+    with open_file(path, TABLE_LIMIT) as packed:
+        limit = min(TABLE_LIMIT, max(_SMALL, _SHRINKS * os.fstat(packed.fileno()).st_size))
+        with gzip.GzipFile(fileobj=packed) as file:
+            text = file.read(limit + 1)
+    if len(text) > limit:
+        raise RecordingError(
+            f"{path} unpacks to more than {limit / 1e6:.0f} MB; a table does not, is it one?"
+        )
+    return text
+
+
+def _first_data_row(text: bytes) -> int:
+    """Return the offset behind a title line without ``#``."""
+    end = text.find(b"\n")
+    first = text[: end if end >= 0 else len(text)].strip()
+    if first and not first.startswith(b"#") and not first[:1].isdigit() and first[:1] not in b"-+":
+        return end + 1 if end >= 0 else 0
+    return 0
+
+
+def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path], list[str]]:
+    """Return stamps and files of ``data.csv``, and names without a file; names stay inside of the folder."""
+    stamps, files, lost = [], [], []
+    for number, line in enumerate(_read_text(table).decode("utf-8", "replace").splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        stamp, _, name = (part.strip() for part in line.partition(","))
+        name = name.split(",")[0].strip() or f"{stamp}.png"
+        if not stamp.lstrip("-").isdigit() or Path(name).name != name:
+            raise RecordingError(
+                f"{table} line {number}: expected 'timestamp [ns],filename', found '{line[:80]}'"
+            )
+        path = next((p for p in (folder / "data" / name, folder / name) if p.is_file()), None)
+        if path is None:
+            lost.append(name)
+            continue
+        if path.suffix.lower() not in _IMAGE_SUFFIXES:
+            raise RecordingError(f"{path}: images must be png or jpg")
+        stamps.append(int(stamp))
+        files.append(path)
+    return stamps, files, lost
+
+
+def _resolution(folder: Path) -> tuple[int, int] | None:
+    """Return the size of the images from ``sensor.yaml`` or the first PNG."""
+    sensor = folder / "sensor.yaml"
+    if sensor.is_file():
+        import yaml
+
+        try:
+            text = read_text(sensor, MAX_BYTES)
+            refuse_hostile(text, sensor.name)
+            size = yaml.safe_load(text)["resolution"]
+            return int(size[0]), int(size[1])
+        except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
+            pass  # EuRoC's own files begin with %YAML:1.0 and are no YAML for some parsers
+    first = next(iter(sorted((folder / "data").glob("*.png"))), None)
+    if first is not None:
+        with open_file(first) as file:
+            head = file.read(24)
+        if head[12:16] == b"IHDR":
+            width, height = struct.unpack(">II", head[16:24])
+            return width, height
+    return None

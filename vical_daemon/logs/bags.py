@@ -1,0 +1,147 @@
+"""Reads ROS 1 bags and ROS 2 bag folders through rosbags; every message comes out as ROS 2 CDR."""
+
+from __future__ import annotations
+
+import bz2
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from vical_drivers.user_files import open_file
+
+from vical_daemon.bus.messages import (
+    COMPRESSED_IMAGE_TYPE,
+    IMAGE_TYPE,
+    IMU_TYPE,
+    POINTS_TYPE,
+    TRACKS_TYPE,
+)
+from vical_daemon.bus.messages.schemas import typestore
+from vical_daemon.config.strict_yaml import MAX_BYTES
+from vical_daemon.logs.mcap.chunks import CHUNK_LIMIT, Budget, decompress_lz4
+from vical_daemon.logs.model import RecordingError
+from vical_daemon.logs.recorded_logs import LogRecording, RawMessage
+
+_ROS1 = b"#ROSBAG V2.0\n"  # wiki.ros.org/Bags/Format/2.0
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Any]:
+    """Open a bag with rosbags, and say in one line what it refuses.
+
+    Args:
+        path: A ``.bag`` file of ROS 1, or a folder with ``metadata.yaml`` of ROS 2.
+
+    Returns:
+        A rosbags `AnyReader`.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    from rosbags.highlevel import AnyReader
+
+    try:
+        with (
+            _bounded(Budget(_checked_size(path))),
+            AnyReader([path], default_typestore=None if path.suffix == ".bag" else typestore()) as reader,
+        ):
+            yield reader
+    except (RecordingError, GeneratorExit):
+        raise
+    except OSError as error:
+        raise RecordingError(f"{error.filename or path}: {error.strerror or error}") from None
+    except Exception as error:  # rosbags raises whatever its parsers raise on damaged files
+        first = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        raise RecordingError(
+            f"{path} cannot be read as a bag: {first[:200]}; try rosbag reindex or ros2 bag reindex"
+        ) from None
+
+
+def _checked_size(path: Path) -> int:
+    """Return the size of a bag, bytes; whatever is no regular file in it is refused."""
+    size = 0
+    for member in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if not member.is_dir():
+            with open_file(member, MAX_BYTES if member.name == "metadata.yaml" else None) as file:
+                if member.suffix == ".bag" and file.read(len(_ROS1)) != _ROS1:
+                    raise RecordingError(
+                        f"{member} cannot be read as a bag: it does not begin like one of ROS 1, version 2.0"
+                    )
+                size += file.seek(0, io.SEEK_END)
+    return size
+
+
+@contextmanager
+def _bounded(budget: Budget) -> Iterator[None]:
+    """While a bag is open, rosbags unpacks with these functions: its own have no limit."""
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader as ros2
+
+    unpackers, zstd = dict(ros1.decompressors), ros2.zstd
+    ros1.decompressors["bz2"] = lambda data: _spend(budget, _decompress_bz2(data))
+    ros1.decompressors["lz4"] = lambda data: _spend(budget, decompress_lz4(memoryview(data), CHUNK_LIMIT))
+    ros2.zstd = _Zstd(zstd, budget)
+    try:
+        yield
+    finally:
+        ros1.decompressors.update(unpackers)
+        ros2.zstd = zstd
+
+
+def _decompress_bz2(data: bytes) -> bytes:
+    unpacker = bz2.BZ2Decompressor()
+    unpacked = unpacker.decompress(data, CHUNK_LIMIT)
+    if not unpacker.eof:
+        raise ValueError(f"a chunk is cut off or unpacks to more than {CHUNK_LIMIT / 1e6:.0f} MB")
+    return unpacked
+
+
+def _spend(budget: Budget, data: bytes) -> bytes:
+    budget.spend(len(data))
+    return data
+
+
+class _Zstd:
+    """The two functions of `compression.zstd` that rosbags uses, within a budget."""
+
+    def __init__(self, module: Any, budget: Budget) -> None:
+        self._module = module
+        self._budget = budget
+
+    def open(self, file: Any, mode: str) -> Any:
+        """Open a packed file."""
+        inside = self._module.open(file, mode)
+        read = inside.read
+        inside.read = lambda size=-1: _spend(self._budget, read(size))
+        return inside
+
+    def decompress(self, data: bytes) -> bytes:
+        """Unpack one message."""
+        with self._module.open(io.BytesIO(data), "rb") as file:
+            unpacked: bytes = file.read(CHUNK_LIMIT + 1)
+        if len(unpacked) > CHUNK_LIMIT:
+            raise ValueError(f"a message unpacks to more than {CHUNK_LIMIT / 1e6:.0f} MB")
+        return _spend(self._budget, unpacked)
+
+
+class BagRecording(LogRecording):
+    """A ``.bag`` file of ROS 1, or a folder with ``metadata.yaml`` of ROS 2."""
+
+    def _raw(self) -> Iterator[RawMessage]:
+        self.warnings.clear()
+        with open_bag(self.path) as reader:
+            for connection, log_time_ns, data in reader.messages():
+                payload = bytes(data) if reader.is2 else _to_cdr(data, connection.msgtype)
+                yield RawMessage(connection.topic, connection.msgtype, log_time_ns, payload)
+
+
+_WANTED = frozenset({IMU_TYPE, IMAGE_TYPE, COMPRESSED_IMAGE_TYPE, POINTS_TYPE, TRACKS_TYPE})
+
+
+def _to_cdr(data: bytes, type_name: str) -> bytes:
+    """Return a ROS 1 message as CDR (its header loses `seq`); of types that are of no use nothing."""
+    if type_name not in _WANTED:
+        return b""
+    return bytes(typestore().ros1_to_cdr(data, type_name))

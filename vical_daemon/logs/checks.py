@@ -1,0 +1,153 @@
+"""Is this recording what it claims to be? Units, rates and overlap, judged before anything is estimated.
+
+An accelerometer in g or a gyro in deg/s would not stop a filter, it would make it converge to nonsense.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.logs.model import ImuArrays, RecordingError, Stream
+
+GRAVITY_MPS2 = 9.80665
+_SLOWEST_IMU_HZ, _FASTEST_IMU_HZ = 10.0, 20_000.0
+_SLOWEST_CAMERA_HZ, _FASTEST_CAMERA_HZ = 1.0, 2_000.0
+_SMOOTHING_S = 0.5
+
+
+def check_imu(name: str, samples: ImuArrays) -> list[str]:
+    """Return warnings about an imu stream.
+
+    Raises:
+        RecordingError: Its rate or its units cannot be right.
+    """
+    if len(samples.t_ns) < 20:
+        raise RecordingError(f"{name}: only {len(samples.t_ns)} samples; nothing can be calibrated from that")
+    rate_hz = _check_imu_rate(name, samples.t_ns)
+    _check_accelerometer(name, samples.specific_force_mps2)
+    _check_gyro(name, rate_hz, samples)
+    return _gaps(name, samples.t_ns, rate_hz)
+
+
+def _check_imu_rate(name: str, t_ns: IntArray) -> float:
+    step_ns = float(np.median(np.diff(t_ns)))
+    rate_hz = 1e9 / step_ns if step_ns > 0 else np.inf
+    if rate_hz > _FASTEST_IMU_HZ:
+        units = {1e3: "microseconds", 1e6: "milliseconds", 1e9: "seconds"}
+        near = min(units, key=lambda factor: abs(np.log(max(step_ns, 1e-3) * factor / 5e6)))
+        raise RecordingError(
+            f"{name}: {rate_hz:.3g} samples a second by its stamps; stamps must be nanoseconds, "
+            f"these look like {units[near]}"
+        )
+    if rate_hz < _SLOWEST_IMU_HZ:
+        raise RecordingError(
+            f"{name}: {rate_hz:.3g} samples a second by its stamps; an imu needs {_SLOWEST_IMU_HZ:g} Hz and "
+            "more: are the stamps nanoseconds, and is this the imu's file?"
+        )
+    return rate_hz
+
+
+def _check_accelerometer(name: str, specific_force: FloatArray) -> None:
+    median = float(np.median(np.linalg.norm(specific_force, axis=1)))
+    if 6.0 < median < 16.0:
+        return
+    if 0.6 < median < 1.6:
+        text = f"it looks like g: multiply by {GRAVITY_MPS2}"
+    elif 600 < median < 1600:
+        text = f"it looks like mg: multiply by {GRAVITY_MPS2 / 1000}"
+    elif median < 0.6:
+        text = "gravity seems to be removed: record the accelerometer as it is"
+    else:
+        text = "check its unit"
+    raise RecordingError(
+        f"{name}: the accelerometer reads {median:.3g} in the middle, m/s^2 (about {GRAVITY_MPS2:.1f}) are "
+        f"expected; {text}"
+    )
+
+
+def _check_gyro(name: str, rate_hz: float, samples: ImuArrays) -> None:
+    ratio, correlation = gyro_scale(samples, rate_hz)
+    if correlation > 0.2 and 0.004 < ratio < 0.07:
+        raise RecordingError(
+            f"{name}: the gyro reads {1 / ratio:.0f} times what the turning of gravity in the accelerometer "
+            "shows; rad/s are expected, it looks like deg/s: multiply by pi/180"
+        )
+    if correlation > 0.2 and ratio > 15:
+        raise RecordingError(
+            f"{name}: the gyro reads only 1/{ratio:.0f} of what the turning of gravity in the accelerometer "
+            "shows; rad/s are expected, check its unit"
+        )
+
+
+def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
+    """Return (scale, correlation) between how gravity turns in the imu frame and what the gyro says.
+
+    A vector that stands still in the world changes in the imu frame as f' = -w x f. Smoothed over
+    0.5 s the specific force is mostly gravity, so scale = <df, -w x f dt> / |w x f dt|^2 is near 1 for
+    rad/s (0.5 to 1 on hand-held recordings) and near pi/180 for deg/s.
+    """
+    width = max(1, round(_SMOOTHING_S * rate_hz))
+    if len(samples.t_ns) < 6 * width:
+        return 1.0, 0.0
+    force = _moving_average(samples.specific_force_mps2, width)
+    gyro = _moving_average(samples.gyro_rps, width)
+    turned = np.cumsum(-np.cross(gyro, force), axis=0) / rate_hz
+    seen = force[2 * width :] - force[: -2 * width]
+    expected = turned[2 * width :] - turned[: -2 * width]
+    power = float((expected**2).sum())
+    product = float((seen * expected).sum())
+    if power <= 0 or not np.isfinite(power):
+        return 1.0, 0.0
+    return product / power, product / float(np.sqrt(power * (seen**2).sum()) + 1e-300)
+
+
+def _moving_average(values: FloatArray, width: int) -> FloatArray:
+    total = np.cumsum(np.vstack([np.zeros((1, values.shape[1])), values]), axis=0)
+    mean: FloatArray = (total[width:] - total[:-width]) / width
+    return mean
+
+
+def _gaps(name: str, t_ns: IntArray, rate_hz: float) -> list[str]:
+    steps_s = np.diff(t_ns) * 1e-9
+    holes = steps_s > 3.5 / rate_hz
+    if not holes.any():
+        return []
+    lost = int(np.round(steps_s[holes] * rate_hz - 1).sum())
+    count = int(holes.sum())
+    return [f"{name}: about {lost} samples missing in {count} holes, the longest {steps_s.max():.3f} s"]
+
+
+def check_camera(stream: Stream, imus: list[Stream]) -> list[str]:
+    """Return warnings about a camera stream.
+
+    Raises:
+        RecordingError: Its rate cannot be right, or it was not recorded together with the imu.
+    """
+    if stream.count < 3:
+        raise RecordingError(f"{stream.name}: only {stream.count} frames in {stream.source}")
+    if not _SLOWEST_CAMERA_HZ <= stream.rate_hz <= _FASTEST_CAMERA_HZ:
+        raise RecordingError(
+            f"{stream.name}: {stream.rate_hz:.3g} frames a second by its stamps; {_SLOWEST_CAMERA_HZ:g} to "
+            f"{_FASTEST_CAMERA_HZ:g} are expected: are the stamps nanoseconds?"
+        )
+    if not imus:
+        return []
+    begin, end = min(imu.begin_ns for imu in imus), max(imu.end_ns for imu in imus)
+    overlap_s = (min(end, stream.end_ns) - max(begin, stream.begin_ns)) * 1e-9
+    imu_s = (end - begin) * 1e-9
+    if overlap_s <= 0:
+        apart_s = (stream.begin_ns - begin) * 1e-9
+        raise RecordingError(
+            f"{stream.name}: its stamps and the imu's do not overlap (they begin {apart_s:.6g} s apart); "
+            "both must come from one clock"
+        )
+    if stream.duration_s > 1.1 * imu_s + 2.0:
+        raise RecordingError(
+            f"{stream.name}: its stamps span {stream.duration_s:.1f} s, the imu's {imu_s:.1f} s; the "
+            "camera's rate or clock is wrong, or the imu was recorded in part only"
+        )
+    outside_s = stream.duration_s - overlap_s
+    if outside_s > 1.0:
+        return [f"{stream.name}: {outside_s:.1f} s of frames lie outside of the imu's time and are of no use"]
+    return []

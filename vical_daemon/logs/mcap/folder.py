@@ -1,0 +1,120 @@
+"""The folder of a recorder: one writer at a time, a quota, a reserve, and recovery of what a crash left."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import secrets
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+from vical_daemon.logs.mcap.files import LogError, describe
+from vical_daemon.logs.mcap.recover import Recovery, recover_folder
+
+_LOCK = ".recorder.lock"
+# Only files of this form are ever deleted: rig_YYYYmmddTHHMMSSZ_run_segment.mcap
+_OURS = re.compile(r"[A-Za-z]\w*_\d{8}T\d{6}Z_[0-9a-f]{6}_\d{4}(\.recovered)?\.mcap")
+
+
+class LogFolder:
+    """A folder of segments ``rig_20261121T022842Z_ab12cd_0000.mcap``.
+
+    The lock lives in the kernel: it goes away with the process that holds it, however that ends, and
+    a second recorder that stands by takes over.
+    """
+
+    def __init__(self, path: Path, *, quota_bytes: int = 0, reserve_bytes: int = 0) -> None:
+        """Remember the folder.
+
+        Args:
+            path: The folder; created by `lock`.
+            quota_bytes: The oldest finished segments are deleted beyond this; 0: no limit.
+            reserve_bytes: Space that must stay free on the disk.
+        """
+        self.path = path
+        self._quota_bytes = quota_bytes
+        self._reserve_bytes = reserve_bytes
+        self._lock_fd = -1
+        self.deleted = 0
+
+    @property
+    def locked(self) -> bool:
+        """This process is the one that may write here."""
+        return self._lock_fd >= 0
+
+    def lock(self) -> bool:
+        """Become the recorder of this folder; False while another process is.
+
+        Raises:
+            LogError: The folder cannot be made or written.
+        """
+        if self.locked:
+            return True
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise LogError(f"cannot record into {self.path}: {describe(error)}") from None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            return False
+        self._lock_fd = descriptor
+        return True
+
+    def unlock(self) -> None:
+        """Let another recorder take over; may be called twice."""
+        if self._lock_fd >= 0:
+            os.close(self._lock_fd)
+            self._lock_fd = -1
+
+    def recover(self) -> list[Recovery]:
+        """Make whole what a killed recorder left; call it with the lock held."""
+        return recover_folder(self.path)
+
+    def segments(self) -> list[Path]:
+        """Finished segments of ours, oldest first."""
+        dated = []
+        for path in self.path.glob("*.mcap"):
+            if _OURS.fullmatch(path.name):
+                try:
+                    dated.append((path.stat().st_mtime_ns, path.name, path))
+                except FileNotFoundError:
+                    continue
+        return [path for _, _, path in sorted(dated)]
+
+    def enforce_quota(self, open_bytes: int) -> list[Path]:
+        """Delete the oldest segments until all, with the open one, fit; returns what was deleted."""
+        if not self._quota_bytes:
+            return []
+        segments = self.segments()
+        sizes = {path: path.stat().st_size for path in segments}
+        total, deleted = sum(sizes.values()) + open_bytes, []
+        for path in segments:
+            if total <= self._quota_bytes:
+                break
+            path.unlink(missing_ok=True)
+            total -= sizes[path]
+            deleted.append(path)
+        self.deleted += len(deleted)
+        return deleted
+
+    def free_bytes(self) -> int:
+        """Space left on the disk for us."""
+        return shutil.disk_usage(self.path).free
+
+    def has_room(self, *, resuming: bool = False) -> bool:
+        """Whether the reserve is untouched; to resume a tenth more must be free, against fluttering."""
+        try:
+            return self.free_bytes() > self._reserve_bytes * (1.1 if resuming else 1.0)
+        except OSError:
+            return False
+
+
+def run_name(rig: str, unix_ns: int) -> str:
+    """Return the first part of the segment names of one run; unique even if the clock is set back."""
+    begin = datetime.fromtimestamp(unix_ns * 1e-9, UTC)
+    return f"{rig}_{begin:%Y%m%dT%H%M%SZ}_{secrets.token_hex(3)}"

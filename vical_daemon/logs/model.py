@@ -1,0 +1,190 @@
+"""What every recording is, wherever it came from: streams, warnings, messages in order of their stamps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from vical_daemon.bus.messages import decode_imu, decode_points
+from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+
+Kind = Literal["imu", "image", "compressed", "points", "tracks"]
+# What a camera is calibrated from where it has several: what is detected already comes first.
+_PREFERENCE: tuple[Kind, ...] = ("points", "tracks", "image", "compressed")
+_WINDOW_NS = 2_000_000_000
+_WINDOW_BYTES = 512 * 2**20
+
+
+class RecordingError(Exception):
+    """A recording that cannot be used; the message is one line: what, where, what to try."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One sensor of a recording.
+
+    Attributes:
+        key: Bus key under which `Recording.messages` gives its messages.
+        kind: imu, image, compressed (image), points or tracks.
+        name: Name of the imu or camera.
+        source: Topic or file it comes from.
+        count: Messages.
+        begin_ns: Stamp of the first.
+        end_ns: Stamp of the last.
+        rate_hz: One over the median interval; 0 with fewer than two messages.
+        largest_gap_s: Longest interval.
+        resolution: width, height, px, of a camera; None where the recording does not say.
+    """
+
+    key: str
+    kind: Kind
+    name: str
+    source: str
+    count: int
+    begin_ns: int
+    end_ns: int
+    rate_hz: float
+    largest_gap_s: float
+    resolution: tuple[int, int] | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """From the first stamp to the last."""
+        return (self.end_ns - self.begin_ns) * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class ImuArrays:
+    """All samples of one imu: stamps (n,) ns, rates (n, 3) rad/s, specific forces (n, 3) m/s^2."""
+
+    t_ns: IntArray
+    gyro_rps: FloatArray
+    specific_force_mps2: FloatArray
+
+
+class Recording(ABC):
+    """A recording that can be put on a bus.
+
+    Attributes:
+        path: Where it lies.
+        rig: Name of the rig in the keys.
+        streams: Its sensors.
+        warnings: What is not as it should be, one line each.
+    """
+
+    path: Path
+    rig: str
+    streams: tuple[Stream, ...]
+    warnings: list[str]
+
+    @property
+    def imus(self) -> dict[str, Stream]:
+        """Imus by name."""
+        return {stream.name: stream for stream in self.streams if stream.kind == "imu"}
+
+    @property
+    def cameras(self) -> dict[str, Stream]:
+        """Cameras by name, each with the stream it is best calibrated from."""
+        best: dict[str, Stream] = {}
+        for kind in reversed(_PREFERENCE):
+            best.update({stream.name: stream for stream in self.streams if stream.kind == kind})
+        return dict(sorted(best.items()))
+
+    @property
+    def imu_samples(self) -> int:
+        """Samples of all imus."""
+        return sum(stream.count for stream in self.imus.values())
+
+    @property
+    def begin_ns(self) -> int:
+        """Stamp of the first message."""
+        return min(stream.begin_ns for stream in self.streams)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first stamp to the last, over all streams."""
+        return (max(stream.end_ns for stream in self.streams) - self.begin_ns) * 1e-9
+
+    def messages(self, streams: Iterable[Stream] | None = None) -> Iterator[tuple[str, bytes]]:
+        """Yield (key, payload) in order of the stamps; at equal stamps imus first, then by key.
+
+        Args:
+            streams: Those to take; None: every imu and, of each camera, its stream in `cameras`.
+
+        Raises:
+            RecordingError: The disk refuses.
+        """
+        chosen = streams if streams is not None else [*self.imus.values(), *self.cameras.values()]
+        return self._messages({stream.key for stream in chosen})
+
+    @abstractmethod
+    def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]: ...
+
+    def imu_arrays(self, name: str) -> ImuArrays:
+        """Return all samples of one imu.
+
+        Raises:
+            KeyError: No imu of this name.
+        """
+        rows = [decode_imu(payload) for _, payload in self._messages({self.imus[name].key})]
+        stamps = np.array([row.stamp_ns for row in rows], dtype=np.int64)
+        gyro = np.array([row.gyro_rps for row in rows], dtype=np.float64).reshape(-1, 3)
+        force = np.array([row.specific_force_mps2 for row in rows], dtype=np.float64).reshape(-1, 3)
+        return ImuArrays(stamps, gyro, force)
+
+    def points_frames(self, camera: str) -> Iterator[PointsFrame]:
+        """Yield the points or tracks of one camera.
+
+        Raises:
+            KeyError: No camera of this name.
+        """
+        for _, payload in self._messages({self.cameras[camera].key}):
+            yield decode_points(payload).to_frame()
+
+
+def stream_statistics(t_ns: IntArray) -> tuple[int, int, int, float, float]:
+    """Return (count, begin_ns, end_ns, rate_hz, largest_gap_s) of sorted stamps."""
+    if not len(t_ns):
+        return 0, 0, 0, 0.0, 0.0
+    steps = np.diff(t_ns)
+    if not len(steps):
+        return 1, int(t_ns[0]), int(t_ns[0]), 0.0, 0.0
+    median_ns = float(np.median(steps))
+    rate_hz = 1e9 / median_ns if median_ns > 0 else 0.0
+    return len(t_ns), int(t_ns[0]), int(t_ns[-1]), rate_hz, float(steps.max()) * 1e-9
+
+
+class Stamped(NamedTuple):
+    """One message on its way into stamp order."""
+
+    stamp_ns: int
+    log_time_ns: int
+    key: str
+    is_imu: bool
+    payload: bytes
+
+
+def in_stamp_order(items: Iterable[Stamped]) -> Iterator[tuple[str, bytes]]:
+    """Sort messages by stamp while looking 2 s of log time (or 512 MB) ahead.
+
+    That is exact for streams whose latencies differ by less than 2 s, and bounded in memory for any.
+    """
+    heap: list[tuple[int, bool, str, int, Stamped]] = []
+    waiting_bytes, newest_ns = 0, 0
+    for number, item in enumerate(items):
+        heappush(heap, (item.stamp_ns, not item.is_imu, item.key, number, item))
+        waiting_bytes += len(item.payload)
+        newest_ns = max(newest_ns, item.log_time_ns)
+        while heap and (newest_ns - heap[0][-1].log_time_ns > _WINDOW_NS or waiting_bytes > _WINDOW_BYTES):
+            oldest = heappop(heap)[-1]
+            waiting_bytes -= len(oldest.payload)
+            yield oldest.key, oldest.payload
+    while heap:
+        oldest = heappop(heap)[-1]
+        yield oldest.key, oldest.payload

@@ -1,0 +1,248 @@
+"""Reads message logs: our MCAP, other ROS 2 MCAP and bags, ROS 1 bags. One scan, then as often as wanted."""
+
+from __future__ import annotations
+
+import re
+import struct
+from abc import abstractmethod
+from array import array
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.bus.messages import (
+    COMPRESSED_IMAGE_TYPE,
+    IMAGE_TYPE,
+    IMU_TYPE,
+    POINTS_TYPE,
+    TRACKS_TYPE,
+    MessageError,
+    decode_image,
+    decode_imu,
+    decode_points,
+)
+from vical_daemon.bus.topics import BY_KIND, PREDICTED, parse_key
+from vical_daemon.logs.mcap import LogError, LogReader
+from vical_daemon.logs.model import (
+    ImuArrays,
+    Kind,
+    Recording,
+    RecordingError,
+    Stamped,
+    Stream,
+    in_stamp_order,
+    stream_statistics,
+)
+
+_KIND_OF_TYPE: dict[str, Kind] = {
+    IMU_TYPE: "imu",
+    IMAGE_TYPE: "image",
+    COMPRESSED_IMAGE_TYPE: "compressed",
+    POINTS_TYPE: "points",
+    TRACKS_TYPE: "tracks",
+}
+_STAMP = struct.Struct("<iI")
+# Where rates and forces stand, counted from the end of a sensor_msgs/Imu.
+_GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
+_IMU_NUMBERS = 37 * 8
+_PLAIN_WORDS = {"image_raw", "image_mono", "image", "data", "data_raw", "raw", "compressed", "camera", "imu"}
+_RIG = "rig0"
+
+
+class RawMessage(NamedTuple):
+    """One message as a log holds it (a tuple because millions of them are made)."""
+
+    topic: str
+    type_name: str
+    log_time_ns: int
+    payload: bytes
+
+
+@dataclass(slots=True)
+class _Channel:
+    """One topic that is of use, while it is scanned."""
+
+    key: str
+    kind: Kind
+    name: str
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+    values: bytearray = field(default_factory=bytearray)
+    resolution: tuple[int, int] | None = None
+    unreadable: int = 0
+
+
+class LogRecording(Recording):
+    """Everything that is a log of ROS messages, given a way to walk through it."""
+
+    def __init__(self, path: Path, topics: Collection[str] | None = None) -> None:
+        """Scan the whole log once: which sensors, how many messages, which stamps.
+
+        Args:
+            path: File or folder.
+            topics: Topics (or names of imus and cameras) to take; None: all that are of use.
+
+        Raises:
+            RecordingError: It cannot be read, or holds nothing of use.
+        """
+        self.path = path
+        self.rig = _RIG
+        self.warnings = []
+        self._wanted = None if topics is None else set(topics)
+        self._channels: dict[str, _Channel] = {}
+        self._others: dict[str, str] = {}
+        self._scan()
+        self.streams = tuple(
+            self._stream(topic, channel) for topic, channel in self._channels.items() if len(channel.stamps)
+        )
+        if not self.streams:
+            raise RecordingError(self._nothing())
+
+    @abstractmethod
+    def _raw(self) -> Iterator[RawMessage]:
+        """Yield all messages in the order of the log, as CDR."""
+
+    def _scan(self) -> None:
+        for raw in self._raw():
+            channel = self._channels.get(raw.topic) or self._meet(raw)
+            if channel is None:
+                continue
+            stamp_ns = stamp_of(raw.payload)
+            if channel.kind == "imu" and not _has_imu_size(raw.payload):
+                stamp_ns = None
+            if stamp_ns is None or (not channel.stamps and not _readable(channel, raw.payload)):
+                channel.unreadable += 1
+                continue
+            if channel.kind == "imu":
+                channel.values += raw.payload[_GYRO]
+                channel.values += raw.payload[_FORCE]
+            channel.stamps.append(stamp_ns)
+        for channel in self._channels.values():
+            if channel.unreadable:
+                self.warnings.append(f"{channel.name}: {channel.unreadable} unreadable messages left out")
+
+    def _meet(self, raw: RawMessage) -> _Channel | None:
+        """Decide at the first message of a topic what it is."""
+        kind = _KIND_OF_TYPE.get(raw.type_name)
+        parsed = parse_key(raw.topic.removeprefix("/"))
+        ours_but_not_measured = parsed is not None and parsed.topic is PREDICTED
+        if kind is None or ours_but_not_measured or raw.topic in self._others:
+            self._others[raw.topic] = raw.type_name
+            return None
+        if parsed is not None:
+            self.rig = parsed.rig
+            name, key = parsed.name, raw.topic.removeprefix("/")
+        else:
+            name = self._name(raw.topic, kind)
+            key = BY_KIND[kind].key(self.rig, name)
+        if self._wanted is not None and not {raw.topic, raw.topic.removeprefix("/"), name} & self._wanted:
+            self._others[raw.topic] = raw.type_name
+            return None
+        channel = self._channels[raw.topic] = _Channel(key, kind, name)
+        return channel
+
+    def _name(self, topic: str, kind: Kind) -> str:
+        """Make a name of a foreign topic: /cam0/image_raw is cam0, /imu/data becomes imu0."""
+        words = [word for word in topic.strip("/").split("/") if word not in _PLAIN_WORDS]
+        name = re.sub(r"[^A-Za-z0-9_]", "_", "_".join(words))[:60]
+        if not re.match(r"[A-Za-z]", name):
+            name = ("imu" if kind == "imu" else "cam") + (name or "0")
+        taken = {c.name for c in self._channels.values() if c.kind == kind}
+        number, free = 2, name
+        while free in taken:
+            free, number = f"{name}_{number}", number + 1
+        return free
+
+    def _stream(self, topic: str, channel: _Channel) -> Stream:
+        stamps = np.sort(np.array(channel.stamps, dtype=np.int64))
+        statistics = stream_statistics(stamps)
+        return Stream(channel.key, channel.kind, channel.name, topic, *statistics, channel.resolution)
+
+    def _nothing(self) -> str:
+        wanted = "sensor_msgs/Imu with Image, CompressedImage or vical_msgs points"
+        if self._wanted is not None:
+            return f"{self.path}: none of the topics {', '.join(sorted(self._wanted))} holds {wanted}"
+        found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self._others.items())[:8])
+        what = found or "; ".join(["no messages at all", *self.warnings])
+        return f"{self.path}: no sensor data: expected {wanted}; found {what}"
+
+    def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]:
+        return in_stamp_order(self._stamped(keys))
+
+    def _stamped(self, keys: set[str]) -> Iterator[Stamped]:
+        for raw in self._raw():
+            channel = self._channels.get(raw.topic)
+            stamp_ns = stamp_of(raw.payload)
+            if channel is not None and channel.key in keys and stamp_ns is not None:
+                yield Stamped(stamp_ns, raw.log_time_ns, channel.key, channel.kind == "imu", raw.payload)
+
+    def imu_arrays(self, name: str) -> ImuArrays:
+        """See `Recording.imu_arrays`; messages that are no good are left out."""
+        channel = next(c for c in self._channels.values() if c.kind == "imu" and c.name == name)
+        t_ns = np.array(channel.stamps, dtype=np.int64)
+        values = np.frombuffer(bytes(channel.values), dtype="<f8").reshape(-1, 6)
+        good = np.isfinite(values).all(axis=1)
+        order = np.argsort(t_ns[good], kind="stable")
+        values = values[good][order]
+        return ImuArrays(t_ns[good][order], values[:, :3].copy(), values[:, 3:].copy())
+
+
+def stamp_of(payload: bytes) -> int | None:
+    """Return the stamp of a message that begins with a Header; None if these bytes hold none."""
+    if len(payload) < 12 or payload[:2] != b"\x00\x01":
+        return None
+    seconds, nanoseconds = _STAMP.unpack_from(payload, 4)
+    if nanoseconds >= 1_000_000_000:
+        return None
+    stamp_ns: int = seconds * 1_000_000_000 + nanoseconds
+    return stamp_ns
+
+
+def _has_imu_size(payload: bytes) -> bool:
+    """Whether these bytes are as long as a sensor_msgs/Imu with this frame id is."""
+    if len(payload) < 16 + _IMU_NUMBERS:
+        return False
+    behind_name = 12 + int.from_bytes(payload[12:16], "little")  # counted from behind the encapsulation
+    return len(payload) == 4 + behind_name + (-behind_name) % 8 + _IMU_NUMBERS
+
+
+def _readable(channel: _Channel, payload: bytes) -> bool:
+    """Try the first message of a topic, and learn the size of the images from it."""
+    try:
+        if channel.kind == "imu":
+            decode_imu(payload)
+        elif channel.kind == "image":
+            image = decode_image(payload)
+            channel.resolution = (image.width, image.height)
+        elif channel.kind in ("points", "tracks"):
+            size = decode_points(payload).image_size
+            channel.resolution = size if all(size) else None
+    except MessageError:
+        return False
+    return True
+
+
+class McapRecording(LogRecording):
+    """One MCAP file, or a folder of the segments of one recording."""
+
+    def _raw(self) -> Iterator[RawMessage]:
+        self.warnings.clear()
+        for path in self._files():
+            try:
+                reader = LogReader(path)
+                for message in reader.messages():
+                    channel = message.channel
+                    if channel.encoding == "cdr":
+                        yield RawMessage(
+                            channel.topic, channel.type_name, message.log_time_ns, message.payload
+                        )
+            except LogError as error:
+                raise RecordingError(str(error)) from None
+            self.warnings.extend(reader.warnings)
+
+    def _files(self) -> list[Path]:
+        if self.path.is_dir():
+            return sorted(self.path.glob("*.mcap"))
+        return [self.path]

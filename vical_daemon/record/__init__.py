@@ -1,0 +1,1 @@
+"""The role that records MCAP logs."""

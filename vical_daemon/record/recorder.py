@@ -1,0 +1,296 @@
+"""The recorder without its thread: what it keeps, when it begins and ends, and what it says of itself."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from importlib.metadata import PackageNotFoundError, version
+
+from vical_drivers.user_files import read_file
+
+from vical_daemon.bus.messages import (
+    DiagnosticStatus,
+    Level,
+    MessageError,
+    check_message,
+    decode_calibration,
+    decode_diagnostics,
+    decode_string,
+    merge_calibrations,
+)
+from vical_daemon.bus.topics import CALIBRATION, COMMAND, STATUS, Topic, parse_key
+from vical_daemon.config.model import Config
+from vical_daemon.config.strict_yaml import MAX_BYTES
+from vical_daemon.logs.mcap import Attachment, LogError, LogFolder, LogSession
+from vical_daemon.record.images import ImageCompressor
+from vical_daemon.record.queue import Arrival, RecordQueue
+from vical_daemon.service.device_serials import DeviceSerials
+from vical_daemon.service.wall_clock import WallClock
+
+_log = logging.getLogger(__name__)
+_RETRY_NS = 5_000_000_000
+_MENDING_S = 5.0
+_KEYS = 512
+_WORDS = 32  # lines in the log about messages and commands that cannot be understood
+_ROLES = ("imu", "camera", "detect", "estimate", "record", "web", "")  # "": tf_static, which has no name
+
+
+class Recorder:
+    """Turns arrivals and commands into segments on the disk; never raises because of disk or data."""
+
+    def __init__(self, config: Config, folder: LogFolder, clock: WallClock) -> None:
+        self._config, self._folder, self._clock = config, folder, clock
+        self._images = ImageCompressor(config)
+        self._wanted = config.record.enabled
+        self._session: LogSession | None = None
+        self._problem = ""
+        self._retry_ns = 0
+        self._command_key = COMMAND.key(config.rig, "record")
+        self._serials = DeviceSerials()
+        self._calibrations: dict[str, bytes] = {}
+        self._latched: dict[str, bytes] = {}
+        self._mending: threading.Thread | None = None
+        self._keys: set[str] = set()
+        self._names = {*config.imus, *config.cameras, *_ROLES}
+        self._told: set[str] = set()  # kinds of which a message did not decode
+        self.messages = 0
+        self.refused = 0
+        self.malformed = 0
+
+    @property
+    def recording(self) -> bool:
+        """A segment is open."""
+        return self._session is not None
+
+    def wants(self, topic: Topic) -> bool:
+        """Whether messages of this kind are recorded."""
+        return topic.recorded and (self._config.record.images or topic.kind not in ("image", "compressed"))
+
+    def write(self, item: Arrival) -> None:
+        """Take one arrival: learn from it, obey it, record it; what does not decode is only counted."""
+        if not (self._decodes(item) and self._admit(item)):
+            return
+        self._learn(item)
+        if self._session is None:
+            return
+        key, payload = self._images.as_recorded(item.key, item.payload)
+        try:
+            self._session.write(key, payload, item.log_time_ns, latched=_latches(item.topic))
+            self.messages += 1
+        except LogError as error:
+            self._fail(str(error))
+
+    def _decodes(self, item: Arrival) -> bool:
+        """Whether a message is what its key says: one that is not closes the whole file to some readers."""
+        try:
+            check_message(item.topic.type_name, item.payload)
+        except MessageError as error:
+            self.malformed += 1
+            if item.topic.kind not in self._told:
+                self._told.add(item.topic.kind)
+                _log.warning(
+                    "%s: not recorded, no %s: %s; more of this kind are only counted",
+                    item.key[:100],
+                    item.topic.type_name,
+                    " ".join(str(error).split()),
+                )
+            return False
+        return True
+
+    def _admit(self, item: Arrival) -> bool:
+        """Refuse keys beyond any sane number: whoever invents names must not fill memory and log."""
+        key = item.key
+        if key in self._keys or self._of_the_rig(item):
+            return True
+        if len(self._keys) >= _KEYS:
+            self.refused += 1
+            return False
+        self._keys.add(key)
+        return True
+
+    def _of_the_rig(self, item: Arrival) -> bool:
+        """Whether a key belongs to a device or role of the config: there is always room for those."""
+        parsed = parse_key(item.key)
+        return parsed is not None and parsed.name in self._names
+
+    def _learn(self, item: Arrival) -> None:
+        if item.key == self._command_key:
+            self._obey(item.payload)
+        elif item.topic is CALIBRATION:
+            self._calibrations[item.key] = item.payload
+        elif item.topic is STATUS:
+            self._note_serials(item.payload)
+        if _latches(item.topic):
+            self._latched[item.key] = item.payload
+
+    def _obey(self, payload: bytes) -> None:
+        word = decode_string(payload).strip()
+        if word == "start":
+            self._wanted, self._retry_ns = True, 0
+            self.tick()
+        elif word == "stop":
+            _log.info("recording stopped by command")
+            self._wanted = False
+            self.close()
+        elif word == "split" and self._session is not None:
+            self._split()
+        elif len(self._told) < _WORDS and word[:40] not in self._told:
+            self._told.add(word[:40])
+            _log.warning("command %r is not known: start, stop or split", word[:40])
+
+    def _split(self) -> None:
+        """Go on in a new file."""
+        if self._session is not None:
+            try:
+                self._session.rotate(self._clock.now_ns())
+            except LogError as error:
+                self._fail(str(error))
+
+    def _note_serials(self, payload: bytes) -> None:
+        for status in decode_diagnostics(payload).statuses:
+            self._serials.note(status)
+        if self._serials.replaced:
+            self._serials.adopt()
+            self._split()  # a file names the devices that it is of
+
+    def tick(self) -> None:
+        """Do what time demands: flush, rotate, quota, reserve, and begin again after a failure."""
+        now_ns = self._clock.now_ns()
+        try:
+            if self._session is not None:
+                self._session.tick(now_ns)
+                self._folder.enforce_quota(self._session.segment_bytes)
+                if not self._folder.has_room():
+                    self._end("the disk has reached record.reserve_bytes; waiting for space")
+            elif self._wanted and now_ns >= self._retry_ns:
+                self._retry_ns = now_ns + _RETRY_NS
+                self._begin(now_ns)
+        except (LogError, OSError) as error:
+            self._fail(str(error))
+
+    def _begin(self, now_ns: int) -> None:
+        if not self._folder.lock():
+            self._problem = f"standing by: another recorder writes into {self._folder.path}"
+            return
+        self._mend()
+        self._folder.enforce_quota(0)
+        if not self._folder.has_room(resuming=bool(self._problem)):
+            self._problem = "the disk has reached record.reserve_bytes; waiting for space"
+            return
+        record = self._config.record
+        self._session = LogSession(
+            self._folder, self._config.rig, now_ns,
+            rotate_s=record.rotate_s, rotate_bytes=record.rotate_bytes,
+            metadata=self._metadata, attachments=self._attachments,
+        )  # fmt: skip
+        self._problem = ""
+        for key, payload in self._latched.items():
+            self._session.write(key, payload, now_ns, latched=True)
+        _log.info("recording into %s", self._session.path)
+
+    def _mend(self) -> None:
+        """Recover what a crash left, beside the recording: a part of 1 GB takes longer than data may wait."""
+        if self._mending is None or not self._mending.is_alive():
+            self._mending = threading.Thread(target=self._recover, name="log recovery", daemon=True)
+            self._mending.start()
+
+    def _recover(self) -> None:
+        try:
+            for recovery in self._folder.recover():
+                _log.info("recovered %s: %d messages", recovery.output.name, recovery.messages)
+        except OSError as error:
+            _log.warning("recovery in %s: %s", self._folder.path, error)
+
+    def _end(self, problem: str) -> None:
+        session, self._session = self._session, None
+        self._problem = problem
+        if problem:
+            _log.warning("%s", problem)
+        if session is not None:
+            session.close(self._clock.now_ns())
+
+    def _fail(self, problem: str) -> None:
+        """Give up the segment (its part can be recovered) and try again in a while."""
+        _log.error("%s; trying again in %d s", problem, _RETRY_NS // 10**9)
+        session, self._session = self._session, None
+        self._problem, self._retry_ns = problem, self._clock.now_ns() + _RETRY_NS
+        if session is not None:
+            try:
+                session.close(self._clock.now_ns())
+            except LogError:
+                pass  # said already; `recover` mends the part
+
+    def close(self) -> None:
+        """Finish the open segment and let another recorder take over; may be called twice."""
+        try:
+            self._end("")
+        except LogError as error:
+            self._problem = str(error)
+            _log.error("%s", error)
+        if self._mending is not None:
+            self._mending.join(_MENDING_S)
+        if self._mending is None or not self._mending.is_alive():  # or two mend one part
+            self._folder.unlock()
+
+    def _metadata(self) -> dict[str, dict[str, str]]:
+        try:
+            program = version("vical")
+        except PackageNotFoundError:
+            program = "unknown"
+        about = {"version": program, "rig": self._config.rig, **self._clock.status_values()}
+        return {"vical": about, "devices": dict(self._serials.known)}
+
+    def _attachments(self) -> list[Attachment]:
+        items = []
+        for name, path in (("config.yaml", self._config.path), ("target.yaml", self._config.target_path)):
+            if path is not None and path.is_file():
+                items.append(Attachment(name, "text/yaml", _without_secrets(read_file(path, MAX_BYTES))))
+        estimates = [decode_calibration(payload) for payload in self._calibrations.values()]
+        if estimates:
+            text = json.dumps(merge_calibrations(estimates).to_json(), indent=1)
+            items.append(Attachment("calibration.json", "application/json", text.encode()))
+        return items
+
+    def status(self, queue: RecordQueue, lost: int) -> DiagnosticStatus:
+        """Return the health of the recorder."""
+        session = self._session
+        values = {
+            "state": "recording" if session else ("waiting" if self._wanted else "stopped"),
+            "file": session.path.name if session else "",
+            "segment_bytes": str(session.segment_bytes if session else 0),
+            "messages": str(self.messages),
+            "queue_depth": str(len(queue)),
+            "dropped": str(sum(queue.dropped.values())),
+            "lost_on_bus": str(lost),
+            "refused": str(self.refused),
+            "malformed": str(self.malformed),
+            "images_not_compressed": str(self._images.failures),
+            "files_deleted": str(self._folder.deleted),
+        }
+        try:
+            values["disk_free_bytes"] = str(self._folder.free_bytes())
+        except OSError:
+            pass  # the folder is away: `problem` says so
+        if self._problem:
+            return DiagnosticStatus(Level.ERROR, "record", self._problem, values=values)
+        if queue.dropped or lost:
+            return DiagnosticStatus(
+                Level.WARN, "record", f"{values['dropped']} dropped, {lost} lost", values=values
+            )
+        message = f"recording, {self.messages} messages" if session else "stopped by command"
+        return DiagnosticStatus(Level.OK, "record", message, values=values)
+
+
+def _latches(topic: Topic) -> bool:
+    """What a segment must hold from its beginning to be readable alone."""
+    return topic.kind in ("camera_info", "tf_static")
+
+
+def _without_secrets(text: bytes) -> bytes:
+    """Return a config without its passwords: logs are handed around."""
+    lines = [
+        line.split(b"password:")[0] + b"password: removed" if b"password:" in line else line
+        for line in text.splitlines()
+    ]
+    return b"\n".join(lines) + b"\n"

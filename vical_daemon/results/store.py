@@ -1,0 +1,202 @@
+"""Keeps the last converged calibration of each pair of devices, found again by their serial numbers.
+
+A file is replaced in one step: whatever happens in between, the next start finds the old or the new
+calibration, never half of one. What is read is checked: a file that cannot be right is set aside.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from vical_drivers.user_files import read_file
+
+from vical_daemon.bus.messages.poses import rotation_matrix
+from vical_daemon.estimation.measurements import CameraPrior
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
+from vical_daemon.service.atomic_file import write_whole
+
+_log = logging.getLogger(__name__)
+_FORMAT = 1
+_SIZE_LIMIT = 2**20
+
+
+class StoreError(Exception):
+    """The store cannot be written; the message is one line for a person."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredCalibration:
+    """A calibration as it was when it had converged.
+
+    Attributes:
+        format: Of the file.
+        imu_serial: Serial number of the imu.
+        camera_serial: Serial number of the camera.
+        camera: Name of the camera in `estimate`.
+        saved_ns: When, UNIX ns.
+        estimate: The estimate with this camera.
+    """
+
+    format: int
+    imu_serial: str
+    camera_serial: str
+    camera: str
+    saved_ns: int
+    estimate: CalibrationEstimate
+
+    @property
+    def known(self) -> CameraEstimate:
+        """What is known about the camera."""
+        return self.estimate.cameras[self.camera]
+
+    def prior(self, resolution: tuple[int, int]) -> CameraPrior:
+        """Return it as what a new calibration starts from.
+
+        Args:
+            resolution: width, height of the images, px.
+        """
+        known = self.known
+        pose = rotation_matrix(known.T_imu_cam.q_wxyz), np.array(known.T_imu_cam.p_m, dtype=np.float64)
+        fx, fy, cx, cy = known.intrinsics
+        k1, k2, p1, p2 = known.distortion
+        return CameraPrior(
+            resolution=resolution,
+            intrinsics=(fx, fy, cx, cy),
+            distortion_model=known.distortion_model,
+            distortion=(k1, k2, p1, p2),
+            T_imu_cam=pose,
+            timeshift_cam_imu_s=known.timeshift_cam_imu_s,
+            readout_s=known.readout_s,
+        )
+
+
+class CalibrationStore:
+    """A folder with one JSON file for each pair of imu and camera."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, imu_serial: str, camera_serial: str) -> Path:
+        """Return the file of a pair; a hash keeps serial numbers apart that look alike as file names."""
+        digest = hashlib.sha256(f"{imu_serial}\0{camera_serial}".encode()).hexdigest()[:8]
+        words = [
+            re.sub(r"[^A-Za-z0-9.-]+", "-", serial).strip(".-")[:40] for serial in (imu_serial, camera_serial)
+        ]
+        return self.folder / f"{words[0] or 'imu'}_{words[1] or 'cam'}_{digest}.json"
+
+    def save(
+        self, imu_serial: str, camera_serial: str, camera: str, estimate: CalibrationEstimate, now_ns: int
+    ) -> Path:
+        """Replace what is stored for a pair, in one step and on the disk when this returns.
+
+        Args:
+            imu_serial: Serial number of the imu.
+            camera_serial: Serial number of the camera.
+            camera: Name of the camera in the estimate.
+            estimate: What to keep.
+            now_ns: UNIX time, ns.
+
+        Raises:
+            StoreError: The estimate makes no sense, or the disk refuses; what was stored before stays.
+        """
+        stored = StoredCalibration(_FORMAT, imu_serial, camera_serial, camera, now_ns, estimate)
+        problem = _problem(stored)
+        if problem:
+            raise StoreError(f"calibration of {camera} is not stored: {problem}")
+        path = self.path(imu_serial, camera_serial)
+        try:
+            write_whole(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
+        except OSError as error:
+            raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
+        return path
+
+    def load(self, imu_serial: str, camera_serial: str) -> StoredCalibration | None:
+        """Return what is stored for a pair; None where there is nothing, or nothing that can be right."""
+        path = self.path(imu_serial, camera_serial)
+        stored = read_stored(path)
+        if stored is not None and (stored.imu_serial, stored.camera_serial) != (imu_serial, camera_serial):
+            _log.warning("%s belongs to other devices and is not used", path)
+            return None
+        return stored
+
+    def all(self) -> list[StoredCalibration]:
+        """Return everything stored that can be right, newest first."""
+        found = [
+            stored for path in sorted(self.folder.glob("*.json")) if (stored := read_stored(path)) is not None
+        ]
+        return sorted(found, key=lambda stored: -stored.saved_ns)
+
+
+def read_stored(path: Path) -> StoredCalibration | None:
+    """Read one file of a store; None (with a warning) where it is not what it should be."""
+    try:
+        text = read_file(path, _SIZE_LIMIT)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        _log.warning("%s cannot be read: %s", path, error.strerror)
+        return None
+    try:
+        stored = msgspec.convert(_without_news(msgspec.json.decode(text)), StoredCalibration)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        _log.warning("%s is no stored calibration and is not used: %s", path, error)
+        return None
+    problem = _problem(stored)
+    if problem:
+        _log.warning("%s is not used: %s", path, problem)
+        return None
+    return stored
+
+
+def _without_news(document: Any) -> Any:
+    """Leave out what was announced and advised then: files of version 0.1.0 hold it as text alone."""
+    estimate = document.get("estimate") if isinstance(document, dict) else None
+    if not isinstance(estimate, dict):
+        return document
+    return document | {"estimate": {k: v for k, v in estimate.items() if k not in ("events", "next_motion")}}
+
+
+def _problem(stored: StoredCalibration) -> str:
+    """Return what is wrong with a stored calibration, "" if nothing."""
+    if stored.format != _FORMAT:
+        return f"format {stored.format} is not known"
+    known = stored.estimate.cameras.get(stored.camera)
+    if known is None:
+        return f"no camera {stored.camera}"
+    pose = known.T_imu_cam
+    if (
+        len(pose.p_m) != 3
+        or len(pose.q_wxyz) != 4
+        or len(known.intrinsics) != 4
+        or len(known.distortion) != 4
+    ):
+        return "wrong number of values"
+    numbers = [*pose.p_m, *pose.q_wxyz, *known.intrinsics, *known.distortion, known.timeshift_cam_imu_s]
+    if not all(math.isfinite(number) for number in numbers):
+        return "a value is not finite"
+    if abs(math.hypot(*pose.q_wxyz) - 1) > 1e-6:
+        return "the quaternion has not length 1"
+    if math.hypot(*pose.p_m) > 10 or abs(known.timeshift_cam_imu_s) > 10 or min(known.intrinsics[:2]) <= 0:
+        return "lever arm, time shift or focal length are impossible"
+    if [len(row) for row in pose.covariance] != [6] * 6:
+        return "the covariance is not 6 x 6"
+    return ""
+
+
+def _plain(value: Any) -> Any:
+    """Number of an array library as a plain one: an estimate must never be lost over its type.
+
+    Raises:
+        TypeError: Anything else.
+    """
+    if hasattr(value, "item"):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} cannot be stored")

@@ -1,0 +1,76 @@
+"""Is this process alive? Judged by what its roles publish from their own loops, not by a timer of its own.
+
+The watchdog of systemd is fed from here: it bites when a role stops publishing its status, or publishes
+that one of its threads is stuck. An unplugged device is *not* a reason: restarting would not plug it in,
+and would take the other devices away as well.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+
+from vical_daemon.bus.interface import Sample
+from vical_daemon.bus.messages import DiagnosticsMessage, Level, MessageError, decode_diagnostics
+
+FRESH_S = 5.0
+START_S = 300.0
+"""How long a role may take to its first status; a slow card was seen to need 60 s for scipy and OpenCV."""
+
+
+class Liveness:
+    """Watches the status messages of some roles.
+
+    Args:
+        roles: Those that run in this process.
+        begin_s: When the roles were started, by the clock of `now_s`.
+        fresh_s: A status older than this means that the role hangs.
+    """
+
+    def __init__(self, roles: Sequence[str], begin_s: float, fresh_s: float = FRESH_S) -> None:
+        self._roles, self._begin_s = tuple(roles), begin_s
+        self._fresh_s = fresh_s
+        self._seen: dict[str, tuple[float, DiagnosticsMessage]] = {}
+        self._lock = threading.Lock()
+
+    def take(self, sample: Sample, now_s: float) -> None:
+        """Take a status message; others are ignored."""
+        try:
+            message = decode_diagnostics(sample.payload)
+        except MessageError:
+            return
+        if message.frame_id in self._roles:
+            with self._lock:
+                self._seen[message.frame_id] = (now_s, message)
+
+    def ready(self) -> bool:
+        """Whether every role has spoken at least once."""
+        with self._lock:
+            return len(self._seen) == len(self._roles)
+
+    def problem(self, now_s: float) -> str:
+        """Return why the process must not be called alive; empty when it may."""
+        with self._lock:
+            seen = dict(self._seen)
+        for role in self._roles:
+            if role not in seen:
+                if now_s - self._begin_s > START_S:
+                    return f"{role} has not started within {START_S:.0f} s"
+                continue
+            at_s, message = seen[role]
+            if now_s - at_s > self._fresh_s:
+                return f"{role} has been silent for {now_s - at_s:.0f} s"
+            for status in message.statuses:
+                if status.level is Level.STALE:
+                    return f"{status.name}: {status.message}"
+        return ""
+
+    def summary(self) -> str:
+        """Return one line for `systemctl status`: each component with its message, the worst first."""
+        with self._lock:
+            messages = [message for _, message in self._seen.values()]
+            missing = [role for role in self._roles if role not in self._seen]
+        statuses = [s for message in messages for s in message.statuses if s.name != "clock"]
+        statuses.sort(key=lambda status: -int(status.level))
+        texts = [f"{s.name}: {s.message}" if s.message else s.name for s in statuses]
+        return "; ".join(([f"starting: {', '.join(missing)}"] if missing else []) + texts)[:500]

@@ -1,0 +1,169 @@
+"""Role web: the page with the live calibration, on loopback unless the config says otherwise.
+
+Read-only, unless a token is set on the robot: in the environment variable VICAL_WEB_TOKEN, or in the file
+`web-token` of the state directory.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus, Subscription
+from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_string
+from vical_daemon.config.model import Config
+from vical_daemon.config.paths import make_private, runtime_directory, state_directory
+from vical_daemon.service.health import StatusSender
+from vical_daemon.service.wall_clock import WallClock, shared_clock
+from vical_daemon.web.images import CameraView
+from vical_daemon.web.server import PageServer
+from vical_daemon.web.state import WebState
+
+if TYPE_CHECKING:
+    from vical_daemon.web.foxglove import FoxgloveServer
+
+TOKEN_VARIABLE = "VICAL_WEB_TOKEN"  # noqa: S105  (the name of the variable, not a secret)
+TOKEN_FILE = "web-token"  # noqa: S105
+_log = logging.getLogger(__name__)
+
+
+class WebError(Exception):
+    """The page cannot be served; the message says where and what to try."""
+
+
+class _Feeds:
+    """Subscriptions of the page: calibrations and statuses always, images only while somebody looks."""
+
+    def __init__(self, config: Config, bus: Bus, state: WebState) -> None:
+        self._config, self._bus, self._state = config, bus, state
+        self.views = {name: CameraView(name) for name in config.cameras}
+        self._always = [
+            bus.subscribe(topics.CALIBRATION.key(config.rig, name), state.take) for name in config.cameras
+        ]
+        self._always.append(bus.subscribe(f"{topics.ROOT}/{config.rig}/status/*", state.take))
+        self._watched: dict[str, list[Subscription]] = {}
+        for sample in bus.latest(f"{topics.ROOT}/{config.rig}/**"):
+            state.take(sample)  # what is known before the first message comes
+
+    def watch(self, camera: str, on: bool) -> None:
+        """Start or stop fetching images and points of one camera."""
+        for subscription in self._watched.pop(camera, []):
+            subscription.close()
+        if on:
+            view, rig = self.views[camera], self._config.rig
+            kinds = (topics.POINTS, topics.TRACKS, topics.PREDICTED, topics.IMAGE, topics.COMPRESSED)
+            self._watched[camera] = [self._bus.subscribe(t.key(rig, camera), view.take) for t in kinds]
+
+    def close(self) -> None:
+        """Leave the bus."""
+        for camera in list(self._watched):
+            self.watch(camera, False)
+        for subscription in self._always:
+            subscription.close()
+
+
+def run(
+    config: Config,
+    bus: Bus,
+    stop: threading.Event,
+    *,
+    clock: WallClock | None = None,
+    ready: Callable[[str], None] | None = None,
+) -> None:
+    """Serve the page until `stop`.
+
+    Args:
+        config: The rig; host and port in `config.web` (port 0: any free one).
+        bus: Where data come from and commands go.
+        stop: Ends the role.
+        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        ready: Called with the address once it is served.
+
+    Raises:
+        WebError: The address cannot be used.
+    """
+    clock = clock or shared_clock(make_private(runtime_directory()))
+    state = WebState(config.rig)
+    feeds = _Feeds(config, bus, state)
+    try:
+        asyncio.run(_serve(config, bus, stop, clock, state, feeds, ready))
+    finally:
+        feeds.close()
+
+
+async def _serve(
+    config: Config,
+    bus: Bus,
+    stop: threading.Event,
+    clock: WallClock,
+    state: WebState,
+    feeds: _Feeds,
+    ready: Callable[[str], None] | None,
+) -> None:
+    def command(role: str, word: str) -> None:
+        bus.publish(topics.COMMAND.key(config.rig, role), encode_string(word))
+
+    settings = config.web
+    server = PageServer(
+        state, feeds.views, feeds.watch, command, read_token(), settings.picture_rate_hz, settings.hosts
+    )
+    host, port = settings.host, settings.port
+    try:
+        port = await server.listen(host, port)
+    except OSError as error:
+        await server.close()
+        code = error.errno or 0  # above 0: of the kernel, whose word is shorter than asyncio's
+        reason = os.strerror(code) if code > 0 else error.strerror or str(error)
+        raise WebError(f"cannot serve the page on {host}:{port}: {reason}; set web.port") from error
+    address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+    _log.info("page at %s", address)
+    if ready is not None:
+        ready(address)
+    status = StatusSender(config.rig, "web", bus, clock)
+    viewer = _foxglove(config, bus)
+
+    def statuses() -> list[DiagnosticStatus]:
+        values = {"malformed": str(state.malformed), "address": address} | server.counters()
+        return [DiagnosticStatus(Level.OK, "web", address, "", values)]
+
+    def stopped() -> bool:
+        status.tick(statuses)
+        return stop.is_set()
+
+    try:
+        await server.run(stopped)
+    finally:
+        if viewer is not None:
+            viewer.close()
+        await server.close()
+
+
+def _foxglove(config: Config, bus: Bus) -> FoxgloveServer | None:
+    """Serve Foxglove too where the config asks for it; a taken port must not end the page."""
+    if not config.web.foxglove_port:
+        return None
+    from vical_daemon.web.foxglove import FoxgloveError, FoxgloveServer
+
+    try:
+        viewer = FoxgloveServer(bus, config, config.web.host, config.web.foxglove_port)
+    except FoxgloveError as error:
+        _log.warning("%s; set web.foxglove_port", error)
+        return None
+    _log.info("Foxglove at ws://%s:%d", config.web.host, viewer.port)
+    return viewer
+
+
+def read_token() -> str:
+    """Return the token that allows commands; "" where none is set: then nobody may."""
+    token = os.environ.get(TOKEN_VARIABLE, "")
+    if token:
+        return token.strip()
+    try:
+        return (state_directory() / TOKEN_FILE).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
