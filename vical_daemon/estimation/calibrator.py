@@ -14,6 +14,7 @@ import numpy as np
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.frame_queue import FrameQueue
 from vical_daemon.estimation.frame_report import FrameReport
+from vical_daemon.estimation.held_lens import HeldLens
 from vical_daemon.estimation.image_intake import (
     ImageIntake,
     by_present_stamps,
@@ -34,7 +35,7 @@ from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoi
 from vical_daemon.estimation.start.starting import LATE_S, Starting
 from vical_daemon.estimation.state import ATTITUDE, POSITION, Layout, make_layout
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
-from vical_daemon.estimation.trust import clock_drift, hypotheses, target_doubt
+from vical_daemon.estimation.trust import clock_drift, hypotheses
 from vical_daemon.estimation.trust.beyond_doubt import BeyondDoubt, size_told
 from vical_daemon.estimation.trust.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.trust.held_back import HeldBack
@@ -72,7 +73,8 @@ class Calibrator:
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
         self._states = options.estimate | _ALWAYS
-        if "intrinsics" not in options.fix:  # else what is missed may as well be the lens
+        self._held = self._held_lenses()
+        if "intrinsics" not in options.fix or self._held:  # else what is missed may as well be the lens
             self._states |= {hypotheses.TARGET}
         self.layout = self._lay_out()
         self.judge = Judge(options, self.layout)
@@ -98,7 +100,17 @@ class Calibrator:
 
     def _lay_out(self) -> Layout:
         models = {name: prior.distortion_model for name, prior in self.priors.items()}
-        return make_layout(models, fix=self.options.fix, estimate=self._states, target_m=self.target)
+        return make_layout(
+            models, fix=self.options.fix, estimate=self._states, target_m=self.target, held=self._held
+        )
+
+    def _held_lenses(self) -> dict[str, HeldLens]:
+        """Lenses whose errors matter to something that is estimated, by camera."""
+        fix = self.options.fix
+        if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
+            return {}
+        lenses = {name: HeldLens.of(prior) for name, prior in self.priors.items()}
+        return {name: lens for name, lens in lenses.items() if lens is not None}
 
     def _new_starting(self, off: Collection[str] = ()) -> Starting:
         """For a rig of which it is known what is not as stated."""
@@ -335,9 +347,6 @@ class Calibrator:
         for block, told in self._beyond_doubt.look(f).items():
             self.judge.announce(told, once=block)
         self._act(self.watch.look(report, f), frame)
-        doubt = target_doubt.told(f.doubt)
-        if doubt:
-            self.judge.announce(doubt, once=hypotheses.TARGET)
         return [report]
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
@@ -403,6 +412,8 @@ class Calibrator:
         before = self._past.filter(f)
         sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
         for name, camera in sound.state.cameras.items() if sound else ():
+            if not self.layout.lens_free(name):
+                continue
             self.priors[name] = replace(
                 self.priors[name],
                 intrinsics=tuple(camera.intrinsics.tolist()),

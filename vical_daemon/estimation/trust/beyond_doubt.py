@@ -18,6 +18,7 @@ from vical_daemon.estimation.trust.hypotheses import (
     Block,
     blocks,
     factor,
+    lens_block,
     not_zero,
     weights,
 )
@@ -30,6 +31,7 @@ KNOWN_SIZE_SIGMA = 0.1
 """Of the size of a target that is known to be off, or where it is asked for, relative."""
 _EVERY_S = 1.0
 _MEASURED = 400  # images
+_PIXELS = 4  # of the entries of a lens are in px
 
 
 def imu_told(entries: FloatArray, sigmas: FloatArray) -> str:
@@ -78,7 +80,7 @@ def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
     (P^-1 - c E E')^-1 = P + P E (I/c - E' P E)^-1 E' P, and the mean moves by P E (I/c - E' P E)^-1 E' x.
     """
     entries = f.S[block.where]
-    c = block.sigma**-2.0 - sigma**-2.0
+    c = float(block.sigma[0]) ** -2.0 - sigma**-2.0
     L = root(np.eye(len(entries)) / c - entries @ entries.T)
     W = solve_lower(L, entries @ f.S.T).T
     dx = W @ solve_lower(L, block.values)
@@ -108,14 +110,38 @@ class BeyondDoubt:
         self._next_s = f.state.t_s + _EVERY_S
         shares = weights(f)
         # a lag is small beside what images that do not fit do: only once that is measured is it known
-        early = {LAG} if max(c.images for c in f.consistency.values()) < _MEASURED else set()
-        known = [n for n in blocks(f) if n not in f.off | early and not_zero(shares, n) > SURE]
+        early = max(c.images for c in f.consistency.values()) < _MEASURED
+        known = [
+            name
+            for name in blocks(f)
+            if name not in f.off and not_zero(shares, name) > SURE and not (early and name == LAG)
+        ]
         return {name: _off(f, name) for name in known}
+
+
+def _lens_told(f: CalibrationFilter, name: str, block: Block) -> str:
+    """The announcement for a lens that is held, with the entry that is off beyond all others."""
+    camera = next(c for c in f.layout.held if lens_block(c) == name)
+    sigmas = np.sqrt(factor(f)) * f.sigmas()[block.where]
+    at = int(np.argmax(np.abs(block.values) / np.hypot(sigmas, block.stated)))
+    entry = f.layout.held[camera].names(f.state.cameras[camera].distortion_model)[at]
+    off = (
+        f"{block.values[at]:+.1f} +- {sigmas[at]:.1f} px"
+        if at < _PIXELS
+        else f"{block.values[at]:+.3f} +- {sigmas[at]:.3f}"
+    )
+    return (
+        f"the fixed lens of {camera} is not this camera's: {entry} is off by {off}; "
+        "the sigmas allow for it: leave the lens free to be rid of it (no `fix` of intrinsics)"
+    )
 
 
 def _off(f: CalibrationFilter, name: str) -> str:
     """Let a block stand by itself; return the announcement."""
+    block = blocks(f)[name]
     f.off.add(name)
+    if block.held:
+        return _lens_told(f, name, block)
     if name in _KNOWN_SIGMA:
         _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
     if name == TARGET:  # what stretches said of the lens, they said with the target as stated

@@ -157,7 +157,7 @@ class Judge:
         if told:
             self.announce(told, once=f"jitter {report.camera}")
         lens = f.agreement[report.camera]
-        if lens.model == RADTAN and lens.moved.any():
+        if lens.model == RADTAN and lens.moved.any() and f.layout.lens_free(report.camera):
             self.announce(_TERM_MISSING.format(report.camera), once=f"lens {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
@@ -258,6 +258,10 @@ class Judge:
                 return Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet", ""
             return Status.CONVERGED, "", ""
         worst = lacking[0]
+        lens = hypotheses.wrong_lens(f)
+        if lens:
+            why = f"{worst.said}: the fixed lens of {lens} is not this camera's: leave it free"
+            return Status.CONVERGING, why, ""
         patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > _PATIENCE_S
         if patient and worst.excess > _LOST:
             names = "; ".join(g.said for g in lacking[:3])
