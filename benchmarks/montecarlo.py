@@ -51,8 +51,8 @@ class Case:
         readout_told: The readout of a rolling shutter is told.
         crooked: The board is not as stated: see `vical_mocks.points.crooked_board`.
         board_size: True size of the board over its stated size.
-        lens_off: The lens is held (`lens_known`) at values that are off by 0.5 % of f, 5 px of the centre, 0.01
-            of k1, one sigma each; "stated": and the estimator is told these sigmas.
+        lens_off: The lens is held (`lens_known`) at values that are off by 0.5 % of f, 5 px of the centre,
+            0.01 of k1, one sigma each; "stated": and the estimator is told these sigmas.
         imu_off: One sigma of each entry of the imu's matrices, of which the gyro's is symmetric (what is not
             is a turn of the imu's frame).
     """

@@ -21,6 +21,7 @@ NAME = r"[A-Za-z][A-Za-z0-9_]{0,62}"  # as `topics.check_name`
 URI = r"(v4l2|iidc|aravis|folder):.+|/.+|\d+"
 Name = Annotated[str, Bound(pattern=NAME, hint="letters, digits and _, begin with a letter, at most 63")]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
+Sigma = Annotated[float, Bound(low=0, high=1e5)]
 Pixels = Annotated[int, Bound(low=16, high=16384)]
 Matrix4 = tuple[
     tuple[float, float, float, float],
@@ -68,11 +69,16 @@ class ImuConfig:
 
 @dataclass(frozen=True, slots=True)
 class LensConfig:
-    """What is known about a lens, in Kalibr's words (`kalibr_io` reads Kalibr's own files)."""
+    """What is known about a lens, in Kalibr's words (`kalibr_io` reads Kalibr's own files).
+
+    `intrinsics_sigma` (px) and `distortion_sigma` say how well a lens is known that `calibration.fix` holds.
+    """
 
     distortion_model: Literal["radtan", "plumb_bob", "equidistant"] = "radtan"
     intrinsics: tuple[Focal, Focal, float, float] | None = None
     distortion_coeffs: tuple[float, ...] | None = None
+    intrinsics_sigma: tuple[Sigma, Sigma, Sigma, Sigma] | None = None
+    distortion_sigma: tuple[Sigma, ...] | None = None
     T_cam_imu: Matrix4 | None = None
     timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
     readout_s: Annotated[float, Bound(low=0, high=0.2)] = 0.0

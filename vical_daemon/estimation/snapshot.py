@@ -11,6 +11,8 @@ from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEsti
 from vical_daemon.estimation.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
 from vical_daemon.estimation.trust.lens_limit import limit as lens_limit
 
+_ROUNDING = 1e-9  # of the sigma of a lens that is off: less is arithmetic
+
 
 def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float) -> CameraEstimate:
     """One camera as it is known now.
@@ -50,12 +52,14 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
 
 def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
     """Of fx fy cx cy and the distortion, shape (n,); where held: as far as images contradict the values."""
-    camera, where, agreement = f.state.cameras[name], f.layout.cameras[name], f.agreement[name]
+    camera, where = f.state.cameras[name], f.layout.cameras[name]
     if where.intrinsics is None or where.distortion is None:
         return np.zeros(4 + len(camera.distortion))
     raw = f.sigmas()
     if name in f.layout.held:
-        return np.asarray(spread * raw[f.layout.lens(name)])
+        told = spread * raw[f.layout.lens(name)]
+        return np.where(told > _ROUNDING * f.layout.held[name].off_sigma, told, 0.0)
+    agreement = f.agreement[name]
     filtered = np.maximum(np.sqrt(agreement.factors), spread) * np.concatenate(
         [raw[where.intrinsics], raw[where.distortion]]
     )
