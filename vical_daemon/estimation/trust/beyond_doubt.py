@@ -12,6 +12,7 @@ from vical_daemon.estimation.retract import retract
 from vical_daemon.estimation.trust.hypotheses import (
     IMU,
     LAG,
+    OFF,
     SIZE,
     SURE,
     TARGET,
@@ -31,6 +32,7 @@ KNOWN_SIZE_SIGMA = 0.1
 """Of the size of a target that is known to be off, or where it is asked for, relative."""
 _EVERY_S = 1.0
 _MEASURED = 400  # images
+_SEEN = 100  # images, as many as `consistency` wants
 _PIXELS = 4  # of the entries of a lens are in px
 
 
@@ -109,14 +111,27 @@ class BeyondDoubt:
             return {}
         self._next_s = f.state.t_s + _EVERY_S
         shares = weights(f)
-        # a lag is small beside what images that do not fit do: only once that is measured is it known
-        early = max(c.images for c in f.consistency.values()) < _MEASURED
+        every, images = blocks(f), max(c.images for c in f.consistency.values())
         known = [
             name
-            for name in blocks(f)
-            if name not in f.off and not_zero(shares, name) > SURE and not (early and name == LAG)
+            for name in every
+            if name not in f.off and not_zero(shares, name) > SURE and images >= _needed(name, every, shares)
         ]
         return {name: _off(f, name) for name in known}
+
+
+def _needed(name: str, every: dict[str, Block], shares: dict[tuple[str, ...], float]) -> int:
+    """Images before a block is announced.
+
+    A lag is small beside what images that do not fit do: only once that is measured is it known. So is
+    whatever seems to be off beside a lens that is held and wrong; and in the first images that may be either.
+    """
+    held = [other for other, block in every.items() if block.held]
+    if name in held:
+        return 0
+    if name == LAG or any(not_zero(shares, other) > OFF for other in held):
+        return _MEASURED
+    return _SEEN if held else 0
 
 
 def _lens_told(f: CalibrationFilter, name: str, block: Block) -> str:
