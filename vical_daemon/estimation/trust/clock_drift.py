@@ -17,7 +17,7 @@ import numpy as np
 from vical_daemon.estimation.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.retract import retract
-from vical_daemon.estimation.unscented import root, solve_lower
+from vical_daemon.estimation.trust.hypotheses import lenses_known
 
 SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s, one sigma; two poor crystals."""
@@ -27,7 +27,6 @@ SKEW_WALK = 1e-8
 """How such a drift wanders (temperature), s/s per sqrt(s)."""
 _APART = 0.05  # share of rigs whose clocks do not run alike
 _LEAST_S = 1.0
-_RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as stated has none
 SURE = 0.99
 """Probability from which on a drift is announced."""
 
@@ -106,25 +105,13 @@ def let_drift(f: CalibrationFilter, camera: str, why: str, *, anew: bool) -> str
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
     """Return the filter as it is to be told: mean and covariance over both hypotheses, for each camera."""
     for name in f.layout.cameras:
-        f = _mixed(f, name, apart(f, name), _lenses_known(f))
+        f = _mixed(f, name, apart(f, name), lenses_known(f))
     return f
 
 
 def as_if_alike(f: CalibrationFilter, camera: str) -> CalibrationFilter:
     """Return the filter on the assumption that this camera's clock does not drift."""
     return _mixed(f, camera, 0.0, f.S)
-
-
-def _lenses_known(f: CalibrationFilter) -> FloatArray:
-    """Square root of the covariance if lenses that are held were known: no evidence on clocks moves those."""
-    if not f.layout.held:
-        return f.S
-    rows = np.concatenate(
-        [f.S[f.layout.lens(n)] / lens.off_sigma[:, None] for n, lens in f.layout.held.items()]
-    )
-    L = root(rows @ rows.T + _RIDGE * np.eye(len(rows)))
-    U = solve_lower(L, rows)
-    return np.asarray(f.S - (f.S @ U.T) @ U)
 
 
 def _mixed(f: CalibrationFilter, camera: str, p: float, S: FloatArray) -> CalibrationFilter:

@@ -42,6 +42,7 @@ SURE = 0.99
 """Probability from which on a block is known to be off."""
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
+_RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as stated has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +108,15 @@ def blocks(f: CalibrationFilter) -> dict[str, Block]:
     return found
 
 
-def wrong_lens(f: CalibrationFilter) -> str:
-    """The camera whose lens is held and known not to be as stated; empty where there is none."""
-    return next((name for name in f.layout.held if lens_block(name) in f.off), "")
+def lenses_known(f: CalibrationFilter) -> FloatArray:
+    """Square root of the covariance, as it is told, if the errors of all lenses that are held were known."""
+    if not f.layout.held:
+        return f.S
+    scaled = [f.S[f.layout.lens(n)] / lens.off_sigma[:, None] for n, lens in f.layout.held.items()]
+    rows = np.concatenate(scaled)
+    L = root(rows @ rows.T + _RIDGE * np.eye(len(rows)))
+    U = solve_lower(L, rows)
+    return np.asarray(f.S - (f.S @ U.T) @ U)
 
 
 def log_bayes_factor(
