@@ -198,6 +198,8 @@ def _one_process(socket: str, sessions: int) -> None:
     subscriptions = [client.subscribe("vical/rig0/**") for client in clients]
     time.sleep(0.3)  # until the subscriptions are known to the router
     sizes = {"cam0": SMALL, "cam1": IMAGE, "cam2": LARGE}
+    _end(router, sizes)  # what is lost before the first sample nobody can count
+    time.sleep(0.3)
     _publish(router, sizes, 10)
     received = []
     for subscription in subscriptions:
@@ -208,7 +210,7 @@ def _one_process(socket: str, sessions: int) -> None:
             _end(router, sizes)
             while (sample := subscription.recv(0.1)) is not None:
                 seen.append(len(sample.payload))
-                if seen[-1] == 1:
+                if seen[-1] == 1 and sample.sequence > 0:
                     ended.add(sample.key)
         received.append(([seen.count(size) for size in sizes.values()], subscription.dropped))
     _say({"sent": 10 * len(sizes), "received": received, "locked_kib": _locked_kib()})
@@ -220,6 +222,8 @@ def _camera(mode: str, socket: str, names: str, sizes: str, count: int) -> None:
     each = [int(size) for size in sizes.split(",")] * len(cameras)
     _say("ready")
     sys.stdin.readline()
+    _end(bus, cameras)  # what is lost before the first sample nobody can count
+    time.sleep(0.3)
     _publish(bus, dict(zip(cameras, each, strict=False)), count)
     _say(count * len(cameras))
     while True:
@@ -238,7 +242,7 @@ def _receiver(kind: str, socket: str) -> None:
             received.setdefault(key, []).append(number)
             if size > 1:
                 images.append(number)
-            else:
+            elif number > 0:  # the first one only begins the count
                 ended.add(key)
 
     dropped: Callable[[], int | None] = lambda: None  # noqa: E731
@@ -262,7 +266,7 @@ def _receiver(kind: str, socket: str) -> None:
     while time.monotonic() < end and len(ended) < keys:
         time.sleep(0.05)
     with lock:
-        gaps = sum(max(numbers) + 1 - len(numbers) for numbers in received.values())
+        gaps = sum(max(numbers) - min(numbers) + 1 - len(numbers) for numbers in received.values())
         _say({"ended": len(ended), "images": len(images), "gaps": gaps, "dropped": dropped()})
 
 

@@ -61,7 +61,7 @@ def can_share_memory() -> bool:
 def _may_lock_anything() -> bool:
     """Whether the kernel exempts this process from the limit (CAP_IPC_LOCK, which root has)."""
     try:
-        status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+        status = Path("/proc/self/status").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return False
     found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)

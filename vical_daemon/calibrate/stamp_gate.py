@@ -52,8 +52,13 @@ class StampGate(Generic[T]):
         self.refused = 0
         self.jumps = 0
 
-    def push(self, stamp_ns: int, item: T) -> list[tuple[int, T]]:
+    def push(self, stamp_ns: int, item: T, *, among_others: bool = False) -> list[tuple[int, T]]:
         """Take a message.
+
+        Args:
+            stamp_ns: Its stamp.
+            item: The message.
+            among_others: Other streams have such stamps: the first message of this one needs no more proof.
 
         Returns:
             The stamps and messages that may pass: this one, none yet, or all that proved a beginning or jump.
@@ -65,7 +70,7 @@ class StampGate(Generic[T]):
         chain = self._chain_of(stamp_ns)
         chain.newest_ns = stamp_ns
         chain.held.append((stamp_ns, item))
-        if len(chain.held) < ENOUGH:
+        if len(chain.held) < ENOUGH and not (self._newest_ns is None and among_others):
             return []
         if self._newest_ns is not None and stamp_ns - chain.first_ns < PROOF_S * 1e9:
             return []

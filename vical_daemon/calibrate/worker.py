@@ -77,6 +77,7 @@ class EstimateRole:
         self._status_key = topics.STATUS.key(config.rig, "imu")
         self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
         self._gates: dict[str, StampGate[ImuMessage | PointsFrame]] = {}
+        self._span_ns: tuple[int, int] | None = None  # of all stamps that passed
         self._next_s = self._next_companion_s = -float("inf")
         self._malformed = self._implausible = 0
         self._images_in_order = 0
@@ -105,12 +106,15 @@ class EstimateRole:
         gate = self._gates.get(key)
         if gate is None:
             gate = self._gates[key] = StampGate()
-        self._pass(gate.push(stamp_ns, item))
+        among_others = self._span_ns is not None and self._span_ns[0] <= stamp_ns <= self._span_ns[1]
+        self._pass(gate.push(stamp_ns, item, among_others=among_others))
 
     def _pass(self, items: list[tuple[int, ImuMessage | PointsFrame]]) -> None:
         for stamp_ns, item in items:
             self._order.push(stamp_ns, item)
             self._images_in_order += isinstance(item, PointsFrame)
+            first_ns, newest_ns = self._span_ns or (stamp_ns, stamp_ns)
+            self._span_ns = min(first_ns, stamp_ns), max(newest_ns, stamp_ns)
 
     @property
     def settled(self) -> int:

@@ -196,8 +196,8 @@ class WebState:
         return document
 
     def _fault(self) -> dict[str, str] | None:
-        """The first component that does not work, or is silent: until it works, no advice helps."""
-        for _, statuses in sorted(self.statuses.items()):
+        """The first component that says it does not work: until it does, no advice helps."""
+        for _, (_, statuses) in sorted(self._statuses.items()):
             for status in statuses:
                 if status.level >= Level.ERROR:
                     headline = fault_headline(status.name)

@@ -190,7 +190,7 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
     judge = FreeJudge(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
     judge.doubts.drifting = True
-    judge.changed("the camera moved")
+    judge.changed()
     assert not judge.doubts.drifting
 
 

@@ -132,5 +132,6 @@ def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypat
     monkeypatch.setattr(
         "vical_daemon.estimation.selection.model_selection.in_doubt", lambda _, name, **_how: name == TARGET
     )
+    c.judge._steady.reset(Status.CONVERGING)  # a converged status would stand for two seconds
     assert c.estimate().status == Status.CONVERGING
     assert c.estimate().reason == "sigmas are small; whether the target is as stated is not sure yet"

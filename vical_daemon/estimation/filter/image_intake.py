@@ -19,6 +19,7 @@ _REPORTED_S = 0.5  # shorter gaps are lost images, which every camera has and th
 _GAP_PERIODS = 4.0  # and than this many usual intervals: a slow camera has no gap at every image
 _FOLLOW = 0.1  # by which usual interval and usual lead follow each new image
 _AGREE = 5  # images in a row that show the same step
+_SETTLED = 10  # images after which the usual lead is known; a role may hold back the first three
 
 
 @dataclass(slots=True)
@@ -34,6 +35,7 @@ class _Stream:
         repeats: Copies of the newest image since.
         stepped_s: Leads of the latest images, all far from the usual one.
         heard_s: Newest inertial reading when the last image arrived.
+        images: Images so far.
     """
 
     newest: PointsFrame
@@ -44,6 +46,7 @@ class _Stream:
     repeats: int = 0
     stepped_s: list[float] = field(default_factory=list)
     heard_s: float = -np.inf
+    images: int = 1
 
 
 @dataclass(slots=True)
@@ -95,6 +98,9 @@ class ImageIntake:
         """Whether a stamp is about where it usually is; a clock that has been set is followed."""
         heard, stream.heard_s = newest_imu_s > stream.heard_s, newest_imu_s
         off_s = lead_s - stream.lead_s
+        stream.images += 1
+        if off_s > 0.0 and stream.images < _SETTLED:  # the first ones came late, held back until believed
+            stream.lead_s, off_s = lead_s, 0.0
         if abs(off_s) <= SEARCHED_S:
             stream.lead_s += _FOLLOW * off_s if heard else 0.0
             stream.stepped_s.clear()
