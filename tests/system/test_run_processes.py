@@ -241,8 +241,8 @@ def test_a_killed_child_is_started_again(daemon: Daemon) -> None:
     children = _running(daemon, parent)
     time.sleep(11.0)  # a child that fails at once is not started again
     os.kill(children[1], signal.SIGKILL)
-    _wait_for(lambda: len(_alive(_children(parent))) == 3)
-    after = _children(parent)
+    _wait_for(lambda: len(found := _alive(_children(parent))) == 3 and children[1] not in found)
+    after = _alive(_children(parent))
     assert children[0] in after and children[2] in after and children[1] not in after
 
 

@@ -15,6 +15,7 @@ import stat
 import sys
 import time
 from collections.abc import Mapping
+from enum import EnumType
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,9 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _method(owner: object, name: str) -> Any:
+    """A method of one of our objects; Python 3.11.0 to 3.11.3 write the members of an enum so, too."""
+    if isinstance(owner, EnumType) and owner.__module__.startswith(_ARITHMETIC) and name in owner.__members__:
+        return owner[name]
     if not type(owner).__module__.startswith(_ARITHMETIC) or name.startswith("__"):
         raise pickle.UnpicklingError(f"{name} is no method of an estimator")
     return getattr(owner, name)
