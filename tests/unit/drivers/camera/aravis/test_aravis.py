@@ -105,6 +105,7 @@ def gige_camera() -> Iterator[str]:
     process.wait()
 
 
+@pytest.mark.root  # Aravis' packet socket; through the UDP socket of an ordinary user, loopback loses packets
 def test_gige_vision_on_loopback(gige_camera: str) -> None:
     with AravisCamera(gige_camera, CameraSettings(rate_hz=30.0, exposure_s=0.003)) as source:
         frames = [source.read(2.0) for _ in range(45)]
