@@ -57,6 +57,14 @@ class Daemon:
         return self.folder / "run" / "zenoh.sock"
 
 
+@pytest.fixture(autouse=True)
+def hang_up_as_usual() -> Iterator[None]:
+    """Children inherit an ignored SIGHUP, for example where the tests themselves run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Daemon]:
     emulator = Gx3Emulator(link="direct", serial_number="6223-00007")

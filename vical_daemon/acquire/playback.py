@@ -197,7 +197,7 @@ def _tape(path: Path) -> _Tape:
     with _tapes_lock:
         if key not in _tapes:
             try:
-                _tapes[key] = _Tape(open_recording(key, check=False))
+                _tapes[key] = _Tape(open_recording(key, check=False, as_recorded=True))
             except RecordingError as error:
                 raise DeviceNotFoundError(str(error)) from None
         return _tapes[key]

@@ -65,7 +65,7 @@ def _summarise(path: Path) -> tuple[Summary, str]:
         except RecordingError as error:
             problem = str(error)
         return summary, problem
-    recording = open_recording(path, check=False)
+    recording = open_recording(path, check=False, as_recorded=True)
     try:
         check_recording(recording)
     except RecordingError as error:

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.speed < 0 or args.wait < 0:
         raise CliError("--speed and --wait must not be negative", EXIT_USAGE)
-    recording = open_recording(args.log, topics=args.streams, check=False)
+    recording = open_recording(args.log, topics=args.streams, check=False, as_recorded=True)
     bus = _open_bus(args)
     try:
         result = replay(

@@ -24,6 +24,7 @@ def open_recording(
     topics: Collection[str] | None = None,
     cameras: Collection[str] = (),
     check: bool = True,
+    as_recorded: bool = False,
 ) -> Recording:
     """Open a recording of any kind.
 
@@ -32,6 +33,8 @@ def open_recording(
         topics: Topics, or names of imus and cameras, to take; None: all that are of use.
         cameras: Of the cameras only these, where there is one of them: files of an ASL folder that belong to
             others may be as broken as they like.
+        as_recorded: Leave the stamps alone. Otherwise readings of an imu that were stamped on arrival are
+            put on the even grid of their device (`even_stamps`), with a warning.
         check: Refuse wrong units, rates and clocks (`check_recording`).
 
     Raises:
@@ -40,7 +43,7 @@ def open_recording(
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path} does not exist; check the path")
-    recording = _open(path, topics, cameras)
+    recording = _open(path, topics, cameras, as_recorded)
     if check:
         check_recording(recording)
     return recording
@@ -60,19 +63,21 @@ def check_recording(recording: Recording) -> None:
         recording.warnings.extend(check_camera(stream, list(recording.imus.values())))
 
 
-def _open(path: Path, topics: Collection[str] | None, cameras: Collection[str]) -> Recording:
+def _open(
+    path: Path, topics: Collection[str] | None, cameras: Collection[str], as_recorded: bool
+) -> Recording:
     if path.is_dir():
         if any(path.glob("*.mcap")):  # also of a ROS 2 bag folder: our reader bears damage
-            return McapRecording(path, topics)
+            return McapRecording(path, topics, as_recorded=as_recorded)
         if (path / "metadata.yaml").is_file():
-            return BagRecording(path, topics)
-        return AslRecording(path, topics, cameras)
+            return BagRecording(path, topics, as_recorded=as_recorded)
+        return AslRecording(path, topics, cameras, as_recorded=as_recorded)
     if path.suffix == ".bag":
-        return BagRecording(path, topics)
+        return BagRecording(path, topics, as_recorded=as_recorded)
     if path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
-        return McapRecording(path, topics)
+        return McapRecording(path, topics, as_recorded=as_recorded)
     if path.suffix == ".db3" and (path.parent / "metadata.yaml").is_file():
-        return BagRecording(path.parent, topics)
+        return BagRecording(path.parent, topics, as_recorded=as_recorded)
     raise RecordingError(
         f"{path} is no recording: expected an .mcap or .bag file, a ROS 2 bag folder or an ASL folder "
         "(with mav0/imu0/data.csv)"

@@ -21,6 +21,7 @@ from vical_daemon.bus.messages import encode_compressed_image, encode_imu, encod
 from vical_daemon.bus.topics import COMPRESSED, IMU, POINTS, TRACKS, TopicError
 from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
 from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.model import (
     ImuArrays,
     Kind,
@@ -53,7 +54,12 @@ class AslRecording(Recording):
     """An ASL folder; numbers are kept bit for bit as the text says them."""
 
     def __init__(
-        self, folder: Path, names: Collection[str] | None = None, cameras: Collection[str] = ()
+        self,
+        folder: Path,
+        names: Collection[str] | None = None,
+        cameras: Collection[str] = (),
+        *,
+        as_recorded: bool = False,
     ) -> None:
         """Parse the tables (images are read later, one by one).
 
@@ -61,6 +67,7 @@ class AslRecording(Recording):
             folder: With `mav0`, or that itself.
             names: Imus and cameras to read; None: all. Files of others are not looked at.
             cameras: Of the cameras only these, if the folder has one of them.
+            as_recorded: Leave the stamps of imus alone.
 
         Raises:
             RecordingError: No imu or no camera there, or a table that cannot be read.
@@ -68,6 +75,8 @@ class AslRecording(Recording):
         self.path = folder
         self.rig = RIG
         self.warnings = []
+        self.stamp_sigma_s = {}
+        self._as_recorded = as_recorded
         self.imu_tables: dict[str, ImuArrays] = {}
         root = folder / "mav0" if (folder / "mav0").is_dir() else folder
         self._sources: list[_Source] = []
@@ -115,7 +124,7 @@ class AslRecording(Recording):
         name = path.parent.name
         rows = self._load(path, _IMU_ROW, "timestamp [ns], 3 gyro and 3 accelerometer columns")
         finite = np.isfinite(rows["values"]).all(axis=1)
-        rows = self._sorted(rows[finite], name, drop_equal=True)
+        rows = self._even(rows[finite], name)
         if not finite.all():
             self.warnings.append(f"{name}: {int((~finite).sum())} samples that are not finite left out")
         gyro = np.ascontiguousarray(rows["values"][:, :3])
@@ -199,6 +208,18 @@ class AslRecording(Recording):
                 "order: swap the columns"
             )
         return _load(whole, path, dtype, columns)
+
+    def _even(self, rows: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+        """Put readings that were stamped on arrival on an even grid; others in order of their stamps."""
+        again = np.append(False, rows[1:] == rows[:-1])  # a row written twice is no reading
+        even = None if self._as_recorded else even_stamps(rows["t"][~again], rows["values"][~again, :3])
+        if even is None:
+            return self._sorted(rows, name, drop_equal=True)
+        self.warnings.append(even.describe(name))
+        self.stamp_sigma_s[name] = even.sigma_s
+        rows = rows[~again]
+        rows["t"] = even.t_ns
+        return rows
 
     def _sorted(self, rows: npt.NDArray[Any], name: str, *, drop_equal: bool) -> npt.NDArray[Any]:
         """Return the rows in order of their stamps."""

@@ -130,7 +130,6 @@ class BagRecording(LogRecording):
     """A ``.bag`` file of ROS 1, or a folder with ``metadata.yaml`` of ROS 2."""
 
     def _raw(self) -> Iterator[RawMessage]:
-        self.warnings.clear()
         with open_bag(self.path) as reader:
             for connection, log_time_ns, data in reader.messages():
                 payload = bytes(data) if reader.is2 else _to_cdr(data, connection.msgtype)

@@ -76,12 +76,14 @@ class Recording(ABC):
         rig: Name of the rig in the keys.
         streams: Its sensors.
         warnings: What is not as it should be, one line each.
+        stamp_sigma_s: Of each imu whose stamps were put on an even grid, how well that is known, s.
     """
 
     path: Path
     rig: str
     streams: tuple[Stream, ...]
     warnings: list[str]
+    stamp_sigma_s: dict[str, float]
 
     @property
     def imus(self) -> dict[str, Stream]:

@@ -25,6 +25,8 @@ from vical_daemon.bus.messages import (
     decode_points,
 )
 from vical_daemon.bus.topics import BY_KIND, PREDICTED, parse_key
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.mcap import LogError, LogReader
 from vical_daemon.logs.model import (
     ImuArrays,
@@ -72,17 +74,21 @@ class _Channel:
     values: bytearray = field(default_factory=bytearray)
     resolution: tuple[int, int] | None = None
     unreadable: int = 0
+    even_ns: IntArray | None = None  # of each of `stamps` the one to use instead
 
 
 class LogRecording(Recording):
     """Everything that is a log of ROS messages, given a way to walk through it."""
 
-    def __init__(self, path: Path, topics: Collection[str] | None = None) -> None:
+    def __init__(
+        self, path: Path, topics: Collection[str] | None = None, *, as_recorded: bool = False
+    ) -> None:
         """Scan the whole log once: which sensors, how many messages, which stamps.
 
         Args:
             path: File or folder.
             topics: Topics (or names of imus and cameras) to take; None: all that are of use.
+            as_recorded: Leave the stamps of imus alone.
 
         Raises:
             RecordingError: It cannot be read, or holds nothing of use.
@@ -90,10 +96,16 @@ class LogRecording(Recording):
         self.path = path
         self.rig = _RIG
         self.warnings = []
+        self.stamp_sigma_s = {}
+        self._scanned = False
         self._wanted = None if topics is None else set(topics)
         self._channels: dict[str, _Channel] = {}
         self._others: dict[str, str] = {}
         self._scan()
+        self._scanned = True
+        for channel in self._channels.values():
+            if channel.kind == "imu" and not as_recorded:
+                self._even(channel)
         self.streams = tuple(
             self._stream(topic, channel) for topic, channel in self._channels.items() if len(channel.stamps)
         )
@@ -155,8 +167,19 @@ class LogRecording(Recording):
             free, number = f"{name}_{number}", number + 1
         return free
 
+    def _even(self, channel: _Channel) -> None:
+        """Put readings that were stamped on arrival on an even grid."""
+        stamps, values = np.array(channel.stamps, dtype=np.int64), _values(channel)
+        if not np.isfinite(values).all():
+            return
+        even = even_stamps(stamps, values[:, :3])
+        if even is not None:
+            self.warnings.append(even.describe(channel.name))
+            self.stamp_sigma_s[channel.name] = even.sigma_s
+            channel.even_ns = even.t_ns
+
     def _stream(self, topic: str, channel: _Channel) -> Stream:
-        stamps = np.sort(np.array(channel.stamps, dtype=np.int64))
+        stamps = np.sort(_stamps(channel))
         statistics = stream_statistics(stamps)
         return Stream(channel.key, channel.kind, channel.name, topic, *statistics, channel.resolution)
 
@@ -172,21 +195,39 @@ class LogRecording(Recording):
         return in_stamp_order(self._stamped(keys))
 
     def _stamped(self, keys: set[str]) -> Iterator[Stamped]:
+        rows = dict.fromkeys(self._channels, 0)
         for raw in self._raw():
             channel = self._channels.get(raw.topic)
             stamp_ns = stamp_of(raw.payload)
-            if channel is not None and channel.key in keys and stamp_ns is not None:
-                yield Stamped(stamp_ns, raw.log_time_ns, channel.key, channel.kind == "imu", raw.payload)
+            if channel is None or channel.key not in keys or stamp_ns is None:
+                continue
+            payload = raw.payload
+            if channel.even_ns is not None:
+                if not _has_imu_size(payload):
+                    continue
+                stamp_ns = int(channel.even_ns[rows[raw.topic]])
+                rows[raw.topic] += 1
+                payload = b"".join([payload[:4], _STAMP.pack(*divmod(stamp_ns, 10**9)), payload[12:]])
+            yield Stamped(stamp_ns, raw.log_time_ns, channel.key, channel.kind == "imu", payload)
 
     def imu_arrays(self, name: str) -> ImuArrays:
         """See `Recording.imu_arrays`; messages that are no good are left out."""
         channel = next(c for c in self._channels.values() if c.kind == "imu" and c.name == name)
-        t_ns = np.array(channel.stamps, dtype=np.int64)
-        values = np.frombuffer(bytes(channel.values), dtype="<f8").reshape(-1, 6)
+        t_ns, values = _stamps(channel), _values(channel)
         good = np.isfinite(values).all(axis=1)
         order = np.argsort(t_ns[good], kind="stable")
         values = values[good][order]
         return ImuArrays(t_ns[good][order], values[:, :3].copy(), values[:, 3:].copy())
+
+
+def _stamps(channel: _Channel) -> IntArray:
+    return np.array(channel.stamps, dtype=np.int64) if channel.even_ns is None else channel.even_ns
+
+
+def _values(channel: _Channel) -> FloatArray:
+    """Rates and forces of an imu, in the order of the log; shape (n, 6)."""
+    values: FloatArray = np.frombuffer(bytes(channel.values), dtype="<f8").reshape(-1, 6)
+    return values
 
 
 def stamp_of(payload: bytes) -> int | None:
@@ -228,7 +269,6 @@ class McapRecording(LogRecording):
     """One MCAP file, or a folder of the segments of one recording."""
 
     def _raw(self) -> Iterator[RawMessage]:
-        self.warnings.clear()
         for path in self._files():
             try:
                 reader = LogReader(path)
@@ -240,7 +280,8 @@ class McapRecording(LogRecording):
                         )
             except LogError as error:
                 raise RecordingError(str(error)) from None
-            self.warnings.extend(reader.warnings)
+            if not self._scanned:
+                self.warnings.extend(reader.warnings)
 
     def _files(self) -> list[Path]:
         if self.path.is_dir():

@@ -1,0 +1,193 @@
+"""Stamps of an IMU that samples evenly, recovered from stamps that were taken on arrival.
+
+Many drivers stamp a reading when its bytes arrive: late by whatever the bus, the scheduler and the buffers
+added, or four readings at once. The device itself samples evenly, so the *number* of a reading says when it
+was taken, up to offset and rate. A delay is never negative: both follow the lower envelope of the stamps,
+as in `vical_drivers.envelope`, here with all of the recording at hand.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import FloatArray, IntArray
+
+_BLOCK_S = 1.0
+"""Of each block the earliest arrival counts, s: 100 to 1000 readings, among which some are hardly delayed."""
+_WINDOW_S = 15.0
+"""Half width of the local line through the earliest arrivals, s. A crystal's rate wanders by 2.4 ppm a minute
+(`vical_drivers.envelope`): within the window that bends a line by 4e-8 / 2 * 15**2 = 5 us."""
+_EVEN_S = 5e-5
+"""Stamps that deviate less from an even grid come from a device's clock and stay as they are, s; as in
+`estimation.inertial.stamp_steps`."""
+_LEAST_BLOCKS = 5
+"""Pieces without losses must hold so many blocks on average: fewer do not show whether the device is even."""
+_CERTAIN = 3.0
+"""Standard errors by which the motion must be smoother over the even stamps: one chance in 740."""
+
+
+class EvenStamps(NamedTuple):
+    """What `even_stamps` found.
+
+    Attributes:
+        t_ns: New stamps, ns, shape (n,), strictly increasing.
+        jitter_s: Standard deviation of what was taken off, s.
+        largest_s: Most that was taken off beyond the median, s.
+        sigma_s: How well the lower envelope is known, s: the scatter of the earliest arrivals about it. What
+            every reading is delayed by at least cannot be seen from the stamps.
+        pieces: Parts between losses, each with an envelope of its own.
+    """
+
+    t_ns: IntArray
+    jitter_s: float
+    largest_s: float
+    sigma_s: float
+    pieces: int
+
+    def describe(self, name: str) -> str:
+        """Return one line for the user about the imu of this name."""
+        return (
+            f"{name}: its stamps jitter by {self.jitter_s * 1e3:.3g} ms but it samples evenly: readings were "
+            f"put on an even grid along the earliest arrivals (moved by up to {self.largest_s * 1e3:.3g} ms)"
+        )
+
+
+def even_stamps(t_ns: IntArray, gyro_rps: FloatArray) -> EvenStamps | None:
+    """Put readings on the even grid of their device.
+
+    Args:
+        t_ns: Stamps in the order in which the readings were recorded, ns, shape (n,).
+        gyro_rps: Rates, rad/s, shape (n, 3): they tell on which time axis the motion is smoother.
+
+    Returns:
+        None where the stamps are fine as they are: even already, rounded to a decimal unit, or of readings
+        that were really taken unevenly.
+    """
+    if len(t_ns) < 3:
+        return None
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    sort = np.argsort(t_s, kind="stable")
+    period_s = _period_s(t_s[sort])
+    if not period_s > 0.0:
+        return None
+    block = max(round(_BLOCK_S / period_s), 2)
+    starts = _pieces(t_s, period_s, block)
+    if starts is None:
+        return None
+    even_s, scatter_s = np.empty_like(t_s), []
+    for begin, end in zip(starts, [*starts[1:], len(t_s)], strict=True):
+        even_s[begin:end], scatter = _on_grid(t_s[begin:end], period_s, block)
+        scatter_s.append(scatter)
+    taken_s = t_s - even_s
+    jitter_s = float(taken_s.std())
+    new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
+    if jitter_s < _EVEN_S or _rounded(t_ns, taken_s, period_s) or (np.diff(new_ns) <= 0).any():
+        return None
+    gain = _surprise(gyro_rps[sort], t_s[sort]) - _surprise(gyro_rps, even_s)
+    if not gain.mean() > _CERTAIN * gain.std() / np.sqrt(len(gain)):
+        return None
+    largest_s = float(taken_s.max() - np.median(taken_s))
+    return EvenStamps(new_ns, jitter_s, largest_s, float(np.median(scatter_s)), len(starts))
+
+
+def _period_s(t_s: FloatArray) -> float:
+    """Interval between readings, s: the median over blocks, most of which lost nothing."""
+    guess_s = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    span = min(max(round(_BLOCK_S / guess_s), 1), len(t_s) - 1) if guess_s > 0.0 else len(t_s) - 1
+    return float(np.median(t_s[span:] - t_s[:-span])) / span
+
+
+def _pieces(t_s: FloatArray, period_s: float, block: int) -> list[int] | None:
+    """First reading of each piece in which none is missing; None where the device cannot be even.
+
+    A loss moves all later arrivals up by whole periods against the count, a doubled reading down.
+    """
+    starts, checked = [0], 0
+    while checked < len(starts):
+        if len(starts) * _LEAST_BLOCKS * block > len(t_s):
+            return None
+        begin, end = starts[checked], [*starts, len(t_s)][checked + 1]
+        cut = _loss(t_s[begin:end], period_s, block) if end - begin >= 2 * block else None
+        if cut is None:
+            checked += 1
+        else:
+            starts.insert(checked + 1, begin + cut)
+    return starts
+
+
+def _loss(t_s: FloatArray, period_s: float, block: int) -> int | None:
+    """First reading behind the largest step of the earliest arrivals; None if all are below half a period.
+
+    No reading comes before its time: the last one that would be too early on the later grid precedes a loss,
+    the first one that would be too early on the earlier grid follows a doubled reading.
+    """
+    late_s = t_s - period_s * np.arange(len(t_s))
+    earliest = _earliest(late_s, block)
+    steps = np.diff(late_s[earliest])
+    at = int(np.abs(steps).argmax())
+    if abs(steps[at]) < 0.5 * period_s:
+        return None
+    low, high = int(earliest[at]), int(earliest[at + 1])
+    between = late_s[low : high + 1]
+    bound_s = max(between[0], between[-1]) - 0.25 * abs(steps[at])
+    too_early = np.flatnonzero(between < bound_s)
+    return low + int(too_early[-1] + 1 if steps[at] > 0.0 else too_early[0])
+
+
+def _earliest(late_s: FloatArray, block: int) -> IntArray:
+    """Index of the earliest arrival of each block; a rest at the end belongs to the last one."""
+    count = max(len(late_s) // block, 1)
+    bounds = [*range(0, count * block, block), len(late_s)]
+    return np.array([a + int(late_s[a:b].argmin()) for a, b in pairwise(bounds)])
+
+
+def _on_grid(t_s: FloatArray, period_s: float, block: int) -> tuple[FloatArray, float]:
+    """Even stamps of one piece, s, shape (n,), and the scatter of its earliest arrivals about them, s."""
+    grid_s = period_s * np.arange(len(t_s))
+    late_s = t_s - grid_s
+    earliest = _earliest(late_s, block)
+    x = np.asarray(grid_s[earliest], np.float64)
+    y = np.asarray(late_s[earliest], np.float64)
+    if len(x) < 2:
+        return grid_s + y[0], 0.0
+    line = np.array([_local_line(x, y, float(at)) for at in x])
+    fitted = np.interp(grid_s, x, line)
+    for end, inner in ((0, 1), (-1, -2)):  # beyond the first and the last one: straight on
+        outside = grid_s < x[0] if end == 0 else grid_s > x[-1]
+        slope = (line[inner] - line[end]) / (x[inner] - x[end])
+        fitted[outside] = line[end] + slope * (grid_s[outside] - x[end])
+    return grid_s + fitted, float(np.std(y - line))
+
+
+def _local_line(x: FloatArray, y: FloatArray, at: float) -> float:
+    """Value at one place of the line through the points around it (tricube weights: Cleveland 1979)."""
+    reach_s = max(_WINDOW_S, float(np.sort(np.abs(x - at))[min(3, len(x) - 1)]) * 1.01)
+    weight = np.clip(1.0 - np.abs((x - at) / reach_s) ** 3, 0.0, None) ** 3
+    centre = weight @ x / weight.sum()
+    spread = weight @ (x - centre) ** 2
+    slope = weight @ ((x - centre) * y) / spread if spread > 0.0 else 0.0
+    return float(weight @ y / weight.sum() + slope * (at - centre))
+
+
+def _rounded(t_ns: IntArray, taken_s: FloatArray, period_s: float) -> bool:
+    """Whether the deviations are those of stamps written in whole 10 us to 10 ms: rounding, not delays."""
+    spread_ns = float(np.ptp(taken_s)) * 1e9
+    return any(
+        spread_ns < 1.05 * unit <= 1.05e9 * period_s and not ((t_ns - t_ns[0]) % unit).any()
+        for unit in (10**4, 10**5, 10**6, 10**7)
+    )
+
+
+def _surprise(values: FloatArray, t_s: FloatArray) -> FloatArray:
+    """Squared error of a line from both neighbours to each inner reading, shape (n - 2,).
+
+    It is divided by what white noise alone would give, so a rig at rest prefers no time axis.
+    """
+    before_s, span_s = t_s[1:-1] - t_s[:-2], t_s[2:] - t_s[:-2]
+    share = np.divide(before_s, span_s, out=np.full(len(span_s), 0.5), where=span_s > 0.0)[:, None]
+    error = values[1:-1] - (1.0 - share) * values[:-2] - share * values[2:]
+    squares: FloatArray = ((error**2) / (1.0 + share**2 + (1.0 - share) ** 2)).sum(axis=1)
+    return squares
