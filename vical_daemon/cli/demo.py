@@ -29,7 +29,8 @@ RATE_HZ = 12.5
 FILTER_SAMPLES = 10
 MOST, AFTER_CONVERGENCE = 80.0, 10.0  # seconds of data
 ENOUGH_SHARE = 0.6  # of the images used in time; with fewer the machine is said to be busy
-BUSY_FACTOR = 4.0  # on a busy machine the demo takes at most so many times its seconds
+SETTLED = 1.0  # s of converged data: images that are still on their way must not undo it
+LONGEST = 4.0  # times its seconds: so long a demo goes on that has not converged by then
 BOARD = {"cols": 9, "rows": 6, "row_spacing_m": 0.045, "col_spacing_m": 0.045}
 _CONFIG = """\
 # What `vical demo` runs, and `vical run -c vical.yaml` as a service. On a robot only `port` and `uri` differ.
@@ -158,7 +159,7 @@ def _run_roles(
 def _busy(result: dict[str, Any]) -> str:
     """Name the usual cause of a late or failed end: a machine that cannot do it in real time; or ""."""
     expected = result["duration_s"] * RATE_HZ
-    if not _starved(result["frames"], result["duration_s"]):
+    if result["frames"] > ENOUGH_SHARE * expected:
         return ""
     return (
         f"only {result['frames']} of {expected:.0f} frames were used in time: this machine is busy; "
@@ -166,33 +167,25 @@ def _busy(result: dict[str, Any]) -> str:
     )
 
 
-def _starved(frames: int, duration_s: float) -> bool:
-    """Whether too few of the images were used in time to judge the demo by its seconds of data."""
-    return frames <= ENOUGH_SHARE * duration_s * RATE_HZ
-
-
 def _follow(watch: Watch, roles: RoleThreads, args: argparse.Namespace) -> None:
-    """Show progress until the data are as long as asked for, or converged for a while, or time is up.
+    """Show progress until there are as many seconds of data as asked for; then, if need be, until converged.
 
-    A machine that is too busy to use the images in time gets longer, until converged.
+    A machine that stands still now and then, or is busy, needs longer: its stamps are worse, its images late.
     """
     from vical_daemon.cli.demo_screen import Screen
 
     most_s = args.seconds or MOST
     begin_s, extended = time.monotonic(), False
     with Screen(CAMERA, quiet=args.quiet) as screen:
-        while time.monotonic() < begin_s + most_s * (BUSY_FACTOR if extended else 1.0) + 15.0:
+        while time.monotonic() < begin_s + most_s * (LONGEST if extended else 1.0) + 15.0:
             if args.seconds is None and watch.converged_for_s > AFTER_CONVERGENCE:
                 return
             if watch.duration_s >= most_s:
-                if watch.converged or not _starved(watch.frames, watch.duration_s):
+                if watch.converged_for_s > SETTLED:
                     return
                 if not extended:
                     extended = True
-                    _say(
-                        "this machine is too busy to use the images in time: going on until converged, "
-                        f"at most {BUSY_FACTOR * most_s:.0f} s"
-                    )
+                    _say(f"not converged yet: going on until it is, for {LONGEST * most_s:.0f} s at most")
             if roles.failed.wait(0.25):
                 return
             screen.show(watch)
