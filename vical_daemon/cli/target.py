@@ -204,5 +204,5 @@ def _report(args: argparse.Namespace, target: Target, size_mm: tuple[float, floa
     print(f"{args.out}: {describe(target).removeprefix('vical ')}, page {size_mm[0]:g} x {size_mm[1]:g} mm")
     print(f"{yaml_path}: target file for --target")
     print(
-        "Print at 100 %, glue it to something flat, and measure the ruler. Correct the target file if it is off."
+        "Print at 100 %, glue it to something flat, measure the ruler. Correct the target file if it is off."
     )
