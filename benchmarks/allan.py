@@ -39,9 +39,9 @@ def study(axes: dict[str, tuple[float, float]], units: tuple[str, str], factors:
           trials: int, hours: float, seed: int) -> list[list[float]]:  # fmt: skip
     """Analyse every axis and print one table; returns (estimate - truth) / sigma of density and walk."""
     print(
-        f"\n| axis | white noise, {units[0]}: truth | mean of {trials} | scatter | stated sigma | "
+        f"\n| axis | white noise, {units[0]}: truth | mean of {trials} | scatter | reported sigma | "
         f"bias instability, {units[1]}: floor | mean | scatter | rate random walk: truth | mean | scatter | "
-        "stated sigma |"
+        "reported sigma |"
     )
     print("|---|" + "---:|" * 11)
     scores = []
@@ -83,6 +83,6 @@ def main(argv: list[str]) -> int:
     )
     scores += study(ACCEL, ("m/s/sqrt(h)", "mg"), (60.0, 101.9716), args.trials, args.hours, args.seed + 1)
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
-    print(f"\nRMS of (estimate - truth) / stated sigma: white noise {spread[0]:.2f}, walk {spread[1]:.2f}")
+    print(f"\nRMS of (estimate - truth) / reported sigma: white noise {spread[0]:.2f}, walk {spread[1]:.2f}")
     print(f"CPU: {time.process_time() - begin_s:.0f} s")
     return 0

@@ -178,11 +178,11 @@ def calibrating(junk: int, seed: int = 11) -> tuple[list[tuple[str, str]], bool]
     estimate, record = seen.statuses["estimate"], seen.statuses["record"]
     grown = {role: f"{a:.0f} -> {b:.0f}" for role, a, b in zip(_ROLES, first, last, strict=True)}
     rows = [
-        ("junk and extreme messages, all keys", f"{junk} in {took_s:.0f} s"),
-        ("status at the end, undisturbed / beside junk", f"{calm.status} / {seen.last.status}"),
-        ("converged after (beside junk)", f"{seen.converged_s or float('nan'):.0f} s"),
+        ("malformed and extreme messages, all keys", f"{junk} in {took_s:.0f} s"),
+        ("status at the end, undisturbed / with them", f"{calm.status} / {seen.last.status}"),
+        ("converged after (with them)", f"{seen.converged_s or float('nan'):.0f} s"),
         ("largest difference of the answers", f"{away:.2f} sigma"),
-        ("images used, undisturbed / beside junk", f"{calm.frames} / {seen.last.frames}"),
+        ("images used, undisturbed / with them", f"{calm.frames} / {seen.last.frames}"),
         ("estimate: malformed, implausible, stamps refused, restarts", _values(
             estimate, "malformed", "implausible", "stamps_refused", "estimator_restarts")),
         ("detect: images, malformed, failures", _values(

@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
         "frozen subscriber (SIGSTOP)": lambda socket, _: [_freeze(_start(subscribe_slowly, socket, 0.0))],
         "slow subscriber (5 ms a message)": lambda socket, _: [_start(subscribe_slowly, socket, 0.005)],
         "subscriber killed with -9 every 2 s": _die_again_and_again,
-        f"junk: {args.junk} messages on our keys": lambda socket, _: [
+        f"{args.junk} malformed messages on our keys": lambda socket, _: [
             _start(publish_junk, socket, args.junk)
         ],
     }
@@ -74,7 +74,7 @@ def _scenarios(faults: dict[str, Callable[[Path, float], list[Any]]], seconds: f
     """One row for each fault; inertial samples lost beside all of them."""
     if not faults:
         return 0
-    print("| beside | imu sent | lost | junk refused | publish p50 / p99 / max ms | age p50 / p99 / max ms "
+    print("| fault | imu sent | lost | rejected | publish p50 / p99 / max ms | age p50 / p99 / max ms "
           "| images sent / got | RSS host MB |\n|---|---|---|---|---|---|---|---|")  # fmt: skip
     lost = 0
     for name, fault in faults.items():

@@ -77,7 +77,7 @@ def trial(
 
 
 def z_shown(limit: npt.NDArray[np.float64], last: Snapshot) -> list[float]:
-    """Errors over their stated sigmas along every direction that the bound says is known.
+    """Errors over their reported sigmas along every direction that the bound says is known.
 
     Args:
         limit: The bound's covariance of lever arm, mounting and time shift, shape (7, 7).

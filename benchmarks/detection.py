@@ -1,4 +1,4 @@
-"""Detectors on rendered pictures: corner errors, stated sigmas, share found, time; feature tracks."""
+"""Detectors on rendered pictures: corner errors, reported sigmas, share found, time; feature tracks."""
 
 from __future__ import annotations
 

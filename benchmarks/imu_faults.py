@@ -34,7 +34,7 @@ def main(argv: list[str]) -> int:
             link="uart", eeprom=Settings(baud=921_600, power_up_mode=2, preset_command=0xC2)
         ),
         "samples at 1 Hz, takes a command a second": lambda: _found(eeprom=Settings(decimation=1000)),
-        "MIP device, driver told single-byte": lambda: _refused("single-byte", device="mip"),
+        "MIP device, driver set to single-byte": lambda: _refused("single-byte", device="mip"),
         "nobody answers": lambda: _refused("auto", mute=True),
         "a second process on the port": _second_process,
         "permission denied (as another user)": _denied,

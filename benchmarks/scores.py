@@ -101,7 +101,7 @@ def coverage(results: Sequence[Result], dof: int, k: float = 3.0) -> tuple[float
 
 HEADER = (
     "| case | t s | trials | lever arm mm: RMSE (bound) ratio | mounting deg | time shift us | f px | c px "
-    "| worst ratio | largest stated sigma / bound | ANEES/dof [95 % band] | 3 sigma coverage |\n"
+    "| worst ratio | largest reported sigma / bound | ANEES/dof [95 % band] | 3 sigma coverage |\n"
     "|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 

@@ -105,7 +105,9 @@ def _believed(rig_seed: int, shift_s: float) -> CalibrationEstimate:
 
 def study_online(seconds: float = 150.0) -> None:
     """The watch beside a filter: what it costs, what it sees of a delay that drifts or that is wrong."""
-    print(f"\n### The watch beside a filter, {seconds:.0f} s, board at 20 Hz, a window of 10 s in every 30\n")
+    print(
+        f"\n### Monitor of a running filter, {seconds:.0f} s, board at 20 Hz, a window of 10 s in every 30\n"
+    )
     print("| imu Hz | drift ppm | filter off by ms | windows | drift found ppm | warns | % of a core |")
     print("|---|---|---|---|---|---|---|")
     for hz, ppm, wrong_ms in ((100.0, 0, 0.0), (100.0, 0, 1.0), (100.0, 50, 0.0), (1000.0, 0, 0.0)):

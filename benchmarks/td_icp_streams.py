@@ -42,7 +42,7 @@ def study_handheld(trials: int) -> None:
     """Table 3.2: corners of a board seen by a hand-held camera, lens and poses from the corners."""
     print(f"\n### {trials} hand-held recordings of a board (48 corners, 0.5 px, 20 Hz), lens refined\n")
     print(
-        "| length s | solved | RMSE us | stated sigma us | inside 2 sigma | R_imu_cam deg/axis |"
+        "| length s | solved | RMSE us | reported sigma us | inside 2 sigma | R_imu_cam deg/axis |"
         "\n|---|---|---|---|---|---|"
     )
     for seconds in (10.0, 20.0):
@@ -63,7 +63,7 @@ def study_joint(trials: int) -> None:
     """Table 3.3: an imu, two cameras and a pose estimator of one robot, all at once."""
     sensors = {"cam0": (15.0, 0.1, 0.012), "cam1": (20.0, 0.15, -0.035), "odometry": (30.0, 0.3, 0.25)}
     print(f"\n### {trials} recordings of 10 s with an imu and three other sensors, registered together\n")
-    print("| pair | RMSE us | stated sigma us | inside 2 sigma |\n|---|---|---|---|")
+    print("| pair | RMSE us | reported sigma us | inside 2 sigma |\n|---|---|---|---|")
     errors: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for seed in range(trials):
         rng, motion = np.random.default_rng([seed, 9]), hand_motion(seed, 55.0)
@@ -113,7 +113,7 @@ def study_real(folder: Path) -> None:
     options = TdIcpOptions(gyro_density=noise.gyro_density, gyro_walk=noise.gyro_walk)
     print("\n### Real: EuRoC imu_april, windows of 10 s (and the whole)\n")
     print(
-        "| from s | mean rate deg/s | delay us | stated sigma us | delay / sigma | status |"
+        "| from s | mean rate deg/s | delay us | reported sigma us | delay / sigma | status |"
         "\n|---|---|---|---|---|---|"
     )
     windows = [(float(s), 10.0) for s in range(0, 63, 4)] + [(0.0, 100.0)]

@@ -59,8 +59,8 @@ def study_tracks(trials: int, seconds: tuple[float, ...] = (15.0, 40.0)) -> None
     """Are the sigmas honest where errors of the tracks persist for 5 to 30 images?"""
     print(
         f"\n### {trials} sets of tracks (20 Hz, {_PERSISTENT_PX} px that last 5 to 30 images, {_WHITE_PX} px "
-        "white)\n\n| length s | solved | RMSE us | stated sigma us | R_imu_cam deg/axis | stated | ANEES | "
-        "inside 3 sigma | CPU s |\n|---|---|---|---|---|---|---|---|---|"
+        "white)\n\n| length s | solved | RMSE us | reported sigma us | R_imu_cam deg/axis | reported | "
+        "ANEES | inside 3 sigma | CPU s |\n|---|---|---|---|---|---|---|---|---|"
     )
     for length in seconds:
         cpu = time.process_time()

@@ -124,6 +124,6 @@ def row_of(name: str, rows: list[dict[str, float]]) -> str:
 
 
 HEADER = (
-    "| case | captured | RMSE us | bound us | ratio | stated sigma us | inside 2 sigma | "
+    "| case | captured | RMSE us | bound us | ratio | reported sigma us | inside 2 sigma | "
     "R_imu_cam deg/axis | rejected | CPU s |\n|---|---|---|---|---|---|---|---|---|---|"
 )

@@ -11,10 +11,11 @@ author = "the vical authors"
 copyright = "the vical authors, Apache-2.0"
 release = version = package_version("vical")
 
-extensions = ["myst_parser", "vical_reference"]
+extensions = ["myst_parser", "vical_reference", "mathml"]
+html_math_renderer = "mathml"
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build", "_ext"]
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
 
 html_theme = "furo"

@@ -177,7 +177,7 @@ def modules_text() -> str:
     parts = []
     for package, folder in PACKAGES.items():
         parts.append(f"## {package}")
-        rows = ["| module | says of itself | public names |", "|---|---|---|"]
+        rows = ["| module | content | public names |", "|---|---|---|"]
         for path in sorted(folder.rglob("*.py")):
             rows += _module_row(package, folder, path)
         parts.append("\n".join(rows))

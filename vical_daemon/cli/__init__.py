@@ -22,16 +22,16 @@ logging.raiseExceptions = False  # a log that cannot be written (full disk, clos
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
-_INTRO = "vical calibrates cameras against an IMU while the robot runs, and says how far to trust the result."
+_INTRO = "vical calibrates cameras against an IMU while the robot runs, with an uncertainty for every number."
 _TEACHING = """\
 Start here:
-  vical demo                                    no hardware needed; ends with truth beside the estimate
-  vical calibrate LOG --target target.yaml      the same filter over a recording of yours
-  vical devices && vical check -c vical.yaml    what is plugged in, and does the config fit
+  vical demo                                    compare the estimate with the truth, without hardware
+  vical calibrate LOG --target target.yaml      calibrate from your own recording
+  vical devices && vical check -c vical.yaml    find the devices, and check the config
   vical run -c vical.yaml                       acquire, stamp, record, calibrate, publish
 
-Every command takes --json (machine output alone on stdout) and --help.
-Exit code: 0 done, 1 a known failure (one line on stderr), 2 bad usage or config,
+Every command takes --json (only machine-readable output on stdout) and --help.
+Exit code: 0 done, 1 a known failure (one line on stderr), 2 wrong usage or config,
 3 done, but the calibration is not `converged`.
 """
 

@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from vical_daemon.cli.imu_options import add_input
 
     add_input(parser)
-    parser.add_argument("-o", "--output", metavar="F.yaml", help="write Kalibr's imu.yaml there")
-    parser.add_argument("--plots", metavar="DIR", help="write gyro.png and accel.png there")
+    parser.add_argument("-o", "--output", metavar="F.yaml", help="write Kalibr's imu.yaml to this file")
+    parser.add_argument("--plots", metavar="DIR", help="write gyro.png and accel.png to this folder")
     parser.add_argument(
         "--tau-min", type=float, metavar="S",
         help="shortest averaging time used, longer than the sensor's filter (default: 0.1 to 1)",
@@ -85,7 +85,7 @@ def _progress(args: argparse.Namespace, what: str) -> None:
 def _document(
     samples: EvenSamples, fits: dict[str, list[NoiseFit]], curves: dict[str, list[AllanCurve]]
 ) -> dict[str, Any]:
-    """Return the result with SI units in the keys' documentation: see docs/allan.md."""
+    """Return the result with SI units in the keys' documentation: see docs/math/allan.md."""
     from dataclasses import asdict
 
     from vical_daemon.estimation.tools.noise_densities import imu_noise

@@ -32,44 +32,60 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_json(child)
         return child
 
-    leaf("list", "cameras of every kind, and how to name them", _list)
-    stream = leaf("stream", "one line per frame with its stamp, then a summary", _stream)
+    leaf("list", "list cameras of every kind, with their names for the config", _list)
+    stream = leaf("stream", "print one line per frame with its stamp, then a summary", _stream)
     _add_device(stream)
     stream.add_argument("--frames", type=int, default=None, metavar="N", help="end after N frames")
     stream.add_argument("--seconds", type=float, default=None, metavar="S", help="end after S seconds")
-    stream.add_argument("--timeout", type=float, default=5.0, metavar="S", help="longest silence, s")
-    snapshot = leaf("snapshot", "one picture into a file", _snapshot)
+    stream.add_argument(
+        "--timeout", type=float, default=5.0, metavar="S", help="fail after S seconds without a frame"
+    )
+    snapshot = leaf("snapshot", "save one image to a file", _snapshot)
     _add_device(snapshot)
     snapshot.add_argument("-o", "--output", metavar="F.png", required=True, help=".png, .jpg or .jpeg")
     snapshot.add_argument(
-        "--skip", type=int, default=_WARM_UP_FRAMES, metavar="N", help="frames before it, for the automatics"
+        "--skip",
+        type=int,
+        default=_WARM_UP_FRAMES,
+        metavar="N",
+        help="discard N frames first, for the automatic exposure",
     )
-    _add_device(leaf("controls", "what can be set on a V4L2 camera, with ranges", _controls))
+    _add_device(leaf("controls", "list the controls of a V4L2 camera, with ranges", _controls))
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("device", metavar="DEVICE", help="/dev/video0, iidc:GUID, aravis:ID, folder:PATH")
     parser.add_argument("--size", metavar="WxH", default=None, help="pixels, e.g. 640x480")
-    parser.add_argument("--rate", type=float, default=None, metavar="HZ", help="frames a second")
+    parser.add_argument("--rate", type=float, default=None, metavar="HZ", help="frames per second")
     parser.add_argument("--format", default=None, metavar="NAME", help="pixel format, e.g. GREY, YUYV, MJPG")
     parser.add_argument("--encoding", choices=("mono8", "mono16", "bgr8"), default="mono8")
     parser.add_argument("--exposure", type=float, default=None, metavar="S", help="exposure time, s")
     parser.add_argument(
-        "--assume-exposure", type=float, default=None, metavar="S", help="of a camera that cannot tell it"
+        "--assume-exposure",
+        type=float,
+        default=None,
+        metavar="S",
+        help="exposure time of a camera that does not report it, s",
     )
     parser.add_argument("--gain", type=float, default=None, help="in the camera's own unit")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="another control; may be repeated"
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="set another control; may be repeated",
     )
-    parser.add_argument("--readout", type=float, default=0.0, metavar="S", help="first to last row, s")
-    parser.add_argument("--rolling", action="store_true", help="rows are exposed one after the other")
+    parser.add_argument(
+        "--readout", type=float, default=0.0, metavar="S", help="readout time from first to last row, s"
+    )
+    parser.add_argument("--rolling", action="store_true", help="the camera has a rolling shutter")
     parser.add_argument(
         "--stamp",
         choices=("auto", "raw", "soe", "eof", "first-packet", "shutter-closed"),
         default="auto",
-        help="what the driver's stamp marks, where its own word is not to be believed",
+        help="what the driver's stamp marks, if the driver's own claim is wrong",
     )
-    parser.add_argument("--buffers", type=int, default=None, metavar="N", help="kernel buffers")
+    parser.add_argument("--buffers", type=int, default=None, metavar="N", help="number of kernel buffers")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -34,7 +34,7 @@ class Finding:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     add_config(parser)
-    parser.add_argument("--no-devices", action="store_true", help="read the files only, open nothing")
+    parser.add_argument("--no-devices", action="store_true", help="check the files only, open no device")
     add_json(parser)
 
 

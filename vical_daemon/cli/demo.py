@@ -62,14 +62,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds",
         type=float,
         metavar="S",
-        help=f"of data (default: until converged, at most {MOST:g})",
+        help=f"seconds of data (default: until converged, at most {MOST:g})",
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="another motion, another noise")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of motion and noise")
     parser.add_argument(
-        "--out", metavar="DIR", help="config, target, recording and result (default: a new folder)"
+        "--out", metavar="DIR", help="folder for config, target, recording and result (default: a new folder)"
     )
     parser.add_argument(
-        "--web", type=int, metavar="PORT", help="serve the live page too (http://127.0.0.1:PORT/, 0: any)"
+        "--web",
+        type=int,
+        metavar="PORT",
+        help="also serve the live page (http://127.0.0.1:PORT/; 0: any free port)",
     )
     add_json(parser)
 

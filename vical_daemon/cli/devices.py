@@ -27,10 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="PORT",
-        help="look for an IMU on this port too (a pseudo terminal is not found by itself); may be repeated",
+        help="also look for an IMU on this port (pseudo terminals are not listed); may be repeated",
     )
     parser.add_argument(
-        "--no-probe", action="store_true", help="list serial ports without sending them a single byte"
+        "--no-probe", action="store_true", help="list serial ports without sending anything to them"
     )
     add_json(parser)
 

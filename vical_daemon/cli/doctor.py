@@ -25,7 +25,7 @@ _DEVICES = ("ttyUSB*", "ttyACM*", "video[0-9]*", "fw[0-9]*")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
-    parser.epilog = "settings and devices are looked at by: vical check -c FILE"
+    parser.epilog = "to check config and devices: vical check -c FILE"
     add_json(parser)
 
 

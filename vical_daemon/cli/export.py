@@ -20,11 +20,11 @@ _RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recordi
 _EPILOG = """\
   vical calibrate log.mcap --target target.yaml -o result.json
   vical export result.json --format kalibr -o camchain-imucam.yaml
-  vical export log.mcap --format openvins -o openvins/         a folder: every file of the format
-  vical export store --format urdf                             the last calibration that was stored
+  vical export log.mcap --format openvins -o openvins/         write every file of the format to a folder
+  vical export store --format urdf                             the last stored calibration
   vical export camchain-imucam.yaml --format basalt            Kalibr's result for other software
 
-Further files of a format (imu.yaml, one file per camera) are written beside the main one.
+Further files of a format (imu.yaml, one file per camera) are written next to the main one.
 """
 
 
@@ -35,18 +35,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--format", required=True, choices=FORMATS, metavar="F", help=", ".join(FORMATS))
     parser.add_argument(
-        "-o", "--output", metavar="F", help="file or folder; without: the main file on stdout"
+        "-o", "--output", metavar="F", help="file or folder (default: the main file on stdout)"
     )
     parser.add_argument("--camera", metavar="NAME", help="only this camera")
-    parser.add_argument("--resolution", metavar="WxH", help="image size, where the source does not say")
+    parser.add_argument("--resolution", metavar="WxH", help="image size, if the source has none")
     parser.add_argument("--imu-noise", metavar="F.yaml", help="Kalibr's imu.yaml with the noise densities")
     parser.add_argument("--imu-topic", metavar="T", default="/imu0", help="ROS topic of the IMU")
     parser.add_argument("--image-topic", metavar="T", help="ROS topic of the images (one camera)")
     parser.add_argument(
-        "--imu-frame", metavar="NAME", help="of the imu in ros and urdf (default: as on the bus, else imu)"
+        "--imu-frame",
+        metavar="NAME",
+        help="name of the IMU frame in ros and urdf (default: as on the bus, else imu)",
     )
     parser.add_argument(
-        "--force", action="store_true", help="write directions too that the motion did not determine"
+        "--force", action="store_true", help="also write directions that the motion did not determine"
     )
     parser.epilog = _EPILOG
     add_json(parser)

@@ -30,29 +30,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_json(child)
         return child
 
-    info = leaf("info", "who the device is, and its settings", _info)
+    info = leaf("info", "show model, serial number, firmware and settings", _info)
     _add_port(info)
-    stream = leaf("stream", "stamped samples, one JSON line each, then a summary", _stream)
+    stream = leaf("stream", "print stamped samples, one JSON line each, then a summary", _stream)
     _add_port(stream)
     _add_stream(stream)
-    decode = leaf("decode", "a raw byte capture as JSON lines, then a summary", _decode)
-    decode.add_argument("file", metavar="FILE", help="raw bytes as they came over the wire")
+    decode = leaf("decode", "decode a raw byte capture to JSON lines, then a summary", _decode)
+    decode.add_argument("file", metavar="FILE", help="raw bytes as received")
     _add_protocol(decode)
     decode.add_argument(
-        "--little-endian-floats", action="store_true", help="the GX3's sampling flag bit 4 was set"
+        "--little-endian-floats",
+        action="store_true",
+        help="floats are little-endian (bit 4 of the GX3's sampling settings)",
     )
-    bias = leaf("capture-gyro-bias", "let the device average its gyro at rest (volatile)", _capture_bias)
+    bias = leaf(
+        "capture-gyro-bias", "let the device measure its gyro bias at rest (lost at power-off)", _capture_bias
+    )
     _add_port(bias)
-    bias.add_argument("--seconds", type=float, default=10.0, metavar="S", help="1 .. 30, 10 is good")
+    bias.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long, 1 to 30 s (10)")
     bias.add_argument(
-        "--store-in-eeprom", action="store_true", help="keep it over power-off (the EEPROM wears out)"
+        "--store-in-eeprom", action="store_true", help="keep the bias after power-off (the EEPROM wears out)"
     )
-    poll = leaf("poll", "one record of any kind, in SI units", _poll)
+    poll = leaf("poll", "read one record of any kind, in SI units", _poll)
     _add_port(poll)
     poll.add_argument(
         "kind", metavar="KIND", help="data command (0xCC: everything) or MIP inertial field (0x04), as hex"
     )
-    _add_port(leaf("selftest", "the device's built-in test; exit 1 where a part fails", _selftest))
+    _add_port(leaf("selftest", "run the device's built-in test; exit 1 if a part fails", _selftest))
 
 
 def _add_protocol(parser: argparse.ArgumentParser) -> None:
@@ -60,10 +64,13 @@ def _add_protocol(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("port", metavar="PORT", help="serial port, best as /dev/serial/by-id/...")
+    parser.add_argument("port", metavar="PORT", help="serial port, preferably /dev/serial/by-id/...")
     _add_protocol(parser)
     parser.add_argument(
-        "--link", choices=_LINKS, default="auto", help="what lies in between; decides about wire time"
+        "--link",
+        choices=_LINKS,
+        default="auto",
+        help="kind of link; on a real UART the wire time is subtracted from stamps",
     )
 
 
@@ -75,14 +82,16 @@ def _add_stream(parser: argparse.ArgumentParser) -> None:
         "--filter-width",
         type=int,
         metavar="M",
-        help="moving average of a GX3, 1 .. 32 ms (default: as long as a sample lasts)",
+        help="moving average of a GX3, 1 to 32 ms (default: one sample interval)",
     )
-    parser.add_argument("--baud", type=int, default=None, help="for streaming; default: as the rate needs it")
+    parser.add_argument(
+        "--baud", type=int, default=None, help="baud while streaming (default: as the rate needs it)"
+    )
     parser.add_argument(
         "--plot",
         metavar="F.png",
         default=None,
-        help="picture of the intervals before and after clock mapping",
+        help="plot the intervals before and after clock mapping",
     )
 
 

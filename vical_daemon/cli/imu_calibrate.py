@@ -30,12 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_input(parser)
     parser.add_argument(
         "--gravity", type=float, default=9.80665, metavar="G",
-        help="local gravity, m/s^2 (default 9.80665); its error becomes accelerometer scale",
+        help="local gravity, m/s^2 (default 9.80665); an error becomes accelerometer scale",
     )  # fmt: skip
     parser.add_argument(
         "--min-rest", type=float, default=1.0, metavar="S", help="ignore shorter rests (default 1)"
     )
-    parser.add_argument("-o", "--output", metavar="F.yaml", help="write matrices and biases there")
+    parser.add_argument("-o", "--output", metavar="F.yaml", help="write matrices and biases to this file")
     parser.epilog = _EPILOG
     add_json(parser)
 

@@ -10,6 +10,6 @@ COLUMNS = "timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2] (the ASL/EuRo
 def add_input(parser: argparse.ArgumentParser) -> None:
     """Add INPUT, --imu, --skip and --seconds."""
     parser.add_argument("input", metavar="INPUT", help=f"MCAP, bag, ASL folder, or CSV with {COLUMNS}")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, where the recording has several")
-    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
-    parser.add_argument("--seconds", type=float, metavar="S", help="use S seconds at most")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
+    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="skip the first S seconds")
+    parser.add_argument("--seconds", type=float, metavar="S", help="use at most S seconds")

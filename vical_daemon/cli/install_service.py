@@ -52,12 +52,12 @@ class Step:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     parser.add_argument("--dry-run", action="store_true", help="show what would be done and written")
-    parser.add_argument("--remove", action="store_true", help="take everything away but config and data")
+    parser.add_argument("--remove", action="store_true", help="remove everything except config and data")
     parser.add_argument("--now", action="store_true", help="also enable and start vical.target")
     parser.add_argument(
-        "--root", metavar="DIR", default="/", help="install below DIR, run no command (images)"
+        "--root", metavar="DIR", default="/", help="install below DIR and run no command (for system images)"
     )
-    parser.add_argument("--program", metavar="PATH", help="the `vical` to run (default: this one)")
+    parser.add_argument("--program", metavar="PATH", help="the `vical` program to run (default: this one)")
     add_json(parser)
 
 

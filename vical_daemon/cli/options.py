@@ -24,7 +24,9 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     """Add `--json` to a leaf command; harmless when it is there already."""
     if "--json" not in parser._option_string_actions:
         parser.add_argument(
-            "--json", action="store_true", help="machine-readable output alone on stdout, the rest on stderr"
+            "--json",
+            action="store_true",
+            help="print only machine-readable output on stdout, the rest on stderr",
         )
 
 
@@ -44,7 +46,7 @@ def add_config(parser: argparse.ArgumentParser, *, required: bool = True) -> Non
         "--config",
         metavar="FILE",
         required=required,
-        help="the rig's YAML (see examples/vical.yaml)",
+        help="config of the rig (see examples/vical.yaml)",
     )
 
 

@@ -14,7 +14,7 @@ from vical_daemon.cli.options import add_json
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     parser.add_argument("log", metavar="LOG", help="an .mcap or .mcap.part file, or a folder with parts")
-    parser.add_argument("-o", "--output", metavar="OUT", help="name of the result (not for a folder)")
+    parser.add_argument("-o", "--output", metavar="OUT", help="name of the repaired file (not for a folder)")
     add_json(parser)
 
 

@@ -24,16 +24,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     parser.add_argument("log", metavar="LOG", help="a recording of any kind")
     parser.add_argument(
-        "--speed", type=float, default=1.0, metavar="X", help="times real time; 0: as fast as it goes"
+        "--speed",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="speed relative to real time; 0: as fast as possible",
     )
     parser.add_argument("--rig", help="publish under this rig's keys (default: as recorded)")
-    parser.add_argument("--streams", nargs="+", metavar="NAME", help="only these topics, imus or cameras")
-    parser.add_argument("--all", action="store_true", help="images as well where a camera has points")
     parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="a router, e.g. tcp/127.0.0.1:7447 (default: ours)"
+        "--streams", nargs="+", metavar="NAME", help="play only these topics, IMUs or cameras"
+    )
+    parser.add_argument("--all", action="store_true", help="also play images of cameras that have points")
+    parser.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        help="router to connect to, e.g. tcp/127.0.0.1:7447 (default: the local bus)",
     )
     parser.add_argument(
-        "--wait", type=float, default=2.0, metavar="S", help="time for others to come, where we host the bus"
+        "--wait",
+        type=float,
+        default=2.0,
+        metavar="S",
+        help="wait S seconds for subscribers, if this command hosts the bus",
     )
     add_config(parser, required=False)
     add_json(parser)

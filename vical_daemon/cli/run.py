@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ROLE",
         nargs="*",
         help="acquire, record, calibrate, web (processes) or imu, camera, record, detect, estimate, web "
-        "(roles); none: all processes that the config asks for, as children",
+        "(roles); default: all processes that the config asks for, as children",
     )
     parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # of the children of `run`
     roles.completer = _known_roles  # type: ignore[attr-defined]  # for argcomplete

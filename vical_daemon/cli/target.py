@@ -36,7 +36,7 @@ EPILOG = """examples:
   vical target --type aprilgrid --paper a0 --tag-size 88mm -o board.pdf
   vical target --type checkerboard --cols 8 --rows 7 --square 30mm -o board.svg
   vical target --from board.yaml -o board.pdf                     print an existing target file
-Print at 100 %, measure the ruler, and put what you measured into the YAML."""
+Print at 100 %, measure the printed ruler, and correct the target file if it is off."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,11 +45,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--type", choices=("aprilgrid", "checkerboard"), help="kind of board")
-    what.add_argument("--from", dest="source", type=Path, metavar="FILE", help="an existing target YAML")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="F.pdf or F.svg")
-    parser.add_argument("--yaml", type=Path, metavar="FILE", help="target YAML (default: beside the board)")
+    what.add_argument(
+        "--from", dest="source", type=Path, metavar="FILE", help="draw the board of an existing target file"
+    )
     parser.add_argument(
-        "--force", action="store_true", help="overwrite a target YAML that says something else"
+        "-o", "--out", type=Path, required=True, metavar="FILE", help="file to print, .pdf or .svg"
+    )
+    parser.add_argument(
+        "--yaml", type=Path, metavar="FILE", help="target file to write (default: next to the board)"
+    )
+    parser.add_argument(
+        "--force", action="store_true", help="overwrite an existing target file with other contents"
     )
     parser.add_argument("--paper", default="a4", help="a5 ... a0, letter, legal, tabloid or WxH in mm (a4)")
     grid = parser.add_argument_group("aprilgrid")
@@ -197,4 +203,6 @@ def _report(args: argparse.Namespace, target: Target, size_mm: tuple[float, floa
         return
     print(f"{args.out}: {describe(target).removeprefix('vical ')}, page {size_mm[0]:g} x {size_mm[1]:g} mm")
     print(f"{yaml_path}: target file for --target")
-    print("Print at 100 %, glue it to something flat, measure the ruler; correct the YAML if it is off.")
+    print(
+        "Print at 100 %, glue it to something flat, measure the ruler. Correct the target file if it is off."
+    )

@@ -25,12 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "in a script: vical watch --until-converged --timeout 120 && echo done"
     add_config(parser, required=False)
     parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="a router, e.g. tcp/127.0.0.1:7447 (default: ours)"
+        "--connect",
+        metavar="ENDPOINT",
+        help="router to connect to, e.g. tcp/127.0.0.1:7447 (default: the local bus)",
     )
-    parser.add_argument("--rig", default="*", help="only this rig (default: all that are heard)")
+    parser.add_argument("--rig", default="*", help="only this rig (default: all rigs on the bus)")
     parser.add_argument("--once", action="store_true", help="print the last known state and end")
     parser.add_argument("--until-converged", action="store_true", help="end when every camera has converged")
-    parser.add_argument("--timeout", type=float, metavar="S", help="give up after so many seconds (exit 1)")
+    parser.add_argument("--timeout", type=float, metavar="S", help="give up after S seconds (exit 1)")
     add_json(parser)
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _RETRY_S = 0.5
 _EPILOG = """\
   vical web -c vical.yaml                 page at http://127.0.0.1:8080/
-  vical web --port 0 --foxglove 8765      no settings needed: asks the bus what there is; Foxglove as well
+  vical web --port 0 --foxglove 8765      needs no config: lists the cameras on the bus; serves Foxglove, too
 
 On a robot set `web: {enabled: true}` instead; then `vical run` serves the page.
 """
@@ -31,10 +31,12 @@ On a robot set `web: {enabled: true}` instead; then `vical run` serves the page.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add where to listen and which bus to ask."""
     add_config(parser, required=False)
-    parser.add_argument("--connect", metavar="ENDPOINT", help="a router, e.g. tcp/127.0.0.1:7447")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="router to connect to, e.g. tcp/127.0.0.1:7447")
     parser.add_argument("--host", help="address to listen on (default: as in the config, 127.0.0.1)")
     parser.add_argument("--port", type=int, help="port (default: as in the config, 8080; 0: any free one)")
-    parser.add_argument("--foxglove", type=int, metavar="PORT", help="WebSocket for Foxglove as well")
+    parser.add_argument(
+        "--foxglove", type=int, metavar="PORT", help="also serve a WebSocket for Foxglove on this port"
+    )
     parser.epilog = _EPILOG
     add_json(parser)
 

@@ -44,7 +44,7 @@ Matrix4 = tuple[
 
 @dataclass(frozen=True, slots=True)
 class NoiseConfig:
-    """Continuous-time noise densities; an IMU's data sheet or `vical allan` has them."""
+    """Continuous-time noise densities, from the IMU's data sheet or `vical allan`."""
 
     gyro_density: Annotated[float, Bound(above=0, high=1.0)] = ImuNoise().gyro_density
     gyro_walk: Annotated[float, Bound(above=0, high=1.0)] = ImuNoise().gyro_walk
@@ -57,15 +57,15 @@ class ImuConfig:
     """One IMU.
 
     Attributes:
-        port: Serial port, best a stable name below /dev/serial/by-id or /dev/vical; or log:FILE (a
-            recording, played as if its IMU were there; log:FILE#NAME of several) or emulated.
+        port: Serial port, preferably a stable name below /dev/serial/by-id or /dev/vical; or log:FILE (plays
+            the IMU of a recording; log:FILE#NAME if it has several), or emulated.
         driver: gx3: MicroStrain 3DM-GX3-25 (and MIP devices).
-        protocol: auto asks the device which one it speaks.
-        rate_hz: Samples a second; the GX3 divides 1000 Hz.
-        filter_samples: Width M of the moving average in the device, ms; its delay is taken off the stamps.
-            None: as long as a sample lasts; longer ones flatten fast motion.
-        baud: Bits a second on the line while streaming; None: as found, or more where the rate needs it.
-        link: What lies in between; on a real UART (ftdi, uart) the bytes' own time is taken off the stamps.
+        protocol: auto detects it.
+        rate_hz: Samples per second; a GX3 divides 1000 Hz.
+        filter_samples: Width M of the moving average in the device, ms; its delay is subtracted from the
+            stamps. None: one sample interval; longer averages flatten fast motion.
+        baud: Bits per second while streaming; None: as found, or more if the rate needs it.
+        link: Kind of link; on a real UART (ftdi, uart) the wire time is subtracted from the stamps.
         noise: Densities for the estimator.
     """
 
@@ -81,7 +81,7 @@ class ImuConfig:
 
 @dataclass(frozen=True, slots=True)
 class LensConfig:
-    """What is known about a lens, in Kalibr's words (`kalibr_io` reads Kalibr's own files)."""
+    """Prior knowledge of a lens and its mounting, with Kalibr's keys."""
 
     distortion_model: Literal["radtan", "plumb_bob", "equidistant"] = "radtan"
     intrinsics: tuple[Focal, Focal, float, float] | None = None
@@ -97,16 +97,16 @@ class CameraConfig:
 
     Attributes:
         uri: v4l2:/dev/video0, iidc:GUID, aravis:NAME, folder:PATH; `vical devices` prints it. Or log:FILE
-            or emulated, as an IMU's `port`.
+            or emulated, as for an IMU's `port`.
         size: width, height, px.
-        rate_hz: Frames a second.
-        exposure_s: Exposure time; None: as the camera has it.
-        assume_exposure_s: Of a camera that cannot tell its exposure time; only dates frames.
-        gain: In the camera's own unit; None: as the camera has it.
-        pixel_format: What travels from the camera, e.g. GREY or MJPG; None: the cheapest.
+        rate_hz: Frames per second.
+        exposure_s: Exposure time; None: leave the camera's setting.
+        assume_exposure_s: Exposure time of a camera that does not report it; used for stamps only.
+        gain: In the camera's own unit; None: leave the camera's setting.
+        pixel_format: Format on the camera's link, e.g. GREY or MJPG; None: the cheapest.
         stamp: What the driver's stamp marks; auto: what the driver says.
-        controls: More controls by the camera's own names.
-        record_as: What a log holds: raw images, or compressed ones (png is lossless, jpeg is small).
+        controls: Further controls, by the camera's own names.
+        record_as: Images in logs: raw or compressed (png is lossless, jpeg is small).
         lens: Prior of intrinsics and mounting.
     """
 
@@ -125,7 +125,7 @@ class CameraConfig:
 
 @dataclass(frozen=True, slots=True)
 class ConvergenceConfig:
-    """When a calibration counts as converged: every sigma below these."""
+    """A calibration is converged when every sigma is below these."""
 
     position_sigma_m: Annotated[float, Bound(above=0, high=1.0)] = 0.005
     rotation_sigma_deg: Annotated[float, Bound(above=0, high=10.0)] = 0.1
@@ -134,18 +134,18 @@ class ConvergenceConfig:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationConfig:
-    """What the estimator does.
+    """Options of the estimator.
 
     Attributes:
-        mode: target: corners of the board; target_free: tracked features.
+        mode: target: corners of a board; target_free: tracked features.
         imu: The IMU to calibrate against; None: the only one.
         cameras: Those to calibrate; empty: all.
-        fix: Held at their priors.
-        estimate: Optional blocks switched on.
-        corner_sigma_px: First guess; measured afterwards.
+        fix: Blocks held at their priors.
+        estimate: Optional blocks that are always estimated.
+        corner_sigma_px: Initial value; measured afterwards.
         gravity_mps2: Magnitude of gravity at the site.
-        lag_s: How long the estimator waits so that late samples are still sorted by stamp.
-        detect_rate_hz: At most so many images a second are searched for the board.
+        lag_s: How long the estimator waits for late samples before it sorts by stamp.
+        detect_rate_hz: Largest number of images per second in which the board is searched.
         convergence: Targets.
     """
 
@@ -163,12 +163,12 @@ class CalibrationConfig:
 
 @dataclass(frozen=True, slots=True)
 class BusConfig:
-    """How processes find each other; nothing listens on a network, loopback included, unless told so here.
+    """How processes connect; nothing listens on a network, loopback included, unless configured here.
 
     Attributes:
         socket: Unix socket of the router, for its user and group; None: `zenoh.sock` in the runtime folder.
-        readers: Who may read: group: members of the router's group, over the socket, who may write as well;
-            loopback: everybody on this computer, who may not.
+        readers: Who may read. group: members of the router's group, over the socket; they may also write.
+            loopback: everybody on this computer, read only.
         tcp_port: Loopback port of the router, for reading; 0: none, or 7447 with `readers: loopback`.
         listen: Further zenoh endpoints of the router (`tls/0.0.0.0:7447`), for reading.
         connect: Endpoints of a site's router that this rig joins.
@@ -178,9 +178,9 @@ class BusConfig:
         password_file: usrpwd dictionary (user:password lines) of those who may connect.
         user: User name for `connect`.
         password: Its password.
-        commanders: Users of `password_file`, or names in client certificates, who may put commands from
-            wherever they come.
-        publishers: The same, who may publish on every key.
+        commanders: Users of `password_file`, or names in client certificates, who may send commands over
+            any endpoint.
+        publishers: Likewise, who may publish on every key.
     """
 
     socket: str | None = None
@@ -205,7 +205,7 @@ class BusConfig:
 
 @dataclass(frozen=True, slots=True)
 class Ros2Config:
-    """Publish also under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md; on where this section stands.
+    """Publish also under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md; on if this section exists.
 
     Attributes:
         namespace: Before every topic, so that robots on one router do not collide; None: the rig's name;
@@ -222,13 +222,13 @@ class RecordConfig:
     """The recorder.
 
     Attributes:
-        enabled: Record from the start; over the bus it can be started and stopped at any time.
-        directory: Where files go; None: `log` in the state directory.
+        enabled: Record from the start; commands on the bus start and stop it at any time.
+        directory: Folder of the files; None: `log` in the state directory.
         images: Record images (points and IMU are always recorded).
-        rotate_s: A new file after so many seconds.
-        rotate_bytes: A new file after so many bytes.
-        quota_bytes: The oldest finished files are deleted beyond this.
-        reserve_bytes: Recording stops before the disk has less than this left.
+        rotate_s: Begin a new file after this time, s.
+        rotate_bytes: Begin a new file after this size.
+        quota_bytes: Beyond this total, the oldest finished files are deleted.
+        reserve_bytes: Recording stops before the disk has less free space than this.
     """
 
     enabled: bool = True
@@ -248,9 +248,9 @@ class WebConfig:
         enabled: Serve it.
         host: Address to listen on; 127.0.0.1: this machine only.
         port: Of the page; 0: any free one.
-        hosts: Names under which browsers ask for the page, beyond localhost, this computer's host name and
-            its address (a proxy's name, a name in your DNS); others are refused.
-        picture_rate_hz: Pictures a second on the page, at most; each costs about 2 ms of a processor.
+        hosts: Further names of the page (a proxy's name, a name in your DNS) beyond localhost, this
+            computer's host name and its address; other names are refused.
+        picture_rate_hz: Largest number of pictures per second on the page; each costs about 2 ms of CPU.
         foxglove_port: WebSocket for Foxglove (its usual port is 8765); 0: none.
     """
 
@@ -274,12 +274,12 @@ class Config:
     """A whole rig.
 
     Attributes:
-        rig: Its name in every bus key.
+        rig: Name of the rig in every bus key.
         imus: By name.
         cameras: By name.
         target: Target file (Kalibr's format); relative to the settings file.
-        ros2: ROS 2's names on the bus as well; None: not.
-        path: Where this was read from; empty when made in memory.
+        ros2: Publish under ROS 2's names, too; None: off.
+        path: File this was read from; None: made in memory.
 
     Relative paths in `target`, ``log:FILE`` and ``folder:PATH`` are taken from the folder of this file.
     """

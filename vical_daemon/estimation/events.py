@@ -257,19 +257,19 @@ REFERENCE: dict[EventKind, About] = {
         "Once, at a probability above 99 %.",
     ),
     EventKind.TARGET_SIZE: About(
-        "The target is larger (+) or smaller (-) than stated; its size is estimated. Value: relative.",
+        "The target is larger (+) or smaller (-) than its file says; its size is estimated. Value: relative.",
         "1",
         "Once: during initialisation if it is far off, else at a probability above 99 %.",
     ),
     EventKind.TARGET_SHAPE: About(
-        "The target is not flat or not as stated; its shape is estimated. Value: the most certain mode, "
-        "at the edges.",
+        "The target is bent, or its print is distorted; its shape is estimated. Value: the most certain "
+        "mode, at the edges.",
         "m",
         "Once, at a probability above 99 %.",
     ),
     EventKind.TARGET_OR_LENS: About(
-        "With the lens fixed: target file or lens is wrong. Value: largest distance of a corner from its "
-        "stated place.",
+        "With the lens fixed: target file or lens is wrong. Value: largest distance of a corner from "
+        "where the target file puts it.",
         "m",
         "Once, at 5 sigma.",
     ),

@@ -1,7 +1,7 @@
 """What one window of images hands on to the next: tilt, speed, biases, calibration, and how well known.
 
 In coordinates that do not know where the world's origin and heading are, so that no information about them
-can arise from nothing. [docs/math/target_free.md, eq. (9)]
+can arise from nothing. [docs/math/target_free.md, "From window to window"]
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The result in the form that other software reads, and Kalibr's files back again.
 
 One `Rig` (plain data) in between: readers make it, writers turn it into text. Each writer states in its
-docstring which way its transform and its time shift point; `docs/export.md` has them side by side.
+docstring which way its transform and its time shift point; `docs/how-to/export.md` has them side by side.
 """
 
 from __future__ import annotations
