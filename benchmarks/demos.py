@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 
     longer = sum(r["duration_s"] > args.seconds + 1.5 for r in good)
     print(
-        "| demos | converged | of these went on | first answer s | converged after s | error / sigma |   (medians)"
+        "| demos | converged | went on | first answer s | converged after s | error / sigma |  (medians)"
     )
     print("|---|---|---|---|---|---|")
     print(
