@@ -31,6 +31,7 @@ class EventKind(StrEnum):
     IMU_CLOCK_REMAPPED = "imu_clock_remapped"
     IMU_GAP = "imu_gap"
     IMU_REPEATED = "imu_repeated"
+    IMU_CLIPPED = "imu_clipped"
     IMAGE_GAP = "image_gap"
     IMAGE_REPEATED = "image_repeated"
     IMU_NOISE = "imu_noise"
@@ -231,6 +232,11 @@ REFERENCE: dict[EventKind, About] = {
     ),
     EventKind.IMU_REPEATED: About(
         "The IMU repeated one reading bit by bit. Value: for how long.", "s", "When new readings come."
+    ),
+    EventKind.IMU_CLIPPED: About(
+        "Motion exceeds the range of the IMU; readings at the range are left out. Value: their share.",
+        "1",
+        "Once, 5 s after the first of them.",
     ),
     EventKind.IMAGE_GAP: About(
         "Images were missing. Value: for how long.",

@@ -355,6 +355,13 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         "",
         lambda e: f"{_of(e, 1.0, 's', '.1f')} in which the IMU repeated one reading",
     ),
+    EventKind.IMU_CLIPPED: (
+        "",
+        lambda e: (
+            f"{_of(e, 100.0, '%', '.1f')} of the readings are at the range of the IMU and left out: "
+            "move the rig more gently"
+        ),
+    ),
     EventKind.IMAGE_GAP: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} without images"),
     EventKind.IMAGE_REPEATED: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} in which one image was repeated"),
     EventKind.IMU_NOISE: ("", _imu_noise),

@@ -53,6 +53,7 @@ class ImuBuffer:
         self._rows = np.empty((4096, 7))
         self._start = 0
         self._stop = 0
+        self._breaks: list[tuple[float, float]] = []
 
     def __len__(self) -> int:
         return self._stop - self._start
@@ -72,10 +73,19 @@ class ImuBuffer:
         """Time of the oldest reading held, s; +inf when empty."""
         return float(self._rows[self._start, 0]) if len(self) else np.inf
 
-    def append(self, t_s: float, gyro: FloatArray, accel: FloatArray) -> bool:
-        """Add a reading; False (and nothing done) when it is not newer than the last, or not finite."""
+    def append(self, t_s: float, gyro: FloatArray, accel: FloatArray, *, broken: bool = False) -> bool:
+        """Add a reading; False (and nothing done) when it is not newer than the last, or not finite.
+
+        Args:
+            t_s: Its time, s.
+            gyro: rad/s, shape (3,).
+            accel: m/s^2, shape (3,).
+            broken: What happened since the reading before cannot be interpolated, however short it was.
+        """
         if t_s <= self.newest_s:
             return False
+        if broken and len(self):
+            self._breaks.append((self.newest_s, t_s))
         if self._stop == len(self._rows):
             self._make_room()
         row = self._rows[self._stop]
@@ -106,6 +116,8 @@ class ImuBuffer:
 
     def gap_within(self, from_s: float, to_s: float) -> bool:
         """Whether readings are missing somewhere between two instants, ends included."""
+        if any(begin < to_s and end > from_s for begin, end in self._breaks):
+            return True
         t = self.rows[:, 0]
         low = max(int(np.searchsorted(t, from_s, side="right")) - 1, 0)
         span = t[low : int(np.searchsorted(t, to_s, side="left")) + 1]
@@ -115,11 +127,14 @@ class ImuBuffer:
     def cut(self, before_s: float) -> None:
         """Forget every reading before `before_s`."""
         self._start += int(np.searchsorted(self.rows[:, 0], before_s))
+        self._breaks = [b for b in self._breaks if b[1] > before_s]
 
     def trim(self, before_s: float) -> None:
         """Forget readings older than `before_s`, but for the last one before it."""
         index = int(np.searchsorted(self.rows[:, 0], before_s)) - 1
         self._start += max(index, 0)
+        if self._breaks:
+            self._breaks = [b for b in self._breaks if b[1] > before_s]
 
     def segment(self, from_s: float, to_s: float) -> ImuSegment | None:
         """Return the readings between two instants with interpolated ends; None where not covered."""

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
 from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
 from vical_daemon.estimation.inertial.stamp_steps import StampSteps
 from vical_daemon.estimation.measurements import FloatArray
@@ -15,6 +16,7 @@ from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _LEARN = 20  # readings by which the usual interval is known
 _MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
+_CLIPPED_S = 5.0  # after the first clipped reading, their share is announced
 _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
@@ -41,6 +43,7 @@ class ImuIntake:
         base_ns: First stamp, ns.
         refused: Readings left out: out of order, no possible values, or with a wrong stamp.
         repeated: Readings left out because they repeat the one before, bit by bit.
+        clipped: Readings left out because a channel is at its range.
         gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
     """
 
@@ -49,6 +52,7 @@ class ImuIntake:
         self.base_ns = 0
         self.refused = 0
         self.repeated = 0
+        self.clipped = 0
         self.gap_end_s = -np.inf
         self._steps = StampSteps()
         self._set_back_s = 0.0  # by how much the clock has been set back in all
@@ -56,7 +60,17 @@ class ImuIntake:
         self._held: tuple[float, Reading] | None = None
         self._last = np.full(6, np.nan)
         self._repeats = 0  # of the newest reading
+        self._limits = RangeLimits()
+        self._spikes: SpikeFilter[Reading] = SpikeFilter()
+        self._taken = 0
+        self._clips = 0  # readings left out since the newest
+        self._clipping: tuple[float, int, int] | None = None  # since when, and counts then
         self._news: list[Event] = []
+
+    @property
+    def spikes(self) -> int:
+        """Readings left out because neither their neighbours nor the other sensor support them."""
+        return self._spikes.spikes
 
     @property
     def shift_s(self) -> float:
@@ -89,18 +103,39 @@ class ImuIntake:
         if self.buffer is None:
             self.base_ns = t_imu_ns
             self.buffer = ImuBuffer(t_imu_ns)
-        t_s = (t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
-        added = self._in_order(self.buffer, t_s, reading)
-        if added:
-            self._repeats = 0
+        added = []
+        for good in self._spikes.sift(six, reading):
+            added += self._unless_clipped(self.buffer, good)
         return added
+
+    def _unless_clipped(self, buffer: ImuBuffer, reading: Reading) -> list[Reading]:
+        """Add a reading whose channels are all within their range; what others read is not known."""
+        t_s = (reading.t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
+        self._taken += 1
+        if self._limits.clipped(np.concatenate([reading.gyro_rps, reading.specific_force_mps2])).any():
+            self.clipped += 1
+            self._clips += 1
+            self._clipping = self._clipping or (t_s, self._taken, self.clipped)
+            return []
+        self._announce_clipping(t_s)
+        added = self._in_order(buffer, t_s, reading)
+        if added:
+            self._repeats = self._clips = 0
+        return added
+
+    def _announce_clipping(self, t_s: float) -> None:
+        if self._clipping is not None and self._clipping[0] < t_s - _CLIPPED_S:
+            _, taken, clipped = self._clipping
+            share = (self.clipped - clipped + 1) / (self._taken - taken + 1)
+            self._news.append(Event(EventKind.IMU_CLIPPED, value=share))
+            self._clipping = np.inf, 0, 0  # once
 
     def _in_order(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> list[Reading]:
         """Add a reading, hold it, or add it after the one held."""
         interval_s = t_s - self._newest_s
         if self._bridged(buffer, interval_s):
             self._held = None
-            self._add(buffer, t_s, reading)
+            self._add(buffer, t_s, reading, broken=self._clips > 0)
             return [reading]
         if self._held is not None:
             held_s, held = self._held
@@ -130,15 +165,17 @@ class ImuIntake:
             held_s, t_s = held_s + back_s, t_s + back_s
         else:
             kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
-            self._news.append(Event(kind, value=held_s - self._newest_s))
+            if not self._clips:
+                self._news.append(Event(kind, value=held_s - self._newest_s))
         self._add(buffer, held_s, held)
         self.gap_end_s = buffer.newest_s
         self._add(buffer, t_s, reading)
         return [held, reading]
 
-    def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> None:
+    def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading, *, broken: bool = False) -> None:
         self._newest_s = t_s
-        buffer.append(self._steps.even(t_s), reading.gyro_rps, reading.specific_force_mps2)
+        even_s = self._steps.even(t_s)
+        buffer.append(even_s, reading.gyro_rps, reading.specific_force_mps2, broken=broken)
 
     def news(self) -> list[Event]:
         """What happened to the stream since the last call."""

@@ -1,0 +1,116 @@
+"""Readings clipped at a sensor's range, and spikes, are left out; everything else is taken as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
+from vical_daemon.estimation.inertial.imu_intake import ImuIntake
+
+RATE_HZ = 200.0
+GRAVITY = (0.0, 0.0, 0.0, 9.81, 0.0, 0.0)
+
+
+def motion(seconds: float = 30.0, noise: float = 2e-3, step: float = 0.0) -> np.ndarray:
+    """Rates, rad/s, and forces, m/s^2, of a rig that is waved about; shape (n, 6)."""
+    t_s = np.arange(0.0, seconds, 1.0 / RATE_HZ)
+    phase = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+    rates_hz = np.array([0.7, 0.9, 1.1, 0.8, 1.0, 1.2])
+    six = np.sin(2.0 * np.pi * rates_hz * t_s[:, None] + phase) * [2.0, 1.8, 1.6, 3.0, 2.0, 2.5]
+    six[:, 3] += 9.81
+    six += np.random.default_rng(1).normal(0.0, noise, six.shape) * [1.0, 1.0, 1.0, 10.0, 10.0, 10.0]
+    return np.round(six / step) * step if step else six
+
+
+def left_out(six: np.ndarray) -> np.ndarray:
+    limits = RangeLimits()
+    return np.array([limits.clipped(row).any() for row in six])
+
+
+@pytest.mark.parametrize("step", [0.0, 3.5e-4])
+@pytest.mark.parametrize(("sensor", "at"), [(slice(0, 3), 1.0), (slice(3, 6), 10.5)])
+def test_clipped_readings_are_found_from_the_first_run_on(step, sensor, at) -> None:
+    six = motion(step=step)
+    beyond = (np.abs(six[:, sensor]) >= at).any(axis=1)
+    six[:, sensor] = np.clip(six[:, sensor], -at, at)
+    found = left_out(six)
+    assert not found[~beyond].any()
+    first = np.flatnonzero(beyond)[0]
+    assert found[first + 40 :].sum() > 0.95 * beyond[first + 40 :].sum()
+
+
+@pytest.mark.parametrize("step", [0.0, 3.5e-4, 2e-3])
+def test_readings_within_the_range_are_not(step) -> None:
+    assert left_out(motion(step=step)).mean() < 1e-3
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3, 1e-2, 0.1])
+def test_a_coarse_sensor_at_rest_is_not_at_its_range(step) -> None:
+    six = np.random.default_rng(2).normal(GRAVITY, 5e-3, (6000, 6))
+    assert not left_out(np.round(six / step) * step if step else six).any()
+
+
+def test_a_larger_value_shows_that_the_range_is_wider() -> None:
+    six = motion()
+    six[: len(six) // 2, :3] = np.clip(six[: len(six) // 2, :3], -1.0, 1.0)
+    found = left_out(six)
+    assert found[: len(six) // 2].mean() > 0.2
+    assert found[len(six) // 2 + 200 :].mean() < 0.01
+
+
+def sifted(six: np.ndarray) -> list[int]:
+    spikes: SpikeFilter[int] = SpikeFilter()
+    return [k for i, row in enumerate(six) for k in spikes.sift(row, i)]
+
+
+def test_single_spikes_are_left_out_and_nothing_else() -> None:
+    six = motion()
+    rng = np.random.default_rng(3)
+    at = np.sort(rng.choice(np.arange(100, len(six), 50), 40, replace=False))
+    six[at, rng.integers(0, 3, 40)] += rng.choice([-1.0, 1.0], 40) * rng.uniform(3.0, 30.0, 40)
+    assert sifted(six) == np.setdiff1d(np.arange(len(six)), at).tolist()
+
+
+def test_a_motion_that_begins_at_once_and_a_shock_are_taken() -> None:
+    rest = np.random.default_rng(4).normal(GRAVITY, 2e-3, (1000, 6))
+    onset = rest.copy()
+    onset[500:, 0] += 2.0
+    assert sifted(onset) == list(range(1000))
+    shock = rest.copy()
+    shock[500] += [1.0, 0.5, 0.0, 30.0, 10.0, 0.0]  # gyro and accelerometer
+    assert sifted(shock) == list(range(1000))
+
+
+def take(six: np.ndarray) -> tuple[ImuIntake, list[EventKind]]:
+    intake, kinds = ImuIntake(), []
+    for i, row in enumerate(six):
+        intake.take(round(i * 1e9 / RATE_HZ), row[:3], row[3:])
+        kinds += [event.kind for event in intake.news()]
+    return intake, kinds
+
+
+def test_clipping_is_announced_once_with_its_share_and_is_never_interpolated() -> None:
+    six = motion()
+    beyond = (np.abs(six[:, :3]) >= 1.5).any(axis=1)
+    six[:, :3] = np.clip(six[:, :3], -1.5, 1.5)
+    intake, events = ImuIntake(), []
+    for i, row in enumerate(six):
+        intake.take(round(i * 1e9 / RATE_HZ), row[:3], row[3:])
+        events += intake.news()
+    assert [event.kind for event in events] == [EventKind.IMU_CLIPPED]
+    assert events[0].value == pytest.approx(beyond[1000:].mean(), abs=0.1)
+    assert intake.clipped == pytest.approx(beyond.sum(), rel=0.1)
+    where = np.flatnonzero(beyond[2000:])[0] + 2000
+    assert intake.buffer is not None
+    assert intake.buffer.gap_within(where / RATE_HZ - 0.02, where / RATE_HZ + 0.02)
+
+
+def test_spikes_leave_no_event_and_no_gap() -> None:
+    six = motion()
+    six[700, 1] -= 12.0
+    intake, kinds = take(six)
+    assert kinds == [] and intake.spikes == 1
+    assert intake.buffer is not None and len(intake.buffer) == len(six) - 1
+    assert not intake.buffer.gap_within(3.4, 3.6)
