@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 from aiohttp.http_exceptions import HttpProcessingError
+from aiohttp.web import RequestPayloadError
 
 from vical_daemon.bus.log_limit import LogLimit
 
@@ -133,6 +134,9 @@ class _Guarded(asyncio.Protocol):
             self._inner.resume_writing()
 
 
+_FOREIGN = (HttpProcessingError, RequestPayloadError, ConnectionError, TimeoutError, UnicodeError)
+
+
 class Malformed(logging.Filter):
     """Turns what aiohttp logs about a malformed request into one line, seldom; counts all of them.
 
@@ -149,7 +153,7 @@ class Malformed(logging.Filter):
         error = record.exc_info[1] if record.exc_info else None
         if error is None:
             return True
-        foreign = isinstance(error, HttpProcessingError | ConnectionError | TimeoutError | UnicodeError)
+        foreign = isinstance(error, _FOREIGN)
         self.count += foreign
         more = self._limits[foreign].admit()
         if more is None:

@@ -248,7 +248,7 @@ class TestKeeper:
         monkeypatch.setattr(estimate_role, "STUCK_S", 0.2)
         monkeypatch.setattr(estimate, "STUCK_S", 2.0)
         service.made[0].hangs = True
-        service.until(lambda: service.status().level is Level.STALE)
+        service.until(lambda: (status := service.status()) and status.level is Level.STALE)
         assert "none used or refused" in service.live.problem(0.0)
         service.until(lambda: len(service.made) > 1 and service.made[1].frames > 10)
         service.until(lambda: service.live.problem(0.0) == "")

@@ -5,6 +5,7 @@ import logging
 
 import pytest
 from aiohttp.http_exceptions import BadStatusLine
+from aiohttp.web import RequestPayloadError
 
 from vical_daemon.bus.log_limit import LogLimit
 from vical_daemon.web.connections import IDLE_S, REPORT_S, UNSENT_S, Gate, Malformed, http_logger
@@ -146,7 +147,7 @@ def test_malformed_requests_are_one_line_and_bugs_keep_their_traceback(caplog):
 
     with caplog.at_level(logging.INFO):
         for k in range(50):
-            fail(BadStatusLine(f"junk\n{k}"))
+            fail(BadStatusLine(f"junk\n{k}") if k % 2 else RequestPayloadError("no gzip"))
         assert malformed.count == 50
         assert len(caplog.records) == 1
         now_s[0] += REPORT_S
