@@ -125,7 +125,11 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
     status, why = result["status"], result["reason"] or result["guidance"]
     if status in _UNUSABLE or not result["cameras"]:
         from vical_daemon.cli.calibration_run import suspects
+        from vical_daemon.cli.input_diagnosis import diagnose_input
 
+        mistake = diagnose_input(job)
+        if mistake:
+            raise CliError(f"no calibration: {mistake}")
         raise CliError(f"no calibration: {status}: {why or 'too little data'} ({suspects(job)})")
     if status == "converged":
         return 0
