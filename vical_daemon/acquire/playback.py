@@ -32,11 +32,11 @@ PAUSE_S = 2.0
 _IMU_KINDS = ("imu",)
 _IMAGE_KINDS = ("image", "compressed")
 _MOST_SAMPLES = 1000  # that one read returns: after a process was held up, the rest comes with the next one
-_tapes: dict[Path, _Tape] = {}
-_tapes_lock = threading.Lock()
+_playbacks: dict[Path, _Playback] = {}
+_playbacks_lock = threading.Lock()
 
 
-class _Tape:
+class _Playback:
     """One recording in this process; it starts when the first of its devices is read."""
 
     def __init__(self, recording: Recording) -> None:
@@ -79,8 +79,8 @@ class _LogDevice(Closing):
 
     def __init__(self, uri: str, kinds: tuple[str, ...], what: str) -> None:
         path, _, name = uri.removeprefix(LOG_SCHEME).partition("#")
-        self._tape = _tape(Path(path))
-        self._stream = _choose(self._tape.recording, kinds, what, name)
+        self._playback = _playback_of(Path(path))
+        self._stream = _choose(self._playback.recording, kinds, what, name)
         self.info = DeviceInfo(
             kind=what,
             model="recording",
@@ -97,7 +97,7 @@ class _LogDevice(Closing):
     def _due(self, end_ns: int) -> tuple[int, bytes] | None:
         """Wait for the next message until `end_ns` (CLOCK_MONOTONIC); returns its stamp and the message."""
         if self._items is None:
-            self._items = self._tape.items(self._stream)
+            self._items = self._playback.items(self._stream)
         if self._next is None:
             try:
                 self._next = next(self._items)
@@ -191,16 +191,16 @@ class LogCamera(_LogDevice):
         return image.pixels(), image.encoding
 
 
-def _tape(path: Path) -> _Tape:
+def _playback_of(path: Path) -> _Playback:
     """Open a recording, once in this process."""
     key = path.absolute()
-    with _tapes_lock:
-        if key not in _tapes:
+    with _playbacks_lock:
+        if key not in _playbacks:
             try:
-                _tapes[key] = _Tape(open_recording(key, check=False))
+                _playbacks[key] = _Playback(open_recording(key, check=False))
             except RecordingError as error:
                 raise DeviceNotFoundError(str(error)) from None
-        return _tapes[key]
+        return _playbacks[key]
 
 
 def _choose(recording: Recording, kinds: tuple[str, ...], what: str, name: str) -> Stream:

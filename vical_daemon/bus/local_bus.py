@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vical_daemon.bus.bus_places import (
+from vical_daemon.bus.socket_paths import (
     Reach,
     local_sockets,
     loopback_answers,

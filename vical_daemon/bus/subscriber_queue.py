@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from vical_daemon.bus.interface import Bus, Sample
 
 
-class Inbox:
+class SubscriberQueue:
     """One bounded queue over several subscriptions, in the order of arrival.
 
     The bus' own thread only appends; nothing is decoded there.

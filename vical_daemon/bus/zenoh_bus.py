@@ -106,7 +106,7 @@ def open_bus(
         return ZenohBus(open_session(config), is_router=True)
 
 
-class _Outlet:
+class _KeyPublisher:
     """The publisher of one key, its numbering, and its last value where that is kept."""
 
     def __init__(self, session: Any, key: str, publisher_id: int) -> None:
@@ -130,8 +130,9 @@ class _Outlet:
         self._queryable = session.declare_queryable(key, self._answer) if self._keep else None
 
     def put(self, payload: bytes) -> None:
+        """Number and send one message."""
         if self._keep:
-            with self._lock:  # the last one is that with the highest number
+            with self._lock:  # so that the kept value is the one with the highest number
                 number = _NUMBER.pack(_MARK, self._publisher_id, next(self._numbers))
                 self._last = (payload, number)
         else:
@@ -226,7 +227,7 @@ class ZenohBus:
         self._is_router = is_router
         self._publisher_id = secrets.randbits(32)
         self._lock = threading.Lock()
-        self._outlets: dict[str, _Outlet] = {}
+        self._publishers: dict[str, _KeyPublisher] = {}
         self._subscriptions: list[ZenohSubscription] = []
         self._closed = False
 
@@ -242,16 +243,16 @@ class ZenohBus:
 
     def publish(self, key: str, payload: bytes) -> None:
         """See `Bus.publish`; without a router the sample is lost, and the number tells so."""
-        outlet = self._outlets.get(key)
-        if outlet is None:
+        publisher = self._publishers.get(key)
+        if publisher is None:
             with self._lock:
                 if self._closed:
                     return
-                outlet = self._outlets.get(key)
-                if outlet is None:
-                    outlet = self._outlets[key] = _Outlet(self._session, key, self._publisher_id)
+                publisher = self._publishers.get(key)
+                if publisher is None:
+                    publisher = self._publishers[key] = _KeyPublisher(self._session, key, self._publisher_id)
         try:
-            outlet.put(payload)
+            publisher.put(payload)
         except zenoh.ZError:  # closing, or no link at this moment
             return
 
@@ -294,10 +295,10 @@ class ZenohBus:
             if self._closed:
                 return
             self._closed = True
-            subscriptions, outlets = list(self._subscriptions), list(self._outlets.values())
+            subscriptions, publishers = list(self._subscriptions), list(self._publishers.values())
         for subscription in subscriptions:
             subscription.close()
         with suppress(zenoh.ZError):
-            for outlet in outlets:
-                outlet.close()
+            for publisher in publishers:
+                publisher.close()
             self._session.close()

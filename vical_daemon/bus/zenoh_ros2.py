@@ -19,7 +19,7 @@ from vical_daemon.bus.ros2_names import Ros2Topic
 from vical_daemon.bus.zenoh_bus import ZenohBus, ZenohSubscription
 
 
-class Ros2Outlet:
+class Ros2Publisher:
     """Publishes bus messages to ROS 2; thread-safe.
 
     Args:
@@ -33,8 +33,8 @@ class Ros2Outlet:
         self._session, self._node, self._domain, self._namespace = session, node, domain, namespace
         self._session_id = str(session.info.zid())
         self._lock = threading.Lock()
-        self._publishers: dict[str, _Publisher | None] = {}
-        self._by_topic: dict[str, _Publisher] = {}
+        self._publishers: dict[str, _TopicPublisher | None] = {}
+        self._by_topic: dict[str, _TopicPublisher] = {}
         token = ros2_names.node_token(self._session_id, 0, node, domain, namespace)
         self._node_token = session.liveliness().declare_token(token)
 
@@ -47,7 +47,7 @@ class Ros2Outlet:
             if publisher is not None:
                 publisher.put(payload)
 
-    def _publisher(self, key: str) -> _Publisher | None:
+    def _publisher(self, key: str) -> _TopicPublisher | None:
         topic = ros2_names.ros2_topic(key, self._namespace)
         if topic is None:
             return None
@@ -56,7 +56,7 @@ class Ros2Outlet:
             token = ros2_names.publisher_token(
                 self._session_id, 0, number, self._node, topic, self._domain, self._namespace
             )
-            self._by_topic[topic.name] = _Publisher(self._session, topic, self._domain, token)
+            self._by_topic[topic.name] = _TopicPublisher(self._session, topic, self._domain, token)
         return self._by_topic[topic.name]
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class Ros2Outlet:
                 self._node_token = None
 
 
-class _Publisher:
+class _TopicPublisher:
     """One ROS topic: publisher, token, sequence number."""
 
     def __init__(self, session: Any, topic: Ros2Topic, domain: int, token: str) -> None:
@@ -119,7 +119,7 @@ class Ros2Bus:
 
     def __init__(self, bus: ZenohBus, node: str, domain: int, namespace: str = "") -> None:
         self._bus = bus
-        self._outlet = Ros2Outlet(bus.session, node, domain, namespace)
+        self._ros2 = Ros2Publisher(bus.session, node, domain, namespace)
 
     @property
     def session(self) -> Any:
@@ -135,7 +135,7 @@ class Ros2Bus:
         """See `Bus.publish`."""
         self._bus.publish(key, payload)
         with suppress(zenoh.ZError):  # closing, or no link at this moment
-            self._outlet.publish(key, payload)
+            self._ros2.publish(key, payload)
 
     def subscribe(
         self,
@@ -155,5 +155,5 @@ class Ros2Bus:
     def close(self) -> None:
         """Leave; may be called twice."""
         with suppress(zenoh.ZError):  # closed before
-            self._outlet.close()
+            self._ros2.close()
         self._bus.close()

@@ -18,7 +18,7 @@ from typing import Any
 
 import zenoh
 
-from vical_daemon.bus.bus_places import Reach, reach, why_closed
+from vical_daemon.bus.socket_paths import Reach, reach, why_closed
 
 _log = logging.getLogger(__name__)
 _SOURCE_PLACE = re.compile(r"[.,]?\s+at /\S+\.rs:\d+\.?")

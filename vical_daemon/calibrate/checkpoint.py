@@ -26,7 +26,7 @@ from vical_drivers.user_files import read_file
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.config.model import Config
 from vical_daemon.config.strict_yaml import MAX_BYTES
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.atomic_file import atomic_write
 from vical_daemon.service.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class Checkpoint:
         try:
             head = _Head(self._identity, dict(devices), self._clock.now_ns())
             body = pickle.dumps(estimator, protocol=5)
-            write_whole(self._path, msgspec.json.encode(head) + b"\n" + body)
+            atomic_write(self._path, msgspec.json.encode(head) + b"\n" + body)
         except Exception as error:
             _log.warning("the estimator's state cannot be kept: %s", " ".join(str(error).split()))
             self._next_s = float("inf")

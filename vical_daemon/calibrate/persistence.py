@@ -47,7 +47,7 @@ _JOURNAL_NAMES = {
 }
 
 
-class Memory:
+class CalibrationPersistence:
     """The store as one running estimator uses it.
 
     Args:

@@ -12,13 +12,13 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class StampOrder(Generic[T]):
+class ReorderBuffer(Generic[T]):
     """A bounded heap of stamped items.
 
     Args:
         lag_s: An item is released when one with a stamp so much later has arrived.
         max_items: When more wait, the earliest are released before their time (a stream with a far
-            future stamp must not fill memory).
+            future stamp must not fill persistence).
 
     Stamps are believed here: `stamp_gate` sees to it that they go on from those before.
     """

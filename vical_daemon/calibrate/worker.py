@@ -29,7 +29,7 @@ from vical_daemon.calibrate.publications import (
     companion_messages,
     delay_statuses,
 )
-from vical_daemon.calibrate.reorder_buffer import StampOrder
+from vical_daemon.calibrate.reorder_buffer import ReorderBuffer
 from vical_daemon.calibrate.stamp_gate import StampGate
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.measurements import PointsFrame
@@ -75,7 +75,7 @@ class EstimateRole:
         self._predictions = Predictions(config.rig)
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
         self._status_key = topics.STATUS.key(config.rig, "imu")
-        self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
+        self._order: ReorderBuffer[ImuMessage | PointsFrame] = ReorderBuffer(config.calibration.lag_s)
         self._gates: dict[str, StampGate[ImuMessage | PointsFrame]] = {}
         self._span_ns: tuple[int, int] | None = None  # of all stamps that passed
         self._next_s = self._next_companion_s = -float("inf")

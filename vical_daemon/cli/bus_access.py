@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vical_daemon.bus.bus_places import own_socket
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.local_bus import open_local_bus
+from vical_daemon.bus.socket_paths import own_socket
 from vical_daemon.bus.zenoh_bus import BusError, ZenohBus, open_bus
 from vical_daemon.bus.zenoh_commands import CommandJournal
 from vical_daemon.config.model import BusConfig, Config, load

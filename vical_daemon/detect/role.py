@@ -22,14 +22,13 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.bus.outgoing import Message, publish
 from vical_daemon.config.model import Config
-from vical_daemon.config.paths import make_private, runtime_directory
 from vical_daemon.config.priors import camera_prior
 from vical_daemon.detect.detectors import Detect, make_detector
 from vical_daemon.detect.flow_aid import GyroAid
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.service import notify
 from vical_daemon.service.health import StatusSender
-from vical_daemon.service.wall_clock import WallClock, shared_clock
+from vical_daemon.service.wall_clock import WallClock, service_clock
 
 QUEUE_DEPTH = 2
 _NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
@@ -192,9 +191,9 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
         config: The rig.
         bus: Where images come from and points go.
         stop: Ends the role.
-        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
     """
-    clock = clock or shared_clock(make_private(runtime_directory()))
+    clock = clock or service_clock()
     workers = [_Worker(config, name, bus, stop) for name in config.calibration_cameras]
     for worker in workers:
         worker.thread.start()

@@ -21,7 +21,7 @@ from vical_drivers.user_files import read_file
 from vical_daemon.bus.messages.poses import rotation_matrix
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.atomic_file import atomic_write
 
 _log = logging.getLogger(__name__)
 _FORMAT = 1
@@ -113,7 +113,7 @@ class CalibrationStore:
             raise StoreError(f"calibration of {camera} is not stored: {problem}")
         path = self.path(imu_serial, camera_serial)
         try:
-            write_whole(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
+            atomic_write(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
         except OSError as error:
             raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
         return path

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import msgspec
 
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.config.paths import make_private, runtime_directory
+from vical_daemon.service.atomic_file import atomic_write
 
 FILE_NAME = "wall_clock.json"
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -69,6 +70,11 @@ def private_clock() -> WallClock:
     return WallClock(measure_offset_ns(), boot_id())
 
 
+def service_clock() -> WallClock:
+    """Return the clock that all processes of the service share."""
+    return shared_clock(make_private(runtime_directory()))
+
+
 def shared_clock(folder: Path) -> WallClock:
     """Return the clock of the service: the first process to come makes the file, the others read it.
 
@@ -85,7 +91,7 @@ def shared_clock(folder: Path) -> WallClock:
         clock = _read(path)  # another role may have been faster
         if clock is None or clock.boot_id != boot_id():
             clock = private_clock()
-            write_whole(path, msgspec.json.encode(clock))
+            atomic_write(path, msgspec.json.encode(clock))
     return clock
 
 

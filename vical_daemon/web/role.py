@@ -17,9 +17,9 @@ from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus, Subscription
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_string
 from vical_daemon.config.model import Config
-from vical_daemon.config.paths import make_private, runtime_directory, state_directory
+from vical_daemon.config.paths import state_directory
 from vical_daemon.service.health import StatusSender
-from vical_daemon.service.wall_clock import WallClock, shared_clock
+from vical_daemon.service.wall_clock import WallClock, service_clock
 from vical_daemon.web.images import CameraView
 from vical_daemon.web.server import PageServer
 from vical_daemon.web.state import WebState
@@ -81,13 +81,13 @@ def run(
         config: The rig; host and port in `config.web` (port 0: any free one).
         bus: Where data come from and commands go.
         stop: Ends the role.
-        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
         ready: Called with the address once it is served.
 
     Raises:
         WebError: The address cannot be used.
     """
-    clock = clock or shared_clock(make_private(runtime_directory()))
+    clock = clock or service_clock()
     state = WebState(config.rig)
     feeds = _Feeds(config, bus, state)
     try:

@@ -58,7 +58,7 @@ class PageServer:
         watch: Called with (camera, True) when the first viewer of a camera comes, (camera, False) when
             the last one goes: without viewers no image is fetched.
         command: Called with (role, word) for a command; None: read-only.
-        token: What a client must show to command; "": nobody may.
+        token: Token that a client must send with a command; "": no client may command.
         picture_rate_hz: Pictures a second, at most.
         hosts: Names under which the page may be asked for, beyond this computer's own.
     """
@@ -87,8 +87,8 @@ class PageServer:
         self._malformed = Malformed()
         self._refusals = LogLimit(5, 60.0)
         self._refused = 0
-        self._shows = {
-            (name, kind): _Show(make)
+        self._broadcasts = {
+            (name, kind): _Broadcast(make)
             for name in views
             for kind, make in (("events", picture_event), ("mjpg", drawn_jpeg))
         }
@@ -157,14 +157,14 @@ class PageServer:
             await asyncio.gather(*pictures, return_exceptions=True)
 
     async def _make_pictures(self, name: str) -> None:
-        """Make each picture once for all who look, and none while nobody does."""
-        shows = [show for (camera, _), show in self._shows.items() if camera == name]
+        """Make each picture once for all viewers, and none while there are no viewers."""
+        broadcasts = [broadcast for (camera, _), broadcast in self._broadcasts.items() if camera == name]
         while True:
-            wanted = [show for show in shows if show.viewers]
+            wanted = [broadcast for broadcast in broadcasts if broadcast.viewers]
             sight = self.views[name].next() if wanted else None
             if sight is not None:
-                for show in wanted:
-                    await show.make(sight)
+                for broadcast in wanted:
+                    await broadcast.make(sight)
             await asyncio.sleep(self._picture_s)
 
     async def _static(self, request: web.Request) -> web.StreamResponse:
@@ -249,39 +249,39 @@ class PageServer:
 
     async def _mjpeg(self, request: web.Request) -> web.StreamResponse:
         kind = "multipart/x-mixed-replace; boundary=frame"
-        return await self._show(request, "mjpg", kind, _part)
+        return await self._send_pictures(request, "mjpg", kind, _part)
 
     async def _picture_events(self, request: web.Request) -> web.StreamResponse:
-        return await self._show(request, "events", "text/event-stream", lambda event: event)
+        return await self._send_pictures(request, "events", "text/event-stream", lambda event: event)
 
-    async def _show(
+    async def _send_pictures(
         self, request: web.Request, kind: str, content_type: str, wrap: Callable[[bytes], bytes]
     ) -> web.StreamResponse:
         name = request.match_info["name"]
-        show = self._shows.get((name, kind))
-        if show is None:
+        broadcast = self._broadcasts.get((name, kind))
+        if broadcast is None:
             raise web.HTTPNotFound
-        if sum(other.viewers for other in self._shows.values()) >= VIEWERS_LIMIT:
+        if sum(other.viewers for other in self._broadcasts.values()) >= VIEWERS_LIMIT:
             raise web.HTTPServiceUnavailable(text="too many viewers")
         response = web.StreamResponse(headers={"Content-Type": content_type, **_HEADERS})
         await response.prepare(request)
-        self._look(name, show, 1)
+        self._count_viewer(name, broadcast, 1)
         try:
             seen = 0
             while True:
-                seen, picture = await show.after(seen)
+                seen, picture = await broadcast.after(seen)
                 await asyncio.wait_for(response.write(wrap(picture)), SLOW_S)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
             pass  # the viewer left, or is too slow: it asks again
         finally:
-            self._look(name, show, -1)
+            self._count_viewer(name, broadcast, -1)
         return response
 
-    def _look(self, name: str, show: _Show, change: int) -> None:
+    def _count_viewer(self, name: str, broadcast: _Broadcast, change: int) -> None:
         """Count a viewer in or out; the first one of a camera makes us fetch its images."""
-        before = any(s.viewers for (camera, _), s in self._shows.items() if camera == name)
-        show.viewers += change
-        after = any(s.viewers for (camera, _), s in self._shows.items() if camera == name)
+        before = any(s.viewers for (camera, _), s in self._broadcasts.items() if camera == name)
+        broadcast.viewers += change
+        after = any(s.viewers for (camera, _), s in self._broadcasts.items() if camera == name)
         if before != after:
             self._watch(name, after)
 
@@ -305,8 +305,8 @@ class PageServer:
         return web.json_response({"sent": document["command"]})
 
 
-class _Show:
-    """The newest picture of one camera in one form, for any number of viewers."""
+class _Broadcast:
+    """Sends the newest picture of one camera, in one encoding, to any number of viewers."""
 
     def __init__(self, encode: Callable[[Sight], bytes | None]) -> None:
         self.viewers = 0

@@ -12,9 +12,9 @@ from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceRep
 from vical_drivers.samples import DeviceInfo, SourceStats
 
 from vical_daemon.acquire.device_loop import DeviceLoop
-from vical_daemon.acquire.device_status import STUCK_S, _judge, device_status
-from vical_daemon.acquire.direct_queue import DirectOutbox, StandIn
-from vical_daemon.acquire.publish_queue import Outbox
+from vical_daemon.acquire.device_status import STUCK_S, _level, device_status
+from vical_daemon.acquire.direct_queue import BackupReader, DirectQueue
+from vical_daemon.acquire.publish_queue import PublishQueue
 from vical_daemon.bus.interface import LocalBus
 from vical_daemon.bus.messages import Level
 from vical_daemon.service import notify
@@ -176,18 +176,18 @@ def test_a_stuck_driver_makes_the_status_stale(stop) -> None:
             return []
 
     bus = LocalBus()
-    outbox = Outbox(bus, 4, "out")
+    queue = PublishQueue(bus, 4, "out")
     loop = _loop(lambda: Stuck([]), [], stop)
     _wait_for(lambda: loop.health().info is not None)
     loop._t_loop_s -= STUCK_S + 1
-    status = device_status("imu/imu0", loop.health(), outbox, 100.0)
+    status = device_status("imu/imu0", loop.health(), queue, 100.0)
     assert status.level is Level.STALE and "stuck" in status.message
     blocked.set()
     stop.set()
-    outbox.close()
+    queue.close()
 
 
-def test_outbox_keeps_order_and_drops_the_oldest_when_the_bus_is_slow() -> None:
+def test_publish_queue_keeps_order_and_drops_the_oldest_when_the_bus_is_slow() -> None:
     bus, gate, got = LocalBus(), threading.Event(), []
 
     def slow(sample) -> None:
@@ -195,16 +195,16 @@ def test_outbox_keeps_order_and_drops_the_oldest_when_the_bus_is_slow() -> None:
         got.append(sample.payload)
 
     bus.subscribe("vical/**", slow)
-    outbox = Outbox(bus, 3, "out")
-    outbox.put("vical/a", b"0")
-    _wait_for(lambda: outbox.waiting == 0)  # the first is in the hands of the bus
+    queue = PublishQueue(bus, 3, "out")
+    queue.put("vical/a", b"0")
+    _wait_for(lambda: queue.waiting == 0)  # the first is in the hands of the bus
     for i in range(1, 6):
-        outbox.put("vical/a", str(i).encode())
-    assert (outbox.waiting, outbox.dropped) == (3, 2)
-    assert _judge(_streaming(), outbox, 100.0)[0] is Level.WARN
+        queue.put("vical/a", str(i).encode())
+    assert (queue.waiting, queue.dropped) == (3, 2)
+    assert _level(_streaming(), queue, 100.0)[0] is Level.WARN
     gate.set()
-    outbox.close()
-    assert got == [b"0", b"3", b"4", b"5"] and outbox.published == 4
+    queue.close()
+    assert got == [b"0", b"3", b"4", b"5"] and queue.published == 4
 
 
 def test_a_bus_that_raises_does_not_end_acquisition() -> None:
@@ -212,12 +212,12 @@ def test_a_bus_that_raises_does_not_end_acquisition() -> None:
         def publish(self, key: str, payload: bytes) -> None:
             raise RuntimeError("no link")
 
-    outbox = Outbox(Broken(), 3, "out")
-    outbox.put("vical/a", b"0")
-    _wait_for(lambda: outbox.dropped == 1)
-    outbox.put("vical/a", b"1")
-    _wait_for(lambda: outbox.dropped == 2)
-    outbox.close()
+    queue = PublishQueue(Broken(), 3, "out")
+    queue.put("vical/a", b"0")
+    _wait_for(lambda: queue.dropped == 1)
+    queue.put("vical/a", b"1")
+    _wait_for(lambda: queue.dropped == 2)
+    queue.close()
 
 
 class HeldUpBus(LocalBus):
@@ -233,43 +233,43 @@ class HeldUpBus(LocalBus):
         self.got.append((payload, threading.current_thread().name))
 
 
-def test_a_direct_outbox_publishes_in_order_and_drops_the_oldest() -> None:
+def test_a_direct_queue_publishes_in_order_and_drops_the_oldest() -> None:
     bus = HeldUpBus(b"")
-    outbox = DirectOutbox(bus, 3)
+    queue = DirectQueue(bus, 3)
     for i in range(5):
-        outbox.put("vical/a", b"%d" % i)
-    assert (outbox.waiting, outbox.dropped, outbox.progress) == (3, 2, None)
-    outbox.flush()
+        queue.put("vical/a", b"%d" % i)
+    assert (queue.waiting, queue.dropped, queue.progress) == (3, 2, None)
+    queue.flush()
     assert [payload for payload, _ in bus.got] == [b"2", b"3", b"4"]
-    assert (outbox.waiting, outbox.published) == (0, 3)
+    assert (queue.waiting, queue.published) == (0, 3)
 
 
-def test_a_direct_outbox_survives_a_bus_that_raises() -> None:
+def test_a_direct_queue_survives_a_bus_that_raises() -> None:
     class Broken(LocalBus):
         def publish(self, key: str, payload: bytes) -> None:
             raise RuntimeError("no link")
 
-    outbox = DirectOutbox(Broken(), 3)
-    outbox.put("vical/a", b"0")
-    outbox.close()
-    assert (outbox.dropped, outbox.published, outbox.progress) == (1, 0, None)
+    queue = DirectQueue(Broken(), 3)
+    queue.put("vical/a", b"0")
+    queue.close()
+    assert (queue.dropped, queue.published, queue.progress) == (1, 0, None)
 
 
-def direct_line(bus, script, stop):
-    """A device whose reading thread publishes, with its stand-in, running."""
-    outbox, source = DirectOutbox(bus, 1000), ScriptedSource(script)
+def direct_pipeline(bus, script, stop):
+    """A device whose reading thread publishes, with its backup reader, running."""
+    queue, source = DirectQueue(bus, 1000), ScriptedSource(script)
     loop: DeviceLoop[int] = DeviceLoop(
-        "imu/imu0", lambda: source, lambda i: outbox.put("vical/a", b"%d" % i), stop,
-        flush=outbox.flush, read_timeout_s=0.02,
+        "imu/imu0", lambda: source, lambda i: queue.put("vical/a", b"%d" % i), stop,
+        flush=queue.flush, read_timeout_s=0.02,
     )  # fmt: skip
     loop.start()
-    StandIn(outbox, loop.read_on, stop, "stand-in").start()
-    return source, loop, outbox
+    BackupReader(queue, loop.read_on, stop, "backup").start()
+    return source, loop, queue
 
 
 def test_while_the_bus_holds_the_reading_thread_up_another_one_reads_on(stop) -> None:
     bus = HeldUpBus(b"3")
-    source, loop, outbox = direct_line(bus, [[i] for i in range(8)], stop)
+    source, loop, queue = direct_pipeline(bus, [[i] for i in range(8)], stop)
     _wait_for(lambda: not source.script)  # all was read, though 3 is not out yet
     assert [payload for payload, _ in bus.got] == [b"0", b"1", b"2"]
     assert loop.health().data_age_s < 5.0
@@ -278,19 +278,19 @@ def test_while_the_bus_holds_the_reading_thread_up_another_one_reads_on(stop) ->
     source.script += [[8], [9]]
     _wait_for(lambda: len(bus.got) == 10)
     assert bus.got == [(b"%d" % i, "imu/imu0") for i in range(10)]
-    assert outbox.dropped == 0
+    assert queue.dropped == 0
 
 
 def test_a_loop_held_up_by_the_bus_still_ends_and_closes_its_device(stop) -> None:
     bus = HeldUpBus(b"0")
-    source, loop, outbox = direct_line(bus, [[0], [1]], stop)
+    source, loop, queue = direct_pipeline(bus, [[0], [1]], stop)
     _wait_for(lambda: not source.script)
     stop.set()
     assert not loop.join(0.05)
     bus.gate.set()
     assert loop.join(5.0) and source.closed
-    loop.read_on()  # a stand-in that comes too late finds nothing to read
-    outbox.close()
+    loop.read_on()  # a backup reader that comes too late finds nothing to read
+    queue.close()
     assert [payload for payload, _ in bus.got] == [b"0", b"1"]
 
 
@@ -304,14 +304,14 @@ def test_levels() -> None:
     from dataclasses import replace
 
     bus = LocalBus()
-    outbox = Outbox(bus, 3, "out")
+    queue = PublishQueue(bus, 3, "out")
     good = _streaming()
-    assert _judge(good, outbox, 100.0)[0] is Level.OK
-    assert _judge(replace(good, data_age_s=3.0), outbox, 100.0)[0] is Level.ERROR
-    assert _judge(replace(good, data_age_s=3.0), outbox, 1.0)[0] is not Level.ERROR
-    assert _judge(replace(good, state="lost", problem="gone"), outbox, 100.0) == (Level.ERROR, "gone")
-    assert _judge(good, outbox, 200.0)[0] is Level.WARN
-    outbox.close()
+    assert _level(good, queue, 100.0)[0] is Level.OK
+    assert _level(replace(good, data_age_s=3.0), queue, 100.0)[0] is Level.ERROR
+    assert _level(replace(good, data_age_s=3.0), queue, 1.0)[0] is not Level.ERROR
+    assert _level(replace(good, state="lost", problem="gone"), queue, 100.0) == (Level.ERROR, "gone")
+    assert _level(good, queue, 200.0)[0] is Level.WARN
+    queue.close()
 
 
 def test_a_pause_between_two_attempts_to_open_is_not_a_stuck_thread(stop) -> None:
@@ -327,4 +327,4 @@ def test_a_pause_between_two_attempts_to_open_is_not_a_stuck_thread(stop) -> Non
     t_paused_s = loop._t_loop_s
     _wait_for(lambda: loop._t_loop_s > t_paused_s)  # the loop goes round while it waits
     assert len(attempts) == 1
-    assert _judge(loop.health(), Outbox(LocalBus(), 1, "out"), 100.0)[0] is Level.ERROR
+    assert _level(loop.health(), PublishQueue(LocalBus(), 1, "out"), 100.0)[0] is Level.ERROR

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
-from vical_daemon.calibrate.persistence import Memory, differences
+from vical_daemon.calibrate.persistence import CalibrationPersistence, differences
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
@@ -52,17 +52,17 @@ def config(tmp_path: Path) -> Config:
 
 def _remember(config: Config, camera: CameraEstimate, camera_serial: str = "C1") -> None:
     bus = LocalBus()
-    memory = Memory(config, bus, private_clock())
+    persistence = CalibrationPersistence(config, bus, private_clock())
     _announce(bus, camera_serial)
-    memory.watch(_estimate(camera))
-    memory.close(None)
+    persistence.watch(_estimate(camera))
+    persistence.close(None)
 
 
-def _later(config: Config, camera_serial: str = "C1") -> Memory:
+def _later(config: Config, camera_serial: str = "C1") -> CalibrationPersistence:
     bus = LocalBus()
-    memory = Memory(config, bus, private_clock())
+    persistence = CalibrationPersistence(config, bus, private_clock())
     _announce(bus, camera_serial)
-    return memory
+    return persistence
 
 
 def test_nothing_known_gives_what_the_config_says(config: Config) -> None:
@@ -98,47 +98,47 @@ def test_what_the_config_holds_fixed_wins(config: Config) -> None:
 
 def test_nothing_is_stored_before_convergence(config: Config) -> None:
     bus = LocalBus()
-    memory = Memory(config, bus, private_clock())
+    persistence = CalibrationPersistence(config, bus, private_clock())
     _announce(bus)
-    memory.watch(_estimate(_camera(), Status.CONVERGING))
-    memory.close(_estimate(_camera(), Status.DEGENERATE))
+    persistence.watch(_estimate(_camera(), Status.CONVERGING))
+    persistence.close(_estimate(_camera(), Status.DEGENERATE))
     assert _later(config).priors()["cam0"].T_imu_cam is None
 
 
 def test_serials_may_come_late_but_not_never(config: Config) -> None:
     _remember(config, _camera())
     bus = LocalBus()
-    memory = Memory(config, bus, private_clock())
+    persistence = CalibrationPersistence(config, bus, private_clock())
     threading.Timer(0.2, _announce, [bus]).start()
-    assert memory.priors()["cam0"].T_imu_cam is not None
+    assert persistence.priors()["cam0"].T_imu_cam is not None
 
 
 def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config: Config) -> None:
     _remember(config, _camera(p_m=(0.5, 0.0, 0.0)), camera_serial="C2")  # known from another day
     bus = LocalBus()
-    memory = Memory(config, bus, private_clock())
+    persistence = CalibrationPersistence(config, bus, private_clock())
     _announce(bus, "C1")
-    assert memory.priors()["cam0"].T_imu_cam is None
-    memory.watch(_estimate(_camera()))
-    of_c1 = memory.devices
+    assert persistence.priors()["cam0"].T_imu_cam is None
+    persistence.watch(_estimate(_camera()))
+    of_c1 = persistence.devices
     for times in range(3):  # another camera in the same place
-        assert not memory.replaced, times
+        assert not persistence.replaced, times
         _announce(bus, "C2")
-        assert memory.devices == {}  # in doubt: no state is kept
-        memory.save(_estimate(_camera(p_m=(0.2, 0.2, 0.2))))
-    assert memory.replaced
-    memory.save(_estimate(_camera(p_m=(0.3, 0.3, 0.3))))  # of the old one: under no name
-    prior = memory.begin_again()["cam0"]
+        assert persistence.devices == {}  # in doubt: no state is kept
+        persistence.save(_estimate(_camera(p_m=(0.2, 0.2, 0.2))))
+    assert persistence.replaced
+    persistence.save(_estimate(_camera(p_m=(0.3, 0.3, 0.3))))  # of the old one: under no name
+    prior = persistence.begin_again()["cam0"]
     assert prior.T_imu_cam is not None
     np.testing.assert_array_equal(prior.T_imu_cam[1], [0.5, 0.0, 0.0])
-    assert memory.stored == ["cam0"] and not memory.replaced
-    assert memory.devices == {**of_c1, "camera/cam0": "C2"}
-    told = memory.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
+    assert persistence.stored == ["cam0"] and not persistence.replaced
+    assert persistence.devices == {**of_c1, "camera/cam0": "C2"}
+    told = persistence.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
     assert (
         event_text(told[0])
         == "camera/cam0 is another device now (serial C2, not C1): the calibration begins anew"
     )
-    memory.close(None)
+    persistence.close(None)
     for serial, p_m in (("C1", [0.08, 0.02, -0.03]), ("C2", [0.6, 0.0, 0.0])):
         prior = _later(config, serial).priors()["cam0"]
         assert prior.T_imu_cam is not None
@@ -147,24 +147,24 @@ def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config:
 
 def test_one_damaged_status_replaces_no_device(config: Config) -> None:
     bus = LocalBus()
-    memory = Memory(config, bus, private_clock())
+    persistence = CalibrationPersistence(config, bus, private_clock())
     for serial in ("C1", "C9", "C8", "C1", "C9", "C9", "C1", "C8"):
         _announce(bus, serial)
-        assert not memory.replaced
+        assert not persistence.replaced
     _announce(bus, "C1")
-    assert memory.devices["camera/cam0"] == "C1"
+    assert persistence.devices["camera/cam0"] == "C1"
 
 
 def test_a_changed_mounting_is_announced_once(config: Config) -> None:
     _remember(config, _camera())
-    memory = _later(config)
-    memory.priors()
-    first = memory.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03), turn_deg=1.0)))
+    persistence = _later(config)
+    persistence.priors()
+    first = persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03), turn_deg=1.0)))
     assert [event_text(e) for e in first.events] == [
         "changed: cam0: moved by 10.0 +- 0.1 mm since the stored calibration",
         "changed: cam0: turned by 1.00 +- 0.01 deg since the stored calibration",
     ]
-    assert memory.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03)))).events == []
+    assert persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03)))).events == []
 
 
 def _differences(before: CameraEstimate, now: CameraEstimate) -> list[tuple[EventKind, float]]:
@@ -191,11 +191,11 @@ def test_the_journal_gets_an_event_as_fields_and_its_name_from_its_kind(
     monkeypatch.setattr(
         "vical_daemon.service.notify.event", lambda name, text, **more: written.append((name, more))
     )
-    memory = _later(config)
-    memory.announce(Event(EventKind.BUMPED, cause=Cause.IMAGES_REFUSED))
-    memory.announce(Event(EventKind.OTHER, said="bumped: only a text"))
-    memory.announce(Event(EventKind.STAMP_JITTER, "cam0", 1e-3))
-    memory.watch(_estimate(_camera(), Status.CONVERGING))
+    persistence = _later(config)
+    persistence.announce(Event(EventKind.BUMPED, cause=Cause.IMAGES_REFUSED))
+    persistence.announce(Event(EventKind.OTHER, said="bumped: only a text"))
+    persistence.announce(Event(EventKind.STAMP_JITTER, "cam0", 1e-3))
+    persistence.watch(_estimate(_camera(), Status.CONVERGING))
     assert [name for name, _ in written] == ["bumped", "calibration", "calibration"]
     assert written[2][1]["kind"] == "stamp_jitter"
     assert (written[2][1]["camera"], written[2][1]["value"]) == ("cam0", 1e-3)

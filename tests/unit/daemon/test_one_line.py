@@ -18,7 +18,7 @@ from vical_drivers.samples import DeviceInfo, SourceStats
 from vical_daemon import cli
 from vical_daemon.acquire.device_loop import DeviceLoop
 from vical_daemon.cli.errors import describe_known, report_thread, write_crash_log
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.atomic_file import atomic_write
 from vical_daemon.service.wall_clock import shared_clock
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as `write` raises it: without the name of a file
@@ -31,7 +31,7 @@ def _refuse(*_: object) -> None:
 def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", _refuse)
     with pytest.raises(OSError, match="No space left") as caught:
-        write_whole(tmp_path / "state.json", b"{}")
+        atomic_write(tmp_path / "state.json", b"{}")
     assert describe_known(caught.value) == (f"{tmp_path}/state.json: No space left on device", 1)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(OSError, match="No space left") as caught:

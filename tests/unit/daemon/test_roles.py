@@ -14,7 +14,7 @@ from vical_drivers.samples import DeviceInfo, Frame, ImuSample, SourceStats
 
 from vical_daemon.acquire import camera as camera_module
 from vical_daemon.acquire import imu as imu_module
-from vical_daemon.acquire.camera import CameraRole
+from vical_daemon.acquire.camera import CameraEncoder
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.messages import (
@@ -238,7 +238,7 @@ class TestDetect:
 
 class TestAcquisition:
     def test_imu_stamp_is_that_of_the_measurement_on_the_shared_clock(self, config: Config) -> None:
-        role = imu_module.ImuRole("rover", "imu0", CLOCK)
+        role = imu_module.ImuEncoder("rover", "imu0", CLOCK)
         payload = role.message(ImuSample(5_000, 9_000, 1, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0)))
         assert payload is not None
         message = decode_imu(payload)
@@ -265,7 +265,7 @@ class TestAcquisition:
         }
 
     def test_image_is_stamped_mid_exposure_and_says_by_which_rule(self) -> None:
-        role = CameraRole("rover", "cam0", CLOCK)
+        role = CameraEncoder("rover", "cam0", CLOCK)
         payload = role.message(_frame(7, stamp_rule="soe+exposure/2", dropped_before=2))
         assert payload is not None
         message = decode_image(payload)

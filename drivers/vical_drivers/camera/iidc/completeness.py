@@ -1,12 +1,12 @@
-"""Tells a whole FireWire image from one that a lost packet has shifted.
+"""Tells a complete FireWire image from one that a lost packet has shifted.
 
 The kernel's isochronous reception knows packets, not images. A buffer waits for the packet that begins an
 image (its sy bit), then takes packet after packet until it is full. When one is lost, the rest of the image
 moves up, and the first packets of the *next* image fill the end. The next image has then lost its beginning:
-no buffer takes it. libdc1394 reports nothing of this. Two things follow, whatever the packets hold:
+no buffer takes it. libdc1394 does not report this. Two rules follow, whatever the packets hold:
 
-* an image that was complete before the next one could begin is whole;
-* a shifted image is never followed by the very next one.
+* an image that was received before the next one could begin is complete;
+* after a shifted image, the next image is always missing.
 
 With embedded data the next image's own header, at a packet boundary, is a third sign. Pure arithmetic.
 """
@@ -28,23 +28,23 @@ LATEST_NEXT_NS = 2_000_000_000
 """The next image's stamp is at most this much later, ns; 0.53 s is the period at the lowest IIDC rate."""
 
 
-class Wholeness(Enum):
-    """What is known of an image when it arrives."""
+class Completeness(Enum):
+    """What is known about an image when it arrives."""
 
-    WHOLE = "whole"
+    COMPLETE = "complete"
     SHIFTED = "shifted"
-    OPEN = "open"  # the next image decides: it is whole if that follows without a gap
+    UNDECIDED = "undecided"  # the next image decides: this one is complete if no frame is missing between
 
 
-def judge(
+def check_completeness(
     buffer: npt.NDArray[np.uint8],
     packet_bytes: int,
     info: EmbeddedInfo,
     frame_info: int,
     age_ns: int,
     rate_hz: float,
-) -> Wholeness:
-    """Judge one image by itself.
+) -> Completeness:
+    """Decide from one image alone whether it is complete.
 
     Args:
         buffer: All packets of the image, padding included, shape (bytes,).
@@ -55,10 +55,10 @@ def judge(
         rate_hz: Frames a second; 0.0: unknown.
     """
     if packet_bytes > 0 and _holds_next_header(buffer, packet_bytes, info, frame_info):
-        return Wholeness.SHIFTED
+        return Completeness.SHIFTED
     if rate_hz > 0 and 0 <= age_ns * rate_hz < EARLIEST_NEXT * 1e9:
-        return Wholeness.WHOLE
-    return Wholeness.OPEN
+        return Completeness.COMPLETE
+    return Completeness.UNDECIDED
 
 
 def _holds_next_header(
