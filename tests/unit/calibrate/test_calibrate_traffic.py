@@ -1,4 +1,4 @@
-"""Whatever travels on its keys, a role goes on: it refuses, counts, and starts a part that fails afresh."""
+"""Whatever travels on its keys, the estimate role goes on: it refuses, counts, and restarts its estimator."""
 
 from __future__ import annotations
 
@@ -16,19 +16,15 @@ from vical_daemon.bus.messages import Level
 from vical_daemon.calibrate import role as estimate
 from vical_daemon.calibrate.worker import STUCK_S, EstimateRole
 from vical_daemon.config.model import Config, loads
-from vical_daemon.detect import role as detect
-from vical_daemon.detect.role import DetectRole
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.service import notify
 from vical_daemon.service.liveness import Liveness
-from vical_daemon.service.progress import Progress, Restarts
 from vical_daemon.service.wall_clock import private_clock
 
 MS = 1_000_000
 NOW = 1_800_000_000_000_000_000
 IMU, POINTS = topics.IMU.key("rover", "imu0"), topics.POINTS.key("rover", "cam0")
-IMAGE = topics.IMAGE.key("rover", "cam0")
 EXTREMES = (1e5, -1e9, 1e300, -1e300, 1e307)
 
 
@@ -148,25 +144,6 @@ class TestEstimate:
         assert role.statuses(0, STUCK_S - 1)[0].level is not Level.STALE
 
 
-def test_progress_is_what_is_done_not_that_somebody_speaks() -> None:
-    progress = Progress()
-    assert progress.look(0, 0, 0.0) == 0.0
-    assert progress.look(0, 0, 100.0) == 0.0  # nothing comes: nothing to do
-    assert progress.look(5, 5, 101.0) == 0.0
-    assert progress.look(6, 5, 102.0) == 0.0
-    assert progress.look(9, 5, 107.0) == 5.0
-    assert progress.look(10, 6, 108.0) == 0.0
-    assert progress.look(10, 6, 200.0) == 0.0
-
-
-def test_restarts_come_later_and_later_but_not_never() -> None:
-    restarts = Restarts()
-    pauses = [restarts.failed("why", 1.0 + k) for k in range(12)]
-    assert pauses[:5] == [0.0, 1.0, 2.0, 4.0, 8.0] and pauses[-1] == 60.0 and restarts.count == 12
-    assert restarts.waiting_s(13.0) == 59.0 and restarts.waiting_s(73.0) == 0.0
-    assert restarts.failed("why", 1000.0) == 0.0
-
-
 class Service:
     """The role estimate, running, with estimators that the test can spoil."""
 
@@ -219,7 +196,7 @@ def service(config: Config, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> A
     service.close()
 
 
-class TestKeeper:
+class TestSupervisor:
     def test_an_estimator_that_raises_is_started_again_and_the_journal_says_so(
         self, service: Service
     ) -> None:
@@ -252,64 +229,3 @@ class TestKeeper:
         assert "none used or refused" in service.live.problem(0.0)
         service.until(lambda: len(service.made) > 1 and service.made[1].frames > 10)
         service.until(lambda: service.live.problem(0.0) == "")
-
-
-def image(t_ns: int, size: tuple[int, int] = (64, 48)) -> Sample:
-    payload = m.encode_image(t_ns, "cam0", np.zeros((size[1], size[0]), np.uint8), "mono8")
-    return Sample(IMAGE, payload, 0)
-
-
-class TestDetect:
-    @pytest.mark.parametrize("stamp", [0, -(10**9), 2**31 * 10**9 - 1])
-    def test_a_stamp_of_nonsense_does_not_stop_the_images(self, config: Config, stamp: int) -> None:
-        role = DetectRole(config, "cam0", lambda picture, t_ns: None)
-        done = 0
-        for k in range(60):
-            if k % 20 == 10:
-                role.points(image(stamp))
-            done += bool(role.points(image(NOW + k * 50 * MS)))
-        assert done == 60
-
-    def test_images_of_another_size_are_refused_until_they_stay(self, config: Config) -> None:
-        role = DetectRole(config, "cam0", lambda picture, t_ns: None)
-        sizes = [(64, 48)] * 3 + [(1, 1), (64, 48), (1, 1), (1, 1)] + [(64, 48)] * 3 + [(32, 24)] * 4
-        done = [bool(role.points(image(NOW + k * 100 * MS, size))) for k, size in enumerate(sizes)]
-        assert done == [True] * 3 + [False, True, False, False] + [True] * 3 + [False, False, True, True]
-        assert role.status().values["malformed"] == "5"
-
-    def test_a_detector_that_raises_is_made_anew(
-        self, config: Config, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        events: list[str] = []
-        monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append(text))
-
-        def raises(picture: Any, t_ns: int) -> None:
-            if t_ns == NOW:
-                raise RuntimeError("(-215:Assertion failed)\nin function 'cornerSubPix'")
-
-        role = DetectRole(config, "cam0", raises)
-        assert role.points(image(NOW)) == []
-        assert role.points(image(NOW + 100 * MS))
-        assert role.status().values["failures"] == "1"
-        (text,) = events
-        assert "cornerSubPix" in text and len(text.splitlines()) == 1
-
-    def test_a_worker_that_hangs_is_not_called_alive(
-        self, config: Config, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        hang, stop, bus = threading.Event(), threading.Event(), LocalBus()
-        monkeypatch.setattr(detect, "STUCK_S", 0.1)
-        monkeypatch.setattr(detect, "make_detector", lambda *_: lambda picture, t_ns: hang.wait(60) and None)
-        worker = detect._Worker(config, "cam0", bus, stop)
-        worker.thread.start()
-        bus.publish(IMAGE, image(NOW).payload)
-        end_s = time.monotonic() + 30
-        while worker.status().level is not Level.STALE:
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
-        hang.set()
-        while worker.status().level is Level.STALE:
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
-        stop.set()
-        worker.close()

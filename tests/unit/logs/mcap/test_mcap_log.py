@@ -316,14 +316,14 @@ def test_a_leftover_that_may_only_be_read_is_recovered(log, tmp_path, monkeypatc
     assert not part.exists()
 
 
-def test_mutated_files_never_raise(log, tmp_path, rng_bus):
+def test_mutated_files_never_raise(log, tmp_path, rng):
     whole = log.read_bytes()
     path = tmp_path / "m.mcap"
     for _ in range(150):
-        raw = bytearray(whole[: int(rng_bus.integers(8, len(whole) + 1))])
-        for _ in range(int(rng_bus.integers(1, 8))):
+        raw = bytearray(whole[: int(rng.integers(8, len(whole) + 1))])
+        for _ in range(int(rng.integers(1, 8))):
             if len(raw) > 8:
-                raw[int(rng_bus.integers(8, len(raw)))] = int(rng_bus.integers(0, 256))
+                raw[int(rng.integers(8, len(raw)))] = int(rng.integers(0, 256))
         path.write_bytes(raw)
         for message in LogReader(path).messages():
             assert zlib.crc32(message.payload) >= 0

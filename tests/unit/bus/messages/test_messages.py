@@ -79,8 +79,8 @@ def an_estimate(rng: np.random.Generator, cameras=("cam0", "cam1")) -> Calibrati
 
 
 @pytest.mark.parametrize("frame_id", ["", "i", "imu", "imu0", "imu01", "imu0123456789", "früh"])
-def test_imu_is_what_rosbags_writes(frame_id, rng_bus):
-    gyro, force = rng_bus.standard_normal((2, 3)).tolist()
+def test_imu_is_what_rosbags_writes(frame_id, rng):
+    gyro, force = rng.standard_normal((2, 3)).tolist()
     covariance = np.zeros(9)
     unknown = covariance.copy()
     unknown[0] = -1
@@ -105,8 +105,8 @@ def test_imu_is_what_rosbags_writes(frame_id, rng_bus):
 @pytest.mark.parametrize(("encoding", "shape", "dtype"), [
     ("mono8", (5, 7), np.uint8), ("mono16", (3, 4), np.uint16), ("bgr8", (2, 3, 3), np.uint8),
 ])  # fmt: skip
-def test_image_is_what_rosbags_writes(encoding, shape, dtype, rng_bus):
-    image = rng_bus.integers(0, np.iinfo(dtype).max, shape).astype(dtype)
+def test_image_is_what_rosbags_writes(encoding, shape, dtype, rng):
+    image = rng.integers(0, np.iinfo(dtype).max, shape).astype(dtype)
     data = image.reshape(-1).view(np.uint8)
     step = image.nbytes // shape[0]
     expected = serialised(
@@ -176,9 +176,9 @@ def test_camera_info_with_a_fifth_coefficient_stays_plumb_bob():
 @pytest.mark.parametrize("type_name", [m.POINTS_TYPE, m.TRACKS_TYPE])
 @pytest.mark.parametrize("n", [0, 1, 144])
 @pytest.mark.parametrize("stated", [True, False])
-def test_points_are_what_rosbags_writes(type_name, n, stated, rng_bus):
-    ids = rng_bus.integers(0, 2**62, n)
-    uv, sigma = rng_bus.uniform(0, 700, (n, 2)), rng_bus.uniform(0.1, 1, n)
+def test_points_are_what_rosbags_writes(type_name, n, stated, rng):
+    ids = rng.integers(0, 2**62, n)
+    uv, sigma = rng.uniform(0, 700, (n, 2)), rng.uniform(0.1, 1, n)
     expected = serialised(
         ros(type_name, header=header("cam0"), width=752, height=480, ids=ids, uv_px=uv.ravel(),
             sigma_px=sigma if stated else np.empty(0)),
@@ -248,9 +248,9 @@ def test_transforms_are_what_rosbags_writes():
     assert m.decode_transforms(expected) == transforms
 
 
-def test_pose_is_what_rosbags_writes_with_ros_covariance(rng_bus):
-    q = rng_bus.standard_normal(4)
-    root = rng_bus.standard_normal((6, 6))
+def test_pose_is_what_rosbags_writes_with_ros_covariance(rng):
+    q = rng.standard_normal(4)
+    root = rng.standard_normal((6, 6))
     pose = PoseEstimate([1.0, 2.0, 3.0], (q / np.linalg.norm(q)).tolist(), (root @ root.T).tolist())
     inner = ros(
         "geometry_msgs/msg/Pose", position=xyz("Point", pose.p_m), orientation=quaternion(*pose.q_wxyz)
@@ -264,17 +264,17 @@ def test_pose_is_what_rosbags_writes_with_ros_covariance(rng_bus):
     assert (decoded.p_m, decoded.q_wxyz) == (tuple(pose.p_m), tuple(pose.q_wxyz))
 
 
-def test_covariance_for_ros_turns_local_errors_into_fixed_axes(rng_bus):
+def test_covariance_for_ros_turns_local_errors_into_fixed_axes(rng):
     """Sampling: R exp(d) as exp(e) R, with scipy's rotations."""
     from scipy.spatial.transform import Rotation
 
-    q = rng_bus.standard_normal(4)
+    q = rng.standard_normal(4)
     q /= np.linalg.norm(q)
     turn = Rotation.from_quat(np.roll(q, -1))
     np.testing.assert_allclose(rotation_matrix(q.tolist()), turn.as_matrix(), atol=1e-14)
-    root = rng_bus.standard_normal((6, 6)) * 1e-4
+    root = rng.standard_normal((6, 6)) * 1e-4
     pose = PoseEstimate([0.0] * 3, q.tolist(), (root @ root.T).tolist())
-    local = rng_bus.standard_normal((20_000, 6)) @ root.T
+    local = rng.standard_normal((20_000, 6)) @ root.T
     fixed = (turn * Rotation.from_rotvec(local[:, 3:]) * turn.inv()).as_rotvec()
     sampled = np.cov(np.hstack([local[:, :3], fixed]).T)
     expected = covariance_for_ros(pose)
@@ -282,8 +282,8 @@ def test_covariance_for_ros_turns_local_errors_into_fixed_axes(rng_bus):
     assert np.abs((sampled - expected) / scale).max() < 0.05
 
 
-def test_calibration_round_trip_loses_nothing(rng_bus):
-    estimate = an_estimate(rng_bus)
+def test_calibration_round_trip_loses_nothing(rng):
+    estimate = an_estimate(rng)
     decoded = [m.decode_calibration(m.encode_calibration(estimate, name)) for name in estimate.cameras]
     assert [d.camera for d in decoded] == ["cam0", "cam1"]
     assert decoded[0].camera_estimate == estimate.cameras["cam0"]
@@ -304,8 +304,8 @@ def test_a_calibration_of_version_0_1_0_is_read_with_its_texts():
     assert known.unobservable == ["time shift: turn the rig to and fro"]
 
 
-def test_kinds_of_a_newer_version_are_read_as_text(rng_bus):
-    raw = m.encode_calibration(an_estimate(rng_bus, ("cam0",)), "cam0")
+def test_kinds_of_a_newer_version_are_read_as_text(rng):
+    raw = m.encode_calibration(an_estimate(rng, ("cam0",)), "cam0")
     newer = raw.replace(b"clock_drift", b"clock_drips").replace(b"turn_faster", b"turn_faxter")
     assert len(newer) == len(raw) != 0 and newer != raw
     estimate = m.decode_calibration(newer).estimate
@@ -324,15 +324,15 @@ def test_calibration_before_the_first_solution():
     assert decoded.estimate == empty
 
 
-def test_calibration_carries_infinite_sigmas(rng_bus):
-    estimate = an_estimate(rng_bus, ("cam0",))
+def test_calibration_carries_infinite_sigmas(rng):
+    estimate = an_estimate(rng, ("cam0",))
     pose = estimate.cameras["cam0"].T_imu_cam
     pose.covariance[0][0] = float("inf")
     assert m.merge_calibrations([m.decode_calibration(m.encode_calibration(estimate, "cam0"))]) == estimate
 
 
-def test_calibration_reads_back_with_rosbags(rng_bus):
-    estimate = an_estimate(rng_bus, ("cam0",))
+def test_calibration_reads_back_with_rosbags(rng):
+    estimate = an_estimate(rng, ("cam0",))
     raw = m.encode_calibration(estimate, "cam0")
     message = typestore().deserialize_cdr(raw, m.CALIBRATION_TYPE)
     known = estimate.cameras["cam0"]
@@ -397,17 +397,17 @@ READERS = {decode: t.type_name for t in TOPICS for decode in GOOD if DECODERS[t.
 
 
 @pytest.mark.parametrize("decode", READERS, ids=lambda f: f.__name__)
-def test_what_we_decode_others_decode_too(decode, rng_bus):
+def test_what_we_decode_others_decode_too(decode, rng):
     """rosbags, its conversion to ROS 1, and mcap-ros2: none refuses a message that we take."""
     name, good = READERS[decode], GOOD[decode]
     read = generate_dynamic(name, m.ros2_schema(name))[name]
     taken = 0
     for k in range(400):
         raw = bytearray(good)
-        for _ in range(rng_bus.integers(1, 4)):
-            raw[rng_bus.integers(4, len(raw))] = rng_bus.choice([0, 1, 2, 255, rng_bus.integers(256)])
-        cut = len(raw) if k % 4 else int(rng_bus.integers(4, len(raw)))
-        data = bytes(raw[:cut]) + bytes(int(rng_bus.integers(0, 6)))
+        for _ in range(rng.integers(1, 4)):
+            raw[rng.integers(4, len(raw))] = rng.choice([0, 1, 2, 255, rng.integers(256)])
+        cut = len(raw) if k % 4 else int(rng.integers(4, len(raw)))
+        data = bytes(raw[:cut]) + bytes(int(rng.integers(0, 6)))
         try:
             m.check_message(name, data)
         except m.MessageError:
