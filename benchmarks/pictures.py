@@ -89,23 +89,7 @@ def terminal(browser: Any, work: Path, log: Path, path: Path) -> None:
         view.take(Sample(message.channel.topic.removeprefix("/"), message.payload, 0))
     console = Console(record=True, width=104, force_terminal=True, file=io.StringIO())
     console.print(live_table.screen(view.estimates, view.health))
-    picture(browser, work, console.export_svg(title="vical watch"), path)
-
-
-def picture(browser: Any, work: Path, svg: str, path: Path) -> None:
-    """Turn an SVG of rich into a PNG, its fonts replaced by the browser's own: nothing is fetched."""
-    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)
-    (work / "terminal.html").write_text(f"<body style='margin:0;background:#fff'>{svg}</body>")
-
-    async def script(page: Any) -> None:
-        await page.open((work / "terminal.html").as_uri(), 1100, 900)
-        await page.wait("!!document.querySelector('svg')")
-        height = await page.evaluate("document.querySelector('svg').getBoundingClientRect().height")
-        await page.open((work / "terminal.html").as_uri(), 1100, round(height) + 2)
-        await page.wait("!!document.querySelector('svg')")
-        await page.screenshot(path)
-
-    browser.drive(script, work / "profile")
+    browser.draw_svg(console.export_svg(title="vical watch"), work, path)
 
 
 def report(browser: Any, work: Path, arguments: list[str], path: Path) -> None:

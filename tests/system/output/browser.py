@@ -88,6 +88,23 @@ def drive(script, folder):
         process.stderr.close()
 
 
+def draw_svg(svg, folder, path):
+    """Turn an SVG of rich into a PNG, its fonts replaced by the browser's own: nothing is fetched."""
+    html = folder / "terminal.html"
+    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)
+    html.write_text(f"<body style='margin:0;background:#fff'>{svg}</body>")
+
+    async def script(page):
+        await page.open(html.as_uri(), 1100, 900)
+        await page.wait("!!document.querySelector('svg')")
+        height = await page.evaluate("document.querySelector('svg').getBoundingClientRect().height")
+        await page.open(html.as_uri(), 1100, round(height) + 2)
+        await page.wait("!!document.querySelector('svg')")
+        await page.screenshot(path)
+
+    drive(script, folder / "profile")
+
+
 async def _run(script, port):
     async with aiohttp.ClientSession() as session:
         async with session.put(f"http://127.0.0.1:{port}/json/new?about:blank") as answer:

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vical_mocks.harness.bus_junk import RIG, Junk, unopened
+from vical_mocks.harness.bus_rig import away_sigmas, good_messages, load_config
+from vical_mocks.harness.processes import usage
 from vical_mocks.points import simulate
 
-from benchmarks.bus_calibration import away_sigmas, good_messages, load_config
-from benchmarks.bus_junk import RIG, Junk, unopened
-from benchmarks.soak import usage
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.calibrate.estimators import input_keys, make_estimator

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.inertial.stamp_steps import StampSteps
 from vical_daemon.estimation.measurements import CalibrationOptions

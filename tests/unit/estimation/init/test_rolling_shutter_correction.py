@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import project_points, simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.trajectory import hand_motion
 
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.inertial.imu_model import Motion
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row

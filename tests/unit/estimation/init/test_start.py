@@ -2,12 +2,19 @@
 
 import numpy as np
 import pytest
+from vical_mocks.harness.boards import APRILGRID, rig_before
+from vical_mocks.harness.feed import (
+    CalibratorSubject,
+    StartErrors,
+    camera_prior,
+    feed,
+    imu_noise,
+    points_frame,
+)
 from vical_mocks.points import board_points, simulate
 from vical_mocks.rig import nominal_gravity, reference_rig
 from vical_mocks.trajectory import hand_motion
 
-from benchmarks.detection import APRILGRID, rig_before
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, points_frame
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.target_poses import Lens, pose_of
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior

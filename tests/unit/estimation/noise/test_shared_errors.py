@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import simulate
 
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame

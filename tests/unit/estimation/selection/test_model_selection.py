@@ -5,10 +5,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vical_mocks import trajectory
 from vical_mocks.curves import Curve, Pause, Paused
+from vical_mocks.harness.feed import feed
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
 from vical_mocks.tracks import simulate_tracks
 
-from benchmarks.feed import feed
 from tests.unit.estimation.test_target_free import subject_for
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis

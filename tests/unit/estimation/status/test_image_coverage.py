@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import simulate
 
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.status.image_coverage import Cover, PictureCover
 

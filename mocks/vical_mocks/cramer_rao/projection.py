@@ -1,4 +1,4 @@
-"""Pixels of world points and their derivatives by everything: benchmark code, apart from the daemon's own."""
+"""Pixels of world points and their derivatives by everything: derived apart from the daemon's own."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+
 from vical_mocks.lens import Lens
 from vical_mocks.rotations import skew
 

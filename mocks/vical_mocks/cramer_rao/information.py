@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from vical_mocks.rig import Rig
 
-from benchmarks.error_model import STATE
+from vical_mocks.cramer_rao.error_model import STATE
+from vical_mocks.rig import Rig
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,12 +64,14 @@ class Constants:
     prior_sigma: list[float] = field(default_factory=list)
 
     def add(self, name: str, size: int, sigma: float) -> None:
+        """Append a block of `size` constants with one prior sigma."""
         start = STATE + len(self.prior_sigma)
         self.slices[name] = slice(start, start + size)
         self.prior_sigma += [sigma] * size
 
     @classmethod
     def of(cls, options: BoundOptions, *, drawn: bool = False) -> Constants:
+        """Return the constants that these options leave unknown."""
         c = cls()
         if options.extrinsics:
             c.add("p_imu_cam", 3, 1.0)
@@ -148,6 +150,7 @@ class Information:
         self.landmarks = [name for name in self.landmarks if name not in identities]
 
     def landmark_place(self, identity: int) -> slice:
+        """Return the rows of a landmark in the matrix."""
         start = self.fixed + 3 * self.landmarks.index(identity)
         return slice(start, start + 3)
 

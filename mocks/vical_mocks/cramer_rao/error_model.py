@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+
+from vical_mocks.cramer_rao.projection import View, jacobians
 from vical_mocks.points import SimulatedFrame
 from vical_mocks.rig import Rig
 from vical_mocks.rotations import skew
-
-from benchmarks.projection import View, jacobians
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def error_slopes(rig: Rig, t_s: FloatArray) -> FloatArray:
 def pixel_jacobians(
     rig: Rig, frames: Sequence[SimulatedFrame], points_m: Sequence[FloatArray]
 ) -> list[dict[str, FloatArray]]:
-    """Derivatives of each frame's pixels at the truth; see `benchmarks.projection.jacobians`."""
+    """Derivatives of each frame's pixels at the truth; see `projection.jacobians`."""
     counts = [len(points) for points in points_m]
     t_s = np.repeat([frame.t_s for frame in frames], counts)
     R_imu_cam, p_imu_cam = rig.extrinsics_at(t_s)

@@ -146,10 +146,9 @@ class Junk:
     def _estimate(self, now_ns: int) -> CalibrationEstimate:
         wild = self._wild
         pose = PoseEstimate(wild(3).tolist(), wild(4).tolist(), wild(36).reshape(6, 6).tolist())
-        camera = CameraEstimate(
-            pose, *wild(2).tolist(), wild(4).tolist(), wild(4).tolist(), "radtan", wild(4).tolist(),
-            wild(4).tolist(), float(wild(1)[0]),
-        )  # fmt: skip
+        shift_s, shift_sigma_s = wild(2).tolist()
+        lens = (wild(4).tolist(), wild(4).tolist(), "radtan", wild(4).tolist(), wild(4).tolist())
+        camera = CameraEstimate(pose, shift_s, shift_sigma_s, *lens, float(wild(1)[0]))
         status = self._rng.choice([Status.CONVERGED, Status.CONVERGING])
         return CalibrationEstimate(
             self._stamp(now_ns), Status(status), "", float(wild(1)[0]), "", float(wild(1)[0]), 2**63, 0,
@@ -205,7 +204,7 @@ def unopened(log: Path, scratch: Path) -> list[str]:
         if done.returncode or not bag.is_file():
             raise RuntimeError((done.stderr or done.stdout)[-200:])
         with AnyReader([bag]) as reader:
-            return reader.message_count
+            return int(reader.message_count)
 
     problems, counts = [], {}
     for read in (with_mcap_ros2, with_rosbags, with_rosbags_convert):

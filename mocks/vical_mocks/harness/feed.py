@@ -9,13 +9,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from vical_mocks.points import SimulatedFrame, SimulatedRun
-from vical_mocks.rotations import exp_so3, log_so3
 
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.result import CameraEstimate
 from vical_daemon.estimation.wording import event_document
+from vical_mocks.points import SimulatedFrame, SimulatedRun
+from vical_mocks.rotations import exp_so3, log_so3
 
 FloatArray = npt.NDArray[np.float64]
 CAMERA = "cam0"
@@ -319,3 +319,16 @@ def imu_noise(run: SimulatedRun) -> ImuNoise:
     """The densities that the data were made with."""
     d = run.rig.densities
     return ImuNoise(d.gyro, d.gyro_walk, d.accel, d.accel_walk, run.options.imu_rate_hz)
+
+
+def nees(error: FloatArray, covariance: FloatArray, size: int) -> float:
+    """Normalised squared error of the first `size` parameters; NaN where the covariance is not positive."""
+    block = covariance[:size, :size]
+    scale = np.sqrt(np.diag(block))
+    if not np.all(scale > 0):
+        return float("nan")
+    e = error[:size] / scale
+    try:
+        return float(e @ np.linalg.solve(block / np.outer(scale, scale), e))
+    except np.linalg.LinAlgError:
+        return float("nan")

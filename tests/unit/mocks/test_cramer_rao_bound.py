@@ -7,14 +7,14 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vical_mocks.cramer_rao.bound import bounds
+from vical_mocks.cramer_rao.error_model import STATE, inertial_factors
+from vical_mocks.cramer_rao.information import BoundOptions
 from vical_mocks.lens import Lens
 from vical_mocks.points import simulate
 from vical_mocks.rig import ImuDensities, reference_rig
 from vical_mocks.tracks import simulate_tracks
 from vical_mocks.trajectory import still
-
-from benchmarks.bound import BoundOptions, bounds
-from benchmarks.error_model import STATE, inertial_factors
 
 STATE_PRIOR = np.repeat([3.0, 10.0, 10.0, 0.3, 2.0], 3)
 
