@@ -15,7 +15,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
@@ -219,6 +219,18 @@ def _numbers(attachment: Any) -> tuple[int, int | None]:
     return publisher, number
 
 
+class Mirror(Protocol):
+    """Publishes the messages of a bus in another form too, e.g. under ROS 2's names."""
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send one message."""
+        ...
+
+    def close(self) -> None:
+        """Leave; may be called twice."""
+        ...
+
+
 class ZenohBus:
     """`Bus` over a zenoh session; made by `open_bus`."""
 
@@ -229,6 +241,7 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._publishers: dict[str, _KeyPublisher] = {}
         self._subscriptions: list[ZenohSubscription] = []
+        self._mirror: Mirror | None = None
         self._closed = False
 
     @property
@@ -241,8 +254,12 @@ class ZenohBus:
         """Whether a client has its router at this moment (it comes back by itself); a router: always."""
         return self._is_router or bool(self._session.info.routers_zid())
 
+    def mirror_to(self, mirror: Mirror) -> None:
+        """Publish every message there as well; closed with the bus."""
+        self._mirror = mirror
+
     def publish(self, key: str, payload: bytes) -> None:
-        """See `Bus.publish`; without a router the sample is lost, and the number tells so."""
+        """See `Bus.publish`; without a router the sample is lost, and leaves a gap in the numbers."""
         publisher = self._publishers.get(key)
         if publisher is None:
             with self._lock:
@@ -251,10 +268,11 @@ class ZenohBus:
                 publisher = self._publishers.get(key)
                 if publisher is None:
                     publisher = self._publishers[key] = _KeyPublisher(self._session, key, self._publisher_id)
-        try:
+        with suppress(zenoh.ZError):  # closing, or no link at this moment
             publisher.put(payload)
-        except zenoh.ZError:  # closing, or no link at this moment
-            return
+        if self._mirror is not None:
+            with suppress(zenoh.ZError):
+                self._mirror.publish(key, payload)
 
     def subscribe(
         self,
@@ -298,6 +316,9 @@ class ZenohBus:
             subscriptions, publishers = list(self._subscriptions), list(self._publishers.values())
         for subscription in subscriptions:
             subscription.close()
+        if self._mirror is not None:
+            with suppress(zenoh.ZError):
+                self._mirror.close()
         with suppress(zenoh.ZError):
             for publisher in publishers:
                 publisher.close()

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import suppress
 from typing import Any
 
 import zenoh
 
 from vical_daemon.bus import ros2_names
-from vical_daemon.bus.interface import Handler, Sample
 from vical_daemon.bus.ros2_names import Ros2Topic
-from vical_daemon.bus.zenoh_bus import ZenohBus, ZenohSubscription
+
+_HEARTBEAT_S = 0.2
 
 
 class Ros2Publisher:
-    """Publishes bus messages to ROS 2; thread-safe.
+    """Publishes bus messages to ROS 2; thread-safe. See `ZenohBus.mirror_to`.
 
     Args:
         session: An open zenoh session.
@@ -102,58 +101,3 @@ class _TopicPublisher:
     def close(self) -> None:
         self._token.undeclare()
         self._publisher.undeclare()
-
-
-_HEARTBEAT_S = 0.2
-
-
-class Ros2Bus:
-    """A `ZenohBus` that publishes everything under ROS 2's names as well.
-
-    Args:
-        bus: The bus.
-        node: Name of the node in the ROS graph.
-        domain: ROS_DOMAIN_ID.
-        namespace: Of node and topics, with its leading slash; empty: none.
-    """
-
-    def __init__(self, bus: ZenohBus, node: str, domain: int, namespace: str = "") -> None:
-        self._bus = bus
-        self._ros2 = Ros2Publisher(bus.session, node, domain, namespace)
-
-    @property
-    def session(self) -> Any:
-        """See `ZenohBus.session`."""
-        return self._bus.session
-
-    @property
-    def connected(self) -> bool:
-        """See `ZenohBus.connected`."""
-        return self._bus.connected
-
-    def publish(self, key: str, payload: bytes) -> None:
-        """See `Bus.publish`."""
-        self._bus.publish(key, payload)
-        with suppress(zenoh.ZError):  # closing, or no link at this moment
-            self._ros2.publish(key, payload)
-
-    def subscribe(
-        self,
-        key_expression: str,
-        handler: Handler | None = None,
-        *,
-        depth: int = 1024,
-        newest_wins: bool = False,
-    ) -> ZenohSubscription:
-        """See `Bus.subscribe`."""
-        return self._bus.subscribe(key_expression, handler, depth=depth, newest_wins=newest_wins)
-
-    def latest(self, key_expression: str, timeout_s: float = 1.0) -> list[Sample]:
-        """See `Bus.latest`."""
-        return self._bus.latest(key_expression, timeout_s)
-
-    def close(self) -> None:
-        """Leave; may be called twice."""
-        with suppress(zenoh.ZError):  # closed before
-            self._ros2.close()
-        self._bus.close()

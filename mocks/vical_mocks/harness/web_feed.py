@@ -1,9 +1,15 @@
 """Feeds a bus with what a rig sends: a calibration that converges, statuses, images with their points."""
 
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.bus import topics
+from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
@@ -12,6 +18,8 @@ from vical_daemon.bus.messages import (
     encode_image,
     encode_points,
 )
+from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
+from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
@@ -21,13 +29,38 @@ from vical_daemon.estimation.result import (
     Status,
 )
 from vical_daemon.estimation.wording import guidance_text
+from vical_daemon.service.wall_clock import private_clock
+from vical_daemon.web import role as web
 
 RIG, CAMERA = "rig0", "cam0"
 T0_NS = 1_700_000_000_000_000_000
 NOTHING = Guidance()
 
 
-def estimate(t_s, rng, status=None, guidance="", withheld=(), motion=NOTHING, events=(), reason=""):
+def serve_page(bus: Bus, stop: threading.Event, ready: Callable[[str], None]) -> threading.Thread:
+    """Start the role web for this rig on a free port; `ready` gets the address, `stop` ends the thread."""
+    config = Config(
+        rig=RIG,
+        imus={"imu0": ImuConfig(port="none")},
+        cameras={CAMERA: CameraConfig(uri="none")},
+        web=WebConfig(enabled=True, port=0),
+    )
+    options = {"clock": private_clock(), "ready": ready}
+    thread = threading.Thread(target=web.run, args=(config, bus, stop), kwargs=options)
+    thread.start()
+    return thread
+
+
+def estimate(
+    t_s: float,
+    rng: np.random.Generator,
+    status: Status | None = None,
+    guidance: str = "",
+    withheld: Sequence[str] = (),
+    motion: Guidance = NOTHING,
+    events: Sequence[Event] = (),
+    reason: str = "",
+) -> CalibrationEstimate:
     """An estimate whose sigmas fall as 1/sqrt(t) and whose errors fit them."""
     shrink = 1.0 / np.sqrt(max(t_s, 0.2))
     sigma = np.array([4e-3, 4e-3, 6e-3, 3e-3, 3e-3, 1e-3]) * shrink
@@ -53,11 +86,13 @@ def estimate(t_s, rng, status=None, guidance="", withheld=(), motion=NOTHING, ev
     )  # fmt: skip
 
 
-def publish_estimate(bus, value):
+def publish_estimate(bus: Bus, value: CalibrationEstimate) -> None:
+    """Publish an estimate of the camera."""
     bus.publish(topics.CALIBRATION.key(RIG, CAMERA), encode_calibration(value, CAMERA))
 
 
-def publish_status(bus, level=Level.OK, message="500.0 Hz, 0 lost"):
+def publish_status(bus: Bus, level: Level = Level.OK, message: str = "500.0 Hz, 0 lost") -> None:
+    """Publish the status of the roles imu (with this level and message) and detect."""
     values = {"samples": "15000", "lost": "0", "rate_hz": "500.02", "jitter_us": "83.4", "state": "streaming"}
     imu = DiagnosticStatus(level, "imu/imu0", message, "6223.12345", values)
     clock = DiagnosticStatus(Level.OK, "clock", "", "", {"offset_ns": "1"})
@@ -67,15 +102,19 @@ def publish_status(bus, level=Level.OK, message="500.0 Hz, 0 lost"):
     bus.publish(topics.STATUS.key(RIG, "detect"), encode_diagnostics(T0_NS, "detect", [found, clock]))
 
 
-def publish_points(bus, number, size=(640, 480)):
-    """Corners alone, as from a log without images."""
+def publish_points(bus: Bus, number: int, size: tuple[int, int] = (640, 480)) -> None:
+    """Publish corners alone, as from a log without images."""
     grid = np.stack(np.meshgrid(np.arange(1, 9), np.arange(1, 7)), axis=-1).reshape(-1, 2) * 45.0
-    payload = encode_points(T0_NS + number * 50_000_000, CAMERA, np.arange(48), grid + 100.0, None, size)
+    payload = encode_points(
+        T0_NS + number * 50_000_000, CAMERA, np.arange(48), np.asarray(grid + 100.0, np.float64), None, size
+    )
     bus.publish(topics.POINTS.key(RIG, CAMERA), payload)
 
 
-def publish_image(bus, number, *, with_points=True, with_prediction=True, width=640):
-    """A checkerboard drifting through the picture, its inner corners as points."""
+def publish_image(
+    bus: Bus, number: int, *, with_points: bool = True, with_prediction: bool = True, width: int = 640
+) -> int:
+    """Publish a checkerboard that drifts through the picture, its inner corners as points; its stamp, ns."""
     stamp = T0_NS + number * 50_000_000
     height = width * 3 // 4
     y, x = np.mgrid[0:height, 0:width]
@@ -90,7 +129,7 @@ def publish_image(bus, number, *, with_points=True, with_prediction=True, width=
         payload = encode_points(stamp, CAMERA, np.arange(48), uv, None, (width, height))
         bus.publish(topics.POINTS.key(RIG, CAMERA), payload)
         if with_prediction:
-            error = np.random.default_rng(number).normal([0.5, -0.3], 0.4, uv.shape)
+            error = np.asarray(np.random.default_rng(number).normal([0.5, -0.3], 0.4, uv.shape))
             expected = encode_points(stamp, CAMERA, np.arange(48), uv + error)
             bus.publish(topics.PREDICTED.key(RIG, CAMERA), expected)
     return stamp
