@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 from vical_drivers.user_files import read_file
 
+from vical_daemon import estimation
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.config.model import Config
 from vical_daemon.config.strict_yaml import MAX_BYTES
@@ -36,7 +37,9 @@ PROVEN_S = 10.0  # an estimator is not kept before it has run so long without fa
 OLDEST_S = 300.0  # an older state says too little about a rig that somebody may have touched meanwhile
 _COST = 100  # a save may take one part in so many of the time
 _SIZE_LIMIT = 2**26  # bytes; 0.4 MB after a minute
-_ARITHMETIC = "vical_daemon.estimation"
+CODE = Path(estimation.__file__).parent
+"""What a state depends on, besides config, target and clock."""
+_ARITHMETIC = estimation.__name__
 _PLAIN = {("builtins", "slice"), ("collections", "deque"), ("numpy", "dtype"), ("numpy", "ndarray")} | {
     (module, name)
     for core in ("numpy._core", "numpy.core")
@@ -165,7 +168,7 @@ def _identity(config: Config, clock: WallClock) -> str:
     """Hash of all that a state depends on: code, config, target, clock."""
     digest = hashlib.sha256(f"{sys.version} {np.__version__} {clock.boot_id} {clock.offset_ns}".encode())
     digest.update(repr(config).encode())
-    files = sorted((Path(__file__).parent / "estimation").rglob("*.py"))
+    files = sorted(CODE.rglob("*.py"))
     for path in (*files, *([config.target_path] if config.target_path else [])):
         if path.is_file():
             digest.update(read_file(path, MAX_BYTES))

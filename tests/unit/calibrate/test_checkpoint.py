@@ -83,6 +83,19 @@ def test_it_goes_on_where_it_was(
     assert a.to_json() == b.to_json()
 
 
+def test_a_state_of_other_code_is_not_taken(
+    tmp_path: Path, config: Config, converged: Calibrator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert any(checkpoint.CODE.rglob("calibrator.py"))  # the code that a state belongs to
+    code = tmp_path / "code"
+    code.mkdir()
+    monkeypatch.setattr(checkpoint, "CODE", code)
+    (code / "filter.py").write_text("GAIN = 1\n")
+    Checkpoint(tmp_path, config, CLOCK).save(converged, DEVICES)
+    (code / "filter.py").write_text("GAIN = 2\n")
+    assert Checkpoint(tmp_path, config, CLOCK).load(DEVICES) is None
+
+
 def test_it_is_used_once_and_not_before_it_has_proven_itself(
     tmp_path: Path, config: Config, converged: Calibrator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
