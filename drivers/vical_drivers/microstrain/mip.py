@@ -20,7 +20,7 @@ import msgspec
 from vical_drivers.microstrain.stream_decoder import StreamDecoder
 
 SYNC = b"\x75\x65"
-SET_BASE, SET_3DM, SET_SYSTEM = 0x01, 0x0C, 0x7F
+SET_BASE, SET_3DM = 0x01, 0x0C
 """Command sets; replies come in the same set."""
 SET_SENSOR = 0x80
 """Data set of the inertial sensor."""

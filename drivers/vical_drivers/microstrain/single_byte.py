@@ -153,11 +153,6 @@ def _readable(name: str, value: float | bytes) -> object:
     return value.decode("ascii", "replace").strip(" \0") if name == "text" else value.hex()
 
 
-def checksum(data: bytes) -> int:
-    """Sum of the bytes modulo 65536; sent most significant byte first."""
-    return sum(data) & 0xFFFF
-
-
 class _Entry(NamedTuple):
     length: int
     unpack: struct.Struct
