@@ -242,7 +242,7 @@ def test_every_command_is_journalled_with_its_origin(tmp_path, caplog):
             assert until(lambda text=line: any(entry.startswith(text) for entry in journalled())), line
         caplog.clear()
         group.publish(topics.COMMAND.key("rover", "estimate"), b"\xff")
-        assert until(lambda: any("1 bytes that are no command" in line for line in journalled()))
+        assert until(lambda: any("1 bytes that are not a command" in line for line in journalled()))
         bus.publish(COMMAND, encode_string("start"))
         assert until(lambda: any("this process" in line for line in journalled()))
         for _ in range(500):

@@ -1,4 +1,4 @@
-"""Where the bus of this computer is, and who may use it: unix sockets, without zenoh."""
+"""The unix sockets of the bus on this computer, and who may use them. Does not need zenoh."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ _TRY_S = 0.5
 
 
 class Reach(Enum):
-    """What happens to those who connect to a socket."""
+    """Result of connecting to a socket."""
 
-    OPEN = "somebody answers"
-    SILENT = "nobody answers"
+    OPEN = "a router answers"
+    SILENT = "no answer"
     CLOSED = "not for this user"
 
 
 def own_socket() -> Path:
-    """Where the router of this user (of the service, for the service) listens."""
+    """Return the socket of this user's router; for the service, of the service's router."""
     return runtime_directory() / "zenoh.sock"
 
 
 def local_sockets() -> list[Path]:
-    """Where a bus may be on this computer, this user's own first.
+    """Return where a bus may be on this computer, this user's own first.
 
-    A folder of somebody else in our place (below /tmp anybody may have made it) is left out.
+    Skips a runtime folder that another user owns: anyone can create one below /tmp.
     """
     own = own_socket()
     try:
@@ -56,7 +56,7 @@ def reach(path: Path) -> Reach:
 
 
 def loopback_answers(port: int) -> bool:
-    """Whether anybody accepts connections on a port of 127.0.0.1."""
+    """Return whether a process accepts connections on a port of 127.0.0.1."""
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=_TRY_S):
             return True
@@ -65,15 +65,15 @@ def loopback_answers(port: int) -> bool:
 
 
 def why_closed(path: Path) -> str:
-    """Say in one line to whom a socket belongs and what to do about it."""
-    for place in (*reversed(path.absolute().parents), path):
+    """Return one line: who owns the socket, and what the user can do."""
+    for part in (*reversed(path.absolute().parents), path):
         try:
-            found = place.stat()
+            found = part.stat()
         except OSError:
             break
-        if os.access(place, os.W_OK if place == path else os.X_OK):
+        if os.access(part, os.W_OK if part == path else os.X_OK):
             continue
-        for_group = stat.S_IWGRP if place == path else stat.S_IXGRP
+        for_group = stat.S_IWGRP if part == path else stat.S_IXGRP
         if not found.st_mode & for_group or found.st_gid == 0:
             return f"the bus at {path} belongs to user {_user(found.st_uid)}, who alone may use it"
         group, members = _group(found.st_gid)

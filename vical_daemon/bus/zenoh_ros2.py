@@ -1,7 +1,8 @@
-"""Our messages under ROS 2's names on the same zenoh session: `ros2 topic echo /rig0/imu0/data` works.
+"""Publishes our messages under ROS 2 names on the same zenoh session.
 
-The payloads are ROS 2 CDR already: only key, attachment and tokens are added. A ROS machine needs
-rmw_zenoh_cpp and a route to our router (`tcp/<robot>:7447`; see docs/how-to/ros2.md).
+`ros2 topic echo /rig0/imu0/data` works. The payloads are ROS 2 CDR already: only key, attachment and tokens
+are added. A ROS machine needs rmw_zenoh_cpp and a route to our router (`tcp/<robot>:7447`; see
+docs/how-to/ros2.md).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Ros2Publisher:
         self._node_token = session.liveliness().declare_token(token)
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Send one message if its key has a ROS name; else do nothing."""
+        """Send one message if its key has a ROS name."""
         with self._lock:
             if key not in self._publishers:
                 self._publishers[key] = self._publisher(key)

@@ -1,4 +1,4 @@
-"""Role estimate: inertial samples and points in, by stamp behind a short lag; calibration out at 5 Hz."""
+"""Role estimate: takes inertial samples and points, publishes the calibration at 5 Hz."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from vical_daemon.service.wall_clock import WallClock, service_clock
 __all__ = ["EstimateRole", "run"]
 
 _log = logging.getLogger(__name__)
-QUEUE_LIMIT = 20_000  # 20 s at 1000 Hz: what arrives while the estimator starts
-_WELL_S = 1.0  # images wait that long now and then
+QUEUE_LIMIT = 20_000  # samples: 20 s at 1000 Hz, which may arrive while the estimator starts
+_BACKLOG_S = 1.0  # images sometimes wait this long
 _OURS = "vical_daemon/"  # in the path of our code
 
 
@@ -68,29 +68,27 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
             checkpoint.forget()
             priors = persistence.begin_again()
             role.reset(_new_estimator(config, priors, persistence), make_watch(config))
-        while True:  # a bounded number at a time, so that publications stay on time when data pile up
+        while True:  # in batches, so that a backlog does not delay publications
             publish(bus, supervisor.work(queue.take(256), time.monotonic()))
             status.tick(lambda: supervisor.statuses(queue.dropped, time.monotonic()))
-            if role.latest is not None and role.latest.status is Status.CONVERGED and supervisor.well:
+            if role.latest is not None and role.latest.status is Status.CONVERGED and supervisor.keeps_up:
                 checkpoint.save(role.estimator, persistence.devices)
             if not len(queue) or stop.is_set():
                 break
-    checkpoint.forget()  # who stops the service may touch the rig
+    checkpoint.forget()  # after a stop the rig may be touched
     commands.close()
     queue.close()
     if role.latest is not None and role.latest.cameras:
-        publish(
-            bus, supervisor.finish()
-        )  # without a solution it would try once more to find one, for seconds
+        publish(bus, supervisor.finish())  # without a solution it would search for one again, for seconds
     persistence.close(role.latest)
     status.tick(lambda: supervisor.statuses(queue.dropped, time.monotonic()), force=True)
 
 
 class _Supervisor:
-    """Gives the role its work, and a fresh estimator where one fails or no longer gets anywhere.
+    """Runs the role, and restarts its estimator if it fails or is stuck.
 
-    An estimator never raises on data. Where it does so nevertheless, the messages to come are good ones: it
-    starts again from what is stored for the devices, later and later if that does not help.
+    An estimator should never raise on data. If it does, the next messages may be fine: it restarts from the
+    stored calibration, with growing pauses after repeated failures.
     """
 
     def __init__(
@@ -99,17 +97,17 @@ class _Supervisor:
         self._config, self._role, self._persistence, self._checkpoint = config, role, persistence, checkpoint
         self._progress, self._restarts = Progress(), Restarts()
         self._stuck_s = 0.0
-        self._given_up = 0  # messages while it waits for its next start
+        self._discarded = 0  # messages during the pause before a restart
 
     @property
-    def well(self) -> bool:
-        """Whether what arrives is being worked on."""
-        return self._stuck_s < _WELL_S
+    def keeps_up(self) -> bool:
+        """Whether the estimator keeps up with its input."""
+        return self._stuck_s < _BACKLOG_S
 
     def work(self, samples: Iterable[Sample], now_s: float) -> list[Message]:
-        """Take what has arrived; what is to be published."""
+        """Process samples and return the messages to publish."""
         if self._restarts.waiting_s(now_s) > 0.0:
-            self._given_up += sum(1 for _ in samples)
+            self._discarded += sum(1 for _ in samples)
             return []
         try:
             for sample in samples:
@@ -124,7 +122,7 @@ class _Supervisor:
         return messages
 
     def finish(self) -> list[Message]:
-        """End of the data; the last word."""
+        """Process the rest of the data and return the last messages."""
         try:
             return self._role.finish()
         except Exception as error:
@@ -143,7 +141,7 @@ class _Supervisor:
 
     def statuses(self, dropped: int, now_s: float) -> list[DiagnosticStatus]:
         """Return the health of the estimator."""
-        first, *others = self._role.statuses(dropped + self._given_up, self._stuck_s)
+        first, *others = self._role.statuses(dropped + self._discarded, self._stuck_s)
         values = {**first.values, "estimator_restarts": str(self._restarts.count)}
         wait_s = self._restarts.waiting_s(now_s)
         if wait_s > 0.0:
@@ -153,7 +151,7 @@ class _Supervisor:
 
 
 def _describe(error: Exception) -> str:
-    """One line on an exception: what, and where in our code."""
+    """Return one line on an exception: what, and where in our code."""
     _log.debug("the estimator raised", exc_info=error)
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if _OURS in frame.filename] or frames
@@ -162,7 +160,7 @@ def _describe(error: Exception) -> str:
 
 
 def _resumed(checkpoint: Checkpoint, persistence: CalibrationPersistence) -> Estimator | None:
-    """Return the estimator of a process that ended without being asked to; None: there was none."""
+    """Return the saved estimator of a process that crashed or was killed, or None."""
     found = checkpoint.load(persistence.devices)
     if found is None:
         return None
@@ -176,16 +174,16 @@ def _resumed(checkpoint: Checkpoint, persistence: CalibrationPersistence) -> Est
 def _new_estimator(
     config: Config, priors: dict[str, CameraPrior], persistence: CalibrationPersistence
 ) -> Estimator:
-    """Return an estimator that knows no more than config and store."""
+    """Return an estimator that starts from config and store."""
     for name in persistence.stored:
         _log.info("%s: starting from the calibration stored for these devices", name)
     return make_estimator(config, priors)
 
 
 def _reset_wanted(commands: Subscription) -> bool:
-    """Read the commands that have come; other words than ``reset`` are not for us."""
+    """Return whether a ``reset`` command has arrived; ignores other commands."""
     wanted = False
     while (sample := commands.recv(0.0)) is not None:
-        with suppress(MessageError):  # of somebody else, and no command
+        with suppress(MessageError):  # not a command
             wanted |= decode_string(sample.payload).strip() == "reset"
     return wanted

@@ -1,6 +1,6 @@
-"""The one settings file of a rig: typed, strict, every refusal with path, bound, file and line.
+"""The settings file of a rig: typed and strict. Errors name path, bound, file and line.
 
-Defaults stand here and beside the algorithms; `examples/vical.yaml` shows every key.
+Defaults are here and in the options of the algorithms; `examples/vical.yaml` shows every key.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NAMESPACE_HINT = (
     "a ROS name like robot7 or /site/robot7: letters, digits and _ between slashes, no digit first"
 )
 LOG_SCHEME = "log:"
-"""Of a `port` or `uri` that is a recording, played as if its device were there."""
+"""Prefix of a `port` or `uri` that is a recording, played in place of the device."""
 EMULATED = "emulated"
 """The `port` or `uri` of a device that `vical run` emulates."""
 URI = rf"(v4l2|iidc|aravis|folder|log):.+|/.+|\d+|{EMULATED}"
@@ -44,7 +44,7 @@ Matrix4 = tuple[
 
 @dataclass(frozen=True, slots=True)
 class NoiseConfig:
-    """Continuous-time noise densities; an IMU's data sheet or `vical allan` has them."""
+    """Continuous-time noise densities, from the IMU's data sheet or from `vical allan`."""
 
     gyro_density: Annotated[float, Bound(above=0, high=1.0)] = ImuNoise().gyro_density
     gyro_walk: Annotated[float, Bound(above=0, high=1.0)] = ImuNoise().gyro_walk
@@ -58,14 +58,14 @@ class ImuConfig:
 
     Attributes:
         port: Serial port, best a stable name below /dev/serial/by-id or /dev/vical; or log:FILE (a
-            recording, played as if its IMU were there; log:FILE#NAME of several) or emulated.
+            recording, played in place of the IMU; log:FILE#NAME if it has several) or emulated.
         driver: gx3: MicroStrain 3DM-GX3-25 (and MIP devices).
-        protocol: auto asks the device which one it speaks.
+        protocol: auto: detect the protocol of the device.
         rate_hz: Samples a second; the GX3 divides 1000 Hz.
-        filter_samples: Width M of the moving average in the device, ms; its delay is taken off the stamps.
-            None: as long as a sample lasts; longer ones flatten fast motion.
+        filter_samples: Width M of the moving average in the device, ms; the driver subtracts its delay from
+            the stamps. None: one sample period; longer filters attenuate fast motion.
         baud: Bits a second on the line while streaming; None: as found, or more where the rate needs it.
-        link: What lies in between; on a real UART (ftdi, uart) the bytes' own time is taken off the stamps.
+        link: Kind of connection; on a real UART (ftdi, uart) the transmission time is subtracted.
         noise: Densities for the estimator.
     """
 
@@ -81,7 +81,7 @@ class ImuConfig:
 
 @dataclass(frozen=True, slots=True)
 class LensConfig:
-    """What is known about a lens, in Kalibr's words (`kalibr_io` reads Kalibr's own files)."""
+    """Prior of a lens, with Kalibr's key names (`config.priors` reads Kalibr's own files)."""
 
     distortion_model: Literal["radtan", "plumb_bob", "equidistant"] = "radtan"
     intrinsics: tuple[Focal, Focal, float, float] | None = None
@@ -100,13 +100,13 @@ class CameraConfig:
             or emulated, as an IMU's `port`.
         size: width, height, px.
         rate_hz: Frames a second.
-        exposure_s: Exposure time; None: as the camera has it.
-        assume_exposure_s: Of a camera that cannot tell its exposure time; only dates frames.
-        gain: In the camera's own unit; None: as the camera has it.
-        pixel_format: What travels from the camera, e.g. GREY or MJPG; None: the cheapest.
-        stamp: What the driver's stamp marks; auto: what the driver says.
-        controls: More controls by the camera's own names.
-        record_as: What a log holds: raw images, or compressed ones (png is lossless, jpeg is small).
+        exposure_s: Exposure time; None: the camera's setting.
+        assume_exposure_s: Exposure time for stamping, if the camera cannot report it.
+        gain: In the camera's own unit; None: the camera's setting.
+        pixel_format: Format that the camera sends, e.g. GREY or MJPG; None: the cheapest.
+        stamp: Event that the driver's stamp marks; auto: as the driver reports.
+        controls: More controls, by the camera's own names.
+        record_as: Images in the log: raw or compressed (png is lossless, jpeg is small).
         lens: Prior of intrinsics and mounting.
     """
 
@@ -125,7 +125,7 @@ class CameraConfig:
 
 @dataclass(frozen=True, slots=True)
 class ConvergenceConfig:
-    """When a calibration counts as converged: every sigma below these."""
+    """A calibration has converged when every sigma is below these."""
 
     position_sigma_m: Annotated[float, Bound(above=0, high=1.0)] = 0.005
     rotation_sigma_deg: Annotated[float, Bound(above=0, high=10.0)] = 0.1
@@ -134,18 +134,18 @@ class ConvergenceConfig:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationConfig:
-    """What the estimator does.
+    """Settings of the estimator.
 
     Attributes:
         mode: target: corners of the board; target_free: tracked features.
         imu: The IMU to calibrate against; None: the only one.
         cameras: Those to calibrate; empty: all.
-        fix: Held at their priors.
-        estimate: Optional blocks switched on.
-        corner_sigma_px: First guess; measured afterwards.
+        fix: Parameters held at their priors.
+        estimate: Optional parameters to estimate.
+        corner_sigma_px: Initial value; then measured.
         gravity_mps2: Magnitude of gravity at the site.
-        lag_s: How long the estimator waits so that late samples are still sorted by stamp.
-        detect_rate_hz: At most so many images a second are searched for the board.
+        lag_s: How long the estimator waits for late samples, to process them in order of their stamps.
+        detect_rate_hz: Highest rate of board detection, images a second.
         convergence: Targets.
     """
 
@@ -163,23 +163,23 @@ class CalibrationConfig:
 
 @dataclass(frozen=True, slots=True)
 class BusConfig:
-    """How processes find each other; nothing listens on a network, loopback included, unless told so here.
+    """The bus. No process listens on a network, loopback included, unless configured here.
 
     Attributes:
         socket: Unix socket of the router, for its user and group; None: `zenoh.sock` in the runtime folder.
-        readers: Who may read: group: members of the router's group, over the socket, who may write as well;
-            loopback: everybody on this computer, who may not.
-        tcp_port: Loopback port of the router, for reading; 0: none, or 7447 with `readers: loopback`.
-        listen: Further zenoh endpoints of the router (`tls/0.0.0.0:7447`), for reading.
+        readers: Who may read. group: members of the router's group, over the socket, who may also write.
+            loopback: all users of this computer, read-only.
+        tcp_port: Loopback port of the router, read-only; 0: none, or 7447 with `readers: loopback`.
+        listen: Further zenoh endpoints of the router (`tls/0.0.0.0:7447`), read-only.
         connect: Endpoints of a site's router that this rig joins.
         tls_ca: Certificate authority, PEM file.
         tls_certificate: This rig's certificate, PEM file.
         tls_key: Its private key, PEM file.
-        password_file: usrpwd dictionary (user:password lines) of those who may connect.
+        password_file: usrpwd dictionary (user:password lines) of the users who may connect.
         user: User name for `connect`.
         password: Its password.
-        commanders: Users of `password_file`, or names in client certificates, who may put commands from
-            wherever they come.
+        commanders: Users of `password_file`, or names in client certificates, who may send commands over
+            any endpoint.
         publishers: The same, who may publish on every key.
     """
 
@@ -205,12 +205,12 @@ class BusConfig:
 
 @dataclass(frozen=True, slots=True)
 class Ros2Config:
-    """Publish also under ROS 2's names (rmw_zenoh), see docs/how-to/ros2.md; on where this section stands.
+    """Publish under ROS 2 names too (rmw_zenoh), see docs/how-to/ros2.md; enabled if this section is present.
 
     Attributes:
-        namespace: Before every topic, so that robots on one router do not collide; None: the rig's name;
+        namespace: Prefix of every topic, so that robots on one router do not collide; None: the rig's name;
             /: none.
-        domain: ROS_DOMAIN_ID of those who listen.
+        domain: ROS_DOMAIN_ID of the subscribers.
     """
 
     namespace: Annotated[str, Bound(pattern=NAMESPACE, hint=NAMESPACE_HINT)] | None = None
@@ -222,13 +222,13 @@ class RecordConfig:
     """The recorder.
 
     Attributes:
-        enabled: Record from the start; over the bus it can be started and stopped at any time.
+        enabled: Record from the start; commands on the bus start and stop it at any time.
         directory: Where files go; None: `log` in the state directory.
         images: Record images (points and IMU are always recorded).
-        rotate_s: A new file after so many seconds.
-        rotate_bytes: A new file after so many bytes.
-        quota_bytes: The oldest finished files are deleted beyond this.
-        reserve_bytes: Recording stops before the disk has less than this left.
+        rotate_s: Length of a file, s.
+        rotate_bytes: Size of a file.
+        quota_bytes: Above this total, the oldest finished files are deleted.
+        reserve_bytes: Recording stops before the disk has less free space than this.
     """
 
     enabled: bool = True
@@ -247,10 +247,10 @@ class WebConfig:
     Attributes:
         enabled: Serve it.
         host: Address to listen on; 127.0.0.1: this machine only.
-        port: Of the page; 0: any free one.
-        hosts: Names under which browsers ask for the page, beyond localhost, this computer's host name and
-            its address (a proxy's name, a name in your DNS); others are refused.
-        picture_rate_hz: Pictures a second on the page, at most; each costs about 2 ms of a processor.
+        port: Port of the page; 0: any free port.
+        hosts: Further host names that browsers may use for the page (a proxy's name, a name in your DNS),
+            besides localhost, this computer's host name and its address; other names are refused.
+        picture_rate_hz: Highest picture rate on the page; a picture costs about 2 ms of CPU.
         foxglove_port: WebSocket for Foxglove (its usual port is 8765); 0: none.
     """
 
@@ -264,7 +264,7 @@ class WebConfig:
 
 @dataclass(frozen=True, slots=True)
 class StoreConfig:
-    """Where the last converged calibration is kept; None: the state directory."""
+    """Where the last converged calibration is stored; None: the state directory."""
 
     directory: str | None = None
 
@@ -274,14 +274,14 @@ class Config:
     """A whole rig.
 
     Attributes:
-        rig: Its name in every bus key.
+        rig: Name of the rig in every bus key.
         imus: By name.
         cameras: By name.
         target: Target file (Kalibr's format); relative to the settings file.
-        ros2: ROS 2's names on the bus as well; None: not.
-        path: Where this was read from; empty when made in memory.
+        ros2: Publishing under ROS 2 names; None: disabled.
+        path: File of this config; None if made in memory.
 
-    Relative paths in `target`, ``log:FILE`` and ``folder:PATH`` are taken from the folder of this file.
+    Relative paths in `target`, ``log:FILE`` and ``folder:PATH`` start at the folder of the config file.
     """
 
     rig: Name = "rig0"
@@ -314,7 +314,7 @@ class Config:
 
     @property
     def target_path(self) -> Path | None:
-        """The target file, relative names taken from the folder of the settings file."""
+        """The target file, relative to the folder of the settings file."""
         if self.target is None:
             return None
         return (self.path.parent if self.path else Path()) / self.target
@@ -331,7 +331,7 @@ def load(path: Path | str) -> Config:
 
 
 def loads(text: str, name: str = "config") -> Config:
-    """Read settings from text; `name` stands in messages.
+    """Read settings from text; `name` is used in messages.
 
     Raises:
         ConfigError: See `load`.
@@ -348,7 +348,7 @@ def _check(document: Document, path: Path | None) -> Config:
 
 
 def _anchored(config: Config) -> Config:
-    """Take the relative paths of devices that are files from the folder of the settings file."""
+    """Make relative paths of recordings and image folders relative to the folder of the settings file."""
     if config.path is None:
         return config
     folder = config.path.absolute().parent

@@ -1,4 +1,4 @@
-"""Role record: everything that travels into MCAP segments, whatever else fails."""
+"""Role record: writes all messages into MCAP segments."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _PERIOD_S = 0.1
 def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | None = None) -> None:
     """Record what arrives on the bus until `stop`.
 
-    The bus' thread only stamps and queues; this thread writes, flushes, rotates and obeys commands.
+    The bus thread only stamps and queues; this thread writes, flushes, rotates and obeys commands.
 
     Args:
         config: The rig.
         bus: Where messages come from.
-        stop: Ends the role; what has arrived by then is still written.
+        stop: Ends the role; messages that have arrived are still written.
         clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
     """
     clock = clock or service_clock()
@@ -42,7 +42,7 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
 
     subscription = bus.subscribe(rig_expression(config.rig), take)
     known = {topic.key(config.rig, "x").replace("/x", "/*") for topic in TOPICS if topic.keep_last}
-    for expression in sorted(known):  # what was published before we came
+    for expression in sorted(known):  # last values from before this role started
         for sample in bus.latest(expression, 0.5):
             take(sample)
     recorder.tick()
