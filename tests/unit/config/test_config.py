@@ -81,7 +81,7 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("lens:\n", "lens:\n      distortion_model: fov\n", "cameras.cam0.lens.distortion_model: the text 'fov' is none of radtan, plumb_bob, equidistant (config line 10)"),
         ("lens:\n", "lens:\n      distortion_coeffs: [0, 0, 0]\n", "cameras.cam0.lens.distortion_coeffs: expected 4 values (k1 k2 p1 p2 of radtan), found 3 (config line 10)"),
         ("lens:\n", "lens:\n      distortion_model: plumb_bob\n      distortion_coeffs: [0, 0, 0, 0]\n", "cameras.cam0.lens.distortion_coeffs: expected 5 values (k1 k2 p1 p2 k3 of plumb_bob), found 4 (config line 11)"),
-        ("lens:\n", "lens:\n      T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]\n", "cameras.cam0.lens.T_cam_imu: the upper left 3x3 block is no rotation (config line 10)"),
+        ("lens:\n", "lens:\n      T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]\n", "cameras.cam0.lens.T_cam_imu: the upper left 3x3 block is not a rotation (config line 10)"),
         ("target: board.yaml", "calibration: {}", "calibration.mode: target needs `target: FILE` (`vical target` makes one), or mode: target_free (config line 11)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [extrinsics]}", "cameras.cam0.lens: calibration.fix holds extrinsics, so T_cam_imu must be given here (config line 9)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [lens]}", "calibration.fix.0: the text 'lens' is none of intrinsics, timeshift, extrinsics (config line 12)"),
