@@ -78,8 +78,8 @@ def _acquire(folder: str, stop: Any, ready: Any, answers: Any, size: tuple[int, 
     from vical_mocks.v4l2_camera import FakeCamera
     from vical_mocks.v4l2_kernel import FakeKernel, RealClock
 
-    from vical_daemon.acquire.camera import QUEUE_DEPTH, CameraRole
-    from vical_daemon.acquire.publish_queue import Outbox
+    from vical_daemon.acquire.camera import QUEUE_DEPTH, CameraEncoder
+    from vical_daemon.acquire.publish_queue import PublishQueue
     from vical_daemon.bus.interface import Bus
     from vical_daemon.bus.zenoh_bus import open_bus
     from vical_daemon.service.wall_clock import WallClock
@@ -92,7 +92,7 @@ def _acquire(folder: str, stop: Any, ready: Any, answers: Any, size: tuple[int, 
     path = kernel.plug(camera)
     settings = CameraSettings(exposure_s=EXPOSURE_S, readout_s=READOUT_S, borrow=True)
     bus: Bus = open_bus(mode="router", socket=Path(folder) / "bus")
-    role, outbox = CameraRole("bench", "cam0", WallClock(0)), Outbox(bus, QUEUE_DEPTH, "out")
+    role, queue = CameraEncoder("bench", "cam0", WallClock(0)), PublishQueue(bus, QUEUE_DEPTH, "out")
     ready.wait(60)
     time.sleep(0.5)  # the subscription has to get here first
     cpu_s, started = time.process_time(), time.monotonic()
@@ -101,14 +101,14 @@ def _acquire(folder: str, stop: Any, ready: Any, answers: Any, size: tuple[int, 
             frame = source.read(0.2)
             payload = role.message(frame) if frame is not None else None
             if payload is not None:
-                outbox.put(KEY, payload)
+                queue.put(KEY, payload)
         stats = source.stats()
     elapsed_s = time.monotonic() - started
     cpu_s = time.process_time() - cpu_s
     time.sleep(0.5)
-    outbox.close()
+    queue.close()
     answers.put({
-        "frames": stats.samples, "lost": stats.lost, "unsent": outbox.dropped, "sent": outbox.published,
+        "frames": stats.samples, "lost": stats.lost, "unsent": queue.dropped, "sent": queue.published,
         "acquire_cpu": 100 * cpu_s / elapsed_s,
     })  # fmt: skip
     time.sleep(1.0)

@@ -9,14 +9,9 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 from vical_mocks import trajectory
-from vical_mocks.points import simulate
-from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
-from vical_mocks.tracks import simulate_tracks
-from vical_mocks.trajectory import Trajectory
-
-from benchmarks import runner
-from benchmarks.bound import Bound, BoundOptions, bounds
-from benchmarks.feed import (
+from vical_mocks.cramer_rao.bound import Bound, bounds
+from vical_mocks.cramer_rao.information import BoundOptions
+from vical_mocks.harness.feed import (
     PARAMETERS,
     CalibratorSubject,
     Snapshot,
@@ -25,6 +20,12 @@ from benchmarks.feed import (
     feed,
     imu_noise,
 )
+from vical_mocks.points import simulate
+from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
+from vical_mocks.tracks import simulate_tracks
+from vical_mocks.trajectory import Trajectory
+
+from benchmarks import runner
 from benchmarks.montecarlo import bound_sigmas
 from vical_daemon.estimation.measurements import CalibrationOptions
 
@@ -100,9 +101,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--given", action="store_true", help="mounting and shift are given roughly")
     parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
     args = parser.parse_args(argv)
-    code = runner.fingerprint(
-        "vical_daemon/estimation", "benchmarks/feed.py", "benchmarks/degenerate.py", "mocks/vical_mocks"
-    )
+    code = runner.fingerprint("vical_daemon/estimation", "benchmarks/degenerate.py", "mocks/vical_mocks")
     print(
         "| motion | ever converged | last status | lost by the bound | withheld | largest z of the rest "
         "| reason |"

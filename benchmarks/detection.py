@@ -8,19 +8,17 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from vical_mocks.camera import CameraSettings, SimulatedCamera
+from vical_mocks.camera import SimulatedCamera
+from vical_mocks.harness.boards import APRILGRID, CHECKERBOARD, DISTORTION, film
 from vical_mocks.lens import Lens
 from vical_mocks.rig import Rig, reference_rig
 from vical_mocks.room import RoomCamera
-from vical_mocks.trajectory import hand_motion
 
 from vical_daemon.vision.detector import BoardDetector
 from vical_daemon.vision.flow_prediction import FlowCamera, FlowPredictor
-from vical_daemon.vision.target import AprilGrid, Checkerboard, Target
+from vical_daemon.vision.target import AprilGrid, Target
 from vical_daemon.vision.tracks import FeatureTracker
 
-DISTORTION = (-0.28, 0.07, 2e-4, 2e-5)
-APRILGRID, CHECKERBOARD = AprilGrid(6, 6, 0.088, 0.3), Checkerboard(8, 7, 0.05, 0.05)
 STEP_S = 0.05
 GROSS_PX = 1.0
 
@@ -50,27 +48,6 @@ def main(argv: list[str]) -> int:
     _hidden(args.frames)
     _tracks(args.frames)
     return 0
-
-
-def rig_before(target: Target, distance_m: float, seed: int = 1, **changes: float) -> Rig:
-    """A hand-held rig before a board; reference lens with EuRoC-like distortion."""
-    side = 1 if isinstance(target, AprilGrid) else -1
-    size = target.points_m[:, :2].max(axis=0)
-    rig = reference_rig(seed)
-    motion = hand_motion(
-        seed,
-        T_imu_cam=(rig.R_imu_cam, rig.p_imu_cam),
-        side=side,
-        distance_m=distance_m,
-        board_size_m=(float(size[0]), float(size[1])),
-    )
-    return reference_rig(seed, trajectory=motion, lens=Lens(distortion=DISTORTION), side=side, **changes)
-
-
-def film(target: Target, distance_m: float, seed: int = 1, **settings: float) -> SimulatedCamera:
-    """The camera of that rig."""
-    rig = rig_before(target, distance_m, seed)
-    return SimulatedCamera(target, rig.lens, rig.camera_pose_target, CameraSettings(**settings), seed)
 
 
 def _boards(frames: int) -> None:

@@ -15,12 +15,12 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
+from vical_mocks.cramer_rao.projection import View, jacobians
+from vical_mocks.harness.feed import CAMERA, Record, Snapshot, error_against_truth
 from vical_mocks.lens import Lens
 from vical_mocks.points import SimulatedRun
 from vical_mocks.rotations import exp_so3, skew
 
-from benchmarks.feed import CAMERA, Record, Snapshot, error_against_truth
-from benchmarks.projection import View, jacobians
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame

@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from vical_mocks.harness.recordings import Items, read
 
-from vical_daemon.bus.messages import decode_imu, decode_points
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.noise.consistency import MODES, modes
 from vical_daemon.estimation.result import CameraEstimate
-from vical_daemon.logs import open_recording
 from vical_daemon.vision.target import load_target
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "euroc_imu_april"
@@ -31,8 +30,6 @@ DISTORTION = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 PRIOR = CameraPrior((752, 480), LENS, "radtan", DISTORTION)
 SPLIT_S = 35.5
 _PART_PX = 24
-
-Items = list[tuple[int, object]]
 
 
 class Half(NamedTuple):
@@ -113,20 +110,6 @@ def held_back(
         imu_noise=NOISE,
     )
     return calibrate(other, options, points, prior).used
-
-
-def read(folder: Path) -> Items:
-    """All messages by stamp; inertial ones first where stamps are equal."""
-    items: list[tuple[int, int, object]] = []
-    for key, payload in open_recording(folder).messages():
-        if "/imu/" in key:
-            imu = decode_imu(payload)
-            items.append((imu.stamp_ns, 0, imu))
-        elif key.endswith(("/points", "/tracks")):
-            frame = decode_points(payload).to_frame()
-            items.append((frame.t_cam_ns, 1, frame))
-    items.sort(key=lambda item: item[:2])
-    return [(t, item) for t, _, item in items]
 
 
 def row(name: str, a: CameraEstimate, b: CameraEstimate) -> str:

@@ -17,12 +17,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from vical_mocks.harness.feed import CalibratorSubject, Record, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import SimulatedRun, simulate
 from vical_mocks.rig import Bump, reference_rig
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 
 from benchmarks import runner
-from benchmarks.feed import CalibratorSubject, Record, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
 
@@ -203,9 +203,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--lens-known", action="store_true")
     parser.add_argument("--target-free", action="store_true")
     args = parser.parse_args(argv)
-    code = runner.fingerprint(
-        "vical_daemon/estimation", "benchmarks/feed.py", "benchmarks/gaps.py", "mocks/vical_mocks"
-    )
+    code = runner.fingerprint("vical_daemon/estimation", "benchmarks/gaps.py", "mocks/vical_mocks")
     print(
         "| disturbance | rigs | reported | announced as bumped | converged again after s (median / worst) "
         "| sigmas after over before (median / worst) | converged beyond 5 sigma |"

@@ -16,12 +16,12 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from vical_mocks.cramer_rao.bound import Draw, bounds, frames_of
+from vical_mocks.cramer_rao.error_model import STATE, error_slopes, steps_in
+from vical_mocks.harness.feed import PARAMETERS
 from vical_mocks.points import SimulatedRun, project_points
 
 from benchmarks import runner, scores
-from benchmarks.bound import Draw, bounds, frames_of
-from benchmarks.error_model import STATE, error_slopes, steps_in
-from benchmarks.feed import PARAMETERS
 from benchmarks.montecarlo import (
     CASES,
     TIMES_S,

@@ -10,14 +10,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+from vical_mocks.cramer_rao.bound import Bound, bounds
+from vical_mocks.cramer_rao.information import BoundOptions
+from vical_mocks.harness.feed import (
+    CalibratorSubject,
+    Record,
+    StartErrors,
+    Subject,
+    camera_prior,
+    feed,
+    imu_noise,
+    nees,
+)
 from vical_mocks.points import SimulatedRun, board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from benchmarks import runner, scores
-from benchmarks.bound import Bound, BoundOptions, bounds
 from benchmarks.ekf import EkfSubject
-from benchmarks.feed import CalibratorSubject, Record, StartErrors, Subject, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 TIMES_S = (10.0, 30.0, 60.0)
@@ -249,7 +259,7 @@ def summary(record: Record, dof: int, times_s: list[float]) -> runner.Result:
         at[f"{t_s:g}"] = shot and {
             "error": shot.error,
             "sigma": np.sqrt(np.diag(shot.covariance)),
-            "nees": scores.nees(shot.error, shot.covariance, dof),
+            "nees": nees(shot.error, shot.covariance, dof),
             "status": shot.status,
             "extra": shot.extra,
         }
@@ -261,7 +271,7 @@ def summary(record: Record, dof: int, times_s: list[float]) -> runner.Result:
             "t_s": [s.t_s for s in shots],
             "error": [s.error for s in shots],
             "sigma": [np.sqrt(np.diag(s.covariance)) for s in shots],
-            "nees": [scores.nees(s.error, s.covariance, dof) for s in shots],
+            "nees": [nees(s.error, s.covariance, dof) for s in shots],
             "status": [s.status for s in shots],
         },
         "events": record.event_documents,
@@ -275,7 +285,7 @@ def summary(record: Record, dof: int, times_s: list[float]) -> runner.Result:
 def code_under_test(kind: str) -> str:
     """Fingerprint of what decides a trial's result."""
     subject = "vical_daemon/estimation" if kind == "vical" else "benchmarks/ekf.py"
-    return runner.fingerprint(subject, "benchmarks/feed.py", "benchmarks/montecarlo.py", "mocks/vical_mocks")
+    return runner.fingerprint(subject, "benchmarks/montecarlo.py", "mocks/vical_mocks")
 
 
 @cache

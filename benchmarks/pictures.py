@@ -10,7 +10,6 @@ real recording lies beside the checkout, its report is taken as well.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import io
 import re
 import subprocess
@@ -18,6 +17,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from vical_mocks.harness import browser
 
 from vical_daemon.cli import live_table
 from vical_daemon.cli.watch import View
@@ -34,26 +35,25 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--out", type=Path, default=Path("pictures"), help="folder (default: ./pictures)")
     parser.add_argument("--seconds", type=float, default=45.0, help="length of the demo")
     args = parser.parse_args(argv)
-    browser = _browser()
     if browser.find() is None:
         print("skipped: no Chromium here (apt-get install chromium)", file=sys.stderr)
         return 0
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
-        log = live_page(browser, work, args.out, args.seconds)
-        terminal(browser, work, log, args.out / "terminal.png")
+        log = live_page(work, args.out, args.seconds)
+        terminal(work, log, args.out / "terminal.png")
         board = ["--target", str(log.with_name("target.yaml"))]
-        report(browser, work, [str(log), *board], args.out / "demo_report.png")
+        report(work, [str(log), *board], args.out / "demo_report.png")
         if EUROC.is_dir():
             known = ["--target", str(EUROC / "target.yaml"), "--initial", str(EUROC / "initial.yaml")]
             fixed = [*known, "--fix", "intrinsics"]
-            report(browser, work, [str(EUROC), *fixed], args.out / "report.png")
+            report(work, [str(EUROC), *fixed], args.out / "report.png")
     print("\n".join(str(path) for path in sorted(args.out.glob("*.png"))))
     return 0
 
 
-def live_page(browser: Any, work: Path, out: Path, seconds: float) -> Path:
+def live_page(work: Path, out: Path, seconds: float) -> Path:
     """Run the demo, look at its page on a desk and on a phone; return the demo's log."""
     command = [*_VICAL, "demo", "--web", "0", "--seconds", str(seconds), "--out", str(work / "demo")]
     demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -78,7 +78,7 @@ def live_page(browser: Any, work: Path, out: Path, seconds: float) -> Path:
     return next(iter((work / "demo").glob("*.mcap")))
 
 
-def terminal(browser: Any, work: Path, log: Path, path: Path) -> None:
+def terminal(work: Path, log: Path, path: Path) -> None:
     """Draw what `vical watch` showed at the end of the log."""
     from rich.console import Console
 
@@ -89,26 +89,10 @@ def terminal(browser: Any, work: Path, log: Path, path: Path) -> None:
         view.take(Sample(message.channel.topic.removeprefix("/"), message.payload, 0))
     console = Console(record=True, width=104, force_terminal=True, file=io.StringIO())
     console.print(live_table.screen(view.estimates, view.health))
-    picture(browser, work, console.export_svg(title="vical watch"), path)
+    browser.draw_svg(console.export_svg(title="vical watch"), work, path)
 
 
-def picture(browser: Any, work: Path, svg: str, path: Path) -> None:
-    """Turn an SVG of rich into a PNG, its fonts replaced by the browser's own: nothing is fetched."""
-    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)
-    (work / "terminal.html").write_text(f"<body style='margin:0;background:#fff'>{svg}</body>")
-
-    async def script(page: Any) -> None:
-        await page.open((work / "terminal.html").as_uri(), 1100, 900)
-        await page.wait("!!document.querySelector('svg')")
-        height = await page.evaluate("document.querySelector('svg').getBoundingClientRect().height")
-        await page.open((work / "terminal.html").as_uri(), 1100, round(height) + 2)
-        await page.wait("!!document.querySelector('svg')")
-        await page.screenshot(path)
-
-    browser.drive(script, work / "profile")
-
-
-def report(browser: Any, work: Path, arguments: list[str], path: Path) -> None:
+def report(work: Path, arguments: list[str], path: Path) -> None:
     """Make the report of a calibration and look at its first page."""
     html = work / "report.html"
     command = [*_VICAL, "calibrate", *arguments, "--report", str(html)]
@@ -120,16 +104,6 @@ def report(browser: Any, work: Path, arguments: list[str], path: Path) -> None:
         await page.screenshot(path)
 
     browser.drive(script, work / "profile")
-
-
-def _browser() -> Any:
-    """Load the tests' driver of a headless Chromium (tests have no packages)."""
-    path = ROOT / "tests" / "system" / "output" / "browser.py"
-    spec = importlib.util.spec_from_file_location("vical_browser", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 if __name__ == "__main__":

@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 from vical_mocks.camera import CameraSettings, SimulatedCamera
+from vical_mocks.harness.boards import APRILGRID, CHECKERBOARD, rig_before
+from vical_mocks.harness.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import SimulatedFrame, simulate
 
 from benchmarks import runner
-from benchmarks.detection import APRILGRID, CHECKERBOARD, rig_before
-from benchmarks.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.vision.detector import BoardDetector
 from vical_daemon.vision.target import Target

@@ -22,19 +22,6 @@ BLOCKS = {
 LENS_BLOCKS = {"f px": (slice(7, 9), 1.0), "c px": (slice(9, 11), 1.0)}
 
 
-def nees(error: FloatArray, covariance: FloatArray, size: int) -> float:
-    """Normalised squared error of the first `size` parameters; NaN where the covariance is not positive."""
-    block = covariance[:size, :size]
-    scale = np.sqrt(np.diag(block))
-    if not np.all(scale > 0):
-        return float("nan")
-    e = error[:size] / scale
-    try:
-        return float(e @ np.linalg.solve(block / np.outer(scale, scale), e))
-    except np.linalg.LinAlgError:
-        return float("nan")
-
-
 def band(count: int, dof: int, level: float = 0.95) -> tuple[float, float]:
     """Interval in which the mean NEES per degree of freedom of `count` honest trials lies."""
     tail = (1 - level) / 2

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from vical_mocks.harness.machine import Machine, MachineError
 
-from benchmarks.machine import Machine, MachineError
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.mcap import recover
 from vical_daemon.vision.target import Checkerboard

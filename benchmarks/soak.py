@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from vical_mocks.harness.processes import usage
 
 from vical_daemon.bus import messages as m
 from vical_daemon.bus import topics
@@ -168,14 +169,3 @@ def report(
 
 def _values(sample: Any) -> dict[str, str]:
     return m.decode_diagnostics(sample.payload).statuses[0].values
-
-
-def usage(pid: int) -> tuple[float, int, int]:
-    """Return memory (MB), descriptors and threads of a process."""
-    process = Path(f"/proc/{pid}")
-    pages = int((process / "statm").read_text().split()[1])
-    return (
-        pages * os.sysconf("SC_PAGE_SIZE") / 2**20,
-        len(list((process / "fd").iterdir())),
-        len(list((process / "task").iterdir())),
-    )

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from vical_mocks.harness.processes import usage
 from vical_mocks.points import board_points
 from vical_mocks.rig import reference_rig
 
-from benchmarks.soak import usage
 from vical_daemon.bus import messages as m
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus, Sample

@@ -11,43 +11,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
+from vical_mocks.harness.recordings import OPENVINS, Figures, camera_of, read
 
-from benchmarks.euroc_halves import read
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 FloatArray = npt.NDArray[np.float64]
-Figures = tuple[float, float, float]
 DATA = Path(__file__).parents[2] / "shared" / "data"
 TIMES_S = (10.0, 30.0, 60.0, 120.0)
-# OpenVINS's own RMS on such data, from its README in the data folder: deg, mm, ms
-OPENVINS: dict[float, Figures] = {
-    10.0: (0.060, 7.2, 0.050),
-    30.0: (0.034, 4.6, 0.020),
-    60.0: (0.031, 3.6, 0.020),
-    120.0: (0.019, 2.1, 0.018),
-}
-
-
-def camera_of(path: Path) -> dict[str, Any]:
-    """First camera of a Kalibr file, with T_imu_cam; the imu's densities under `noise`."""
-    document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    camera: dict[str, Any] = dict(document["cam0"])
-    if "T_cam_imu" in camera:
-        T = np.array(camera["T_cam_imu"])
-        camera["R"], camera["p"] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
-    imu = document.get("imu0")
-    if imu:
-        names = (
-            "gyroscope_noise_density",
-            "gyroscope_random_walk",
-            "accelerometer_noise_density",
-            "accelerometer_random_walk",
-        )
-        camera["noise"] = ImuNoise(*(float(imu[n]) for n in names), float(imu["rate_hz"]))
-    return camera
 
 
 def run(

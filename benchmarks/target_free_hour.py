@@ -8,11 +8,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from vical_mocks.points import SimulatedFrame, SimulatedRun
-from vical_mocks.rig import reference_rig
-from vical_mocks.tracks import simulate_tracks
-
-from benchmarks.feed import (
+from vical_mocks.harness.feed import (
     CalibratorSubject,
     Record,
     StartErrors,
@@ -21,6 +17,10 @@ from benchmarks.feed import (
     imu_noise,
     points_frame,
 )
+from vical_mocks.points import SimulatedFrame, SimulatedRun
+from vical_mocks.rig import reference_rig
+from vical_mocks.tracks import simulate_tracks
+
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 _REPORTS = 7

@@ -9,13 +9,13 @@ from functools import partial
 
 import cv2
 import numpy as np
+from vical_mocks.harness.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import SimulatedRun
 from vical_mocks.rig import reference_rig
 from vical_mocks.room import RoomCamera
 from vical_mocks.tracks import simulate_tracks
 
 from benchmarks import runner
-from benchmarks.feed import PARAMETERS, CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.vision.tracks import FeatureTracker, TrackOptions
 

@@ -18,29 +18,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from vical_mocks.harness import web_feed
 
-from benchmarks.web_viewers import _feed_module, watch
+from benchmarks.web_viewers import watch
+from vical_daemon.bus.zenoh_bus import open_bus
 
 STATUS_PER_ESTIMATE = 6 / 5
 IMAGES_HZ = 10.0
 
 
 def serve(pipe: Connection, socket: str) -> None:
-    """Child: role web as a client of the bus; sends its address, ends when told."""
-    from vical_daemon.bus.zenoh_bus import open_bus
-    from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
-    from vical_daemon.service.wall_clock import private_clock
-    from vical_daemon.web import role as web
-
+    """Child: role web as a client of the bus; sends its address, ends on any message."""
     bus, stop = open_bus(mode="client", socket=socket), threading.Event()
-    config = Config(
-        imus={"imu0": ImuConfig(port="none")},
-        cameras={"cam0": CameraConfig(uri="none")},
-        web=WebConfig(enabled=True, port=0),
-    )
-    options = {"clock": private_clock(), "ready": pipe.send}
-    thread = threading.Thread(target=web.run, args=(config, bus, stop), kwargs=options)
-    thread.start()
+    thread = web_feed.serve_page(bus, stop, pipe.send)
     pipe.recv()
     stop.set()
     thread.join()
@@ -49,18 +39,18 @@ def serve(pipe: Connection, socket: str) -> None:
 
 def feed(bus: Any, stop: threading.Event, speed: float, sent: list[int]) -> None:
     """Publish like a rig, `speed` times as fast; counts the estimates in `sent`."""
-    module, rng = _feed_module(), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     begin_s, images = time.monotonic(), 0
     while not stop.is_set():
         elapsed_s = time.monotonic() - begin_s
         due = int(5 * speed * elapsed_s) - sent[0]
         for _ in range(due):
-            module.publish_estimate(bus, module.estimate(30.0 + 0.2 * sent[0], rng))
+            web_feed.publish_estimate(bus, web_feed.estimate(30.0 + 0.2 * sent[0], rng))
             sent[0] += 1
         for _ in range(int(due * STATUS_PER_ESTIMATE / 2)):  # two statuses a call
-            module.publish_status(bus)
+            web_feed.publish_status(bus)
         if elapsed_s * IMAGES_HZ > images:
-            module.publish_image(bus, images)
+            web_feed.publish_image(bus, images)
             images += 1
         stop.wait(0.02)
 
@@ -86,8 +76,6 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--seconds", type=float, default=1500.0)
     parser.add_argument("--speed", type=float, default=20.0, help="times the rate of a rig")
     args = parser.parse_args(argv)
-    from vical_daemon.bus.zenoh_bus import open_bus
-
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     points: list[tuple[float, int, int]] = []

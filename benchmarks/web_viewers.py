@@ -8,48 +8,35 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import importlib.util
 import multiprocessing
 import resource
 import threading
 import time
 from multiprocessing.connection import Connection
-from pathlib import Path
-from typing import Any
 
 import aiohttp
 import numpy as np
+from vical_mocks.harness import web_feed
+
+from vical_daemon.bus.interface import LocalBus
 
 
 def serve(pipe: Connection, seconds: float) -> None:
     """Child: role web over a LocalBus; sends its address, then CPU seconds of the page and of the bus."""
-    from vical_daemon.bus.interface import LocalBus
-    from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
-    from vical_daemon.service.wall_clock import private_clock
-    from vical_daemon.web import role as web
-
-    feed = _feed_module()
     recorded = LocalBus()
     messages: list[tuple[str, bytes]] = []
     recorded.subscribe("vical/**", lambda sample: messages.append((sample.key, sample.payload)))
     rng, steps = np.random.default_rng(0), []
     for k in range(int(10 * seconds)):  # made before the measurement: it is the page that is measured
         messages.clear()
-        feed.publish_image(recorded, k)
+        web_feed.publish_image(recorded, k)
         if k % 2:
-            feed.publish_estimate(recorded, feed.estimate(0.1 * k, rng))
+            web_feed.publish_estimate(recorded, web_feed.estimate(0.1 * k, rng))
         if k % 10 == 0:
-            feed.publish_status(recorded)
+            web_feed.publish_status(recorded)
         steps.append(list(messages))
     bus, stop = LocalBus(), threading.Event()
-    config = Config(
-        imus={"imu0": ImuConfig(port="none")},
-        cameras={"cam0": CameraConfig(uri="none")},
-        web=WebConfig(enabled=True, port=0),
-    )
-    options = {"clock": private_clock(), "ready": pipe.send}
-    thread = threading.Thread(target=web.run, args=(config, bus, stop), kwargs=options)
-    thread.start()
+    thread = web_feed.serve_page(bus, stop, pipe.send)
     pipe.recv()  # viewers are there
     begin, begin_bus = _cpu_s(), time.thread_time()
     for step in steps:
@@ -65,15 +52,6 @@ def serve(pipe: Connection, seconds: float) -> None:
 def _cpu_s() -> float:
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
-
-
-def _feed_module() -> Any:
-    path = Path(__file__).parents[1] / "tests" / "system" / "output" / "web_feed.py"
-    spec = importlib.util.spec_from_file_location("web_feed", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 async def watch(address: str, events: int, pictures: int, done: threading.Event) -> int:

@@ -1,4 +1,4 @@
-"""For other programs: the calibration of a robot as it is now, as it changes, and when it has converged.
+"""Python API for other programs: the current calibration of a robot, its updates, and its convergence.
 
 >>> from vical_daemon import client                                    # doctest: +SKIP
 >>> with client.connect() as robot:                                    # doctest: +SKIP
@@ -31,7 +31,7 @@ _DEPTH = 256
 
 
 class ClientError(Exception):
-    """What was asked for did not come; the message is one line for a person."""
+    """A request failed or timed out; the message is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Update:
     Attributes:
         rig: Name of the robot.
         camera: Name of the camera.
-        estimate: Everything the estimator says (of this camera alone).
+        estimate: The complete estimate, of this camera alone.
     """
 
     rig: str
@@ -50,10 +50,10 @@ class Update:
 
     @property
     def known(self) -> CameraEstimate:
-        """What is known about the camera.
+        """The calibration of the camera.
 
         Raises:
-            ClientError: Nothing yet.
+            ClientError: There is no solution yet.
         """
         known = self.estimate.cameras.get(self.camera)
         if known is None:
@@ -64,12 +64,12 @@ class Update:
 
     @property
     def announcements(self) -> list[str]:
-        """What was announced since the last estimate, as text; as data: `estimate.events`."""
+        """The events since the last estimate, as text; as data: `estimate.events`."""
         return [event_text(event) for event in self.estimate.events]
 
     @property
     def converged(self) -> bool:
-        """Whether the numbers may be used."""
+        """Whether the calibration has converged."""
         return self.estimate.status is Status.CONVERGED and self.camera in self.estimate.cameras
 
 
@@ -81,7 +81,7 @@ class Client(Closing):
 
         Args:
             bus: An open bus.
-            rig: Name of the robot, or ``*`` for all that are heard.
+            rig: Name of the robot, or ``*`` for all.
             owns_bus: `close` closes it.
         """
         self._bus = bus
@@ -89,7 +89,7 @@ class Client(Closing):
         self._owns_bus = owns_bus
 
     def latest(self, camera: str = "*", timeout_s: float = 1.0) -> list[Update]:
-        """Return the last estimate of each camera (of one), [] where nobody calibrates.
+        """Return the last estimate of each camera (of one); [] if there is no estimator.
 
         Args:
             camera: Name of a camera, or ``*``.
@@ -99,7 +99,7 @@ class Client(Closing):
         return [update for sample in samples if (update := _read(sample)) is not None]
 
     def subscribe(self, callback: Callable[[Update], None], camera: str = "*") -> Subscription:
-        """Call back for every estimate from now on, beginning with the last one: late is not too late.
+        """Call back for every estimate, starting with the last one published.
 
         Args:
             callback: Called in a thread of the bus; keep it short.
@@ -120,11 +120,11 @@ class Client(Closing):
         return subscription
 
     def updates(self, camera: str = "*", timeout_s: float | None = None) -> Iterator[Update]:
-        """Yield estimates, beginning with the last one, until none has come for `timeout_s`."""
+        """Yield estimates, starting with the last one, until none has come for `timeout_s`."""
         waiting: queue.Queue[Update] = queue.Queue(_DEPTH)
 
         def keep(update: Update) -> None:
-            if waiting.full():  # a slow reader gets the newest
+            if waiting.full():  # a slow reader skips to the newest
                 with suppress(queue.Empty):
                     waiting.get_nowait()
             with suppress(queue.Full):
@@ -166,7 +166,7 @@ class Client(Closing):
         return topics.CALIBRATION.pattern.format(rig=self._rig, name=name)
 
     def close(self) -> None:
-        """Leave the bus; may be called twice."""
+        """Close the connection; may be called twice."""
         if self._owns_bus:
             self._bus.close()
 
@@ -182,7 +182,7 @@ class AsyncClient:
         return await asyncio.to_thread(self._client.latest, camera, timeout_s)
 
     async def updates(self, camera: str = "*") -> AsyncIterator[Update]:
-        """Yield estimates, beginning with the last one; a slow reader gets the newest."""
+        """Yield estimates, starting with the last one; a slow reader skips to the newest."""
         loop = asyncio.get_running_loop()
         waiting: asyncio.Queue[Update] = asyncio.Queue(_DEPTH)
 
@@ -192,7 +192,7 @@ class AsyncClient:
             waiting.put_nowait(update)
 
         def hand_over(update: Update) -> None:
-            with suppress(RuntimeError):  # the loop has ended meanwhile
+            with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(keep, update)
 
         subscription = await asyncio.to_thread(self._client.subscribe, hand_over, camera)
@@ -213,13 +213,13 @@ class AsyncClient:
                     if update.converged:
                         return update
         except TimeoutError:
-            pass  # what was last heard says why, below
+            pass  # the last update gives the reason, below
         finally:
             await updates.aclose()  # type: ignore[attr-defined]
         raise ClientError(_why_not(last, timeout_s))
 
     async def close(self) -> None:
-        """Leave the bus; may be called twice."""
+        """Close the connection; may be called twice."""
         await asyncio.to_thread(self._client.close)
 
     async def __aenter__(self) -> Self:
@@ -262,7 +262,7 @@ async def connect_async(
 
 
 def _read(sample: Sample) -> Update | None:
-    """Return what a sample says; None for junk on our key."""
+    """Return the update in a sample; None if it is malformed."""
     parsed = parse_key(sample.key)
     if parsed is None or parsed.topic is not topics.CALIBRATION:
         return None

@@ -273,8 +273,6 @@ class SingleByteFace:
         function, value = struct.unpack(">BI", command[3:8])
         if function == 1:
             self._state.set_ticks(k, value)
-        elif function == 2:
-            self._state.pps_seconds = value
         return frame(b"\xd7" + struct.pack(">I", self._state.ticks(k)))
 
     def _communication(self, command: bytes, k: int) -> bytes:

@@ -65,7 +65,6 @@ class Gx3State:
     eeprom: Settings = field(default_factory=Settings)
     eeprom_writes: int = 0
     ticks_offset: int = 0
-    pps_seconds: int = 0
     eeprom_words: dict[int, int] = field(default_factory=dict)
 
     def power_up(self) -> None:

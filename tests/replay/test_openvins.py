@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from vical_mocks.harness.recordings import OPENVINS, camera_of, read
 
-from benchmarks.euroc_halves import read
-from benchmarks.target_free import OPENVINS, camera_of
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.target_free import TargetFreeCalibrator

@@ -7,12 +7,12 @@ a filter whose sigmas are 25 % off, or that loses a third of the information, fa
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from vical_mocks.cramer_rao.bound import bounds
+from vical_mocks.cramer_rao.information import BoundOptions
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, nees
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
-from benchmarks.bound import BoundOptions, bounds
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
-from benchmarks.scores import nees
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 pytestmark = [pytest.mark.statistical, pytest.mark.timeout(400)]

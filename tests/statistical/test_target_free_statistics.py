@@ -6,12 +6,12 @@ Limits are chi-square quantiles at 99.9 %, as in `test_calibration_statistics.py
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from vical_mocks.cramer_rao.bound import bounds
+from vical_mocks.cramer_rao.information import BoundOptions
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, nees
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
-from benchmarks.bound import BoundOptions, bounds
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
-from benchmarks.scores import nees
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.carry import IMU
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 from vical_daemon import client
-from vical_daemon.bus import bus_places, topics
-from vical_daemon.bus.bus_places import Reach, local_sockets, reach, why_closed
+from vical_daemon.bus import socket_paths, topics
 from vical_daemon.bus.local_bus import open_local_bus
 from vical_daemon.bus.messages import encode_string
+from vical_daemon.bus.socket_paths import Reach, local_sockets, reach, why_closed
 from vical_daemon.bus.zenoh_bus import BusError, open_bus
 from vical_daemon.cli.bus_access import open_client, open_for_roles
 from vical_daemon.config.model import BusConfig, Config
@@ -53,8 +53,8 @@ def vical_elsewhere(
         "import os, pathlib, sys\n"
         "from vical_daemon.config import paths\n"
         f"paths.LOOPBACK_PORT = {port}\n"
-        "from vical_daemon.bus import bus_places\n"
-        f"bus_places.SERVICE_SOCKET = pathlib.Path({str(service)!r})\n"
+        "from vical_daemon.bus import socket_paths\n"
+        f"socket_paths.SERVICE_SOCKET = pathlib.Path({str(service)!r})\n"
         "from vical_daemon.cli import bus_access, main, watch, web\n"
         "import rich.live, vical_daemon.cli.live_table, vical_daemon.bus.messages, vical_daemon.web.role\n"
         "'localhost'.encode('idna')\n"
@@ -138,7 +138,7 @@ def test_readers_loopback_lets_everybody_watch_and_nobody_command(service, tmp_p
 def test_a_folder_that_is_closed_to_us_is_one_line(service, monkeypatch):
     if os.geteuid() == 0:
         pytest.skip("nothing is closed to root")
-    monkeypatch.setattr(bus_places, "SERVICE_SOCKET", service)
+    monkeypatch.setattr(socket_paths, "SERVICE_SOCKET", service)
     monkeypatch.setenv("VICAL_RUNTIME_DIR", str(service.parent.parent / "nothing"))
     service.parent.chmod(0)
     assert reach(service) is Reach.CLOSED
@@ -170,7 +170,7 @@ def test_the_line_names_user_or_group(tmp_path, monkeypatch):
 
 
 def test_nobody_there_is_said_with_every_place(tmp_path, monkeypatch):
-    monkeypatch.setattr(bus_places, "SERVICE_SOCKET", tmp_path / "service.sock")
+    monkeypatch.setattr(socket_paths, "SERVICE_SOCKET", tmp_path / "service.sock")
     monkeypatch.setenv("VICAL_RUNTIME_DIR", str(tmp_path))
     with pytest.raises(BusError, match=r"nothing answers; start `vical run") as error:
         open_local_bus(tcp_port=free_port())
@@ -180,7 +180,7 @@ def test_nobody_there_is_said_with_every_place(tmp_path, monkeypatch):
 
 
 def test_clients_find_the_service_without_being_told(service, tmp_path, monkeypatch):
-    monkeypatch.setattr(bus_places, "SERVICE_SOCKET", service)
+    monkeypatch.setattr(socket_paths, "SERVICE_SOCKET", service)
     monkeypatch.setenv("VICAL_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "zenoh.sock").touch()  # left behind by a router of this user that was killed
     with client.connect() as robot:
@@ -199,7 +199,7 @@ def test_a_folder_that_somebody_else_made_in_our_place_is_not_used(tmp_path, mon
         st_uid = 12345
 
     monkeypatch.setattr(Path, "stat", lambda self, **k: Foreign if self == tmp_path else stat(self, **k))
-    assert local_sockets() == [bus_places.SERVICE_SOCKET]
+    assert local_sockets() == [socket_paths.SERVICE_SOCKET]
 
 
 def test_the_socket_is_closed_to_others_whatever_the_mask(tmp_path):
@@ -242,7 +242,7 @@ def test_every_command_is_journalled_with_its_origin(tmp_path, caplog):
             assert until(lambda text=line: any(entry.startswith(text) for entry in journalled())), line
         caplog.clear()
         group.publish(topics.COMMAND.key("rover", "estimate"), b"\xff")
-        assert until(lambda: any("1 bytes that are no command" in line for line in journalled()))
+        assert until(lambda: any("1 bytes that are not a command" in line for line in journalled()))
         bus.publish(COMMAND, encode_string("start"))
         assert until(lambda: any("this process" in line for line in journalled()))
         for _ in range(500):

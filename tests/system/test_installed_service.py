@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from vical_mocks.harness.machine import Machine, MachineError
 
-from benchmarks.machine import Machine, MachineError
 from vical_daemon.cli.process_sets import PROCESSES
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]

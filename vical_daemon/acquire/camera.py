@@ -11,20 +11,20 @@ import numpy as np
 import numpy.typing as npt
 from vical_drivers.samples import Frame, FrameSource
 
-from vical_daemon.acquire.device_loop import SingleReads
-from vical_daemon.acquire.pipeline import Line, clock_of_the_service, run_lines, start_line
+from vical_daemon.acquire.device_loop import FrameReader
+from vical_daemon.acquire.pipeline import DevicePipeline, run_pipelines, start_pipeline
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import encode_image
 from vical_daemon.config.model import LOG_SCHEME, CameraConfig, Config
-from vical_daemon.service.wall_clock import WallClock
+from vical_daemon.service.wall_clock import WallClock, service_clock
 
 QUEUE_DEPTH = 8  # images are large: 8 of 1.3 MB
 
 OpenCamera = Callable[[CameraConfig], FrameSource]
 
 
-class CameraRole:
+class CameraEncoder:
     """Turns the frames of one camera into messages. No I/O.
 
     Args:
@@ -42,7 +42,7 @@ class CameraRole:
         self._rules: Counter[str] = Counter()
 
     def message(self, frame: Frame) -> bytes | None:
-        """Return the message of one frame, stamped mid-exposure; None if its stamp does not follow."""
+        """Return the message of one frame, stamped mid-exposure; None if its stamp does not increase."""
         self._dropped += frame.dropped_before
         if frame.t_exposure_mid_ns <= self._t_last_ns:
             self._backwards += 1
@@ -53,7 +53,7 @@ class CameraRole:
         return encode_image(stamp_ns, self._name, frame.image, frame.encoding)
 
     def counters(self) -> dict[str, str]:
-        """Return what the driver's counters do not say: which stamp rule was used, and how often."""
+        """Return counters that the driver does not keep: how often each stamp rule was used, and losses."""
         rules = ", ".join(f"{rule} ({count})" for rule, count in self._rules.items())
         return {
             "stamp_rule": rules,
@@ -63,10 +63,10 @@ class CameraRole:
 
 
 def open_camera(config: CameraConfig) -> FrameSource:
-    """Open the device that the config names, or play the recording that it names (`playback`).
+    """Open the device of the config, or play the recording that the config gives in its place (`playback`).
 
     Raises:
-        DriverError: It cannot be opened; one line.
+        DriverError: The device cannot be opened; one line.
     """
     if config.uri.startswith(LOG_SCHEME):
         from vical_daemon.acquire.playback import LogCamera
@@ -78,7 +78,7 @@ def open_camera(config: CameraConfig) -> FrameSource:
 
 
 def driver_options(config: CameraConfig) -> dict[str, Any]:
-    """Return what the driver is asked for."""
+    """Return the settings for the driver."""
     width, height = config.size
     return {
         "width": width,
@@ -93,12 +93,12 @@ def driver_options(config: CameraConfig) -> dict[str, Any]:
         "rolling_shutter": config.lens.readout_s > 0,
         "readout_s": config.lens.readout_s,
         "stamp": config.stamp,
-        "borrow": True,  # the message is built before the next read: the only copy on this way
+        "borrow": True,  # the message is built before the next read, so that no second copy is needed
     }
 
 
 def _decompress(data: npt.NDArray[np.uint8], *, colour: bool) -> npt.NDArray[np.uint8]:
-    """Decompress a JPEG; OpenCV is loaded only if a camera sends some."""
+    """Decompress a JPEG. Loads OpenCV only if a camera sends JPEGs."""
     from vical_daemon.vision import image_codec
 
     return image_codec.decode_image(data, colour=colour)
@@ -118,17 +118,15 @@ def run(
         config: The rig.
         bus: Where images and status go.
         stop: Ends the role.
-        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
-        open_source: Opens a device (the demo gives a rendered one).
+        clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
+        open_source: Opens a device; the demo passes a rendered camera.
     """
-    clock = clock or clock_of_the_service()
+    clock = clock or service_clock()
 
-    def start(name: str) -> Line[Frame]:
-        camera = config.cameras[name]
-        maker = CameraRole(config.rig, name, clock)
-        return start_line(
-            f"camera/{name}", maker, lambda: SingleReads(open_source(camera)), bus, stop,
-            rate_hz=camera.rate_hz, depth=QUEUE_DEPTH,
+    def start(name: str, camera: CameraConfig) -> DevicePipeline[Frame]:
+        return start_pipeline(
+            f"camera/{name}", CameraEncoder(config.rig, name, clock),
+            lambda: FrameReader(open_source(camera)), bus, stop, rate_hz=camera.rate_hz, depth=QUEUE_DEPTH,
         )  # fmt: skip
 
-    run_lines(config.rig, "camera", [start(name) for name in config.cameras], bus, stop, clock)
+    run_pipelines(config.rig, "camera", (start(*item) for item in config.cameras.items()), bus, stop, clock)

@@ -1,4 +1,4 @@
-"""Keeps one device streaming, whatever happens to it: the loop behind the imu and camera roles."""
+"""The loop that keeps one device streaming; used by the imu and camera roles."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ T_co = TypeVar("T_co", covariant=True)
 
 
 class Source(Protocol[T_co]):
-    """What the loop needs of a source (see `ImuSource`); `read` returns the items that arrived."""
+    """What the loop needs from a source (see `ImuSource`); `read` returns the items that arrived."""
 
     @property
     def info(self) -> DeviceInfo:
-        """Who the device is."""
+        """Identity of the device."""
         ...
 
     def read(self, timeout_s: float) -> Sequence[T_co]:
@@ -41,8 +41,8 @@ class Source(Protocol[T_co]):
     def __exit__(self, *args: Any) -> None: ...
 
 
-class SingleReads:
-    """A `FrameSource` as the loop wants it: `read` returns a list."""
+class FrameReader:
+    """Adapts a `FrameSource` to the loop: `read` returns a list."""
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
@@ -71,15 +71,15 @@ class SingleReads:
 
 @dataclass(frozen=True, slots=True)
 class DeviceHealth:
-    """How a device is, at one moment.
+    """State of a device at one moment.
 
     Attributes:
-        state: opening, streaming, silent (open, but nothing comes) or lost.
+        state: opening, streaming, silent (open, but no data) or lost.
         problem: One line, empty when streaming.
-        info: Who it is; None before it was opened once.
-        stats: The source's own counters, of the present opening.
+        info: Identity of the device; None before it was first opened.
+        stats: The source's counters since the device was last opened.
         data_age_s: Since the last item; infinite before the first.
-        loop_age_s: Since the loop last went round; large when the thread is stuck in the driver.
+        loop_age_s: Since the loop last turned; large when the thread is stuck in the driver.
         openings: How often the device was opened.
     """
 
@@ -93,20 +93,19 @@ class DeviceHealth:
 
 
 class DeviceLoop(Generic[T]):
-    """One thread per device: blocking read, hand over, and recovery without a restart.
+    """One thread per device: blocking read, delivery, and recovery without a restart.
 
-    A source that was opened comes back by itself (that is its contract); the loop opens it when it was not
-    there at the start, and once more from scratch when it stays silent for very long, or when another device
-    came back in its place.
+    A source that was opened reconnects by itself; that is its contract. The loop opens the device if it was
+    absent at the start, and again if it stays silent for `silence_s` or another device took its place.
 
     Args:
         name: For logs and the thread, e.g. ``imu/imu0``.
         open_source: Opens the device; raises `DriverError` when it cannot.
         deliver: Called with each item, in this thread; must return at once.
         stop: Ends the loop.
-        flush: Called after each read, in this thread; may take its time if a `StandIn` calls `read_on`.
-        read_timeout_s: Longest blocking read; how fast `stop` is noticed.
-        silence_s: Without data for so long the device is closed and opened again.
+        flush: Called after each read, in this thread; may block if a `BackupReader` calls `read_on`.
+        read_timeout_s: Longest blocking read; the loop notices `stop` this fast.
+        silence_s: The device is closed and opened again after this long without data.
         first_pause_s: Before the second attempt to open.
         longest_pause_s: The pauses double up to this.
     """
@@ -131,8 +130,10 @@ class DeviceLoop(Generic[T]):
         self._first_pause_s, self._longest_pause_s = first_pause_s, longest_pause_s
         self._health = DeviceHealth()
         self._source: Source[T] | None = None
-        self._broken = False  # the source raised what it should not: close it
-        self._turn = threading.Lock()  # of whoever reads: samples are put in the order of their reading
+        self._broken = False  # the source raised an unexpected error: close it
+        self._turn = (
+            threading.Lock()
+        )  # held while reading: samples are delivered in the order in which they were read
         self._t_data_s = -float("inf")
         self._t_loop_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -152,7 +153,7 @@ class DeviceLoop(Generic[T]):
         return self._health.openings
 
     def health(self) -> DeviceHealth:
-        """Return how the device is now."""
+        """Return the state of the device now."""
         now_s, source = time.monotonic(), self._source
         stats = source.stats() if source is not None else self._health.stats
         return replace(
@@ -168,20 +169,20 @@ class DeviceLoop(Generic[T]):
                     self._opened(source)
                     if self._stream():
                         pause_s = self._first_pause_s
-            except Exception as error:  # also what a library raises when its device is gone
+            except Exception as error:  # libraries raise anything when a device is gone
                 self._failed(error)
             self._pause(pause_s)
             pause_s = min(2 * pause_s, self._longest_pause_s)
 
     def _pause(self, pause_s: float) -> None:
-        """Wait in short steps: whoever waits for a device is alive, not stuck."""
+        """Wait in short steps, so that a loop that waits for its device does not count as stuck."""
         end_s = time.monotonic() + pause_s
         while not self._stop.is_set() and (left_s := end_s - time.monotonic()) > 0:
             self._t_loop_s = time.monotonic()
             self._stop.wait(min(left_s, self._read_timeout_s))
 
     def _stream(self) -> bool:
-        """Read until `stop`, or until nothing came for `silence_s`; True if anything came."""
+        """Read until `stop`, or until no data came for `silence_s`; True if there were any data."""
         t_open_s = time.monotonic()
         self._broken = False
         try:
@@ -199,15 +200,15 @@ class DeviceLoop(Generic[T]):
         return self._t_data_s > t_open_s
 
     def read_on(self) -> None:
-        """Read once and deliver; for another thread while the loop's own is held up in `flush`."""
+        """Read once and deliver; for another thread while the loop's own is blocked in `flush`."""
         with self._turn:
             source = self._source
-            if source is None:  # closed while another thread waited for its turn
+            if source is None:  # closed while another thread waited for the lock
                 return
             try:
                 items = source.read(self._read_timeout_s)
-            except Exception as error:  # in whatever thread this is
-                # the source cannot tell what is left of it, or has closed itself
+            except Exception as error:  # must end neither this thread nor the backup reader
+                # after these errors the source is closed, or in an unknown state
                 self._broken = isinstance(error, DeviceReplacedError) or not isinstance(error, DriverError)
                 self._failed(error)
                 items = []
@@ -245,7 +246,7 @@ class DeviceLoop(Generic[T]):
         text = str(error) if isinstance(error, DriverError) else f"{type(error).__name__}: {error}"
         problem = " ".join(text.split())
         _log.debug("%s failed", self.name, exc_info=error)
-        if problem != self._health.problem:  # said once, not at each attempt
+        if problem != self._health.problem:  # logged once, not at each attempt
             _log.warning("%s: %s", self.name, problem)
         if self._health.state in ("streaming", "silent"):
             notify.event("device_lost", f"{self.name}: {problem}", level="warning", device=self.name)

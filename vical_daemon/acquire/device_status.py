@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from vical_daemon.acquire.device_loop import DeviceHealth
-from vical_daemon.acquire.direct_queue import DirectOutbox
-from vical_daemon.acquire.publish_queue import Outbox
+from vical_daemon.acquire.direct_queue import DirectQueue
+from vical_daemon.acquire.publish_queue import PublishQueue
 from vical_daemon.bus.messages import DiagnosticStatus, Level
 
 STUCK_S = 5.0
-"""A thread that has not gone round for so long is stuck: its component is STALE and the watchdog bites."""
+"""A device loop that has not turned for this long, s, is stuck: STALE, and systemd restarts the process."""
 
 
 def device_status(
     name: str,
     health: DeviceHealth,
-    outbox: Outbox | DirectOutbox,
+    queue: PublishQueue | DirectQueue,
     nominal_rate_hz: float,
     extra: dict[str, str] | None = None,
 ) -> DiagnosticStatus:
     """Return the status of one device: level, one line for a person, and every counter."""
     stats, info = health.stats, health.info
-    level, message = _judge(health, outbox, nominal_rate_hz)
+    level, message = _level(health, queue, nominal_rate_hz)
     values = {
         "state": health.state,
         "samples": str(stats.samples),
@@ -32,8 +32,8 @@ def device_status(
         "reconnects": str(stats.reconnects),
         "openings": str(health.openings),
         "data_age_s": f"{health.data_age_s:.3f}",
-        "queue_depth": str(outbox.waiting),
-        "queue_dropped": str(outbox.dropped),
+        "queue_depth": str(queue.waiting),
+        "queue_dropped": str(queue.dropped),
     }
     if stats.jitter_us is not None:
         values["jitter_us"] = f"{stats.jitter_us:.1f}"
@@ -48,15 +48,17 @@ def device_status(
     return DiagnosticStatus(level, name, message, info.serial_number if info else "", values)
 
 
-def _judge(health: DeviceHealth, outbox: Outbox | DirectOutbox, nominal_rate_hz: float) -> tuple[Level, str]:
+def _level(
+    health: DeviceHealth, queue: PublishQueue | DirectQueue, nominal_rate_hz: float
+) -> tuple[Level, str]:
     if health.loop_age_s > STUCK_S:
         return Level.STALE, f"its thread is stuck for {health.loop_age_s:.0f} s"
     if health.state != "streaming":
         return Level.ERROR, health.problem or health.state
     if health.data_age_s > max(2.0, 5 / nominal_rate_hz):
         return Level.ERROR, f"no data for {health.data_age_s:.1f} s"
-    if outbox.dropped:
-        return Level.WARN, f"{outbox.dropped} samples dropped: the bus is too slow"
+    if queue.dropped:
+        return Level.WARN, f"{queue.dropped} samples dropped: the bus is too slow"
     if health.stats.rate_hz and abs(health.stats.rate_hz / nominal_rate_hz - 1) > 0.1:
         return Level.WARN, f"{health.stats.rate_hz:.1f} Hz instead of {nominal_rate_hz:g} Hz"
     return Level.OK, f"{health.stats.rate_hz:.1f} Hz, {health.stats.lost} lost"

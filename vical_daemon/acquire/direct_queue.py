@@ -1,8 +1,8 @@
-"""From a device to the bus without a thread in between, for small messages at a high rate.
+"""From a device to the bus without a second thread, for small messages at a high rate.
 
 Waking another thread for each of 1000 samples a second costs more than decoding them. So the thread that
-reads a device also publishes. While the bus holds it up (a stuck subscriber can do so for a second, which a
-terminal's 4 kB do not outlast), a `StandIn` reads on, and what it reads waits its turn.
+reads a device also publishes. A stuck subscriber can block `publish` for a second, and the 4 kB buffer of a
+terminal overflows before that. Meanwhile a `BackupReader` reads the device and queues the samples.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
-from vical_daemon.acquire.publish_queue import Counted
+from vical_daemon.acquire.publish_queue import CountingPublisher
 from vical_daemon.bus.interface import Bus
 
-LOOK_S = 0.025
-"""The stand-in looks so often: a publication that lasts from one look to the next is held up."""
+CHECK_S = 0.025
+"""Period of the backup reader's check. A publication that lasts from one check to the next is blocked."""
 
 
-class DirectOutbox(Counted):
-    """Queues by `put`; `flush` publishes in that order. What does not fit is dropped and counted.
+class DirectQueue(CountingPublisher):
+    """Queues by `put`; `flush` publishes in that order. Drops and counts what does not fit.
 
-    One thread flushes. Putting is up to one thread at a time, while another may flush.
+    One thread flushes. One thread at a time may put, also while another flushes.
 
     Args:
-        bus: Where to.
-        depth: Messages that may wait, at least 2. When full the *oldest* goes: newer data are worth more.
+        bus: Where the messages go.
+        depth: Messages that may wait, at least 2. When full, the *oldest* is dropped.
     """
 
     def __init__(self, bus: Bus, depth: int) -> None:
@@ -43,44 +43,44 @@ class DirectOutbox(Counted):
 
     @property
     def progress(self) -> int | None:
-        """Messages done with so far; None while nothing is being published."""
+        """Messages published or refused so far; None while nothing is being published."""
         return self._published + self._refused if self._publishing else None
 
     def put(self, key: str, payload: bytes) -> None:
-        """Queue one message; returns at once."""
+        """Queue one message. Returns at once."""
         if len(self._queue) >= self._depth:
-            with suppress(IndexError):  # whoever publishes was faster
+            with suppress(IndexError):  # the publishing thread was faster
                 self._queue.popleft()
                 self._overflowed += 1
         self._queue.append((key, payload))
 
     def flush(self) -> None:
-        """Publish what waits, and what comes meanwhile."""
+        """Publish what waits, and what is queued meanwhile."""
         queue, self._publishing = self._queue, True
         while queue:
-            self._hand_over(*queue.popleft())
+            self._publish(*queue.popleft())
         self._publishing = False
 
     def close(self) -> None:
-        """Publish what waits, once the reading has ended; not while the bus still holds that thread up."""
+        """Publish what waits, after the reading has ended. Does nothing while the bus still blocks."""
         if not self._publishing:
             self.flush()
 
 
-class StandIn:
-    """Reads on while the thread that reads and publishes is held up by the bus.
+class BackupReader:
+    """Reads a device while the thread that normally reads it is blocked in `publish`.
 
     Args:
-        outbox: Tells whether it is.
-        read_on: Reads once and puts what came.
-        stop: Ends it.
-        name: Of its thread.
+        queue: Its `progress` shows whether the bus blocks.
+        read_on: Reads once and queues the samples.
+        stop: Ends the thread.
+        name: Name of the thread.
     """
 
     def __init__(
-        self, outbox: DirectOutbox, read_on: Callable[[], None], stop: threading.Event, name: str
+        self, queue: DirectQueue, read_on: Callable[[], None], stop: threading.Event, name: str
     ) -> None:
-        self._outbox, self._read_on, self._stop = outbox, read_on, stop
+        self._queue, self._read_on, self._stop = queue, read_on, stop
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
@@ -90,10 +90,10 @@ class StandIn:
     def _run(self) -> None:
         seen: int | None = None
         while not self._stop.is_set():
-            time.sleep(LOOK_S)  # costs a tenth of `wait`, and the end of the thread is not waited for
-            while self._held_up_at(seen) and not self._stop.is_set():
+            time.sleep(CHECK_S)  # costs a tenth of `stop.wait`; nobody waits for this thread to end
+            while self._blocked_at(seen) and not self._stop.is_set():
                 self._read_on()
-            seen = self._outbox.progress
+            seen = self._queue.progress
 
-    def _held_up_at(self, seen: int | None) -> bool:
-        return seen is not None and self._outbox.progress == seen
+    def _blocked_at(self, seen: int | None) -> bool:
+        return seen is not None and self._queue.progress == seen

@@ -1,6 +1,6 @@
 """Role imu: one thread per IMU, blocking read -> stamp (in the driver) -> bounded queue -> bus.
 
-The same thread publishes; another one reads on where the bus holds it up (`direct_outbox`).
+The reading thread also publishes. While the bus blocks it, another thread reads (`direct_queue`).
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from collections.abc import Callable
 
 from vical_drivers.samples import ImuSample, ImuSource
 
-from vical_daemon.acquire.pipeline import Line, clock_of_the_service, run_lines, start_direct_line
+from vical_daemon.acquire.pipeline import DevicePipeline, run_pipelines, start_pipeline
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import imu_encoder
 from vical_daemon.config.model import LOG_SCHEME, Config, ImuConfig
-from vical_daemon.service.wall_clock import WallClock
+from vical_daemon.service.wall_clock import WallClock, service_clock
 
 QUEUE_DEPTH = 8192  # 8 s at 1000 Hz
 
 OpenImu = Callable[[ImuConfig], ImuSource]
 
 
-class ImuRole:
+class ImuEncoder:
     """Turns the samples of one IMU into messages. No I/O.
 
     Args:
@@ -39,12 +39,14 @@ class ImuRole:
         self._worst_sigma_ns = 0
 
     def message(self, sample: ImuSample) -> bytes | None:
-        """Return the message of one sample; None if its stamp does not follow the one before.
+        """Return the message of one sample; None if its stamp does not increase.
 
-        The stamp is that of the measurement: wire time and filter delay were taken off by the driver.
+        The stamp is the instant of the measurement: the driver has subtracted wire time and filter delay.
         """
         t_host_ns = sample.t_host_ns
-        if t_host_ns <= self._t_last_ns:  # the device clock restarted: wait until time goes on
+        if (
+            t_host_ns <= self._t_last_ns
+        ):  # the device clock restarted: drop samples until stamps increase again
             self._backwards += 1
             return None
         self._t_last_ns = t_host_ns
@@ -53,16 +55,16 @@ class ImuRole:
         return self._encode(t_host_ns + self._offset_ns, sample.gyro_rps, sample.specific_force_mps2)
 
     def counters(self) -> dict[str, str]:
-        """Return what the driver's counters do not say; the worst sigma is that since the last call."""
+        """Return counters that the driver does not keep; the stamp sigma is the worst since the last call."""
         sigma_us, self._worst_sigma_ns = self._worst_sigma_ns * 1e-3, 0
         return {"stamps_backwards": str(self._backwards), "stamp_sigma_us": f"{sigma_us:.1f}"}
 
 
 def open_imu(config: ImuConfig) -> ImuSource:
-    """Open the device that the config names, or play the recording that it names (`playback`).
+    """Open the device of the config, or play the recording that the config gives in its place (`playback`).
 
     Raises:
-        DriverError: It cannot be opened; one line.
+        DriverError: The device cannot be opened; one line.
     """
     if config.port.startswith(LOG_SCHEME):
         from vical_daemon.acquire.playback import LogImu
@@ -94,17 +96,15 @@ def run(
         config: The rig.
         bus: Where samples and status go.
         stop: Ends the role.
-        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
-        open_source: Opens a device (the demo's is the real one, on a pseudo terminal).
+        clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
+        open_source: Opens a device; the demo uses the real driver on a pseudo terminal.
     """
-    clock = clock or clock_of_the_service()
+    clock = clock or service_clock()
 
-    def start(name: str) -> Line[ImuSample]:
-        imu = config.imus[name]
-        maker = ImuRole(config.rig, name, clock)
-        return start_direct_line(
-            f"imu/{name}", maker, lambda: open_source(imu), bus, stop,
-            rate_hz=imu.rate_hz, depth=QUEUE_DEPTH,
+    def start(name: str, imu: ImuConfig) -> DevicePipeline[ImuSample]:
+        return start_pipeline(
+            f"imu/{name}", ImuEncoder(config.rig, name, clock), lambda: open_source(imu),
+            bus, stop, rate_hz=imu.rate_hz, depth=QUEUE_DEPTH, direct=True,
         )  # fmt: skip
 
-    run_lines(config.rig, "imu", [start(name) for name in config.imus], bus, stop, clock)
+    run_pipelines(config.rig, "imu", (start(*item) for item in config.imus.items()), bus, stop, clock)

@@ -1,129 +1,118 @@
-"""What the acquiring roles have in common: devices with their threads, and a status until the end."""
+"""What the acquiring roles have in common: one pipeline per device, and their status until the role ends."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 from vical_daemon.acquire.device_loop import DeviceLoop, Source
 from vical_daemon.acquire.device_status import device_status
-from vical_daemon.acquire.direct_queue import DirectOutbox, StandIn
-from vical_daemon.acquire.publish_queue import Outbox
+from vical_daemon.acquire.direct_queue import BackupReader, DirectQueue
+from vical_daemon.acquire.publish_queue import PublishQueue
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import DiagnosticStatus
-from vical_daemon.config.paths import make_private, runtime_directory
 from vical_daemon.service.health import StatusSender
-from vical_daemon.service.wall_clock import WallClock, shared_clock
+from vical_daemon.service.wall_clock import WallClock
 
 JOIN_S = 3.0
 T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)
 
 
-class MessageMaker(Protocol[T_contra]):
-    """Turns what one device delivers into messages. No I/O."""
+class MessageEncoder(Protocol[T_contra]):
+    """Turns the items of one device into messages. No I/O."""
 
     @property
     def key(self) -> str:
-        """Where they go."""
+        """Bus key of the messages."""
         ...
 
     def message(self, item: T_contra) -> bytes | None:
-        """Return the message of one item; None: there is none to send."""
+        """Return the message of one item, or None if the item must not be sent."""
         ...
 
     def counters(self) -> dict[str, str]:
-        """Return what the driver's counters do not say."""
+        """Return counters that the driver does not keep."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
-class Line(Generic[T]):
-    """One device on its way to the bus; make it with `start_line` or `start_direct_line`."""
+class DevicePipeline(Generic[T]):
+    """The running threads of one device, from the device to the bus; see `start_pipeline`."""
 
-    maker: MessageMaker[T]
+    encoder: MessageEncoder[T]
     loop: DeviceLoop[T]
-    outbox: Outbox | DirectOutbox
+    queue: PublishQueue | DirectQueue
     rate_hz: float
 
     def status(self) -> DiagnosticStatus:
         """Return the status of the device."""
         loop = self.loop
-        return device_status(loop.name, loop.health(), self.outbox, self.rate_hz, self.maker.counters())
+        return device_status(loop.name, loop.health(), self.queue, self.rate_hz, self.encoder.counters())
 
 
-def start_line(
+def start_pipeline(
     name: str,
-    maker: MessageMaker[T],
+    encoder: MessageEncoder[T],
     open_source: Callable[[], AbstractContextManager[Source[T]]],
     bus: Bus,
     stop: threading.Event,
     *,
     rate_hz: float,
     depth: int,
-) -> Line[T]:
-    """Start the threads of one device: blocking read -> stamp (in the driver) -> outbox -> bus.
+    direct: bool = False,
+) -> DevicePipeline[T]:
+    """Start the threads of one device: blocking read -> stamp (in the driver) -> queue -> bus.
 
     Args:
         name: For logs and status, e.g. ``imu/imu0``.
-        maker: Makes its messages.
-        open_source: Opens it.
+        encoder: Makes the messages.
+        open_source: Opens the device.
         bus: Where the messages go.
-        stop: Ends it.
-        rate_hz: Nominal.
+        stop: Ends the threads.
+        rate_hz: Nominal rate.
         depth: Messages that may wait for the bus.
+        direct: Publish in the reading thread, see `direct_queue`; for small messages at a high rate.
     """
-    outbox = Outbox(bus, depth, f"{name} out")
-    loop = DeviceLoop(name, open_source, _delivery(maker, outbox), stop)
+    queue: PublishQueue | DirectQueue
+    if direct:
+        queue = DirectQueue(bus, depth)
+        loop = DeviceLoop(name, open_source, _delivery(encoder, queue), stop, flush=queue.flush)
+        BackupReader(queue, loop.read_on, stop, f"{name} backup").start()
+    else:
+        queue = PublishQueue(bus, depth, f"{name} out")
+        loop = DeviceLoop(name, open_source, _delivery(encoder, queue), stop)
     loop.start()
-    return Line(maker, loop, outbox, rate_hz)
+    return DevicePipeline(encoder, loop, queue, rate_hz)
 
 
-def start_direct_line(
-    name: str,
-    maker: MessageMaker[T],
-    open_source: Callable[[], AbstractContextManager[Source[T]]],
-    bus: Bus,
-    stop: threading.Event,
-    *,
-    rate_hz: float,
-    depth: int,
-) -> Line[T]:
-    """As `start_line`, for small messages at a high rate: whoever reads publishes, see `direct_outbox`."""
-    outbox = DirectOutbox(bus, depth)
-    loop = DeviceLoop(name, open_source, _delivery(maker, outbox), stop, flush=outbox.flush)
-    loop.start()
-    StandIn(outbox, loop.read_on, stop, f"{name} stand-in").start()
-    return Line(maker, loop, outbox, rate_hz)
-
-
-def _delivery(maker: MessageMaker[T], outbox: Outbox | DirectOutbox) -> Callable[[T], None]:
-    make, put, key = maker.message, outbox.put, maker.key
+def _delivery(encoder: MessageEncoder[T], queue: PublishQueue | DirectQueue) -> Callable[[T], None]:
+    encode, put, key = encoder.message, queue.put, encoder.key
 
     def deliver(item: T) -> None:
-        payload = make(item)
+        payload = encode(item)
         if payload is not None:
             put(key, payload)
 
     return deliver
 
 
-def run_lines(
-    rig: str, role: str, lines: Sequence[Line[Any]], bus: Bus, stop: threading.Event, clock: WallClock
+def run_pipelines(
+    rig: str,
+    role: str,
+    pipelines: Iterable[DevicePipeline[Any]],
+    bus: Bus,
+    stop: threading.Event,
+    clock: WallClock,
 ) -> None:
     """Publish the status of the devices until `stop`, then end their threads."""
-    sender = StatusSender(rig, role, bus, clock)
-    sender.run_until(
-        stop, lambda: [line.status() for line in lines], lambda: sum(line.loop.openings for line in lines)
+    running = list(pipelines)
+    StatusSender(rig, role, bus, clock).run_until(
+        stop, lambda: [p.status() for p in running], lambda: sum(p.loop.openings for p in running)
     )
-    for line in lines:
-        line.loop.join(JOIN_S)
-        line.outbox.close()
-
-
-def clock_of_the_service() -> WallClock:
-    """Return the clock that all processes of the service share."""
-    return shared_clock(make_private(runtime_directory()))
+    for pipeline in running:
+        pipeline.loop.join(JOIN_S)
+        pipeline.queue.close()

@@ -1,8 +1,8 @@
-"""A recording played as if its devices were there: `port: log:FILE` and `uri: log:FILE` of the settings.
+"""Plays a recording in place of devices: `port: log:FILE` and `uri: log:FILE` of the settings.
 
-Samples come when their time has come, with stamps of now on CLOCK_MONOTONIC. All devices of one recording
-share one time base, so that the time shift between them is the recorded one. The recording is played over
-and over: a rig whose motion jumps once in a while, which the estimator takes for a gap in the data.
+Samples come in real time, with stamps of now on CLOCK_MONOTONIC. All devices of one recording share one time
+base, which keeps the recorded time shift between them. The recording repeats; the estimator takes the jump of
+the motion at the end for a gap in the data.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from vical_daemon.logs import Recording, RecordingError, Stream, open_recording
 from vical_daemon.logs.recorded_logs import stamp_of
 
 PAUSE_S = 2.0
-"""Between the end of a recording and its next beginning: longer than what a filter bridges by prediction."""
+"""Pause before a recording repeats: longer than the gaps that the filter bridges by prediction."""
 
 _IMU_KINDS = ("imu",)
 _IMAGE_KINDS = ("image", "compressed")
-_MOST_SAMPLES = 1000  # that one read returns: after a process was held up, the rest comes with the next one
-_tapes: dict[Path, _Tape] = {}
-_tapes_lock = threading.Lock()
+_MOST_SAMPLES = 1000  # per read; after a delay of the process, the next read returns the rest
+_playbacks: dict[Path, _Playback] = {}
+_playbacks_lock = threading.Lock()
 
 
-class _Tape:
-    """One recording in this process; it starts when the first of its devices is read."""
+class _Playback:
+    """The playback of one recording; it starts when the first of its devices is read."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
@@ -47,9 +47,9 @@ class _Tape:
         self._lock = threading.Lock()
 
     def items(self, stream: Stream) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (number of the play, stamp on CLOCK_MONOTONIC in ns, message) of a stream, without an end.
+        """Yield (repetition, stamp on CLOCK_MONOTONIC in ns, message) of a stream, without end.
 
-        Whoever comes later joins in where the recording is by then.
+        A later call joins at the present position of the recording.
         """
         now_ns = time.monotonic_ns()
         with self._lock:
@@ -65,22 +65,22 @@ class _Tape:
 
 
 class _LogDevice(Closing):
-    """What a played IMU and a played camera have in common.
+    """Base of the played IMU and camera.
 
     Args:
-        uri: ``log:FILE`` or ``log:FILE#NAME``, where the recording has several such devices.
-        kinds: Kinds of streams that will do.
+        uri: ``log:FILE``, or ``log:FILE#NAME`` if the recording has several such devices.
+        kinds: Accepted kinds of streams.
         what: imu or camera.
 
     Raises:
         DeviceNotFoundError: There is no such recording, or no such device in it.
-        DeviceRefusedError: Several, and none is named.
+        DeviceRefusedError: The recording has several, and the URI names none.
     """
 
     def __init__(self, uri: str, kinds: tuple[str, ...], what: str) -> None:
         path, _, name = uri.removeprefix(LOG_SCHEME).partition("#")
-        self._tape = _tape(Path(path))
-        self._stream = _choose(self._tape.recording, kinds, what, name)
+        self._playback = _playback_of(Path(path))
+        self._stream = _choose(self._playback.recording, kinds, what, name)
         self.info = DeviceInfo(
             kind=what,
             model="recording",
@@ -95,14 +95,14 @@ class _LogDevice(Closing):
         self._play: int | None = None
 
     def _due(self, end_ns: int) -> tuple[int, bytes] | None:
-        """Wait for the next message until `end_ns` (CLOCK_MONOTONIC); returns its stamp and the message."""
+        """Wait for the next message until `end_ns` (CLOCK_MONOTONIC); return (stamp, message) or None."""
         if self._items is None:
-            self._items = self._tape.items(self._stream)
+            self._items = self._playback.items(self._stream)
         if self._next is None:
             try:
                 self._next = next(self._items)
             except RecordingError as error:
-                self._items = None  # the next read takes it up again
+                self._items = None  # the next read starts again
                 raise DeviceLostError(str(error)) from None
         play, t_host_ns, payload = self._next
         _sleep_until(min(t_host_ns, end_ns))
@@ -116,11 +116,11 @@ class _LogDevice(Closing):
         return t_host_ns, payload
 
     def stats(self) -> SourceStats:
-        """Counters since it was opened; `reconnects`: how often the recording began again."""
+        """Counters since it was opened; `reconnects` counts the repetitions."""
         return self._statistics.snapshot()
 
     def close(self) -> None:
-        """Forget where it was; the recording goes on for the others."""
+        """Stop this device; the recording continues for the others."""
         self._items = self._next = None
 
 
@@ -136,7 +136,7 @@ class LogImu(_LogDevice):
         samples: list[ImuSample] = []
         while len(samples) < _MOST_SAMPLES and (item := self._due(end_ns)) is not None:
             t_host_ns, payload = item
-            end_ns = time.monotonic_ns()  # what is due by now comes along; nobody waits for more
+            end_ns = time.monotonic_ns()  # return what is due by now; do not wait for more
             try:
                 message = decode_imu(payload)
             except MessageError:
@@ -191,16 +191,16 @@ class LogCamera(_LogDevice):
         return image.pixels(), image.encoding
 
 
-def _tape(path: Path) -> _Tape:
+def _playback_of(path: Path) -> _Playback:
     """Open a recording, once in this process."""
     key = path.absolute()
-    with _tapes_lock:
-        if key not in _tapes:
+    with _playbacks_lock:
+        if key not in _playbacks:
             try:
-                _tapes[key] = _Tape(open_recording(key, check=False, as_recorded=True))
+                _playbacks[key] = _Playback(open_recording(key, check=False, as_recorded=True))
             except RecordingError as error:
                 raise DeviceNotFoundError(str(error)) from None
-        return _tapes[key]
+        return _playbacks[key]
 
 
 def _choose(recording: Recording, kinds: tuple[str, ...], what: str, name: str) -> Stream:

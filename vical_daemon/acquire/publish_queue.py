@@ -12,8 +12,8 @@ from vical_daemon.bus.interface import Bus
 _log = logging.getLogger(__name__)
 
 
-class Counted:
-    """What an outbox hands to the bus, counted."""
+class CountingPublisher:
+    """Publishes on the bus and counts what was published and what was dropped."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -21,7 +21,7 @@ class Counted:
 
     @property
     def dropped(self) -> int:
-        """Messages that did not fit, or that the bus did not take."""
+        """Messages that did not fit into the queue, or that the bus refused."""
         return self._overflowed + self._refused
 
     @property
@@ -29,25 +29,25 @@ class Counted:
         """Messages handed to the bus."""
         return self._published
 
-    def _hand_over(self, key: str, payload: bytes) -> None:
+    def _publish(self, key: str, payload: bytes) -> None:
         try:
             self._bus.publish(key, payload)
             self._published += 1
-        except Exception:  # a broken link must not end acquisition; the bus comes back by itself
+        except Exception:  # a broken link must not end acquisition; the bus reconnects by itself
             self._refused += 1
             _log.exception("cannot publish on %s", key)
 
 
-class Outbox(Counted):
-    """Publishes in the order of `put`, in a thread of its own; what does not fit is dropped and counted.
+class PublishQueue(CountingPublisher):
+    """Publishes in the order of `put`, in a thread of its own. Drops and counts what does not fit.
 
-    One thread puts. The queue is the interpreter's own: at 1000 samples a second a `Condition` costs more
-    than decoding them.
+    Only one thread may call `put`. `SimpleQueue` is implemented in C: at 1000 samples a second a `Condition`
+    costs more than decoding them.
 
     Args:
-        bus: Where to.
-        depth: Messages that may wait. When full the *oldest* goes: newer data are worth more.
-        name: Of the thread.
+        bus: Where the messages go.
+        depth: Messages that may wait. When full, the *oldest* is dropped: newer data are worth more.
+        name: Name of the thread.
     """
 
     def __init__(self, bus: Bus, depth: int, name: str) -> None:
@@ -63,23 +63,23 @@ class Outbox(Counted):
         return self._queue.qsize()
 
     def put(self, key: str, payload: bytes) -> None:
-        """Queue one message; returns at once."""
+        """Queue one message. Returns at once."""
         if self._queue.qsize() >= self._depth:
             self._make_room()
         self._queue.put((key, payload))
 
     def _make_room(self) -> None:
-        with suppress(Empty):  # the thread was faster
+        with suppress(Empty):  # the publishing thread was faster
             if self._queue.get_nowait() is None:
-                self._queue.put(None)  # closed in the meantime: that must not get lost
+                self._queue.put(None)  # `close` was called meanwhile: keep its mark
             else:
                 self._overflowed += 1
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Publish what waits, then stop; gives up after `timeout_s`. May be called twice."""
+        """Publish what waits, then stop. Gives up after `timeout_s`. May be called twice."""
         self._queue.put(None)
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
         while (message := self._queue.get()) is not None:
-            self._hand_over(*message)
+            self._publish(*message)

@@ -1,1 +1,1 @@
-"""The bus between processes: keys, messages, and zenoh; the only package that imports zenoh."""
+"""The bus between processes: keys, messages, and zenoh. No other package imports zenoh."""

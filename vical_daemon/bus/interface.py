@@ -1,4 +1,4 @@
-"""The bus: what every role talks through, and the in-memory bus for tests, demo and replay.
+"""The interface of the bus, and the in-memory bus for tests, demo and replay.
 
 Payloads are bytes (ROS 2 CDR, see `bus/messages`); keys and their delivery rules are in `topics`.
 """
@@ -17,12 +17,12 @@ from vical_daemon.bus.topics import parse_key
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One message as it travels.
+    """One message on the bus.
 
     Attributes:
         key: Full key, e.g. ``vical/rig0/imu/imu0``.
         payload: CDR bytes, as recorded.
-        sequence: Number given by the publisher for this key, from 0; gaps are losses.
+        sequence: Counted by the publisher per key, from 0; gaps are losses.
     """
 
     key: str
@@ -34,11 +34,11 @@ Handler = Callable[[Sample], None]
 
 
 class Subscription(Protocol):
-    """A bounded queue of received samples, or a handler being fed."""
+    """A bounded queue of received samples, or a handler that gets them."""
 
     @property
     def dropped(self) -> int:
-        """Samples that this subscriber missed (full queue, or gaps in the numbers)."""
+        """Samples lost to a full queue, or to gaps in the sequence."""
         ...
 
     def recv(self, timeout_s: float | None = None) -> Sample | None:
@@ -51,10 +51,10 @@ class Subscription(Protocol):
 
 
 class Bus(Protocol):
-    """Publish, subscribe, ask for the last value. Thread-safe."""
+    """Publish, subscribe, query the last value. Thread-safe."""
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Send; delivery rules come from the `topics` table. Never raises on a slow subscriber."""
+        """Send a message with the delivery rules of the `topics` table. Never raises on a slow subscriber."""
         ...
 
     def subscribe(
@@ -65,19 +65,19 @@ class Bus(Protocol):
         depth: int = 1024,
         newest_wins: bool = False,
     ) -> Subscription:
-        """Receive what matches (``*`` one chunk, ``**`` any number).
+        """Receive the samples of matching keys (``*`` matches one chunk, ``**`` any number).
 
         Args:
             key_expression: Zenoh key expression.
             handler: Called for each sample (LocalBus: in the publisher's thread, before `publish`
-                returns; zenoh: in a thread of its own). None: take them with `recv`.
+                returns; zenoh: in a thread of its own). None: the caller takes them with `recv`.
             depth: Queue length when there is no handler.
             newest_wins: A full queue drops the oldest (images for a detector) instead of the newest.
         """
         ...
 
     def latest(self, key_expression: str, timeout_s: float = 1.0) -> list[Sample]:
-        """Return the last value of each matching key that is kept (see `topics`), [] where none is."""
+        """Return the kept last value of each matching key (see `topics`); [] if there is none."""
         ...
 
     def close(self) -> None:
@@ -85,7 +85,7 @@ class Bus(Protocol):
         ...
 
 
-@lru_cache(maxsize=4096)  # asked for each sample, about the same few keys
+@lru_cache(maxsize=4096)  # called for each sample, with few different keys
 def key_matches(expression: str, key: str) -> bool:
     """Tell whether a key matches a zenoh key expression made of chunks, ``*`` and ``**``.
 
@@ -106,7 +106,7 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
 
 
 class SampleQueue:
-    """A bounded queue between the bus and a reader; what does not fit is counted."""
+    """A bounded queue between the bus and a reader. Drops and counts what does not fit."""
 
     def __init__(self, depth: int, newest_wins: bool) -> None:
         self._depth = depth
@@ -117,7 +117,7 @@ class SampleQueue:
         self.dropped = 0
 
     def put(self, sample: Sample) -> None:
-        """Append a sample; when full the oldest or this one goes, never waits."""
+        """Append a sample; a full queue drops the oldest or this one. Never waits."""
         with self._ready:
             if len(self._queue) >= self._depth:
                 self.dropped += 1
@@ -134,7 +134,7 @@ class SampleQueue:
             return self._queue.popleft() if self._queue else None
 
     def close(self) -> None:
-        """Wake whoever waits; what is queued can still be taken."""
+        """Wake the waiting readers; queued samples can still be taken."""
         with self._ready:
             self._closed = True
             self._ready.notify_all()
@@ -157,7 +157,7 @@ class LocalSubscription:
         return self._queue.dropped
 
     def deliver(self, sample: Sample) -> None:
-        """Hand one sample over (called by the bus)."""
+        """Take one sample (called by the bus)."""
         if self._handler is not None:
             self._handler(sample)
         else:
@@ -168,7 +168,7 @@ class LocalSubscription:
         return self._queue.recv(timeout_s)
 
     def close(self) -> None:
-        """Leave the bus and wake whoever waits."""
+        """Unsubscribe and wake the waiting readers."""
         self._bus.remove(self)
         self._queue.close()
 

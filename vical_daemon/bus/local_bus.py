@@ -1,4 +1,4 @@
-"""Joins the bus of this computer as a client, wherever it is."""
+"""Connects to the bus of this computer as a client."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vical_daemon.bus.bus_places import (
+from vical_daemon.bus.socket_paths import (
     Reach,
     local_sockets,
     loopback_answers,
@@ -20,15 +20,15 @@ from vical_daemon.config.paths import LOOPBACK_PORT
 def open_local_bus(
     sockets: Sequence[Path] = (), tcp_port: int = LOOPBACK_PORT, **credentials: Any
 ) -> ZenohBus:
-    """Join the bus of this computer: over a unix socket, else over loopback TCP where the rig opens that.
+    """Connect to the bus of this computer: over a unix socket, else over loopback TCP if the rig opens it.
 
     Args:
-        sockets: Where to look, first come first; empty: this user's own, then the service's.
+        sockets: Sockets to try, in order; empty: this user's own, then the service's.
         tcp_port: Loopback port to try afterwards; 0: none.
         **credentials: As in `zenoh_bus.open_bus`.
 
     Raises:
-        BusError: Nobody hosts a bus here, or not for this user; the message says what to do.
+        BusError: There is no bus here, or not for this user; the message says what to do.
     """
     sockets = sockets or local_sockets()
     closed = []

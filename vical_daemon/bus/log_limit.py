@@ -1,4 +1,4 @@
-"""How many lines an outsider may cause in the journal."""
+"""Limits the log lines that outside senders can cause."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 
 class LogLimit:
-    """Lets so many lines through in each period and counts the others. Thread-safe.
+    """Lets a number of lines through in each period and counts the others. Thread-safe.
 
     Args:
         lines: Let through in each period.
@@ -23,7 +23,7 @@ class LogLimit:
         self._used = self._left_out = 0
 
     def admit(self) -> str | None:
-        """Return what to add to the line, mostly nothing, else how many were left out; None: no line."""
+        """Return a suffix for the line: "", or how many lines were left out before it; None: log no line."""
         now_s = self._clock()
         with self._lock:
             if now_s - self._begin_s >= self._period_s:

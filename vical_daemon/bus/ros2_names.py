@@ -1,4 +1,4 @@
-"""Names by which an unmodified ROS 2 machine with rmw_zenoh finds us: keys, tokens, attachments. No I/O.
+"""Names under which an unmodified ROS 2 machine with rmw_zenoh finds our messages. No I/O.
 
 Conventions of rmw_zenoh since Jazzy (its docs/design.md): data travel on
 ``<domain>/<topic>/<dds type>/<type hash>`` with a 33-byte attachment; nodes and publishers are announced
@@ -20,13 +20,13 @@ GID_BYTES = 16
 
 @dataclass(frozen=True, slots=True)
 class Ros2Topic:
-    """How one of our keys looks to ROS 2.
+    """The ROS 2 side of one of our keys.
 
     Attributes:
         name: ROS topic with its leading slash.
         type_name: ROS 2 type, ``sensor_msgs/msg/Imu``.
         reliable: RELIABLE (else BEST_EFFORT).
-        transient_local: The last message is kept for whoever joins late (tf_static).
+        transient_local: The last message is kept for late subscribers (tf_static).
         depth: Length of the history.
     """
 
@@ -38,7 +38,7 @@ class Ros2Topic:
 
 
 def ros2_topic(key: str, namespace: str = "") -> Ros2Topic | None:
-    """Return how a bus key looks to ROS 2; None for a key that stays ours.
+    """Return the ROS 2 topic of a bus key; None for a key that ROS 2 does not get.
 
     Args:
         key: Of the bus.
@@ -133,11 +133,11 @@ def publisher_token(
 def gid(token: str) -> bytes:
     """Return 16 bytes that identify a publisher.
 
-    rmw_zenoh hashes the token with XXH3; subscribers only compare for equality, so any good hash will do.
+    rmw_zenoh hashes the token with XXH3. Subscribers only compare for equality, so any good hash works.
     """
     return blake2b(token.encode(), digest_size=GID_BYTES).digest()
 
 
 def attachment(sequence: int, source_time_ns: int, publisher_gid: bytes) -> bytes:
-    """Return the 33 bytes that go with every message; without them rmw_zenoh drops it."""
+    """Return the 33-byte attachment of a message; rmw_zenoh drops messages without it."""
     return ATTACHMENT.pack(sequence, source_time_ns, GID_BYTES, publisher_gid)

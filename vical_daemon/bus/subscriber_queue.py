@@ -1,4 +1,4 @@
-"""What has arrived on several keys, for a role that works in a loop of its own."""
+"""One queue for the samples of several keys, for a role with its own loop."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from collections.abc import Iterator, Sequence
 from vical_daemon.bus.interface import Bus, Sample
 
 
-class Inbox:
+class SubscriberQueue:
     """One bounded queue over several subscriptions, in the order of arrival.
 
-    The bus' own thread only appends; nothing is decoded there.
+    The bus thread only appends; the role decodes.
 
     Args:
-        bus: Where from.
-        key_expressions: What.
-        limit: Samples kept; when full the oldest goes and is counted.
+        bus: Where the samples come from.
+        key_expressions: Keys to subscribe to.
+        limit: Samples kept. When full, the oldest is dropped and counted.
     """
 
     def __init__(self, bus: Bus, key_expressions: Sequence[str], limit: int) -> None:
@@ -33,7 +33,7 @@ class Inbox:
 
     @property
     def dropped(self) -> int:
-        """Samples lost here, or before they came here (gaps in their numbers)."""
+        """Samples lost in this queue, or before it (gaps in their sequence)."""
         return self._dropped + sum(subscription.dropped for subscription in self._subscriptions)
 
     def _keep(self, sample: Sample) -> None:
@@ -45,13 +45,13 @@ class Inbox:
         self._arrived.set()
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until something is there; False after the timeout."""
+        """Wait for a sample; False after the timeout."""
         came = self._arrived.wait(timeout_s)
         self._arrived.clear()
         return came
 
     def take(self, count: int) -> Iterator[Sample]:
-        """Yield at most `count` of the samples that are there."""
+        """Yield at most `count` queued samples."""
         for _ in range(count):
             with self._lock:
                 if not self._queue:
@@ -60,6 +60,6 @@ class Inbox:
             yield sample
 
     def close(self) -> None:
-        """End the subscriptions; what is there can still be taken."""
+        """End the subscriptions; queued samples can still be taken."""
         for subscription in self._subscriptions:
             subscription.close()

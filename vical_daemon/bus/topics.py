@@ -1,8 +1,7 @@
-"""THE table of keys: what travels under which name, how often, how urgently, and who keeps it.
+"""The table of keys: name, type, rate and delivery rules of every message on the bus.
 
-A newcomer who has read `TOPICS` knows every message of the system. Everything else about keys follows
-from it: publishers take priority and congestion rule from here, the recorder what to record, and the
-bus what to answer when somebody asks for the last value.
+`TOPICS` lists every message of the system. Publishers take priority and congestion rule from it, the
+recorder takes what to record, and the bus takes which last values to keep.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
 class TopicError(ValueError):
-    """A name that cannot be part of a key; the message says what is allowed."""
+    """A name that cannot be part of a key; the message states the rule."""
 
 
 class Priority(StrEnum):
-    """Order of delivery when a link is busy; names as zenoh has them."""
+    """Order of delivery when a link is busy; names as in zenoh."""
 
     REAL_TIME = "REAL_TIME"
     DATA_HIGH = "DATA_HIGH"
@@ -32,7 +31,7 @@ class Priority(StrEnum):
 
 
 class Congestion(StrEnum):
-    """What a publisher does when a link is full: wait a moment, or drop this message."""
+    """What a publisher does when a link is full: wait, or drop the message."""
 
     BLOCK = "BLOCK"
     DROP = "DROP"
@@ -49,8 +48,8 @@ class Topic:
         rate_hz: Nominal rate.
         priority: Order of delivery on a busy link.
         congestion: Wait or drop.
-        recorded: Goes into the log unless the config says otherwise.
-        keep_last: Whoever joins late gets the last value at once.
+        recorded: Recorded, unless the config disables it.
+        keep_last: Late subscribers can query the last value.
         depth: Queue length that a subscriber should have.
     """
 
@@ -78,7 +77,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class ParsedKey:
-    """What a key says: whose (`rig`), what (`topic`) and which device or role (`name`, "" if none)."""
+    """The parts of a key: rig, topic, and name of device or role ("" if none)."""
 
     rig: str
     topic: Topic
@@ -134,7 +133,7 @@ def check_name(name: str) -> str:
     """Return the name of a rig, device or role if it may be part of a key.
 
     Letters, digits and ``_``, beginning with a letter, at most 63: valid in zenoh, in ROS and as a file
-    name, so that no name can leave its key or its folder.
+    name. So a name cannot leave its key or its folder.
 
     Raises:
         TopicError: It may not.
@@ -148,7 +147,7 @@ def check_name(name: str) -> str:
 
 @lru_cache(maxsize=1024)
 def parse_key(key: str) -> ParsedKey | None:
-    """Tell what a key of ours says; None for a key that is not in the table, or with a name that cannot be.
+    """Return the parts of a key; None for a key that is not in the table, or with an invalid name.
 
     >>> parsed = parse_key("vical/rig0/imu/imu0")
     >>> parsed.rig, parsed.topic.kind, parsed.name
@@ -163,5 +162,5 @@ def parse_key(key: str) -> ParsedKey | None:
 
 
 def rig_expression(rig: str) -> str:
-    """Key expression of everything of one rig."""
+    """Return the key expression that matches all keys of one rig."""
     return f"{ROOT}/{check_name(rig)}/**"

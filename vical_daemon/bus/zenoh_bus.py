@@ -1,8 +1,8 @@
 """The bus between processes and hosts: zenoh, with the delivery rules of the topics table.
 
 One process of a rig (`acquire`) hosts the router; the others are its clients over a unix socket that is open
-to the user and group of the host. Nothing multicasts, and nothing listens on a network, loopback included,
-unless an endpoint says so; then those who come over it may only read (`zenoh_rights`).
+to the user and group of the host. Multicast is off. No process listens on a network, loopback included,
+unless an endpoint is configured; clients of that endpoint may only read (`zenoh_rights`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
@@ -63,20 +63,20 @@ def open_bus(
         socket: Unix socket: where the router listens (for its own user and group), where a client connects.
         tcp_port: Loopback port that the router listens on as well; 0: none. A client without socket and
             endpoints connects to it.
-        listen: Further endpoints of the router, e.g. ``tls/0.0.0.0:7447``. Who comes over these, over
-            `tcp_port` or over `connect` may only subscribe and ask, unless named below.
+        listen: Further endpoints of the router, e.g. ``tls/0.0.0.0:7447``. Clients of these, of `tcp_port`
+            and of `connect` may only subscribe and query, unless named below.
         connect: Endpoints of other routers (a site's), e.g. ``tls/site.example:7447``.
-        tls_ca: Certificate authority, PEM file; with it TLS demands a certificate of both sides.
+        tls_ca: Certificate authority, PEM file; with it TLS requires a certificate of both sides.
         tls_certificate: Own certificate, PEM file.
         tls_key: Its private key, PEM file.
-        password_file: Router: ``user:password`` lines of those who may connect.
+        password_file: Router: ``user:password`` lines of the users who may connect.
         user: Own user name.
         password: Own password.
         commanders: Router: users, or names in client certificates, who may put commands.
         publishers: Router: users, or names in client certificates, who may publish and answer on all keys.
 
     Raises:
-        BusError: No router there, wrong password, socket in use, or settings that zenoh refuses.
+        BusError: No router, wrong password, socket in use, or settings that zenoh refuses.
     """
     if mode not in ("router", "client"):
         raise ValueError(f"mode {mode!r}: router or client")
@@ -106,8 +106,8 @@ def open_bus(
         return ZenohBus(open_session(config), is_router=True)
 
 
-class _Outlet:
-    """The publisher of one key, its numbering, and its last value where that is kept."""
+class _KeyPublisher:
+    """The publisher of one key, with its sequence numbers, and its last value if that is kept."""
 
     def __init__(self, session: Any, key: str, publisher_id: int) -> None:
         parsed = parse_key(key)
@@ -130,8 +130,9 @@ class _Outlet:
         self._queryable = session.declare_queryable(key, self._answer) if self._keep else None
 
     def put(self, payload: bytes) -> None:
+        """Number and send one message."""
         if self._keep:
-            with self._lock:  # the last one is that with the highest number
+            with self._lock:  # so that the kept value is the one with the highest number
                 number = _NUMBER.pack(_MARK, self._publisher_id, next(self._numbers))
                 self._last = (payload, number)
         else:
@@ -151,7 +152,7 @@ class _Outlet:
 
 
 class ZenohSubscription:
-    """Subscription of a `ZenohBus`; zenoh's thread only hands samples over."""
+    """Subscription of a `ZenohBus`; zenoh's thread only delivers samples."""
 
     def __init__(self, handler: Handler | None, depth: int, newest_wins: bool) -> None:
         self._handler = handler
@@ -162,12 +163,12 @@ class ZenohSubscription:
         self._subscriber: Any = None
 
     def declare(self, session: Any, key_expression: str) -> None:
-        """Begin to receive."""
+        """Start receiving."""
         self._subscriber = session.declare_subscriber(key_expression, self._take)
 
     @property
     def dropped(self) -> int:
-        """Samples lost on the way (gaps in their numbers) or to a full queue."""
+        """Samples lost on the way (gaps in the sequence) or to a full queue."""
         return self._queue.dropped + self._gaps
 
     def _take(self, received: Any) -> None:
@@ -179,7 +180,7 @@ class ZenohSubscription:
                 self._handler(sample)
         except Exception:
             self._failures += 1
-            if self._failures == 1:  # once: whoever sends junk must not fill the journal
+            if self._failures == 1:  # once: junk must not fill the journal
                 _log.exception("handler of %s failed", received.key_expr)
 
     def _read(self, received: Any) -> Sample:
@@ -192,7 +193,7 @@ class ZenohSubscription:
         if expected is not None and number > expected:
             self._gaps += number - expected
         if expected is None and len(self._expected) >= 4096:
-            self._expected.clear()  # somebody invents keys: forget, rather than grow
+            self._expected.clear()  # a sender invents keys: forget them, to bound memory
         self._expected[source] = number + 1
         return Sample(key, received.payload.to_bytes(), number)
 
@@ -210,12 +211,24 @@ class ZenohSubscription:
 
 
 def _numbers(attachment: Any) -> tuple[int, int | None]:
-    """Return (publisher, number) of a sample of ours, (0, None) of anything else."""
+    """Return (publisher, number) of a sample of vical, (0, None) of any other."""
     raw = attachment.to_bytes() if attachment is not None else b""
     if len(raw) != _NUMBER.size or raw[:4] != _MARK:
         return 0, None
     _, publisher, number = _NUMBER.unpack(raw)
     return publisher, number
+
+
+class Mirror(Protocol):
+    """Publishes the messages of a bus in another form too, e.g. under ROS 2's names."""
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send one message."""
+        ...
+
+    def close(self) -> None:
+        """Leave; may be called twice."""
+        ...
 
 
 class ZenohBus:
@@ -226,34 +239,40 @@ class ZenohBus:
         self._is_router = is_router
         self._publisher_id = secrets.randbits(32)
         self._lock = threading.Lock()
-        self._outlets: dict[str, _Outlet] = {}
+        self._publishers: dict[str, _KeyPublisher] = {}
         self._subscriptions: list[ZenohSubscription] = []
+        self._mirror: Mirror | None = None
         self._closed = False
 
     @property
     def session(self) -> Any:
-        """The zenoh session, for what goes beyond a `Bus` (ROS 2 keys, liveliness)."""
+        """The zenoh session, for ROS 2 keys and liveliness."""
         return self._session
 
     @property
     def connected(self) -> bool:
-        """Whether a client has its router at this moment (it comes back by itself); a router: always."""
+        """Whether a client has its router now (it reconnects by itself); always true for a router."""
         return self._is_router or bool(self._session.info.routers_zid())
 
+    def mirror_to(self, mirror: Mirror) -> None:
+        """Publish every message there as well; closed with the bus."""
+        self._mirror = mirror
+
     def publish(self, key: str, payload: bytes) -> None:
-        """See `Bus.publish`; without a router the sample is lost, and the number tells so."""
-        outlet = self._outlets.get(key)
-        if outlet is None:
+        """See `Bus.publish`; without a router the sample is lost, and leaves a gap in the numbers."""
+        publisher = self._publishers.get(key)
+        if publisher is None:
             with self._lock:
                 if self._closed:
                     return
-                outlet = self._outlets.get(key)
-                if outlet is None:
-                    outlet = self._outlets[key] = _Outlet(self._session, key, self._publisher_id)
-        try:
-            outlet.put(payload)
-        except zenoh.ZError:  # closing, or no link at this moment
-            return
+                publisher = self._publishers.get(key)
+                if publisher is None:
+                    publisher = self._publishers[key] = _KeyPublisher(self._session, key, self._publisher_id)
+        with suppress(zenoh.ZError):  # closing, or no link at this moment
+            publisher.put(payload)
+        if self._mirror is not None:
+            with suppress(zenoh.ZError):
+                self._mirror.publish(key, payload)
 
     def subscribe(
         self,
@@ -271,7 +290,7 @@ class ZenohBus:
         return subscription
 
     def latest(self, key_expression: str, timeout_s: float = 1.0) -> list[Sample]:
-        """See `Bus.latest`: asks every publisher of a matching key."""
+        """See `Bus.latest`: queries every publisher of a matching key."""
         newest: dict[str, Sample] = {}
         replies = self._session.get(
             key_expression,
@@ -294,10 +313,13 @@ class ZenohBus:
             if self._closed:
                 return
             self._closed = True
-            subscriptions, outlets = list(self._subscriptions), list(self._outlets.values())
+            subscriptions, publishers = list(self._subscriptions), list(self._publishers.values())
         for subscription in subscriptions:
             subscription.close()
+        if self._mirror is not None:
+            with suppress(zenoh.ZError):
+                self._mirror.close()
         with suppress(zenoh.ZError):
-            for outlet in outlets:
-                outlet.close()
+            for publisher in publishers:
+                publisher.close()
             self._session.close()

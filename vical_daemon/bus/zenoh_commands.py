@@ -1,9 +1,8 @@
-"""Every command on the bus in the journal of the process that hosts it, with where it came from.
+"""Logs every command on the bus, with its sender, in the process that hosts the bus.
 
-zenoh names the session that published, by the id in the timestamp that the session put on its message. That
-is what the sender says of itself: a member of the group can put another id there. The link is the router's
-own knowledge: the kind of socket, the address, and the name in a client certificate (zenoh 1.10 tells neither
-the user of a unix socket nor that of a password).
+The timestamp of a message names the zenoh session that published it. The sender sets this id, so a member of
+the group can forge it. The router itself knows the link: kind of socket, address, and the name in a client
+certificate (zenoh 1.10 does not report the user of a unix socket or of a password).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 
 class CommandJournal:
-    """Journals commands, at most 30 lines in 10 s.
+    """Logs commands, at most 30 lines in 10 s.
 
     Args:
         session: The session of the router.
@@ -40,7 +39,7 @@ class CommandJournal:
         try:
             word = repr(decode_string(payload)[:40])
         except MessageError:
-            word = f"{len(payload)} bytes that are no command"
+            word = f"{len(payload)} bytes that are not a command"
         to = f"{parsed.rig}/{parsed.name}" if parsed else str(received.key_expr)[:80]
         _log.info("command to %s: %s, from %s%s", to, word, self._origin(received), more)
 

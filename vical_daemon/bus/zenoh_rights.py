@@ -1,7 +1,7 @@
-"""Who may do what on a router that listens on a network, loopback included: zenoh's access control.
+"""Access control of a router that listens on a network, loopback included.
 
-Whoever comes over the unix socket may do everything: the file system decides who that is. Everybody else may
-subscribe and ask, and nothing more unless named.
+Clients of the unix socket may do everything; file permissions control who can open it. All others may
+only subscribe and query, unless named.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ COMMANDS = "vical/*/command/*"
 
 
 def access_rules(commanders: Sequence[str] = (), publishers: Sequence[str] = ()) -> dict[str, Any]:
-    """Return zenoh's ``access_control`` section; what no rule allows is dropped at the router.
+    """Return zenoh's ``access_control`` section; the router drops what no rule allows.
 
     Args:
-        commanders: Who may put commands: users of the password file, or names in client certificates.
-        publishers: Who may publish and answer on every key.
+        commanders: Users of the password file, or names in client certificates, who may send commands.
+        publishers: The same, who may publish and answer queries on every key.
     """
 
     def allow(name: str, flow: str, messages: list[str], keys: list[str]) -> dict[str, Any]:

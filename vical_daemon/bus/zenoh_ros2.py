@@ -1,26 +1,26 @@
-"""Our messages under ROS 2's names on the same zenoh session: `ros2 topic echo /rig0/imu0/data` works.
+"""Publishes our messages under ROS 2 names on the same zenoh session.
 
-The payloads are ROS 2 CDR already: only key, attachment and tokens are added. A ROS machine needs
-rmw_zenoh_cpp and a route to our router (`tcp/<robot>:7447`; see docs/how-to/ros2.md).
+`ros2 topic echo /rig0/imu0/data` works. The payloads are ROS 2 CDR already: only key, attachment and tokens
+are added. A ROS machine needs rmw_zenoh_cpp and a route to our router (`tcp/<robot>:7447`; see
+docs/how-to/ros2.md).
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from contextlib import suppress
 from typing import Any
 
 import zenoh
 
 from vical_daemon.bus import ros2_names
-from vical_daemon.bus.interface import Handler, Sample
 from vical_daemon.bus.ros2_names import Ros2Topic
-from vical_daemon.bus.zenoh_bus import ZenohBus, ZenohSubscription
+
+_HEARTBEAT_S = 0.2
 
 
-class Ros2Outlet:
-    """Publishes bus messages to ROS 2; thread-safe.
+class Ros2Publisher:
+    """Publishes bus messages to ROS 2; thread-safe. See `ZenohBus.mirror_to`.
 
     Args:
         session: An open zenoh session.
@@ -33,13 +33,13 @@ class Ros2Outlet:
         self._session, self._node, self._domain, self._namespace = session, node, domain, namespace
         self._session_id = str(session.info.zid())
         self._lock = threading.Lock()
-        self._publishers: dict[str, _Publisher | None] = {}
-        self._by_topic: dict[str, _Publisher] = {}
+        self._publishers: dict[str, _TopicPublisher | None] = {}
+        self._by_topic: dict[str, _TopicPublisher] = {}
         token = ros2_names.node_token(self._session_id, 0, node, domain, namespace)
         self._node_token = session.liveliness().declare_token(token)
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Send one message if its key has a ROS name; else do nothing."""
+        """Send one message if its key has a ROS name."""
         with self._lock:
             if key not in self._publishers:
                 self._publishers[key] = self._publisher(key)
@@ -47,7 +47,7 @@ class Ros2Outlet:
             if publisher is not None:
                 publisher.put(payload)
 
-    def _publisher(self, key: str) -> _Publisher | None:
+    def _publisher(self, key: str) -> _TopicPublisher | None:
         topic = ros2_names.ros2_topic(key, self._namespace)
         if topic is None:
             return None
@@ -56,7 +56,7 @@ class Ros2Outlet:
             token = ros2_names.publisher_token(
                 self._session_id, 0, number, self._node, topic, self._domain, self._namespace
             )
-            self._by_topic[topic.name] = _Publisher(self._session, topic, self._domain, token)
+            self._by_topic[topic.name] = _TopicPublisher(self._session, topic, self._domain, token)
         return self._by_topic[topic.name]
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class Ros2Outlet:
                 self._node_token = None
 
 
-class _Publisher:
+class _TopicPublisher:
     """One ROS topic: publisher, token, sequence number."""
 
     def __init__(self, session: Any, topic: Ros2Topic, domain: int, token: str) -> None:
@@ -102,58 +102,3 @@ class _Publisher:
     def close(self) -> None:
         self._token.undeclare()
         self._publisher.undeclare()
-
-
-_HEARTBEAT_S = 0.2
-
-
-class Ros2Bus:
-    """A `ZenohBus` that publishes everything under ROS 2's names as well.
-
-    Args:
-        bus: The bus.
-        node: Name of the node in the ROS graph.
-        domain: ROS_DOMAIN_ID.
-        namespace: Of node and topics, with its leading slash; empty: none.
-    """
-
-    def __init__(self, bus: ZenohBus, node: str, domain: int, namespace: str = "") -> None:
-        self._bus = bus
-        self._outlet = Ros2Outlet(bus.session, node, domain, namespace)
-
-    @property
-    def session(self) -> Any:
-        """See `ZenohBus.session`."""
-        return self._bus.session
-
-    @property
-    def connected(self) -> bool:
-        """See `ZenohBus.connected`."""
-        return self._bus.connected
-
-    def publish(self, key: str, payload: bytes) -> None:
-        """See `Bus.publish`."""
-        self._bus.publish(key, payload)
-        with suppress(zenoh.ZError):  # closing, or no link at this moment
-            self._outlet.publish(key, payload)
-
-    def subscribe(
-        self,
-        key_expression: str,
-        handler: Handler | None = None,
-        *,
-        depth: int = 1024,
-        newest_wins: bool = False,
-    ) -> ZenohSubscription:
-        """See `Bus.subscribe`."""
-        return self._bus.subscribe(key_expression, handler, depth=depth, newest_wins=newest_wins)
-
-    def latest(self, key_expression: str, timeout_s: float = 1.0) -> list[Sample]:
-        """See `Bus.latest`."""
-        return self._bus.latest(key_expression, timeout_s)
-
-    def close(self) -> None:
-        """Leave; may be called twice."""
-        with suppress(zenoh.ZError):  # closed before
-            self._outlet.close()
-        self._bus.close()

@@ -1,6 +1,6 @@
-"""Opening a zenoh session: its settings, security, the router's socket, and errors in one line.
+"""Opens zenoh sessions: settings, security, the router's socket, and one-line errors.
 
-The traps that shaped these settings are listed in docs/bus.md.
+docs/bus.md explains the settings.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Any
 
 import zenoh
 
-from vical_daemon.bus.bus_places import Reach, reach, why_closed
+from vical_daemon.bus.socket_paths import Reach, reach, why_closed
 
 _log = logging.getLogger(__name__)
 _SOURCE_PLACE = re.compile(r"[.,]?\s+at /\S+\.rs:\d+\.?")
 ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|wss|serial|unixsock-stream|unixpipe|vsock)/.+")
-"""How the endpoints look that zenoh understands."""
+"""Endpoints that zenoh accepts."""
 _PAYLOAD_LIMIT = 256 * 2**20
 RETRY = {"retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}}
-"""How a session comes back to its router."""
+"""How a session reconnects to its router."""
 _POOL_BYTES = 4 * 2**20
 """Shared memory of a router, bytes: three images of 1.3 MP. Every receiver of the same user locks it, so it
-stays below the usual limit of 8 MiB, for foreign programs' sake; an image that finds no room is copied."""
+stays below the usual limit of 8 MiB of other programs. Images that do not fit are copied."""
 _ENOUGH_LOCKED_BYTES = 64 * 2**20
 """Limit of locked memory from which memory is shared, bytes: ten routers' pools with their bookkeeping
 (5.4 MiB each, measured: tests/system/test_shared_memory.py)."""
@@ -44,22 +44,22 @@ _QUEUE_SIZES = {
 
 
 class BusError(Exception):
-    """The bus cannot be opened; the message is one line that says what to try."""
+    """The bus cannot be opened; the message is one line with a remedy."""
 
 
 def can_share_memory() -> bool:
-    """Whether this process may lock enough memory for the bus to share images instead of copying them.
+    """Return whether this process may lock enough memory to share images instead of copying them.
 
-    zenoh locks every segment that it maps, its own and those of the sessions that it receives from. Where the
-    limit is reached, it drops what it cannot map, silently. So memory is shared only where the limit leaves
-    room for several routers (docs/bus.md, "Shared memory").
+    zenoh locks every segment that it maps, its own and those of its senders. At the limit it silently drops
+    the messages that it cannot map. So memory is shared only if the limit has room for
+    several routers (docs/bus.md, "Shared memory").
     """
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     return soft == resource.RLIM_INFINITY or soft >= _ENOUGH_LOCKED_BYTES or _may_lock_anything()
 
 
 def _may_lock_anything() -> bool:
-    """Whether the kernel exempts this process from the limit (CAP_IPC_LOCK, which root has)."""
+    """Return whether the kernel exempts this process from the limit (CAP_IPC_LOCK, which root has)."""
     try:
         status = Path("/proc/self/status").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -69,7 +69,7 @@ def _may_lock_anything() -> bool:
 
 
 def _warn_of_copies() -> None:
-    """Say once in a process that images are copied, and what to raise."""
+    """Log once per process that images are copied, and which limit to raise."""
     global _warned
     if not _warned:
         _warned = True
@@ -81,7 +81,7 @@ def _warn_of_copies() -> None:
 
 
 def base_config(*, router: bool = False) -> dict[str, Any]:
-    """Return what all sessions have in common; only a router has memory to share."""
+    """Return the settings of all sessions; only a router shares memory."""
     shared = can_share_memory()
     return {
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
@@ -138,9 +138,9 @@ def add_security(
 
 @contextmanager
 def closed_to_others() -> Iterator[None]:
-    """Let what is created meanwhile, sockets above all, be for this user and group alone.
+    """Create files and sockets for this user and group only, while the context lasts.
 
-    The mask is the whole process's: a router is opened before the roles are started.
+    The umask applies to the whole process: a router is opened before the roles start.
     """
     before = os.umask(0o007)
     try:
@@ -153,7 +153,7 @@ def free_socket(path: Path) -> None:
     """Remove the socket of a router that was killed.
 
     Raises:
-        BusError: Somebody answers there, or the folder is not ours.
+        BusError: A router answers there, or the folder belongs to another user.
     """
     probe = sockets.socket(sockets.AF_UNIX)
     try:
@@ -174,7 +174,7 @@ def free_socket(path: Path) -> None:
 
 
 def open_session(config: dict[str, Any]) -> Any:
-    """Open a session; where the process may lock too little memory, without shared memory."""
+    """Open a session, without shared memory if the process may lock too little."""
     shared = config["transport"]["shared_memory"]["enabled"]
     if not shared:
         _warn_of_copies()
@@ -193,7 +193,7 @@ def open_session(config: dict[str, Any]) -> Any:
 
 
 def _explain(config: dict[str, Any], text: str) -> str:
-    """Say in one line what is wrong and what to try; places in zenoh's own source help nobody."""
+    """Return one line with the cause and a remedy, without the source lines that zenoh adds."""
     detail = " ".join(_SOURCE_PLACE.sub("", text).split())[:200]
     if config["mode"] == "client":
         endpoints = config["connect"]["endpoints"]
@@ -212,7 +212,7 @@ def _explain(config: dict[str, Any], text: str) -> str:
 
 
 def _answers(endpoint: str) -> bool:
-    """Whether anybody accepts connections at an endpoint (of the kinds that can be tried simply)."""
+    """Return whether a process accepts connections at an endpoint (tcp, tls or unix socket)."""
     protocol, _, place = endpoint.partition("/")
     try:
         if protocol == "unixsock-stream":

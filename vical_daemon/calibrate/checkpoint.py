@@ -1,7 +1,7 @@
-"""Keeps the running estimator in the runtime directory, so that a restarted process goes on where it was.
+"""Saves the running estimator in the runtime directory, so that a restarted process resumes it.
 
-A restart then costs a gap in the data and no calibration. The file holds for the same devices, config, code
-and boot only. It is used once: a state that makes the process fail again is not met a second time.
+A restart then costs a gap in the data, not the calibration. The file is valid for the same devices, config,
+code and boot only. It is used once, so that a state that crashes the process is not loaded again.
 """
 
 from __future__ import annotations
@@ -23,20 +23,23 @@ import msgspec
 import numpy as np
 from vical_drivers.user_files import read_file
 
+from vical_daemon import estimation
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.config.model import Config
 from vical_daemon.config.strict_yaml import MAX_BYTES
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.atomic_file import atomic_write
 from vical_daemon.service.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
 FILE_NAME = "estimator"
 SAVE_EVERY_S = 2.0
-PROVEN_S = 10.0  # an estimator is not kept before it has run so long without failing
-OLDEST_S = 300.0  # an older state says too little about a rig that somebody may have touched meanwhile
-_COST = 100  # a save may take one part in so many of the time
+PROVEN_S = 10.0  # an estimator is not saved before it has run this long without failing
+OLDEST_S = 300.0  # after this long the rig may have been touched
+_COST = 100  # saving may take 1/100 of the time
 _SIZE_LIMIT = 2**26  # bytes; 0.4 MB after a minute
-_ARITHMETIC = "vical_daemon.estimation"
+CODE = Path(estimation.__file__).parent
+"""The code that a state depends on."""
+_ARITHMETIC = estimation.__name__
 _PLAIN = {("builtins", "slice"), ("collections", "deque"), ("numpy", "dtype"), ("numpy", "ndarray")} | {
     (module, name)
     for core in ("numpy._core", "numpy.core")
@@ -46,7 +49,7 @@ _PLAIN = {("builtins", "slice"), ("collections", "deque"), ("numpy", "dtype"), (
         (f"{core}.numeric", "_frombuffer"),
     )
 }
-"""What a state consists of, besides the classes of the estimation."""
+"""Types in a state, besides the classes of the estimation."""
 
 
 class _Head(msgspec.Struct, frozen=True):
@@ -59,9 +62,9 @@ class Checkpoint:
     """The state of one estimator, on disk.
 
     Args:
-        folder: The runtime directory; None: nothing is kept (demo, tests).
+        folder: The runtime directory; None: nothing is saved (demo, tests).
         config: The rig.
-        clock: Of the service; another one means another boot, and stamps that do not follow.
+        clock: Clock of the service. Another clock means another boot, with unrelated stamps.
     """
 
     def __init__(self, folder: Path | None, config: Config, clock: WallClock) -> None:
@@ -71,10 +74,10 @@ class Checkpoint:
         self._next_s = time.monotonic() + PROVEN_S
 
     def load(self, devices: Mapping[str, str]) -> tuple[Estimator, float] | None:
-        """Return the state that an earlier process left for these devices, and its age, s; or None.
+        """Return the state that an earlier process saved for these devices, and its age, s; or None.
 
         Args:
-            devices: Serial numbers by component; empty: not known, then nothing is taken.
+            devices: Serial numbers by component; empty: unknown, so no state is loaded.
         """
         if self._path is None:
             return None
@@ -91,19 +94,19 @@ class Checkpoint:
             return _Unpickler(io.BytesIO(body)).load(), age_s
         except FileNotFoundError:
             return None
-        except Exception as error:  # whatever stands there: the estimator then starts as it always did
+        except Exception as error:  # any damaged file: the estimator then starts without it
             _log.warning("%s is not used: %s", self._path, " ".join(str(error).split()))
             return None
 
     def save(self, estimator: Estimator, devices: Mapping[str, str]) -> None:
-        """Keep a converged estimator; does nothing most of the time, and never raises."""
+        """Save a converged estimator, if enough time has passed since the last save. Never raises."""
         begin_s = time.monotonic()
         if self._path is None or begin_s < self._next_s or not devices:
             return
         try:
             head = _Head(self._identity, dict(devices), self._clock.now_ns())
             body = pickle.dumps(estimator, protocol=5)
-            write_whole(self._path, msgspec.json.encode(head) + b"\n" + body)
+            atomic_write(self._path, msgspec.json.encode(head) + b"\n" + body)
         except Exception as error:
             _log.warning("the estimator's state cannot be kept: %s", " ".join(str(error).split()))
             self._next_s = float("inf")
@@ -112,7 +115,7 @@ class Checkpoint:
         self._next_s = end_s + max(SAVE_EVERY_S, _COST * (end_s - begin_s))
 
     def forget(self) -> None:
-        """Remove the file: the next estimator starts from what is stored for the devices."""
+        """Remove the file: the next estimator starts from the stored calibration."""
         self._next_s = time.monotonic() + PROVEN_S
         if self._path is None:
             return
@@ -123,7 +126,7 @@ class Checkpoint:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Makes objects of the estimation and plain ones, nothing else: a file is never a program."""
+    """Creates objects of the estimation and plain types only, so that a file cannot run code."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("builtins", "getattr"):  # a method of one of our objects
@@ -138,7 +141,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _method(owner: object, name: str) -> Any:
-    """A method of one of our objects; Python 3.11.0 to 3.11.3 write the members of an enum so, too."""
+    """Return a method of an estimator's object; Python 3.11.0 to 3.11.3 pickle enum members this way, too."""
     if isinstance(owner, EnumType) and owner.__module__.startswith(_ARITHMETIC) and name in owner.__members__:
         return owner[name]
     if not type(owner).__module__.startswith(_ARITHMETIC) or name.startswith("__"):
@@ -147,10 +150,10 @@ def _method(owner: object, name: str) -> Any:
 
 
 def _read_private(path: Path) -> bytes:
-    """Read a file that this user wrote and nobody else can.
+    """Read a file that only this user can have written.
 
     Raises:
-        OSError: There is none, or it is somebody else's.
+        OSError: There is no file, or another user could have written it.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as file:
@@ -162,10 +165,10 @@ def _read_private(path: Path) -> bytes:
 
 
 def _identity(config: Config, clock: WallClock) -> str:
-    """Hash of all that a state depends on: code, config, target, clock."""
+    """Return a hash of what a state depends on: code, config, target, clock."""
     digest = hashlib.sha256(f"{sys.version} {np.__version__} {clock.boot_id} {clock.offset_ns}".encode())
     digest.update(repr(config).encode())
-    files = sorted((Path(__file__).parent / "estimation").rglob("*.py"))
+    files = sorted(CODE.rglob("*.py"))
     for path in (*files, *([config.target_path] if config.target_path else [])):
         if path.is_file():
             digest.update(read_file(path, MAX_BYTES))

@@ -1,4 +1,4 @@
-"""Chooses the estimator that a config asks for; target-based and target-free look the same from outside."""
+"""Creates the estimator of a config. Target-based and target-free estimators have one interface."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Estimator(Protocol):
         ...
 
     def stamps_known_to(self, sigma_s: float) -> None:
-        """Take how well the imu's driver knows its device's clock now, one sigma, s."""
+        """Take the stamp uncertainty that the IMU's driver reports now, one sigma, s."""
         ...
 
     def add_points(self, frame: PointsFrame) -> None:
@@ -32,11 +32,11 @@ class Estimator(Protocol):
 
     @property
     def waiting(self) -> int:
-        """Images taken that have neither been used nor refused yet."""
+        """Images that have been neither used nor rejected yet."""
         ...
 
     def process(self) -> Sequence[Any]:
-        """Do what can be done with what has arrived."""
+        """Process the data that have arrived."""
         ...
 
     def finish(self) -> Sequence[Any]:
@@ -44,11 +44,11 @@ class Estimator(Protocol):
         ...
 
     def estimate(self) -> CalibrationEstimate:
-        """Return what is known now; takes the events since the last call along."""
+        """Return the current estimate, with the events since the last call."""
         ...
 
     def trace(self, camera: str) -> list[TracePoint]:
-        """Return how the calibration of one camera developed."""
+        """Return the history of one camera's calibration."""
         ...
 
 
@@ -57,7 +57,7 @@ def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None)
 
     Args:
         config: The rig.
-        priors: What is known about the cameras; None: what the config says.
+        priors: Priors of the cameras; None: those of the config.
 
     Raises:
         ConfigError: The target file is missing or wrong.
@@ -70,12 +70,12 @@ def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None)
     from vical_daemon.estimation.calibrator import Calibrator
     from vical_daemon.vision.target import load_target
 
-    assert config.target_path is not None  # `config.load` has seen to it
+    assert config.target_path is not None  # checked by `config.load`
     return Calibrator(options, priors, load_target(config.target_path).points_m)
 
 
 def make_watch(config: Config) -> DelayWatch | None:
-    """Make what compares the time shift with that of the rotations alone; None without a target."""
+    """Make the check of the time shift against rotations alone; None without a target."""
     if config.target_path is None or config.calibration.mode == "target_free":
         return None
     from vical_daemon.estimation.temporal.td_icp import TdIcpOptions

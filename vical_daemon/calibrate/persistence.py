@@ -1,8 +1,8 @@
-"""Remembers calibrations over restarts, by the serial numbers of the devices, and announces changes.
+"""Stores calibrations by the serial numbers of the devices, and announces changes since the stored one.
 
-Serial numbers come from the status of the acquiring roles, so the estimator needs no access to devices. What
-is estimated belongs to the devices that were there when the estimator began. When one of them is replaced,
-nothing more is saved until `begin_again`: else the calibration of one device would be filed under another.
+Serial numbers come from the status of the acquiring roles, so the estimator needs no access to devices. An
+estimate belongs to the devices that were present when the estimator started. After one of them is replaced,
+nothing is saved until `begin_again`. Otherwise the calibration would be stored under the wrong device.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 SAVE_EVERY_S = 60.0
 SERIALS_WITHIN_S = 3.0
 SIGMAS = 4.0
-# What nobody needs to be told of, however significant: thermal play of a mount.
+# Smaller changes are not announced, however significant: thermal play of a mount.
 IRRELEVANT_M, IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 
 
@@ -47,13 +47,13 @@ _JOURNAL_NAMES = {
 }
 
 
-class Memory:
+class CalibrationPersistence:
     """The store as one running estimator uses it.
 
     Args:
         config: The rig.
-        bus: Where the status of the devices is heard.
-        clock: For the date of what is saved.
+        bus: Source of the device status.
+        clock: Date of the stored calibrations.
     """
 
     def __init__(self, config: Config, bus: Bus, clock: WallClock) -> None:
@@ -72,9 +72,9 @@ class Memory:
         self._subscriptions = [bus.subscribe(key, self._listen) for key in self._keys]
 
     def priors(self, wait_s: float = SERIALS_WITHIN_S) -> dict[str, CameraPrior]:
-        """Return what is known about each camera: what was stored for these devices, else the config.
+        """Return the prior of each camera: the stored calibration of these devices, else the config.
 
-        What the config gives for a held parameter stays.
+        Fixed parameters keep the values of the config.
 
         Args:
             wait_s: How long to wait for the serial numbers.
@@ -94,11 +94,11 @@ class Memory:
 
     @property
     def replaced(self) -> bool:
-        """Whether a device of this calibration was replaced by another one since the estimator began."""
+        """Whether a device of this calibration was replaced since the estimator started."""
         return bool(self._serials.replaced)
 
     def begin_again(self) -> dict[str, CameraPrior]:
-        """Turn to the devices that are there now; return what is known about each camera with them."""
+        """Switch to the devices that are present now; return the prior of each camera."""
         for line in self._serials.adopt():
             said = f"{line}: the calibration begins anew"
             _log.warning("%s", said)
@@ -110,12 +110,12 @@ class Memory:
 
     @property
     def stored(self) -> list[str]:
-        """Cameras for which a calibration of these devices is stored."""
+        """Cameras with a stored calibration for these devices."""
         return list(self._before)
 
     @property
     def devices(self) -> dict[str, str]:
-        """Serial numbers of the devices of this calibration by component; empty while one is not certain."""
+        """Serial numbers of the devices by component; empty while one of them is uncertain."""
         names = self._components()
         known = {name: serial for name, serial in self._serials.known.items() if name in names}
         return known if len(known) == len(names) and not self._serials.in_doubt else {}
@@ -125,15 +125,15 @@ class Memory:
         return [f"imu/{self._config.calibration_imu}", *cameras]
 
     def announce(self, event: Event) -> None:
-        """Write an event into the journal now and into the next estimate."""
+        """Write an event to the journal now, and add it to the next estimate."""
         self._journal(event)
         self._announced.append(event)
 
     def watch(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
-        """Look at an estimate before it is published: save it when it is good, announce what changed.
+        """Save an estimate that converged, and announce what changed since the stored calibration.
 
         Returns:
-            The estimate, with an event added where the calibration differs from the stored one.
+            The estimate, with the events added.
         """
         events = list(estimate.events)
         if estimate.status is Status.CONVERGED:
@@ -158,7 +158,7 @@ class Memory:
         notify.event(name, event_text(event), level="warning", rig=self._config.rig, **fields)
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
-        """Store a converged estimate now (once a minute, and at the end)."""
+        """Store an estimate if it has converged."""
         if estimate is None or estimate.status is not Status.CONVERGED or self._serials.in_doubt:
             return
         self._saved_s = time.monotonic()
@@ -205,14 +205,14 @@ class Memory:
 
 
 def differences(camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float) -> list[Event]:
-    """Return by how much a mounting differs from an earlier one, beyond both sigmas and what matters.
+    """Return the significant differences of a mounting from an earlier one, above the `IRRELEVANT_` limits.
 
-    Each component is compared with the sum of both variances; rotations as the angle about each axis.
+    Compares each component with the sum of both variances, and rotations as the angle about each axis.
 
     Args:
         camera: Name of the camera.
-        before: As stored.
-        now: As estimated.
+        before: Stored calibration.
+        now: Current estimate.
         t_s: Time of the comparison, s since the first inertial reading.
     """
     old, new = before.T_imu_cam, now.T_imu_cam
@@ -235,14 +235,14 @@ def differences(camera: str, before: CameraEstimate, now: CameraEstimate, t_s: f
 
 
 def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Length of a vector, and its standard deviation."""
+    """Return the length of a vector, and its standard deviation."""
     length = float(np.linalg.norm(vector))
     along = vector / length
     return length, math.sqrt(max(float(along @ covariance @ along), 0.0))
 
 
 def _merge(given: CameraPrior, stored: CameraPrior, fix: tuple[str, ...]) -> CameraPrior:
-    """Take what was stored, but for what the config holds fixed."""
+    """Return the stored prior, with the fixed parameters of the config."""
     merged = replace(stored, readout_s=given.readout_s or stored.readout_s)
     if "intrinsics" in fix:
         merged = replace(merged, intrinsics=given.intrinsics, distortion=given.distortion)

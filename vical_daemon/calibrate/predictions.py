@@ -1,4 +1,4 @@
-"""Where the filter expected the points of an image, before it used them: for eyes and for logs."""
+"""Publishes where the filter expected the points of an image, before it used them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vical_daemon.bus.outgoing import Message
 
 
 class Predictions:
-    """Keeps the verdict on the newest image of each camera until it is published.
+    """Keeps the report on the newest image of each camera until it is published.
 
     Args:
         rig: Name of the rig.
@@ -24,7 +24,7 @@ class Predictions:
         self._newest: dict[str, Any] = {}
 
     def take(self, frames: Sequence[Any]) -> None:
-        """Take what the estimator says of some images (those without a prediction are of no use here)."""
+        """Take the reports on some images; ignores those without a prediction."""
         for frame in frames:
             if len(getattr(frame, "predicted_px", ())):
                 self._newest[frame.camera] = frame

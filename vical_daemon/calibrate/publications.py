@@ -1,4 +1,4 @@
-"""An estimate as messages: ours without loss, and the standard ones for those who know only ROS."""
+"""An estimate as messages: our own, which is complete, and the standard ROS ones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def calibration_messages(config: Config, estimate: CalibrationEstimate) -> list[Message]:
-    """Return the estimate of every camera (also before there is a solution), with pose where there is one."""
+    """Return the estimate of every camera, and its pose once there is a solution."""
     messages: list[Message] = []
     imu = config.calibration_imu
     for name in config.calibration_cameras:
@@ -37,9 +37,9 @@ def calibration_messages(config: Config, estimate: CalibrationEstimate) -> list[
 
 
 def companion_messages(config: Config, estimate: CalibrationEstimate) -> list[Message]:
-    """Return what changes slowly: CameraInfo of every camera, and tf_static once converged.
+    """Return CameraInfo of every camera, and tf_static once converged.
 
-    Before convergence no transform is sent: whoever listens to tf takes it for final.
+    No transform is sent before convergence: users of tf take it as final.
     """
     messages: list[Message] = []
     transforms = []
@@ -66,7 +66,7 @@ def companion_messages(config: Config, estimate: CalibrationEstimate) -> list[Me
 
 
 def calibration_status(estimate: CalibrationEstimate | None, counters: dict[str, str]) -> DiagnosticStatus:
-    """Return the health of the estimator: how far it is and why it is not further."""
+    """Return the health of the estimator: its progress and what limits it."""
     if estimate is None:
         return DiagnosticStatus(Level.OK, "estimate", "waiting for data", "", counters)
     bad = estimate.status in (Status.DEGENERATE, Status.INCONSISTENT)
@@ -84,7 +84,7 @@ def calibration_status(estimate: CalibrationEstimate | None, counters: dict[str,
 
 
 def delay_statuses(verdicts: Mapping[str, DelayVerdict]) -> list[DiagnosticStatus]:
-    """Return per camera what rotations alone say about its time shift; a warning where the filter differs."""
+    """Return per camera the time shift from rotations alone; a warning if the filter differs."""
     return [
         DiagnosticStatus(
             Level.WARN if verdict.warning else Level.OK,

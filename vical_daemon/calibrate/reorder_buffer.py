@@ -1,7 +1,6 @@
-"""Sorts what arrives out of order: several streams in, one stream by stamp out, behind a fixed lag.
+"""Merges several streams into one, ordered by stamp, with a fixed lag.
 
-The lag is counted in the data's own time, not on a clock, so that a replay gives exactly the order of the
-live run, and the same order at any speed.
+The lag is measured by stamps, not by a clock. So a replay at any speed gives the order of the live run.
 """
 
 from __future__ import annotations
@@ -12,15 +11,14 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 
-class StampOrder(Generic[T]):
+class ReorderBuffer(Generic[T]):
     """A bounded heap of stamped items.
 
     Args:
-        lag_s: An item is released when one with a stamp so much later has arrived.
-        max_items: When more wait, the earliest are released before their time (a stream with a far
-            future stamp must not fill memory).
+        lag_s: An item is released when a stamp this much later has arrived.
+        max_items: When more items wait, the earliest are released early, to bound memory.
 
-    Stamps are believed here: `stamp_gate` sees to it that they go on from those before.
+    Stamps are trusted here; `stamp_gate` has checked that they are continuous.
     """
 
     def __init__(self, lag_s: float, max_items: int = 20_000) -> None:
@@ -41,10 +39,10 @@ class StampOrder(Generic[T]):
         return self._newest_ns
 
     def push(self, stamp_ns: int, item: T) -> None:
-        """Take an item; one that comes later than the lag allows is counted in `late` and goes out next.
+        """Take an item. An item later than the lag is counted in `late` and released next.
 
-        It is not dropped: a stream that is delayed as a whole (a busy machine) is still in order by itself,
-        and the estimator waits with an image until inertial data bracket it.
+        It is not dropped: a stream that a busy machine delays as a whole is still in order, and the
+        estimator holds an image until inertial data bracket it.
         """
         if self._newest_ns is None or stamp_ns > self._newest_ns:
             self._newest_ns = stamp_ns
@@ -54,7 +52,7 @@ class StampOrder(Generic[T]):
         self._arrivals += 1
 
     def pop_due(self) -> list[T]:
-        """Return the items that have waited long enough, by stamp, equal stamps in order of arrival."""
+        """Return the items older than the lag, by stamp; equal stamps in order of arrival."""
         due: list[T] = []
         if self._newest_ns is None:
             return due
@@ -64,7 +62,7 @@ class StampOrder(Generic[T]):
         return due
 
     def pop_all(self) -> list[T]:
-        """Return everything that waits (end of the data)."""
+        """Return all items (end of the data)."""
         return [self._pop() for _ in range(len(self._heap))]
 
     def _pop(self) -> T:

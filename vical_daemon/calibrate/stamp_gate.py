@@ -1,8 +1,8 @@
-"""Lets the messages of one stream pass whose stamps go on from those before; a jump must prove itself.
+"""Passes the messages of a stream whose stamps are continuous; a jump must be confirmed first.
 
-Stamps cannot be held against the clock of this machine: a replay has those of its log, another host a clock
-of its own. But one stream goes on from where it is. One message with a stamp of nonsense, taken at its word,
-would make all good ones after it look hours late.
+Stamps cannot be compared with the clock of this machine: a replay has the stamps of its log, and another host
+has its own clock. But the stamps of one stream are continuous. If one wrong stamp were accepted, all good
+messages after it would look hours late.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 REACH_S = 2.0
-"""Messages of one stream follow each other within this, s; the slowest cameras that are taken have 1 Hz."""
+"""Longest step between messages of a stream, s; the slowest supported cameras have 1 Hz."""
 LEAST_S = 50e-6
-"""And not faster than this, s: 20 kHz, above every inertial device that is taken; junk repeats its stamps."""
+"""Shortest step, s: 20 kHz, above every supported IMU; junk repeats its stamps."""
 ENOUGH = 3
-"""Messages that agree with each other: two of a random kind may do so by chance."""
+"""Consecutive messages that confirm a jump; two may agree by chance."""
 PROOF_S = 0.5
-"""So long, s, must messages agree before a stream that is known is believed to have jumped: in this time, a
-stream that goes on where it was would have shown itself."""
-_CHAINS = 64  # sequences followed at a time: among so many stamps of junk a good one is still found
+"""Time over which messages must agree before a jump of a known stream is accepted, s. If the stream had not
+jumped, its next message would have arrived within this time."""
+_CHAINS = 64  # candidate sequences kept: a good one is found among this many junk stamps
 
 
 @dataclass(slots=True)
 class _Chain(Generic[T]):
-    """Messages that go on from each other and not from the stream.
+    """Messages that are continuous with each other, but not with the stream.
 
     Attributes:
         first_ns: Stamp of the first one.
@@ -42,8 +42,8 @@ class StampGate(Generic[T]):
     """The gate of one stream.
 
     Attributes:
-        refused: Messages whose stamps did not go on from those before and never proved themselves.
-        jumps: How often the stream went on from somewhere else.
+        refused: Messages whose stamps were not continuous and were never confirmed.
+        jumps: How often the stream jumped.
     """
 
     def __init__(self) -> None:
@@ -58,10 +58,10 @@ class StampGate(Generic[T]):
         Args:
             stamp_ns: Its stamp.
             item: The message.
-            among_others: Other streams have such stamps: the first message of this one needs no more proof.
+            among_others: Other streams have such stamps: the first message needs no confirmation.
 
         Returns:
-            The stamps and messages that may pass: this one, none yet, or all that proved a beginning or jump.
+            The stamps and messages that pass: this one, none yet, or all that confirmed a start or jump.
         """
         if self._newest_ns is not None and _near(stamp_ns, self._newest_ns):
             self._newest_ns = stamp_ns
@@ -81,7 +81,7 @@ class StampGate(Generic[T]):
         return chain.held
 
     def flush(self) -> list[tuple[int, T]]:
-        """End of the data: what there is of a stream too short to prove that it is one."""
+        """Return, at the end of the data, the messages of a stream too short to be confirmed."""
         if self._newest_ns is not None:
             self._refuse_all()
             return []
@@ -89,7 +89,7 @@ class StampGate(Generic[T]):
         return [pair for chain in chains for pair in chain.held]
 
     def _chain_of(self, stamp_ns: int) -> _Chain[T]:
-        """The sequence that a stamp goes on from, moved to the end; a new one where there is none."""
+        """Return the sequence that a stamp continues, moved to the end; a new one if there is none."""
         for k in range(len(self._chains) - 1, -1, -1):
             chain = self._chains[k]
             if LEAST_S * 1e9 <= stamp_ns - chain.newest_ns <= REACH_S * 1e9:

@@ -1,4 +1,4 @@
-"""What the role estimate does, without I/O: messages in, by stamp behind a short lag; messages out."""
+"""The estimate role without I/O: messages in, reordered by stamp; messages out."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from vical_daemon.calibrate.publications import (
     companion_messages,
     delay_statuses,
 )
-from vical_daemon.calibrate.reorder_buffer import StampOrder
+from vical_daemon.calibrate.reorder_buffer import ReorderBuffer
 from vical_daemon.calibrate.stamp_gate import StampGate
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.measurements import PointsFrame
@@ -43,8 +43,8 @@ Inspect = Callable[[CalibrationEstimate], CalibrationEstimate]
 PUBLISH_S = 0.2
 COMPANION_S = 1.0
 STUCK_S = 10.0
-"""Images that arrive and are neither used nor refused for so long: the estimator is not alive, s. They wait
-for inertial data at most 2 s, and a start on a slow card was seen to take 3 s."""
+"""The estimator is stuck if images arrive and none is used or rejected for this long, s. Images wait at most
+2 s for inertial data; a start on a slow card took 3 s."""
 
 
 class EstimateRole:
@@ -52,11 +52,11 @@ class EstimateRole:
 
     Args:
         config: The rig.
-        estimator: What does the arithmetic.
-        period_s: Between two publications; a change shows as soon as the next one.
-        keep: Takes the verdict on every frame (for reports); None: they are dropped.
-        inspect: Sees every estimate before it is published and may add to it.
-        watch: Compares the time shift with that of the rotations alone; None: nobody does.
+        estimator: The estimator.
+        period_s: Time between two publications.
+        keep: Gets the report on every frame; None: they are dropped.
+        inspect: Gets every estimate before it is published and may add to it.
+        watch: Checks the time shift against rotations alone; None: no check.
     """
 
     def __init__(
@@ -75,9 +75,9 @@ class EstimateRole:
         self._predictions = Predictions(config.rig)
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
         self._status_key = topics.STATUS.key(config.rig, "imu")
-        self._order: StampOrder[ImuMessage | PointsFrame] = StampOrder(config.calibration.lag_s)
+        self._order: ReorderBuffer[ImuMessage | PointsFrame] = ReorderBuffer(config.calibration.lag_s)
         self._gates: dict[str, StampGate[ImuMessage | PointsFrame]] = {}
-        self._span_ns: tuple[int, int] | None = None  # of all stamps that passed
+        self._span_ns: tuple[int, int] | None = None  # first and last of all stamps that passed
         self._next_s = self._next_companion_s = -float("inf")
         self._malformed = self._implausible = 0
         self._images_in_order = 0
@@ -85,7 +85,7 @@ class EstimateRole:
         self.latest: CalibrationEstimate | None = None
 
     def take(self, sample: Sample) -> None:
-        """Take one message from the bus; what cannot be read, or cannot be, is counted."""
+        """Take one message from the bus. Counts malformed and implausible messages."""
         try:
             if sample.key == self._imu_key:
                 imu = admit_imu(sample.payload)
@@ -102,7 +102,7 @@ class EstimateRole:
             self._malformed += 1
 
     def _sort_in(self, key: str, stamp_ns: int, item: ImuMessage | PointsFrame) -> None:
-        """Put an item into its place by stamp, once the stamps of its stream make sense."""
+        """Queue an item by stamp, once the stamps of its stream are continuous."""
         gate = self._gates.get(key)
         if gate is None:
             gate = self._gates[key] = StampGate()
@@ -118,17 +118,17 @@ class EstimateRole:
 
     @property
     def settled(self) -> int:
-        """Images so far (of `images`) that the estimator has looked at, or that were refused."""
+        """Images so far (of `images`) that were used or rejected."""
         return self.images - self._images_in_order - self.estimator.waiting
 
     def _stamps_known(self, message: DiagnosticsMessage) -> None:
-        """Pass on what the driver says of its device's clock."""
+        """Pass the driver's stamp uncertainty to the estimator."""
         for status in message.statuses:
             if status.name == f"imu/{self.config.calibration_imu}" and "stamp_sigma_us" in status.values:
                 self.estimator.stamps_known_to(admit_stamp_sigma_s(status.values["stamp_sigma_us"]))
 
     def step(self, now_s: float | None = None) -> list[Message]:
-        """Do what can be done with what was taken and return what is to be published.
+        """Process what was taken and return the messages to publish.
 
         Args:
             now_s: Any steady clock, for the 5 Hz; None: the time of the data (offline, repeatable).
@@ -139,7 +139,7 @@ class EstimateRole:
         return self._publications(now_s)
 
     def finish(self) -> list[Message]:
-        """End of the data: use everything and return the last word."""
+        """Process the rest at the end of the data and return the last messages."""
         for gate in self._gates.values():
             self._pass(gate.flush())
         self._feed(self._order.pop_all())
@@ -148,7 +148,7 @@ class EstimateRole:
         return self._publications(0.0)
 
     def reset(self, estimator: Estimator, watch: DelayWatch | None = None) -> None:
-        """Forget everything and begin anew with a fresh estimator (and watch)."""
+        """Start again with a new estimator (and watch)."""
         self._order.pop_all()
         self._images_in_order = 0
         self.estimator, self.latest, self._watch = estimator, None, watch
@@ -190,8 +190,8 @@ class EstimateRole:
         """Return the health of the estimator.
 
         Args:
-            dropped: Samples that never came here.
-            stuck_s: For how long images have come and none has been used or refused (see `Progress`).
+            dropped: Samples lost before this role.
+            stuck_s: How long images have arrived without one being used or rejected (see `Progress`).
         """
         counters = {
             "queue_depth": str(len(self._order)),

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vical_daemon.bus.bus_places import own_socket
 from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.local_bus import open_local_bus
+from vical_daemon.bus.socket_paths import own_socket
 from vical_daemon.bus.zenoh_bus import BusError, ZenohBus, open_bus
 from vical_daemon.bus.zenoh_commands import CommandJournal
 from vical_daemon.config.model import BusConfig, Config, load
@@ -52,10 +52,10 @@ def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) 
     if bus is not None:
         _log.info("on the bus as zenoh id %s", bus.session.info.zid())  # the journal of commands names it
     if bus is not None and config.ros2 is not None:
-        from vical_daemon.bus.zenoh_ros2 import Ros2Bus
+        from vical_daemon.bus.zenoh_ros2 import Ros2Publisher
 
         node = f"{config.rig}_{min(roles, default='vical')}"
-        return Ros2Bus(bus, node, config.ros2.domain, config.ros2_namespace)
+        bus.mirror_to(Ros2Publisher(bus.session, node, config.ros2.domain, config.ros2_namespace))
     return bus
 
 

@@ -155,7 +155,7 @@ def _check_imu(what: str, imu: ImuConfig, open_source: Callable[[ImuConfig], Imu
 def _check_camera(
     what: str, camera: CameraConfig, open_source: Callable[[CameraConfig], FrameSource]
 ) -> Iterator[Finding]:
-    from vical_drivers.camera.opening import judge_camera
+    from vical_drivers.camera.opening import check_open_camera
     from vical_drivers.errors import DriverError
 
     from vical_daemon.acquire.camera import driver_options
@@ -165,7 +165,7 @@ def _check_camera(
     except DriverError as error:
         yield Finding(what, camera.uri, str(error))
         return
-    problems = judge_camera(source, camera.uri, **driver_options(camera))
+    problems = check_open_camera(source, camera.uri, **driver_options(camera))
     if not problems:
         width, height = camera.size
         yield Finding(what, f"{camera.uri}: {width} x {height} at {camera.rate_hz:g} Hz")

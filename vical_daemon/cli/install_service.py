@@ -17,7 +17,7 @@ from textwrap import indent
 
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.atomic_file import atomic_write
 
 _UNITS = Path("etc/systemd/system")
 _HOMES = ("/home", "/root", "/run/user")
@@ -230,7 +230,7 @@ def _require_rights(root: Path) -> None:
 def _perform(step: Step) -> None:
     if step.action == "write":
         path = Path(step.what)
-        write_whole(path, step.text.encode())
+        atomic_write(path, step.text.encode())
         path.chmod(0o644)
     elif step.action == "remove":
         path = Path(step.what)

@@ -1,1 +1,1 @@
-"""The one settings file of a rig, and where the service keeps its files."""
+"""The settings file of a rig, and the folders of the service."""

@@ -1,4 +1,4 @@
-"""What no single value of a config shows: values that contradict each other or the hardware."""
+"""Checks of a config across values: contradictions between values, or with the hardware."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ NEEDS_TARGET = "plumb_bob needs a target; without one use radtan"
 
 
 def contradictions(config: Config) -> Iterator[tuple[str, str]]:
-    """Yield (path, text) of what no single value shows."""
+    """Yield (path, text) of each contradiction."""
     for name, imu in config.imus.items():
-        if not imu.port.startswith("log:"):  # a recording has the rate that it has
+        if not imu.port.startswith("log:"):  # the rate of a recording is fixed
             yield from _check_gx3_rate(f"imus.{name}.rate_hz", imu.rate_hz)
     for name, camera in config.cameras.items():
         path = f"cameras.{name}.lens"
@@ -50,13 +50,13 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def _check_bus(bus: BusConfig) -> Iterator[tuple[str, str]]:
-    """A name is worth something only where it has to be proven."""
+    """Check that the names of commanders and publishers are authenticated."""
     proven = bus.password_file or (bus.tls_ca and bus.tls_certificate)
     for key in ("commanders", "publishers"):
         if getattr(bus, key) and not proven:
             yield (
                 f"bus.{key}",
-                "nobody can prove such a name; set password_file, or tls_ca and tls_certificate",
+                "clients cannot prove such a name; set password_file, or tls_ca and tls_certificate",
             )
 
 
@@ -94,7 +94,7 @@ def _check_lens(path: str, camera: CameraConfig, fix: tuple[str, ...]) -> Iterat
 
 
 def coefficients_error(model: str, values: Sequence[float]) -> str:
-    """Say what is wrong with the number of a distortion model's coefficients; empty if nothing."""
+    """Return the problem with the number of distortion coefficients, "" if none."""
     names = COEFFICIENTS[model]
     if len(values) == len(names):
         return ""
@@ -102,13 +102,13 @@ def coefficients_error(model: str, values: Sequence[float]) -> str:
 
 
 def rigid_error(matrix: Sequence[Sequence[float]]) -> str:
-    """Say what is wrong with a 4x4 rigid transform; empty if nothing."""
+    """Return the problem with a 4x4 rigid transform, "" if none."""
     T = np.asarray(matrix)
     R = T[:3, :3]
     if not np.allclose(T[3], [0, 0, 0, 1], atol=1e-9):
         return "the last row must be 0 0 0 1"
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        return "the upper left 3x3 block is no rotation"
+        return "the upper left 3x3 block is not a rotation"
     if np.abs(T[:3, 3]).max() > 10:
         return "the camera lies more than 10 m from the IMU; the unit is m"
     return ""

@@ -1,4 +1,4 @@
-"""Where the service keeps what: run time, state and logs; systemd says where, else the user's own folders."""
+"""Folders of the service for run time and state: those of systemd, else the user's own."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import tempfile
 from pathlib import Path
 
 LOOPBACK_PORT = 7447
-"""zenoh's usual port: of the loopback endpoint, where the config opens one without naming a port."""
+"""zenoh's usual port, used for the loopback endpoint if the config names no other."""
 
 
 def runtime_directory() -> Path:
-    """Sockets and files that live until the next boot (`RUNTIME_DIRECTORY`, ``/run/vical`` as a service)."""
+    """Return the folder for sockets and files until the next boot (``/run/vical`` as a service)."""
     given = os.environ.get("VICAL_RUNTIME_DIR") or _first("RUNTIME_DIRECTORY")
     if given:
         return Path(given)
@@ -20,7 +20,7 @@ def runtime_directory() -> Path:
 
 
 def state_directory() -> Path:
-    """What must survive: calibrations and recordings (`STATE_DIRECTORY`, ``/var/lib/vical`` as a service)."""
+    """Return the folder for calibrations and recordings (``/var/lib/vical`` as a service)."""
     given = os.environ.get("VICAL_STATE_DIR") or _first("STATE_DIRECTORY")
     if given:
         return Path(given)
@@ -29,7 +29,7 @@ def state_directory() -> Path:
         return Path(home) / "vical"
     try:
         return Path.home() / ".local" / "state" / "vical"
-    except RuntimeError:  # a user without HOME and without an entry in the list of users
+    except RuntimeError:  # a user without HOME and without a passwd entry
         return runtime_directory() / "state"
 
 
@@ -37,7 +37,7 @@ def make_private(folder: Path) -> Path:
     """Create a folder that only this user (and group) may enter, and return it.
 
     Raises:
-        PermissionError: It exists and belongs to somebody else, who could put files there for us to read.
+        PermissionError: It belongs to another user, who could place files there.
     """
     folder.mkdir(mode=0o750, parents=True, exist_ok=True)
     if folder.stat().st_uid not in (os.getuid(), 0):
@@ -46,5 +46,5 @@ def make_private(folder: Path) -> Path:
 
 
 def _first(variable: str) -> str:
-    """Systemd separates several folders with colons."""
+    """Return the first folder of a variable in which systemd separates folders with colons."""
     return os.environ.get(variable, "").split(":")[0]

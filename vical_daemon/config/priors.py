@@ -1,4 +1,4 @@
-"""What is known before the first sample, in the estimator's terms: from the config, or from Kalibr's files.
+"""Priors of the estimator, from the config or from Kalibr's files.
 
 Kalibr's camchain.yaml (`cam0: intrinsics, T_cam_imu, timeshift_cam_imu, ...`) and imu.yaml keys, at the top
 level or under `imu0`; every key is optional.
@@ -32,7 +32,7 @@ Density = Annotated[float, Bound(above=0, high=10.0)]
 
 @dataclass(frozen=True, slots=True)
 class _KalibrCamera:
-    """The keys of one camera in a Kalibr camchain; those below `resolution` are read and not used."""
+    """The keys of one camera in a Kalibr camchain; those below `resolution` are accepted and ignored."""
 
     camera_model: Literal["pinhole"] = "pinhole"
     distortion_model: Literal["radtan", "plumb_bob", "equidistant", "none"] = "radtan"
@@ -50,7 +50,7 @@ class _KalibrCamera:
 
 @dataclass(frozen=True, slots=True)
 class _KalibrImu:
-    """The keys of one IMU in Kalibr's imu.yaml; those below `rate_hz` are read and not used."""
+    """The keys of one IMU in Kalibr's imu.yaml; those below `rate_hz` are accepted and ignored."""
 
     gyroscope_noise_density: Density = ImuNoise().gyro_density
     gyroscope_random_walk: Density = ImuNoise().gyro_walk
@@ -66,12 +66,12 @@ class _KalibrImu:
 
 @dataclass(frozen=True, slots=True)
 class Initial:
-    """What an `--initial` file says.
+    """Contents of an `--initial` file.
 
     Attributes:
-        cameras: Prior by camera name; resolution (0, 0) where the file does not give it.
-        imu_noise: None where the file has no IMU keys.
-        imu_rate_hz: None where the file does not say.
+        cameras: Prior by camera name; resolution (0, 0) if the file does not give it.
+        imu_noise: None if the file has no IMU keys.
+        imu_rate_hz: None if the file does not give it.
     """
 
     cameras: dict[str, CameraPrior] = field(default_factory=dict)
@@ -124,7 +124,7 @@ def camera_prior(config: Config, name: str) -> CameraPrior:
 
 
 def calibration_options(config: Config) -> CalibrationOptions:
-    """Return the estimator's switches of a config."""
+    """Return the estimator's options of a config."""
     calibration = config.calibration
     wanted = calibration.convergence
     imu = config.imus[config.calibration_imu] if config.imus else None

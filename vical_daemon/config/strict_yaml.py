@@ -1,8 +1,8 @@
-"""YAML as people write it, with the line of every value and none of YAML 1.1's surprises.
+"""YAML with the line number of every value, and without the surprises of YAML 1.1.
 
 PyYAML's resolver reads ``1e-3`` as a string, ``12:30`` as 750 and ``010`` as 8. Here the first is the
-number it means and the other two are refused. Duplicate keys are refused; so are aliases, which a
-settings file does not need and a hostile one uses to fill memory. Knows no schema.
+number it means, and the other two are refused. Duplicate keys are refused, and so are aliases: a settings
+file does not need them, and a hostile one can use them to fill memory. Knows no schema.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ Value = None | bool | int | float | str | list["Value"] | dict[str, "Value"]
 
 
 class ConfigError(Exception):
-    """A settings file that cannot be used; one line naming file, path, bound and line.
+    """A settings file that cannot be used; the message is one line with path, bound, file and line.
 
     Args:
-        message: The first thing that is wrong.
-        problems: All of them, for `vical check`.
+        message: The first problem.
+        problems: All problems, for `vical check`.
     """
 
     exit_code = 2
@@ -72,7 +72,7 @@ def read(path: Path) -> Document:
     """Read a file.
 
     Raises:
-        ConfigError: It is missing, unreadable, too large, no YAML, or no mapping.
+        ConfigError: It is missing, unreadable, too large, not YAML, or not a mapping.
     """
     try:
         text = read_text(path, MAX_BYTES)
@@ -86,10 +86,10 @@ def read(path: Path) -> Document:
 
 
 def parse(text: str, name: str) -> Document:
-    """Parse text; `name` stands in messages.
+    """Parse text; `name` is used in messages.
 
     Raises:
-        ConfigError: Not YAML, or one of the things this module refuses.
+        ConfigError: Not YAML, or YAML that this module refuses.
     """
     document = Document(name)
     try:
@@ -110,10 +110,10 @@ def parse(text: str, name: str) -> Document:
 
 
 def refuse_hostile(text: str, name: str) -> None:
-    """Look at the tokens first: they come one by one, before anything is built from them.
+    """Refuse hostile YAML by its tokens, before anything is built from them.
 
     Raises:
-        ConfigError: Aliases, or nested too deeply.
+        ConfigError: Aliases, or too deep nesting.
         yaml.YAMLError: Not YAML.
     """
     depth = 0

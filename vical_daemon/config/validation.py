@@ -1,8 +1,8 @@
-"""Checks a parsed YAML document against dataclasses and builds them; finds all problems at once.
+"""Builds dataclasses from a parsed YAML document, and reports all problems at once.
 
 Understands int, float, bool, str, Literal, `X | None`, `tuple[X, ...]`, `tuple[X, Y]`, `dict[str, X]`,
-`Annotated[X, Bound(...)]` and nested dataclasses; a field with metadata `hidden` is not for files.
-Unknown keys are refused with the nearest known one.
+`Annotated[X, Bound(...)]` and nested dataclasses. A field with metadata `hidden` cannot be set in a file.
+The error for an unknown key suggests the nearest known one.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """What a value must satisfy beyond its type.
+    """Bounds of a value.
 
     Attributes:
         low: Smallest allowed number.
         high: Largest allowed number.
         above: The number must be larger than this.
         pattern: Regular expression that the whole text must match.
-        hint: What to write instead, in words.
+        hint: Valid values, in words.
     """
 
     low: float | None = None
@@ -40,7 +40,7 @@ class Bound:
 
 
 class _MistakeError(Exception):
-    """A value does not fit; the message has the path but no line yet."""
+    """An invalid value; the message has the path but no line yet."""
 
     def __init__(self, path: str, text: str) -> None:
         super().__init__(text)

@@ -1,4 +1,4 @@
-"""Chooses what finds points in images: a detector for the board, or a tracker of natural features."""
+"""Creates the detector of a config: for the board, or a tracker of natural features."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from vical_daemon.vision.flow_prediction import FlowPredictor
 
 Detect = Callable[[Any, int], "Found | None"]
-"""Image and its stamp (ns) -> the points, or None where nothing was found."""
+"""Image and its stamp (ns) -> the points, or None if there are none."""
 
 
 class Found(Protocol):
@@ -35,11 +35,11 @@ class Found(Protocol):
 
 
 def make_detector(config: Config, predictor: FlowPredictor | None = None) -> Detect:
-    """Make the detector of one camera (it may remember the image before).
+    """Make the detector of one camera; it may keep the last image.
 
     Args:
         config: The rig.
-        predictor: Foretells the flow of natural features; a board needs none.
+        predictor: Predicts the flow of natural features; not used with a board.
 
     Raises:
         ConfigError: The target file is missing or wrong.
@@ -51,5 +51,5 @@ def make_detector(config: Config, predictor: FlowPredictor | None = None) -> Det
     from vical_daemon.vision.detector import BoardDetector
     from vical_daemon.vision.target import load_target
 
-    assert config.target_path is not None  # `config.load` has seen to it
+    assert config.target_path is not None  # checked by `config.load`
     return BoardDetector(load_target(config.target_path)).detect

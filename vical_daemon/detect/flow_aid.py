@@ -1,4 +1,4 @@
-"""Tells a feature tracker what gyro and calibration say about the flow to come. No I/O."""
+"""Feeds gyro and calibration to the flow prediction of a feature tracker. No I/O."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CameraEstimate, Status
 from vical_daemon.vision.flow_prediction import FlowCamera, FlowPredictor
 
-ENOUGH_HZ = 200.0  # the mean rate between two images does not need more
-_WAITING = 4000
-_BELIEVED = (Status.CONVERGING, Status.CONVERGED)
+ENOUGH_HZ = 200.0  # enough for the mean rate between two images
+_QUEUE_LIMIT = 4000
+_USABLE = (Status.CONVERGING, Status.CONVERGED)
 
 
 class GyroAid:
     """Feeds the flow predictor of one camera.
 
-    Inertial samples are kept as they come and decoded when an image asks for them, as many as are needed.
-    Without a prior of the mounting the gyro helps from the first calibration on.
+    Inertial samples are queued undecoded; `prepare` decodes them when an image needs them. Without a prior of
+    the mounting, the gyro helps from the first calibration on.
 
     Args:
         config: The rig.
         camera: Name of the camera.
-        prior: What is known about it.
+        prior: Its prior.
     """
 
     def __init__(self, config: Config, camera: str, prior: CameraPrior) -> None:
@@ -40,26 +40,26 @@ class GyroAid:
         self.calibration_key = topics.CALIBRATION.key(config.rig, camera)
         self._every = max(1, int(config.imus[imu].rate_hz / ENOUGH_HZ))
         self._count = 0
-        self._samples: deque[bytes] = deque(maxlen=_WAITING)
+        self._samples: deque[bytes] = deque(maxlen=_QUEUE_LIMIT)
 
     def take_imu(self, sample: Sample) -> None:
-        """Keep an inertial sample; cheap enough for the bus' own thread."""
+        """Queue an inertial sample; cheap enough for the bus thread."""
         self._count += 1
         if self._count % self._every == 0:
             self._samples.append(sample.payload)
 
     def take_calibration(self, sample: Sample) -> None:
-        """Believe a calibration that is on its way or converged; anything else changes nothing."""
+        """Use a calibration that is converging or converged; ignore any other."""
         try:
             message = admit_calibration(sample.payload)
         except MessageError:
             return
         known = message.camera_estimate
-        if known is not None and message.estimate.status in _BELIEVED:
+        if known is not None and message.estimate.status in _USABLE:
             self.predictor.camera = _from_estimate(known)
 
     def prepare(self) -> None:
-        """Hand what has come to the predictor."""
+        """Pass the queued samples to the predictor."""
         while self._samples:
             try:
                 imu = admit_imu(self._samples.popleft())

@@ -1,4 +1,4 @@
-"""Role detect: images in, target points (or feature tracks) out; the newest image wins when it is slow."""
+"""Role detect: images in, target points or feature tracks out. A slow detector skips to the newest image."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.bus.outgoing import Message, publish
 from vical_daemon.config.model import Config
-from vical_daemon.config.paths import make_private, runtime_directory
 from vical_daemon.config.priors import camera_prior
 from vical_daemon.detect.detectors import Detect, make_detector
 from vical_daemon.detect.flow_aid import GyroAid
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.service import notify
 from vical_daemon.service.health import StatusSender
-from vical_daemon.service.wall_clock import WallClock, shared_clock
+from vical_daemon.service.wall_clock import WallClock, service_clock
 
 QUEUE_DEPTH = 2
 _NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 JOIN_S = 3.0
 STUCK_S = 20.0
-"""At one image for so long, s: a detection takes 0.1 s; on a slow card OpenCV takes some to load."""
-_SET_BACK_NS = 2e9  # further behind the last image than any queue can bring it
-_NEW_SIZE = 3  # images in a row
+"""A detector that works on one image for this long, s, is stuck. A detection takes 0.1 s; on a slow card
+loading OpenCV takes some seconds."""
+_SET_BACK_NS = 2e9  # longer than any queue delays an image
+_NEW_SIZE = 3  # images in a row that confirm another size
 _log = logging.getLogger(__name__)
 
 
@@ -47,8 +47,8 @@ class DetectRole:
     Args:
         config: The rig.
         camera: Name of the camera.
-        detector: Finds points in one image; None: what the config asks for.
-        prior: What is known about the camera; None: what the config says.
+        detector: Finds points in one image; None: that of the config.
+        prior: Prior of the camera; None: that of the config.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class DetectRole:
         self._busy_s = 0.0
 
     def points(self, sample: Sample) -> list[Message]:
-        """Return the points message of one image (also when nothing was found); [] if it was skipped."""
+        """Return the points message of one image, also if no point was found; [] if the image was skipped."""
         begin_s = time.perf_counter()
         try:
             stamp_ns, image = _decode(sample)
@@ -94,7 +94,7 @@ class DetectRole:
             if self.aid is not None:
                 self.aid.prepare()
             found = self._detect(image, stamp_ns)
-        except Exception as error:  # OpenCV raises on pictures that nobody has thought of
+        except Exception as error:  # OpenCV raises on unusual images
             self._failed(error)
             return []
         height, width = image.shape[:2]
@@ -107,7 +107,7 @@ class DetectRole:
         return [(self.key, payload)]
 
     def _of_usual_size(self, size: tuple[int, int]) -> bool:
-        """Whether an image is as large as those before; a camera with a new setting is believed soon."""
+        """Whether an image has the usual size; a new size is accepted after a few images."""
         if self._size is None or size == self._size:
             self._size, self._other = size, ((0, 0), 0)
             return True
@@ -118,32 +118,32 @@ class DetectRole:
         return True
 
     def _due(self, stamp_ns: int) -> bool:
-        """Whether an image comes so late after the last one as `detect_rate_hz` asks for."""
+        """Whether `detect_rate_hz` allows an image so soon after the last one."""
         ahead_ns = self._next_ns - stamp_ns
         if 0.5 * self._period_ns < ahead_ns < _SET_BACK_NS:
             return False
-        if ahead_ns >= _SET_BACK_NS:  # the clock was set back, or the image before was nonsense
+        if ahead_ns >= _SET_BACK_NS:  # the clock was set back, or the stamp before was wrong
             self._next_ns = stamp_ns
         self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
         return True
 
     def _failed(self, error: Exception) -> None:
-        """Go on with a fresh detector; each problem is said once."""
+        """Replace the detector; log each problem once."""
         self._failures += 1
         text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         if text != self._problem:
             self._problem = text
             _log.error("%s: the detector failed and starts again: %s", self.camera, text)
-            told = f"{self.camera}: the detector failed and starts again: {text}"
-            notify.event("detector_restarted", told, level="warning", camera=self.camera)
+            line = f"{self.camera}: the detector failed and starts again: {text}"
+            notify.event("detector_restarted", line, level="warning", camera=self.camera)
         self._detect = self._make()
 
     def status(self, dropped: int = 0, busy_s: float = 0.0) -> DiagnosticStatus:
-        """Return how it goes.
+        """Return the health of the detector.
 
         Args:
-            dropped: Images that came while it was busy.
-            busy_s: For how long it has been at the present image.
+            dropped: Images that arrived while it was busy.
+            busy_s: Time spent on the current image.
         """
         share = self._found / self._images if self._images else 0.0
         values = {
@@ -164,7 +164,7 @@ class DetectRole:
 
 
 def attach_aid(bus: Bus, role: DetectRole) -> list[Subscription]:
-    """Let a role that follows natural features hear gyro and calibration; nothing for the others."""
+    """Subscribe a role that tracks natural features to gyro and calibration; [] for other roles."""
     if role.aid is None:
         return []
     return [
@@ -192,9 +192,9 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
         config: The rig.
         bus: Where images come from and points go.
         stop: Ends the role.
-        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
     """
-    clock = clock or shared_clock(make_private(runtime_directory()))
+    clock = clock or service_clock()
     workers = [_Worker(config, name, bus, stop) for name in config.calibration_cameras]
     for worker in workers:
         worker.thread.start()
@@ -204,11 +204,11 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
 
 
 class _Worker:
-    """One camera's thread: takes the newest image, detects, publishes."""
+    """Thread of one camera: takes the newest image, detects, publishes."""
 
     def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
         self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
-        self._since_s: float | None = None  # when it began with the present image
+        self._since_s: float | None = None  # start of the current image
         self._aid = attach_aid(bus, self._role)
         key = topics.IMAGE.key(config.rig, camera)
         self.subscription = bus.subscribe(key, depth=QUEUE_DEPTH, newest_wins=True)
@@ -229,6 +229,6 @@ class _Worker:
         while not self._stop.is_set():
             sample = self.subscription.recv(0.2)
             if sample is not None:
-                self._since_s = time.monotonic()  # stays where the thread ends or hangs
+                self._since_s = time.monotonic()  # stays set if the thread ends or hangs
                 publish(self._bus, self._role.points(sample))
                 self._since_s = None

@@ -1,4 +1,4 @@
-"""Recordings of every kind, as messages in order of their stamps, ready for a bus.
+"""Reads recordings of every kind, as messages in order of their stamps.
 
 `open_recording` takes an MCAP of ours or of ROS 2, a folder of MCAP segments, a ROS 2 bag folder, a
 ROS 1 bag or an ASL/EuRoC folder, checks that units and rates can be right, and returns a `Recording`.
@@ -30,7 +30,7 @@ def open_recording(
 
     Args:
         path: File or folder.
-        topics: Topics, or names of imus and cameras, to take; None: all that are of use.
+        topics: Topics, or names of imus and cameras, to take; None: all that can be used.
         cameras: Of the cameras only these, where there is one of them: files of an ASL folder that belong to
             others may be as broken as they like.
         as_recorded: Leave the stamps alone. Otherwise readings of an imu that were stamped on arrival are
@@ -38,7 +38,7 @@ def open_recording(
         check: Refuse wrong units, rates and clocks (`check_recording`).
 
     Raises:
-        RecordingError: It cannot be used; the message is one line that says what to try.
+        RecordingError: It cannot be used; the message is one line with a remedy.
     """
     path = Path(path)
     if not path.exists():
@@ -50,10 +50,10 @@ def open_recording(
 
 
 def check_recording(recording: Recording) -> None:
-    """Judge units, rates and overlap; adds to `recording.warnings`.
+    """Check units, rates and overlap; adds to `recording.warnings`.
 
     Raises:
-        RecordingError: Something cannot be right, or imu or camera are missing.
+        RecordingError: A value is implausible, or imu or camera are missing.
     """
     if not recording.imus:
         raise RecordingError(f"{recording.path} holds no imu data; `vical info` shows what is in it")

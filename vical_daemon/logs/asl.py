@@ -37,7 +37,7 @@ _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
 _IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
-_SMALL = 2**25  # bytes; so much a packed table may always unpack to
+_SMALL = 2**25  # bytes; a packed table may always unpack to this size
 _SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
 
 
@@ -51,7 +51,7 @@ class _Source:
 
 
 class AslRecording(Recording):
-    """An ASL folder; numbers are kept bit for bit as the text says them."""
+    """An ASL folder; numbers are read without rounding."""
 
     def __init__(
         self,
@@ -65,12 +65,12 @@ class AslRecording(Recording):
 
         Args:
             folder: With `mav0`, or that itself.
-            names: Imus and cameras to read; None: all. Files of others are not looked at.
+            names: Imus and cameras to read; None: all. Files of others are not read.
             cameras: Of the cameras only these, if the folder has one of them.
             as_recorded: Leave the stamps of imus alone.
 
         Raises:
-            RecordingError: No imu or no camera there, or a table that cannot be read.
+            RecordingError: The imu or the camera is missing, or a table cannot be read.
         """
         self.path = folder
         self.rig = RIG
@@ -257,7 +257,7 @@ class AslRecording(Recording):
 
 
 def _without_cut_line(text: bytes, columns: int) -> bytes:
-    """Return a table without its last line where that has no end and too few columns."""
+    """Return a table without its last line if that is cut off."""
     kept, newline, last = text.rpartition(b"\n")
     if not newline or not last.strip() or last.lstrip().startswith(b"#"):
         return text
@@ -284,7 +284,7 @@ def _load(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.ND
 
 
 def _accelerometer_first(title: str) -> bool:
-    """Whether a table's title says that the accelerometer's columns stand in front of the gyro's."""
+    """Whether the title of a table names the accelerometer before the gyro."""
     names = [name.strip().lower() for name in title.lstrip("# ").split(",")]
     accel = [i for i, name in enumerate(names) if re.match(r"a(?![a-z]*(ng|tt))|lin|spec|force|f_", name)]
     gyro = [i for i, name in enumerate(names) if re.match(r"w(_|x|y|z)|gyr|ang|omega|rot", name)]
@@ -309,10 +309,10 @@ def _read_text(path: Path) -> bytes:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Unpack a table, no further than a table of this size can be.
+    """Unpack a table, up to the largest plausible size.
 
     Raises:
-        RecordingError: It goes on.
+        RecordingError: It is larger.
     """
     with open_file(path, TABLE_LIMIT) as packed:
         limit = min(TABLE_LIMIT, max(_SMALL, _SHRINKS * os.fstat(packed.fileno()).st_size))
@@ -335,7 +335,7 @@ def _first_data_row(text: bytes) -> int:
 
 
 def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path], list[str]]:
-    """Return stamps and files of ``data.csv``, and names without a file; names stay inside of the folder."""
+    """Return stamps and files of ``data.csv``, and names without a file; names cannot leave the folder."""
     stamps, files, lost = [], [], []
     for number, line in enumerate(_read_text(table).decode("utf-8", "replace").splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -369,7 +369,7 @@ def _resolution(folder: Path) -> tuple[int, int] | None:
             size = yaml.safe_load(text)["resolution"]
             return int(size[0]), int(size[1])
         except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
-            pass  # EuRoC's own files begin with %YAML:1.0 and are no YAML for some parsers
+            pass  # EuRoC's own files begin with %YAML:1.0, which some parsers refuse
     first = next(iter(sorted((folder / "data").glob("*.png"))), None)
     if first is not None:
         with open_file(first) as file:

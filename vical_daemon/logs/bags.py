@@ -29,7 +29,7 @@ _ROS1 = b"#ROSBAG V2.0\n"  # wiki.ros.org/Bags/Format/2.0
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Any]:
-    """Open a bag with rosbags, and say in one line what it refuses.
+    """Open a bag with rosbags; turns its errors into one line.
 
     Args:
         path: A ``.bag`` file of ROS 1, or a folder with ``metadata.yaml`` of ROS 2.
@@ -60,7 +60,7 @@ def open_bag(path: Path) -> Iterator[Any]:
 
 
 def _checked_size(path: Path) -> int:
-    """Return the size of a bag, bytes; whatever is no regular file in it is refused."""
+    """Return the size of a bag, bytes; refuses members that are not regular files."""
     size = 0
     for member in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not member.is_dir():
@@ -75,7 +75,7 @@ def _checked_size(path: Path) -> int:
 
 @contextmanager
 def _bounded(budget: Budget) -> Iterator[None]:
-    """While a bag is open, rosbags unpacks with these functions: its own have no limit."""
+    """Replace the unpacking functions of rosbags, which have no limit, while a bag is open."""
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader as ros2
 
@@ -140,7 +140,7 @@ _WANTED = frozenset({IMU_TYPE, IMAGE_TYPE, COMPRESSED_IMAGE_TYPE, POINTS_TYPE, T
 
 
 def _to_cdr(data: bytes, type_name: str) -> bytes:
-    """Return a ROS 1 message as CDR (its header loses `seq`); of types that are of no use nothing."""
+    """Return a ROS 1 message as CDR (its header loses `seq`); None for types that are not used."""
     if type_name not in _WANTED:
         return b""
     return bytes(typestore().ros1_to_cdr(data, type_name))

@@ -1,4 +1,4 @@
-"""Is this recording what it claims to be? Units, rates and overlap, judged before anything is estimated.
+"""Checks units, rates and overlap of a recording before the estimation.
 
 An accelerometer in g or a gyro in deg/s would not stop a filter, it would make it converge to nonsense.
 """
@@ -21,7 +21,7 @@ def check_imu(name: str, samples: ImuArrays) -> list[str]:
     """Return warnings about an imu stream.
 
     Raises:
-        RecordingError: Its rate or its units cannot be right.
+        RecordingError: Its rate or its units are implausible.
     """
     if len(samples.t_ns) < 20:
         raise RecordingError(f"{name}: only {len(samples.t_ns)} samples; nothing can be calibrated from that")
@@ -83,7 +83,7 @@ def _check_gyro(name: str, rate_hz: float, samples: ImuArrays) -> None:
 
 
 def gyro_scale(samples: ImuArrays, rate_hz: float) -> tuple[float, float]:
-    """Return (scale, correlation) between how gravity turns in the imu frame and what the gyro says.
+    """Return (scale, correlation) between the rotation of gravity in the imu frame and the gyro.
 
     A vector that stands still in the world changes in the imu frame as f' = -w x f. Smoothed over
     0.5 s the specific force is mostly gravity, so scale = <df, -w x f dt> / |w x f dt|^2 is near 1 for
@@ -124,7 +124,7 @@ def check_camera(stream: Stream, imus: list[Stream]) -> list[str]:
     """Return warnings about a camera stream.
 
     Raises:
-        RecordingError: Its rate cannot be right, or it was not recorded together with the imu.
+        RecordingError: Its rate is implausible, or it was not recorded together with the imu.
     """
     if stream.count < 3:
         raise RecordingError(f"{stream.name}: only {stream.count} frames in {stream.source}")

@@ -1,4 +1,4 @@
-"""What every recording is, wherever it came from: streams, warnings, messages in order of their stamps."""
+"""The interface of every recording: streams, warnings, messages in order of their stamps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vical_daemon.bus.messages import decode_imu, decode_points
 from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
 
 Kind = Literal["imu", "image", "compressed", "points", "tracks"]
-# What a camera is calibrated from where it has several: what is detected already comes first.
+# Preferred stream of a camera that has several: points before images.
 _PREFERENCE: tuple[Kind, ...] = ("points", "tracks", "image", "compressed")
 _WINDOW_NS = 2_000_000_000
 _WINDOW_BYTES = 512 * 2**20
@@ -72,10 +72,10 @@ class Recording(ABC):
     """A recording that can be put on a bus.
 
     Attributes:
-        path: Where it lies.
+        path: File or folder.
         rig: Name of the rig in the keys.
         streams: Its sensors.
-        warnings: What is not as it should be, one line each.
+        warnings: Problems, one line each.
         stamp_sigma_s: Of each imu whose stamps were put on an even grid, how well that is known, s.
     """
 
@@ -173,9 +173,9 @@ class Stamped(NamedTuple):
 
 
 def in_stamp_order(items: Iterable[Stamped]) -> Iterator[tuple[str, bytes]]:
-    """Sort messages by stamp while looking 2 s of log time (or 512 MB) ahead.
+    """Sort messages by stamp with a look-ahead of 2 s of log time (or 512 MB).
 
-    That is exact for streams whose latencies differ by less than 2 s, and bounded in memory for any.
+    The order is exact for streams whose latencies differ by less than 2 s; memory is bounded for any.
     """
     heap: list[tuple[int, bool, str, int, Stamped]] = []
     waiting_bytes, newest_ns = 0, 0

@@ -47,7 +47,7 @@ _KIND_OF_TYPE: dict[str, Kind] = {
     TRACKS_TYPE: "tracks",
 }
 _STAMP = struct.Struct("<iI")
-# Where rates and forces stand, counted from the end of a sensor_msgs/Imu.
+# Offsets of rates and forces from the end of a sensor_msgs/Imu.
 _GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
 _IMU_NUMBERS = 37 * 8
 _PLAIN_WORDS = {"image_raw", "image_mono", "image", "data", "data_raw", "raw", "compressed", "camera", "imu"}
@@ -65,7 +65,7 @@ class RawMessage(NamedTuple):
 
 @dataclass(slots=True)
 class _Channel:
-    """One topic that is of use, while it is scanned."""
+    """One topic that is used, during the scan."""
 
     key: str
     kind: Kind
@@ -78,7 +78,7 @@ class _Channel:
 
 
 class LogRecording(Recording):
-    """Everything that is a log of ROS messages, given a way to walk through it."""
+    """Base of all logs of ROS messages; a subclass iterates over the messages."""
 
     def __init__(
         self, path: Path, topics: Collection[str] | None = None, *, as_recorded: bool = False
@@ -87,11 +87,11 @@ class LogRecording(Recording):
 
         Args:
             path: File or folder.
-            topics: Topics (or names of imus and cameras) to take; None: all that are of use.
+            topics: Topics (or names of imus and cameras) to take; None: all that can be used.
             as_recorded: Leave the stamps of imus alone.
 
         Raises:
-            RecordingError: It cannot be read, or holds nothing of use.
+            RecordingError: It cannot be read, or holds no usable topic.
         """
         self.path = path
         self.rig = _RIG
@@ -136,7 +136,7 @@ class LogRecording(Recording):
                 self.warnings.append(f"{channel.name}: {channel.unreadable} unreadable messages left out")
 
     def _meet(self, raw: RawMessage) -> _Channel | None:
-        """Decide at the first message of a topic what it is."""
+        """Classify a topic by its first message."""
         kind = _KIND_OF_TYPE.get(raw.type_name)
         parsed = parse_key(raw.topic.removeprefix("/"))
         ours_but_not_measured = parsed is not None and parsed.topic is PREDICTED
@@ -211,7 +211,7 @@ class LogRecording(Recording):
             yield Stamped(stamp_ns, raw.log_time_ns, channel.key, channel.kind == "imu", payload)
 
     def imu_arrays(self, name: str) -> ImuArrays:
-        """See `Recording.imu_arrays`; messages that are no good are left out."""
+        """See `Recording.imu_arrays`; malformed messages are skipped."""
         channel = next(c for c in self._channels.values() if c.kind == "imu" and c.name == name)
         t_ns, values = _stamps(channel), _values(channel)
         good = np.isfinite(values).all(axis=1)

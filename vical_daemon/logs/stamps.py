@@ -1,4 +1,4 @@
-"""Stamps as text: to nanoseconds without losing a digit, whatever unit they are written in."""
+"""Converts stamps from text to nanoseconds, exactly, from any unit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LATEST_NS = 4_102_444_800 * FACTOR_NS["s"]  # the year 2100: no stamp lies behi
 
 
 class StampError(ValueError):
-    """A stamp that is no number; holds its place in the column, counted from 0."""
+    """A stamp that is not a number; has its index in the column, from 0."""
 
     def __init__(self, index: int) -> None:
         super().__init__(f"stamp {index} is no number")
@@ -75,7 +75,7 @@ def unit_named(title: str) -> str | None:
 def unit_by_spacing(
     values: list[int] | list[Decimal], slowest_hz: float, fastest_hz: float, usual_hz: float
 ) -> str:
-    """Return the unit in which the spacing of stamps makes sense.
+    """Return the unit in which the spacing of the stamps is plausible.
 
     Nanoseconds wherever they do; else the unit whose rate comes closest to the usual one. Two stamps of a
     stream are never so far in the future that a unit could be excluded by its size alone, but the latest is.
@@ -84,7 +84,7 @@ def unit_by_spacing(
         values: Stamps in any order; repeated ones do not count.
         slowest_hz: Lowest rate that such a stream has.
         fastest_hz: Highest.
-        usual_hz: A middling one.
+        usual_hz: Typical rate.
     """
     ordered = np.unique(np.array(values, dtype=object))
     if len(ordered) < 2:

@@ -1,4 +1,4 @@
-"""What `vical info` says of a recording: every topic with rate, holes, jitter and latency."""
+"""The summary of a recording for `vical info`: rate, gaps, jitter and latency of every topic."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TopicSummary:
         count: Messages.
         rate_hz: One over the median interval of the stamps.
         gaps: Intervals longer than 1.5 times the median.
-        missing: Messages that these holes would have held.
+        missing: Messages that are missing in these gaps.
         largest_gap_s: The longest interval.
         jitter_us: Spread (1.4826 times the median deviation) of the intervals.
         latency_ms: Median and 99th percentile of arrival minus stamp; None where arrival is not
@@ -87,7 +87,7 @@ def summarise_log(path: Path) -> Summary:
         if tally is None:
             tally = tallies[channel.topic] = _Tally(channel.type_name)
         stamp_ns = stamp_of(message.payload) if channel.encoding == "cdr" else None
-        # TFMessage and String begin with something else than a stamp
+        # TFMessage and String do not start with a stamp
         plausible = stamp_ns is not None and abs(stamp_ns - message.log_time_ns) < 10**18
         tally.stamps.append(stamp_ns if plausible and stamp_ns is not None else _fit(message.log_time_ns))
         tally.arrivals.append(_fit(message.log_time_ns))
@@ -121,7 +121,7 @@ def _summary(
     attachments: dict[str, int],
 ) -> Summary:
     topics = [_topic(name, tally) for name, tally in sorted(tallies.items())]
-    # a replayed log holds stamps of another day beside today's: how long it took, the arrivals know
+    # a replayed log mixes stamps of two days: take the duration from the arrivals
     times = [tally.arrivals or tally.stamps for tally in tallies.values() if tally.stamps]
     begins, ends = [min(values) for values in times], [max(values) for values in times]
     duration_s = (max(ends) - min(begins)) * 1e-9 if begins else 0.0

@@ -1,4 +1,4 @@
-"""Trajectories as text: stamps and orientations, in an order of columns that the file itself states.
+"""Reads trajectory files: stamps and orientations, with the column order that the file states.
 
 Nothing is guessed from the orientations: with the parts of all quaternions permuted alike, the angles between
 them stay what they are, so a wrong order fits a gyro as well as the right one does and turns the mounting.
@@ -38,7 +38,7 @@ class Trajectory:
     Attributes:
         t_ns: Stamps, ns, shape (n,).
         q_wxyz: Quaternions as the file gives them, w first, shape (n, 4).
-        warnings: What was read otherwise than the plain formats have it, one line each.
+        warnings: Deviations from the plain formats, one line each.
     """
 
     t_ns: IntArray

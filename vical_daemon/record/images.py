@@ -1,4 +1,4 @@
-"""Images compressed on their way into a log: CompressedImage instead of Image, where the config says so."""
+"""Compresses images for the log, for cameras whose config asks for it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _ENCODINGS = ("mono8", "mono16", "bgr8")
 
 
 class ImageCompressor:
-    """Recodes the images of those cameras whose `record_as` is not raw.
+    """Compresses the images of cameras whose `record_as` is not raw.
 
     Attributes:
         failures: Images that could not be compressed; they are recorded raw.
@@ -24,7 +24,7 @@ class ImageCompressor:
         self.failures = 0
 
     def as_recorded(self, key: str, payload: bytes) -> tuple[str, bytes]:
-        """Return key and message to record: as they came, or compressed. Never raises on data."""
+        """Return key and message to record, unchanged or compressed. Never raises on data."""
         parsed = parse_key(key) if self._kinds else None
         if parsed is None or parsed.topic is not IMAGE or parsed.rig != self._rig:
             return key, payload

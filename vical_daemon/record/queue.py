@@ -1,4 +1,4 @@
-"""What waits between the bus and the disk: stamped on arrival, bounded in memory, images given up first."""
+"""The queue between the bus and the disk: stamped on arrival, bounded in memory, drops images first."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Arrival(NamedTuple):
 
 
 class RecordQueue:
-    """What waits for the disk. When it piles up images go first, and inertial data last."""
+    """Messages that wait for the disk. When it fills up, images are dropped first."""
 
     def __init__(self, limit_bytes: int = QUEUE_BYTES) -> None:
         self._limit_bytes = limit_bytes
@@ -36,7 +36,7 @@ class RecordQueue:
         return len(self._queue)
 
     def put(self, item: Arrival) -> None:
-        """Append; beyond half of the limit no images, beyond the limit nothing."""
+        """Append a message, or drop and count it: images above half of the limit, others above the limit."""
         image = item.topic.kind in ("image", "compressed")
         with self._ready:
             if self._bytes + len(item.payload) > self._limit_bytes / (2 if image else 1):
@@ -47,7 +47,7 @@ class RecordQueue:
             self._ready.notify()
 
     def take(self, timeout_s: float) -> list[Arrival]:
-        """Return all that waits; [] after the timeout."""
+        """Return all queued messages; [] after the timeout."""
         with self._ready:
             self._ready.wait_for(lambda: bool(self._queue), timeout_s)
             items = list(self._queue)
@@ -57,6 +57,6 @@ class RecordQueue:
 
 
 def arrival(sample: Sample, clock: WallClock) -> Arrival | None:
-    """Return a sample as it is recorded; None for keys that are not in the topics table."""
+    """Return a sample with its arrival time; None for keys that are not in the topics table."""
     parsed = parse_key(sample.key)
     return Arrival(parsed.topic, sample.key, sample.payload, clock.now_ns()) if parsed else None

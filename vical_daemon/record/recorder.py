@@ -1,4 +1,4 @@
-"""The recorder without its thread: what it keeps, when it begins and ends, and what it says of itself."""
+"""The recorder without its thread: what it records, when it starts and stops, and its status."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from vical_daemon.service.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
 _RETRY_NS = 5_000_000_000
-_MENDING_S = 5.0
+_RECOVERY_S = 5.0
 _KEYS = 512
-_WORDS = 32  # lines in the log about messages and commands that cannot be understood
+_REPORTS = 32  # log lines about malformed messages and unknown commands
 _ROLES = ("imu", "camera", "detect", "estimate", "record", "web", "")  # "": tf_static, which has no name
 
 
 class Recorder:
-    """Turns arrivals and commands into segments on the disk; never raises because of disk or data."""
+    """Writes arrivals into segments on the disk, and obeys commands. Never raises because of disk or data."""
 
     def __init__(self, config: Config, folder: LogFolder, clock: WallClock) -> None:
         self._config, self._folder, self._clock = config, folder, clock
@@ -50,10 +50,10 @@ class Recorder:
         self._serials = DeviceSerials()
         self._calibrations: dict[str, bytes] = {}
         self._latched: dict[str, bytes] = {}
-        self._mending: threading.Thread | None = None
+        self._recovery: threading.Thread | None = None
         self._keys: set[str] = set()
         self._names = {*config.imus, *config.cameras, *_ROLES}
-        self._told: set[str] = set()  # kinds of which a message did not decode
+        self._reported: set[str] = set()  # kinds of which a message did not decode
         self.messages = 0
         self.refused = 0
         self.malformed = 0
@@ -68,7 +68,7 @@ class Recorder:
         return topic.recorded and (self._config.record.images or topic.kind not in ("image", "compressed"))
 
     def write(self, item: Arrival) -> None:
-        """Take one arrival: learn from it, obey it, record it; what does not decode is only counted."""
+        """Process one arrival: use it, obey it, record it. Malformed messages are only counted."""
         if not (self._decodes(item) and self._admit(item)):
             return
         self._learn(item)
@@ -82,15 +82,15 @@ class Recorder:
             self._fail(str(error))
 
     def _decodes(self, item: Arrival) -> bool:
-        """Whether a message is what its key says: one that is not closes the whole file to some readers."""
+        """Whether a message has the type of its key; if not, some readers would refuse the whole file."""
         try:
             check_message(item.topic.type_name, item.payload)
         except MessageError as error:
             self.malformed += 1
-            if item.topic.kind not in self._told:
-                self._told.add(item.topic.kind)
+            if item.topic.kind not in self._reported:
+                self._reported.add(item.topic.kind)
                 _log.warning(
-                    "%s: not recorded, no %s: %s; more of this kind are only counted",
+                    "%s: not recorded, not a %s: %s; further ones are only counted",
                     item.key[:100],
                     item.topic.type_name,
                     " ".join(str(error).split()),
@@ -99,7 +99,7 @@ class Recorder:
         return True
 
     def _admit(self, item: Arrival) -> bool:
-        """Refuse keys beyond any sane number: whoever invents names must not fill memory and log."""
+        """Refuse new keys above a limit, so that invented names do not fill memory and log."""
         key = item.key
         if key in self._keys or self._of_the_rig(item):
             return True
@@ -110,7 +110,7 @@ class Recorder:
         return True
 
     def _of_the_rig(self, item: Arrival) -> bool:
-        """Whether a key belongs to a device or role of the config: there is always room for those."""
+        """Whether a key belongs to a device or role of the config: those are always recorded."""
         parsed = parse_key(item.key)
         return parsed is not None and parsed.name in self._names
 
@@ -135,12 +135,12 @@ class Recorder:
             self.close()
         elif word == "split" and self._session is not None:
             self._split()
-        elif len(self._told) < _WORDS and word[:40] not in self._told:
-            self._told.add(word[:40])
+        elif len(self._reported) < _REPORTS and word[:40] not in self._reported:
+            self._reported.add(word[:40])
             _log.warning("command %r is not known: start, stop or split", word[:40])
 
     def _split(self) -> None:
-        """Go on in a new file."""
+        """Continue in a new file."""
         if self._session is not None:
             try:
                 self._session.rotate(self._clock.now_ns())
@@ -152,10 +152,10 @@ class Recorder:
             self._serials.note(status)
         if self._serials.replaced:
             self._serials.adopt()
-            self._split()  # a file names the devices that it is of
+            self._split()  # a file names its devices
 
     def tick(self) -> None:
-        """Do what time demands: flush, rotate, quota, reserve, and begin again after a failure."""
+        """Do the periodic work: flush, rotate, enforce quota and reserve, restart after a failure."""
         now_ns = self._clock.now_ns()
         try:
             if self._session is not None:
@@ -173,7 +173,7 @@ class Recorder:
         if not self._folder.lock():
             self._problem = f"standing by: another recorder writes into {self._folder.path}"
             return
-        self._mend()
+        self._start_recovery()
         self._folder.enforce_quota(0)
         if not self._folder.has_room(resuming=bool(self._problem)):
             self._problem = "the disk has reached record.reserve_bytes; waiting for space"
@@ -189,11 +189,11 @@ class Recorder:
             self._session.write(key, payload, now_ns, latched=True)
         _log.info("recording into %s", self._session.path)
 
-    def _mend(self) -> None:
-        """Recover what a crash left, beside the recording: a part of 1 GB takes longer than data may wait."""
-        if self._mending is None or not self._mending.is_alive():
-            self._mending = threading.Thread(target=self._recover, name="log recovery", daemon=True)
-            self._mending.start()
+    def _start_recovery(self) -> None:
+        """Recover what a crash left, in a thread: a part of 1 GB takes longer than data may wait."""
+        if self._recovery is None or not self._recovery.is_alive():
+            self._recovery = threading.Thread(target=self._recover, name="log recovery", daemon=True)
+            self._recovery.start()
 
     def _recover(self) -> None:
         try:
@@ -211,7 +211,7 @@ class Recorder:
             session.close(self._clock.now_ns())
 
     def _fail(self, problem: str) -> None:
-        """Give up the segment (its part can be recovered) and try again in a while."""
+        """Give up the segment (its part can be recovered) and retry later."""
         _log.error("%s; trying again in %d s", problem, _RETRY_NS // 10**9)
         session, self._session = self._session, None
         self._problem, self._retry_ns = problem, self._clock.now_ns() + _RETRY_NS
@@ -219,7 +219,7 @@ class Recorder:
             try:
                 session.close(self._clock.now_ns())
             except LogError:
-                pass  # said already; `recover` mends the part
+                pass  # logged already; `recover` repairs the part
 
     def close(self) -> None:
         """Finish the open segment and let another recorder take over; may be called twice."""
@@ -228,9 +228,9 @@ class Recorder:
         except LogError as error:
             self._problem = str(error)
             _log.error("%s", error)
-        if self._mending is not None:
-            self._mending.join(_MENDING_S)
-        if self._mending is None or not self._mending.is_alive():  # or two mend one part
+        if self._recovery is not None:
+            self._recovery.join(_RECOVERY_S)
+        if self._recovery is None or not self._recovery.is_alive():  # or two processes would recover one part
             self._folder.unlock()
 
     def _metadata(self) -> dict[str, dict[str, str]]:
@@ -271,7 +271,7 @@ class Recorder:
         try:
             values["disk_free_bytes"] = str(self._folder.free_bytes())
         except OSError:
-            pass  # the folder is away: `problem` says so
+            pass  # the folder is missing: `problem` reports it
         if self._problem:
             return DiagnosticStatus(Level.ERROR, "record", self._problem, values=values)
         if queue.dropped or lost:
@@ -283,12 +283,12 @@ class Recorder:
 
 
 def _latches(topic: Topic) -> bool:
-    """What a segment must hold from its beginning to be readable alone."""
+    """Whether a segment must start with the last message of a topic, to be readable alone."""
     return topic.kind in ("camera_info", "tf_static")
 
 
 def _without_secrets(text: bytes) -> bytes:
-    """Return a config without its passwords: logs are handed around."""
+    """Return a config without its passwords, because logs are shared."""
     lines = [
         line.split(b"password:")[0] + b"password: removed" if b"password:" in line else line
         for line in text.splitlines()

@@ -1,4 +1,4 @@
-"""Role record: everything that travels into MCAP segments, whatever else fails."""
+"""Role record: writes all messages into MCAP segments."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 from vical_daemon.bus.interface import Bus, Sample
 from vical_daemon.bus.topics import TOPICS, rig_expression
 from vical_daemon.config.model import Config
-from vical_daemon.config.paths import make_private, runtime_directory, state_directory
+from vical_daemon.config.paths import state_directory
 from vical_daemon.logs.mcap import LogFolder
 from vical_daemon.record.queue import RecordQueue, arrival
 from vical_daemon.record.recorder import Recorder
 from vical_daemon.service.health import StatusSender
-from vical_daemon.service.wall_clock import WallClock, shared_clock
+from vical_daemon.service.wall_clock import WallClock, service_clock
 
 _PERIOD_S = 0.1
 
@@ -21,15 +21,15 @@ _PERIOD_S = 0.1
 def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | None = None) -> None:
     """Record what arrives on the bus until `stop`.
 
-    The bus' thread only stamps and queues; this thread writes, flushes, rotates and obeys commands.
+    The bus thread only stamps and queues; this thread writes, flushes, rotates and obeys commands.
 
     Args:
         config: The rig.
         bus: Where messages come from.
-        stop: Ends the role; what has arrived by then is still written.
-        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        stop: Ends the role; messages that have arrived are still written.
+        clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
     """
-    clock = clock or shared_clock(make_private(runtime_directory()))
+    clock = clock or service_clock()
     path = Path(config.record.directory) if config.record.directory else state_directory() / "log"
     folder = LogFolder(path, quota_bytes=config.record.quota_bytes, reserve_bytes=config.record.reserve_bytes)
     recorder, queue = Recorder(config, folder, clock), RecordQueue()
@@ -42,7 +42,7 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
 
     subscription = bus.subscribe(rig_expression(config.rig), take)
     known = {topic.key(config.rig, "x").replace("/x", "/*") for topic in TOPICS if topic.keep_last}
-    for expression in sorted(known):  # what was published before we came
+    for expression in sorted(known):  # last values from before this role started
         for sample in bus.latest(expression, 0.5):
             take(sample)
     recorder.tick()

@@ -1,1 +1,1 @@
-"""What a calibration leaves behind: store, exports, report."""
+"""Results of a calibration: store, exports, report."""

@@ -1,4 +1,4 @@
-"""Roll, pitch and yaw of a mounting with sigmas of their own, for people; nothing computes with them."""
+"""Roll, pitch and yaw of a mounting with their sigmas, for display only."""
 
 from __future__ import annotations
 

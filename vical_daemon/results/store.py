@@ -1,4 +1,4 @@
-"""Keeps the last converged calibration of each pair of devices, found again by their serial numbers.
+"""Stores the last converged calibration of each pair of devices, by their serial numbers.
 
 A file is replaced in one step: whatever happens in between, the next start finds the old or the new
 calibration, never half of one. What is read is checked: a file that cannot be right is set aside.
@@ -21,7 +21,7 @@ from vical_drivers.user_files import read_file
 from vical_daemon.bus.messages.poses import rotation_matrix
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.service.atomic_file import atomic_write
 
 _log = logging.getLogger(__name__)
 _FORMAT = 1
@@ -29,19 +29,19 @@ _SIZE_LIMIT = 2**20
 
 
 class StoreError(Exception):
-    """The store cannot be written; the message is one line for a person."""
+    """The store cannot be written; the message is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredCalibration:
-    """A calibration as it was when it had converged.
+    """A stored calibration.
 
     Attributes:
         format: Of the file.
         imu_serial: Serial number of the imu.
         camera_serial: Serial number of the camera.
         camera: Name of the camera in `estimate`.
-        saved_ns: When, UNIX ns.
+        saved_ns: Time of saving, UNIX ns.
         estimate: The estimate with this camera.
     """
 
@@ -54,11 +54,11 @@ class StoredCalibration:
 
     @property
     def known(self) -> CameraEstimate:
-        """What is known about the camera."""
+        """The estimate of the camera."""
         return self.estimate.cameras[self.camera]
 
     def prior(self, resolution: tuple[int, int]) -> CameraPrior:
-        """Return it as what a new calibration starts from.
+        """Return it as the prior of a new calibration.
 
         Args:
             resolution: width, height of the images, px.
@@ -85,7 +85,7 @@ class CalibrationStore:
         self.folder = folder
 
     def path(self, imu_serial: str, camera_serial: str) -> Path:
-        """Return the file of a pair; a hash keeps serial numbers apart that look alike as file names."""
+        """Return the file of a pair; a hash distinguishes serial numbers that give the same file name."""
         digest = hashlib.sha256(f"{imu_serial}\0{camera_serial}".encode()).hexdigest()[:8]
         words = [
             re.sub(r"[^A-Za-z0-9.-]+", "-", serial).strip(".-")[:40] for serial in (imu_serial, camera_serial)
@@ -95,17 +95,17 @@ class CalibrationStore:
     def save(
         self, imu_serial: str, camera_serial: str, camera: str, estimate: CalibrationEstimate, now_ns: int
     ) -> Path:
-        """Replace what is stored for a pair, in one step and on the disk when this returns.
+        """Replace the stored calibration of a pair, atomically and synced to disk.
 
         Args:
             imu_serial: Serial number of the imu.
             camera_serial: Serial number of the camera.
             camera: Name of the camera in the estimate.
-            estimate: What to keep.
+            estimate: The estimate to store.
             now_ns: UNIX time, ns.
 
         Raises:
-            StoreError: The estimate makes no sense, or the disk refuses; what was stored before stays.
+            StoreError: The estimate is invalid, or the disk refuses; the old calibration is kept.
         """
         stored = StoredCalibration(_FORMAT, imu_serial, camera_serial, camera, now_ns, estimate)
         problem = _problem(stored)
@@ -113,13 +113,13 @@ class CalibrationStore:
             raise StoreError(f"calibration of {camera} is not stored: {problem}")
         path = self.path(imu_serial, camera_serial)
         try:
-            write_whole(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
+            atomic_write(path, msgspec.json.format(msgspec.json.encode(stored, enc_hook=_plain), indent=1))
         except OSError as error:
             raise StoreError(f"{path} cannot be written: {error.strerror or error}") from None
         return path
 
     def load(self, imu_serial: str, camera_serial: str) -> StoredCalibration | None:
-        """Return what is stored for a pair; None where there is nothing, or nothing that can be right."""
+        """Return the stored calibration of a pair; None if there is none, or an invalid one."""
         path = self.path(imu_serial, camera_serial)
         stored = read_stored(path)
         if stored is not None and (stored.imu_serial, stored.camera_serial) != (imu_serial, camera_serial):
@@ -128,7 +128,7 @@ class CalibrationStore:
         return stored
 
     def all(self) -> list[StoredCalibration]:
-        """Return everything stored that can be right, newest first."""
+        """Return all valid stored calibrations, newest first."""
         found = [
             stored for path in sorted(self.folder.glob("*.json")) if (stored := read_stored(path)) is not None
         ]
@@ -136,7 +136,7 @@ class CalibrationStore:
 
 
 def read_stored(path: Path) -> StoredCalibration | None:
-    """Read one file of a store; None (with a warning) where it is not what it should be."""
+    """Read one file of a store; None (with a warning) if it is invalid."""
     try:
         text = read_file(path, _SIZE_LIMIT)
     except FileNotFoundError:
@@ -157,7 +157,7 @@ def read_stored(path: Path) -> StoredCalibration | None:
 
 
 def _without_news(document: Any) -> Any:
-    """Leave out what was announced and advised then: files of version 0.1.0 hold it as text alone."""
+    """Drop events and guidance, which files of version 0.1.0 have as text only."""
     estimate = document.get("estimate") if isinstance(document, dict) else None
     if not isinstance(estimate, dict):
         return document
@@ -165,7 +165,7 @@ def _without_news(document: Any) -> Any:
 
 
 def _problem(stored: StoredCalibration) -> str:
-    """Return what is wrong with a stored calibration, "" if nothing."""
+    """Return the problem with a stored calibration, "" if none."""
     if stored.format != _FORMAT:
         return f"format {stored.format} is not known"
     known = stored.estimate.cameras.get(stored.camera)
@@ -192,7 +192,7 @@ def _problem(stored: StoredCalibration) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Number of an array library as a plain one: an estimate must never be lost over its type.
+    """Return a number of an array library as a plain one.
 
     Raises:
         TypeError: Anything else.

@@ -1,1 +1,1 @@
-"""What every process of the service needs: clock, paths, health, systemd."""
+"""Shared by all processes of the service: clock, health, systemd, atomic files."""

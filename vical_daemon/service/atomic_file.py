@@ -1,4 +1,4 @@
-"""Files that are whole at any moment: a reader, or a power cut, finds the old content or the new."""
+"""Atomic file writes: after a crash or power cut a file has its old or its new content."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import os
 from pathlib import Path
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that its name means the old or the new content at any moment, also on the disk.
+def atomic_write(path: Path, data: bytes) -> None:
+    """Write a file atomically: a reader finds the old or the new content, never a part of it.
 
     Args:
-        path: Its folder is made where it is missing.
+        path: The file; its folder is created if missing.
         data: The new content.
 
     Raises:
-        OSError: As the system says; then the old content stands and nothing else is left.
+        OSError: The write failed; the old content is kept and no temporary file is left.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.new")

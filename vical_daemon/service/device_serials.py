@@ -1,24 +1,24 @@
-"""Which devices are there, by what the acquiring roles say of them in their status. No I/O."""
+"""Serial numbers of the devices, from the status of the acquiring roles. No I/O."""
 
 from __future__ import annotations
 
 from vical_daemon.bus.messages import DiagnosticStatus
 
 CONFIRMED = 3
-"""A device was replaced when its status says so this often in a row: a damaged message says it once."""
+"""Statuses in a row that confirm a replaced device; a damaged message shows another serial number once."""
 LIMIT = 64
-"""Components that are kept; whoever invents names must not fill the memory."""
+"""Components kept, so that invented names do not fill memory."""
 
 
 class DeviceSerials:
-    """Serial numbers by component, e.g. ``imu/imu0``; a replaced device is told from a damaged message."""
+    """Serial numbers by component, e.g. ``imu/imu0``; one damaged message does not replace a device."""
 
     def __init__(self) -> None:
         self.known: dict[str, str] = {}
         self._others: dict[str, tuple[str, int]] = {}  # component -> another one, times in a row
 
     def note(self, status: DiagnosticStatus) -> None:
-        """Take the status of one component; one without a serial number says nothing."""
+        """Take the status of one component; ignored without a serial number."""
         name, serial = status.name, status.hardware_id
         if not serial or (name not in self.known and len(self.known) >= LIMIT):
             return
@@ -30,16 +30,16 @@ class DeviceSerials:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether some device may have been replaced."""
+        """Whether a device may have been replaced."""
         return bool(self._others)
 
     @property
     def replaced(self) -> dict[str, str]:
-        """Components with another device than the known one, and its serial number."""
+        """Components whose device was replaced, with the new serial number."""
         return {name: serial for name, (serial, times) in self._others.items() if times >= CONFIRMED}
 
     def adopt(self) -> list[str]:
-        """Make the devices that are there now the known ones; returns what changed, a line each."""
+        """Accept the present devices as the known ones; returns one line per change."""
         lines = [
             f"{name} is another device now (serial {serial}, not {self.known[name]})"
             for name, serial in self.replaced.items()

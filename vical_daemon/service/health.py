@@ -1,4 +1,4 @@
-"""How a role tells that it is well: a status once a second, from its own loop and its own counters."""
+"""Publishes the status of a role once a second, from its own loop."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class StatusSender:
     Args:
         rig: Name of the rig.
         role: Name of the role, becomes the last part of the key.
-        bus: Where to.
-        clock: Stamps, and the clock pair in every status.
+        bus: Where the status goes.
+        clock: Source of the stamps; every status includes its offset.
     """
 
     def __init__(self, rig: str, role: str, bus: Bus, clock: WallClock) -> None:
@@ -30,7 +30,7 @@ class StatusSender:
         self._next_s = 0.0
 
     def tick(self, statuses: Callable[[], list[DiagnosticStatus]], *, force: bool = False) -> None:
-        """Publish if a second has gone by; call it from the role's own loop."""
+        """Publish if a second has passed; call it from the role's own loop."""
         now_s = time.monotonic()
         if now_s < self._next_s and not force:
             return
@@ -50,7 +50,7 @@ class StatusSender:
         Args:
             stop: Ends it.
             statuses: Makes what is published.
-            openings: How often devices were opened: it may be another device now, which is told at once.
+            openings: How often devices were opened. A change is published at once, as the device may be new.
         """
         opened = 0
         while not stop.is_set():

@@ -1,8 +1,7 @@
-"""Is this process alive? Judged by what its roles publish from their own loops, not by a timer of its own.
+"""Liveness of this process, from the status messages that its roles publish in their own loops.
 
-The watchdog of systemd is fed from here: it bites when a role stops publishing its status, or publishes
-that one of its threads is stuck. An unplugged device is *not* a reason: restarting would not plug it in,
-and would take the other devices away as well.
+It feeds the watchdog of systemd, which restarts the process if a role stops publishing or reports a stuck
+thread. An unplugged device is *not* a reason: a restart would not plug it in, and would interrupt the others.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from vical_daemon.bus.messages import DiagnosticsMessage, Level, MessageError, d
 
 FRESH_S = 5.0
 START_S = 300.0
-"""How long a role may take to its first status; a slow card was seen to need 60 s for scipy and OpenCV."""
+"""Longest time to the first status of a role; a slow card needed 60 s to load scipy and OpenCV."""
 
 
 class Liveness:
     """Watches the status messages of some roles.
 
     Args:
-        roles: Those that run in this process.
+        roles: The roles of this process.
         begin_s: When the roles were started, by the clock of `now_s`.
         fresh_s: A status older than this means that the role hangs.
     """
@@ -44,12 +43,12 @@ class Liveness:
                 self._seen[message.frame_id] = (now_s, message)
 
     def ready(self) -> bool:
-        """Whether every role has spoken at least once."""
+        """Whether every role has published a status."""
         with self._lock:
             return len(self._seen) == len(self._roles)
 
     def problem(self, now_s: float) -> str:
-        """Return why the process must not be called alive; empty when it may."""
+        """Return why the process is not alive; "" if it is."""
         with self._lock:
             seen = dict(self._seen)
         for role in self._roles:

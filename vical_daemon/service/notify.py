@@ -1,7 +1,6 @@
-"""Talks to systemd: readiness, watchdog and status line (sd_notify), events with fields (journald).
+"""Notifies systemd (readiness, watchdog, status line) and writes events with fields to journald.
 
-Both are one datagram; no library is needed. Without systemd every function does nothing and says so by
-returning False.
+Each is one datagram, so no library is needed. Without systemd every function does nothing and returns False.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ def status(text: str) -> bool:
 
 
 def watchdog() -> bool:
-    """Feed the watchdog; call it only while data flow, never from an idle timer."""
+    """Feed the watchdog; call it only while the roles are alive, never from an idle timer."""
     return _notify("WATCHDOG=1")
 
 

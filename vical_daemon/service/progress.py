@@ -1,15 +1,15 @@
-"""Is what comes in also worked on, and when may a part that failed be started again? Pure bookkeeping."""
+"""Detects a role without progress, and times restarts after failures. No I/O, no clock."""
 
 from __future__ import annotations
 
-_CALM_S = 300.0  # a failure so long after the one before is the first of its kind again
+_CALM_S = 300.0  # a failure this long after the last one counts as the first
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 
 
 class Progress:
-    """Compares what was received with what was settled: used, or refused with a reason.
+    """Compares the items received with the items settled: used, or rejected with a reason.
 
-    A role that goes round and round is not alive; one that settles what it receives is.
+    A role whose loop turns is not necessarily alive; one that settles its input is.
     """
 
     def __init__(self) -> None:
@@ -20,12 +20,12 @@ class Progress:
         """Take the counters as they are now.
 
         Args:
-            received: Items that came in so far.
-            settled: Items used or refused so far.
+            received: Items received so far.
+            settled: Items used or rejected so far.
             now_s: A steady clock.
 
         Returns:
-            For how long items have come in and none has been settled, s; 0: all is well.
+            How long items have arrived without one being settled, s; 0: there is progress.
         """
         if settled != self._settled:
             self._since_s, self._received, self._settled = None, received, settled
@@ -35,7 +35,7 @@ class Progress:
 
 
 class Restarts:
-    """When a part that failed may start again: at once the first time, then after pauses that double.
+    """Pauses before the restarts of a part that failed: none at first, then doubling.
 
     Attributes:
         count: Failures so far.
@@ -49,7 +49,7 @@ class Restarts:
         self._last_s = self._until_s = -float("inf")
 
     def failed(self, why: str, now_s: float) -> float:
-        """Note a failure; the pause to make before the next start, s."""
+        """Note a failure; return the pause before the next start, s."""
         self.count += 1
         self._row = self._row + 1 if now_s - self._last_s < _CALM_S else 1
         self.why, self._last_s = why, now_s
@@ -60,5 +60,5 @@ class Restarts:
         return pause_s
 
     def waiting_s(self, now_s: float) -> float:
-        """How long to wait still before it may work again, s; 0: it may."""
+        """Return the rest of the pause, s; 0: it may start."""
         return max(self._until_s - now_s, 0.0)

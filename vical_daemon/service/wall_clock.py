@@ -1,8 +1,8 @@
-"""One offset from CLOCK_MONOTONIC to UNIX time for all processes: NTP never tears two sensors apart.
+"""One offset from CLOCK_MONOTONIC to UNIX time for all processes, so that NTP cannot shift one sensor.
 
-Inside a host stamps are monotonic; on the wire they are UNIX time = monotonic + one offset that whichever
-process comes first measures and leaves in a file. A later step of the wall clock changes nothing until all
-processes of the service have been stopped and the runtime directory is gone, or the machine boots again.
+Inside a host, stamps are monotonic. On the bus they are UNIX time = monotonic + offset. The first process
+measures the offset and stores it in a file. A later step of the wall clock has no effect until all processes
+of the service have stopped and the runtime directory is gone, or until the next boot.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from pathlib import Path
 
 import msgspec
 
-from vical_daemon.service.atomic_file import write_whole
+from vical_daemon.config.paths import make_private, runtime_directory
+from vical_daemon.service.atomic_file import atomic_write
 
 FILE_NAME = "wall_clock.json"
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -31,19 +32,19 @@ class WallClock:
     boot_id: str = ""
 
     def unix_ns(self, t_host_ns: int) -> int:
-        """Turn a monotonic stamp into the stamp that travels."""
+        """Convert a monotonic stamp to UNIX time, ns."""
         return t_host_ns + self.offset_ns
 
     def now_ns(self) -> int:
-        """UNIX time by this clock: never steps."""
+        """Return UNIX time by this clock, ns; it never steps."""
         return time.monotonic_ns() + self.offset_ns
 
     def step_ns(self) -> int:
-        """How far the wall clock has moved away since the offset was taken, ns."""
+        """Return how far the wall clock has stepped since the offset was measured, ns."""
         return measure_offset_ns() - self.offset_ns
 
     def status_values(self) -> dict[str, str]:
-        """The pair that every status carries."""
+        """Return the values that every status includes."""
         return {
             "wall_minus_monotonic_ns": str(self.offset_ns),
             "boot_id": self.boot_id,
@@ -52,7 +53,7 @@ class WallClock:
 
 
 def measure_offset_ns() -> int:
-    """UNIX time minus CLOCK_MONOTONIC, ns: the tightest of a few bracketed readings."""
+    """Return UNIX time minus CLOCK_MONOTONIC, ns: the tightest of a few bracketed readings."""
     best_width_ns, best_offset_ns = None, 0
     for _ in range(5):
         before_ns = time.monotonic_ns()
@@ -65,33 +66,38 @@ def measure_offset_ns() -> int:
 
 
 def private_clock() -> WallClock:
-    """A clock for a process that shares its stamps with nobody (demo, tests)."""
+    """Return a clock for a single process (demo, tests)."""
     return WallClock(measure_offset_ns(), boot_id())
 
 
-def shared_clock(folder: Path) -> WallClock:
-    """Return the clock of the service: the first process to come makes the file, the others read it.
+def service_clock() -> WallClock:
+    """Return the clock that all processes of the service share."""
+    return shared_clock(make_private(runtime_directory()))
 
-    A file of an earlier boot, or one that cannot be read, is replaced.
+
+def shared_clock(folder: Path) -> WallClock:
+    """Return the clock of the service: the first process writes the file, the others read it.
+
+    Replaces a file of an earlier boot, or one that cannot be read.
 
     Args:
         folder: The runtime directory.
     """
     path = folder / FILE_NAME
     clock = _read(path)
-    if clock is not None and clock.boot_id == boot_id():  # such a file is never replaced: no lock needed
+    if clock is not None and clock.boot_id == boot_id():  # a valid file is never replaced: no lock needed
         return clock
     with _alone_in(folder):
         clock = _read(path)  # another role may have been faster
         if clock is None or clock.boot_id != boot_id():
             clock = private_clock()
-            write_whole(path, msgspec.json.encode(clock))
+            atomic_write(path, msgspec.json.encode(clock))
     return clock
 
 
 @contextlib.contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock; it is gone with the process."""
+    """Hold the folder's lock; the kernel releases it if the process dies."""
     handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
@@ -101,7 +107,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def boot_id() -> str:
-    """The kernel's name for this boot; empty where it has none."""
+    """Return the kernel's id of this boot, or ""."""
     try:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:

@@ -10,7 +10,7 @@ import numpy as np
 from vical_daemon.vision.aprilgrid import search_tags
 from vical_daemon.vision.checkerboard import put_in_order, search_checkerboard
 from vical_daemon.vision.detection import AnyImage, Detection, FloatArray, Gray, as_gray
-from vical_daemon.vision.grid_model import GridModel, fit_grid
+from vical_daemon.vision.grid_model import GridModel
 from vical_daemon.vision.guided import (
     BoardFix,
     BoolArray,
@@ -40,22 +40,16 @@ class DetectorStats:
     """What the detector did so far.
 
     Attributes:
-        frames: Pictures given.
-        found: Pictures with a board.
-        guided: Of these, found without a full search.
+        guided: Pictures in which the board was found without a full search.
         searches: Full searches.
-        losses: Times that guided detection gave up.
     """
 
-    frames: int = 0
-    found: int = 0
     guided: int = 0
     searches: int = 0
-    losses: int = 0
 
 
 @dataclass(frozen=True)
-class _Memory:
+class _LastFrame:
     """The last frame with a board."""
 
     fix: BoardFix
@@ -78,24 +72,16 @@ class BoardDetector:
         self.stats = DetectorStats()
         self._layout = BoardLayout.of(target)
         self._guided = guided
-        self._memory: _Memory | None = None
+        self._last: _LastFrame | None = None
         self._lens = -0.1
         self._misses = 0
 
-    def reset(self) -> None:
-        """Forget the last frames."""
-        self._memory = None
-
-    def detect(
-        self, image: AnyImage, t_ns: int | None = None, predicted_uv: FloatArray | None = None
-    ) -> Detection | None:
+    def detect(self, image: AnyImage, t_ns: int | None = None) -> Detection | None:
         """Find the board.
 
         Args:
             image: Shape (height, width) uint8/uint16 or (height, width, 3) uint8 (BGR).
             t_ns: Stamp, ns; lets the guided search scale velocities over dropped frames.
-            predicted_uv: Where the estimator expects each point, shape (points, 2), nan where unseen; used
-                instead of the last frames' motion.
 
         Returns:
             The points found (at least four), or None.
@@ -105,21 +91,19 @@ class BoardDetector:
         """
         gray = as_gray(image)
         picture = SaddleImage(gray)
-        self.stats.frames += 1
-        fix = self._follow(picture, gray, t_ns, predicted_uv) if self._guided else None
+        fix = self._follow(picture, gray, t_ns) if self._guided else None
         if fix is not None:
             self.stats.guided += 1
         else:
-            fix = self._search(picture, gray, predicted_uv)
+            fix = self._search(picture, gray)
         if fix is None or fix.found.sum() < MIN_POINTS:
-            self._memory = None
+            self._last = None
             return None
-        self.stats.found += 1
         self._remember(fix, gray, t_ns)
         ids = np.flatnonzero(fix.found).astype(np.int64)
         return Detection(ids, fix.uv_px[ids], fix.sigma_px[ids])
 
-    def _search(self, picture: SaddleImage, gray: Gray, predicted_uv: FloatArray | None) -> BoardFix | None:
+    def _search(self, picture: SaddleImage, gray: Gray) -> BoardFix | None:
         self.stats.searches += 1
         uv = np.full((len(self._layout.xy_m), 2), np.nan)
         if isinstance(self.target, AprilGrid):
@@ -131,19 +115,15 @@ class BoardDetector:
             self._misses = 0 if found is not None else self._misses + 1
             if found is None:
                 return None
-            last = predicted_uv
-            if last is None and self._memory is not None:
-                last = np.where(self._memory.fix.found[:, None], self._memory.fix.uv_px, np.nan)
+            last = None
+            if self._last is not None:
+                last = np.where(self._last.fix.found[:, None], self._last.fix.uv_px, np.nan)
             uv = put_in_order(picture, self._layout, found, last)
         return complete_board(picture, self._layout, uv, np.isfinite(uv).all(axis=1), self._lens)
 
-    def _follow(
-        self, picture: SaddleImage, gray: Gray, t_ns: int | None, predicted_uv: FloatArray | None
-    ) -> BoardFix | None:
+    def _follow(self, picture: SaddleImage, gray: Gray, t_ns: int | None) -> BoardFix | None:
         """Guided detection; None when there is nothing to follow or the board is lost."""
-        start = self._given(picture, predicted_uv) if predicted_uv is not None else None
-        if start is None:
-            start = self._flow(gray, t_ns)
+        start = self._flow(gray, t_ns)
         if start is None:
             return None
         model, predicted = start
@@ -151,30 +131,23 @@ class BoardDetector:
         if fix is not None:
             fix = check_identity(picture, self._layout, refine_missing(picture, self._layout, fix))
         if fix is None or not self._holds(fix, picture.shape):
-            self.stats.losses += 1
             return None
         return fix
 
-    def _given(self, picture: SaddleImage, predicted_uv: FloatArray) -> tuple[GridModel, FloatArray] | None:
-        """Start from the estimator's prediction."""
-        valid = np.isfinite(predicted_uv).all(axis=1)
-        model = fit_grid(self._layout.xy_m[valid], predicted_uv[valid], picture.shape, self._lens)
-        return None if model is None else (model, predicted_uv)
-
     def _flow(self, gray: Gray, t_ns: int | None) -> tuple[GridModel, FloatArray] | None:
         """Start from the last frame, moved by the optical flow of a few well spread corners."""
-        memory = self._memory
-        if memory is None or memory.gray.shape != gray.shape:
+        last = self._last
+        if last is None or last.gray.shape != gray.shape:
             return None
-        step = _elapsed(memory.t_ns, t_ns)
+        step = _elapsed(last.t_ns, t_ns)
         if step is None:
             return None
-        moved = np.nan_to_num(memory.velocity_px * step)
-        found = np.flatnonzero(memory.fix.found)
+        moved = np.nan_to_num(last.velocity_px * step)
+        found = np.flatnonzero(last.fix.found)
         chosen = found[np.linspace(0, len(found) - 1, min(len(found), FLOW_POINTS)).round().astype(int)]
-        before = memory.fix.uv_px[chosen].astype(np.float32)
+        before = last.fix.uv_px[chosen].astype(np.float32)
         after, status, _ = cv2.calcOpticalFlowPyrLK(
-            memory.gray,
+            last.gray,
             gray,
             before[:, None, :],
             np.ascontiguousarray((before + moved[chosen])[:, None, :], np.float32),
@@ -187,8 +160,8 @@ class BoardDetector:
         if good.sum() < 4:
             return None
         where = after.reshape(-1, 2)[good].astype(np.float64)
-        model = memory.fix.model.refit(self._layout.xy_m[chosen[good]], where)
-        shift = predict_with_residuals(memory.fix, self._layout) - memory.fix.model.predict(self._layout.xy_m)
+        model = last.fix.model.refit(self._layout.xy_m[chosen[good]], where)
+        shift = predict_with_residuals(last.fix, self._layout) - last.fix.model.predict(self._layout.xy_m)
         return model, model.predict(self._layout.xy_m) + shift
 
     def _holds(self, fix: BoardFix, shape: tuple[int, int]) -> bool:
@@ -203,16 +176,16 @@ class BoardDetector:
 
     def _remember(self, fix: BoardFix, gray: Gray, t_ns: int | None) -> None:
         velocity = np.full(fix.uv_px.shape, np.nan)
-        if self._memory is not None:
-            step = _elapsed(self._memory.t_ns, t_ns)
+        if self._last is not None:
+            step = _elapsed(self._last.t_ns, t_ns)
             if step is not None:
-                both = fix.found & self._memory.fix.found
-                velocity[both] = (fix.uv_px - self._memory.fix.uv_px)[both] / step
+                both = fix.found & self._last.fix.found
+                velocity[both] = (fix.uv_px - self._last.fix.uv_px)[both] / step
                 if both.any():
                     velocity[~both] = np.median(velocity[both], axis=0)
         if fix.found.sum() >= 24:
             self._lens += 0.2 * (float(fix.model.parameters[8]) - self._lens)
-        self._memory = _Memory(fix, gray, t_ns, velocity)
+        self._last = _LastFrame(fix, gray, t_ns, velocity)
 
 
 def _elapsed(before_ns: int | None, now_ns: int | None) -> float | None:

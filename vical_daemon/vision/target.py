@@ -88,7 +88,7 @@ class Checkerboard:
 
     ``point_id = row * cols + col`` at (col * col_spacing_m, row * row_spacing_m): rows count downwards. Where
     ``cols + rows`` is odd the two ends differ in colour and the square above and left of point 0 is black;
-    otherwise a half turn maps the board onto itself (see `is_symmetric`).
+    otherwise a half turn maps the board onto itself, and one image cannot tell which end is up.
 
     Attributes:
         cols: Inner corners along x.
@@ -102,11 +102,6 @@ class Checkerboard:
     row_spacing_m: float
     col_spacing_m: float
     kind: ClassVar[str] = "checkerboard"
-
-    @property
-    def is_symmetric(self) -> bool:
-        """Whether the board looks the same upside down, so that one image cannot tell which end is up."""
-        return (self.cols + self.rows) % 2 == 0
 
     @cached_property
     def points_m(self) -> FloatArray:

@@ -102,15 +102,11 @@ class FeatureTracker:
     Args:
         options: Settings.
         predictor: Foretells flow from gyro rates; None: from the flow of the last frames only.
-
-    Attributes:
-        lost_epipolar: Features given up because they moved against the rest of the scene.
     """
 
     def __init__(self, options: TrackOptions | None = None, predictor: FlowPredictor | None = None) -> None:
         self.options = options or TrackOptions()
         self.predictor = predictor or FlowPredictor()
-        self.lost_epipolar = 0
         self._features = _Features()
         self._last: _Picture | None = None
         self._frame = 0
@@ -229,7 +225,6 @@ class FeatureTracker:
             if inlier is not None and inlier.sum() >= 0.5 * len(inlier):
                 keep = np.ones(len(known), bool)
                 keep[known] = inlier.ravel() > 0
-                self.lost_epipolar += int(np.sum(~keep))
                 features.keep(keep)
         features.old_uv = features.uv.copy()
 

@@ -1,1 +1,1 @@
-"""The page with the live calibration: state kept from the bus, HTTP server, static files (no build step)."""
+"""The page with the live calibration: its state, HTTP server, and static files (no build step)."""

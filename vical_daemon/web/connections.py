@@ -1,4 +1,4 @@
-"""How many connections the page holds at a time, and what malformed requests leave in the journal."""
+"""Limits the open connections of the page, and the log lines of malformed requests."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from aiohttp.web import RequestPayloadError
 from vical_daemon.bus.log_limit import LogLimit
 
 CONNECTIONS_LIMIT = 128
-"""Open at a time: twice the viewers that are admitted (32 of values, 32 of pictures)."""
+"""Open connections: twice the viewers that are admitted (32 of values, 32 of pictures)."""
 IDLE_S = 5.0
-"""So long a connection may take to send a whole request header, and may stay without another request."""
+"""Longest time for a request header, and longest time without a request, s."""
 UNSENT_S = 30.0
-"""So long a client may take to fetch the rest of an answer."""
+"""Longest time for a client to fetch the rest of an answer, s."""
 BODY_S = 5.0
-"""So long a request may take to send its body."""
+"""Longest time for a request body, s."""
 REPORT_S = 60.0
-"""A malformed request is one line in the journal, and at most one in so long."""
+"""Shortest time between two log lines about malformed requests, s."""
 _FULL = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 class Gate:
-    """Counts connections. Where there is no room, the one that has been idle for longest makes some.
+    """Limits connections. A new connection above the limit closes the one that has been idle longest.
 
-    So a thousand half-open connections shut nobody out; a thousand that are being served would, and the next
-    one is refused.
+    So half-open connections cannot block the page. If all connections are being served, the new one is
+    refused.
 
     Args:
         make: Returns the protocol of a new connection.
-        limit: Open connections at a time.
+        limit: Open connections.
         clock: Monotonic seconds.
     """
 
@@ -54,11 +54,11 @@ class Gate:
 
     @property
     def open(self) -> int:
-        """Connections at this moment."""
+        """Number of open connections."""
         return len(self._open)
 
     def admit(self, protocol: asyncio.Protocol, transport: asyncio.Transport) -> bool:
-        """Let a connection in, at the cost of an idle one if need be; False: no room."""
+        """Admit a connection, closing an idle one if necessary; False: no room."""
         if len(self._open) >= self._limit:
             self.refused += 1
             oldest = next(iter(self._idle), None)
@@ -70,7 +70,7 @@ class Gate:
         return True
 
     def sweep(self) -> None:
-        """Close what has been idle for too long: half-open, or done and gone to sleep."""
+        """Close connections that have been idle for too long."""
         now_s = self._clock()
         for protocol, since_s in list(self._idle.items()):
             unsent = self._open[protocol].get_write_buffer_size()
@@ -88,17 +88,17 @@ class Gate:
         self._idle.pop(protocol, None)
 
     def busy(self, protocol: asyncio.Protocol) -> None:
-        """A request of this connection is being answered: it may take as long as it likes."""
+        """Note that a request of this connection is being answered: no time limit."""
         self._idle.pop(protocol, None)
 
     def idle(self, protocol: asyncio.Protocol) -> None:
-        """The answer is out."""
+        """Note that the answer was sent."""
         if protocol in self._open:
             self._idle[protocol] = self._clock()
 
 
 class _Guarded(asyncio.Protocol):
-    """Stands between a socket and aiohttp's protocol, which sees only connections that were admitted."""
+    """Wraps aiohttp's protocol, which gets only admitted connections."""
 
     def __init__(self, inner: asyncio.Protocol, gate: Gate) -> None:
         self._inner, self._gate = inner, gate
@@ -138,9 +138,9 @@ _FOREIGN = (HttpProcessingError, RequestPayloadError, ConnectionError, TimeoutEr
 
 
 class Malformed(logging.Filter):
-    """Turns what aiohttp logs about a malformed request into one line, seldom; counts all of them.
+    """Counts malformed requests and logs at most one line per `REPORT_S` about them.
 
-    A bug of ours keeps its traceback, as seldom.
+    Errors in our own code keep their traceback, at the same rate.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -166,7 +166,7 @@ class Malformed(logging.Filter):
 
 
 def http_logger(malformed: Malformed) -> logging.Logger:
-    """Return the logger that aiohttp gets: below ours, with the filter."""
+    """Return the logger for aiohttp, with the filter."""
     logger = logging.Logger("vical_daemon.web.http")
     logger.parent = logging.getLogger(__name__)
     logger.addFilter(malformed)

@@ -1,7 +1,7 @@
-"""The bus, live in Foxglove: the same bytes over its WebSocket, fetched only while a viewer asks for them.
+"""Serves the bus to Foxglove over its WebSocket: the same bytes, fetched only while a viewer subscribes.
 
-Points are sent a second time as image annotations, so that they appear drawn into the image. Those are
-not ROS messages; they exist on this wire alone, never in a log.
+Points are also sent as image annotations, so that Foxglove draws them into the image. The annotations are
+not ROS messages and are never recorded.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vical_daemon.bus.messages import MessageError, decode_points
 from vical_daemon.bus.messages.schemas import ros2_schema
 from vical_daemon.config.model import Config
 
-BACKLOG = 256  # messages kept for a slow viewer; the oldest go first
+BACKLOG = 256  # messages kept for a slow viewer; the oldest are dropped first
 _SUFFIX = "/annotations"
 _GREEN, _ORANGE = Color(r=0.0, g=0.8, b=0.4, a=1.0), Color(r=1.0, g=0.55, b=0.26, a=1.0)
 _DRAWN = {topics.POINTS: _GREEN, topics.TRACKS: _GREEN, topics.PREDICTED: _ORANGE}
@@ -40,7 +40,7 @@ class FoxgloveServer:
     """Serves one rig.
 
     Args:
-        bus: Where messages come from.
+        bus: Source of the messages.
         config: Names of the rig's devices.
         host: Address to listen on.
         port: 0: any free one, see `port`.
@@ -83,11 +83,11 @@ class FoxgloveServer:
             self._annotations[drawn] = ImageAnnotationsChannel(drawn, context=self._context)
 
     def on_subscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
-        """A viewer opened a topic: the first one makes us fetch it."""
+        """Fetch a topic from its first viewer on."""
         self._count(channel.topic, 1)
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:  # noqa: ARG002
-        """A viewer closed a topic: after the last one we stop fetching it."""
+        """Stop fetching a topic after its last viewer."""
         self._count(channel.topic, -1)
 
     def _count(self, topic: str, change: int) -> None:

@@ -23,21 +23,21 @@ from vical_daemon.bus.messages import (
     decode_points,
 )
 
-WIDTH_LIMIT = 800  # wider images are thinned: the page is for looking, not for measuring
+WIDTH_LIMIT = 800  # px; wider images are thinned for display
 QUALITY = 70
-PATIENCE_NS = 1_200_000_000  # an image without points is shown when nothing better came for so long
+PATIENCE_NS = 1_200_000_000  # an image without points is shown after this time without a better one
 RESTART_NS = 5_000_000_000
-SIDE_LIMIT = 10_000  # px: no stated size may make us take memory without end
-KEPT_BYTES = 24 * 2**20  # images that wait for their points: about a second of them
+SIDE_LIMIT = 10_000  # px: bounds memory for an image size that a message states
+KEPT_BYTES = 24 * 2**20  # images that wait for their points: about 1 s
 _STAMP = struct.Struct("<4xiI")  # behind the four bytes that begin every CDR message
 _RING = np.array([(x, y) for x in range(-5, 6) for y in range(-5, 6) if 10 <= x * x + y * y <= 26])
 _CROSS = np.array([(d, s * d) for d in range(-3, 4) for s in (-1, 1)])
-_DETECTED, _PREDICTED = (115, 158, 0), (0, 94, 213)  # BGR: green and orange that the colour-blind tell apart
+_DETECTED, _PREDICTED = (115, 158, 0), (0, 94, 213)  # BGR: green and orange, distinct to the colour-blind
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """An image with what was found in it and what the filter had expected there.
+    """An image with the points found and the points predicted.
 
     Attributes:
         stamp_ns: Stamp of all three, UNIX ns.
@@ -97,13 +97,13 @@ class CameraView:
         self._points.append(sample)
 
     def _begin_anew(self) -> None:
-        """The clock went back: a replay that began again."""
+        """Forget all messages: the stamps went back, as when a replay repeats."""
         for queue in (self._images, self._points, self._predicted):
             queue.clear()
         self._shown_ns = self._since_ns = 0
 
     def next(self) -> Sight | None:
-        """Return what is to be shown next; None while there is nothing newer than the last one.
+        """Return the next sight to show; None if there is nothing newer.
 
         The newest image that has both its points and a prediction; while nothing is predicted, one that
         has its points; while nothing is detected, an image alone; while no images come, points alone.
@@ -130,7 +130,7 @@ class CameraView:
         return Sight(chosen, stamps[chosen], points.get(chosen), predicted.get(chosen))
 
     def _points_alone(self, points: dict[int, Sample], predicted: dict[int, Sample]) -> Sight | None:
-        """The newest points, if possible with a prediction; None where they have been shown."""
+        """Return the newest points, if possible with a prediction; None if they have been shown."""
         fresh = [stamp_ns for stamp_ns in sorted(points, reverse=True) if stamp_ns > self._shown_ns]
         if not fresh:
             return None
@@ -142,7 +142,7 @@ class CameraView:
 def picture_event(sight: Sight) -> bytes | None:
     """Return a server-sent event with the picture and its points for the browser to draw; None: unreadable.
 
-    Where only points arrive, there is no picture in it.
+    Without an image the picture is empty.
 
     The points travel as numbers, in pixels of the full image, so that they stay sharp on a small picture.
     """
@@ -182,10 +182,10 @@ def drawn_jpeg(sight: Sight) -> bytes | None:
 
 
 def _contents(sight: Sight) -> tuple[npt.NDArray[Any], PointsMessage | None, PointsMessage | None]:
-    """Decode a sight; the image is black where only points arrive.
+    """Decode a sight; without an image the picture is black.
 
     Raises:
-        MessageError: One of its messages is not what it says.
+        MessageError: One of its messages is malformed.
     """
     read = [None if s is None else decode_points(s.payload) for s in (sight.points, sight.predicted)]
     pixels = np.zeros(_size(read[0]), np.uint8) if sight.image is None else _pixels(sight.image)
@@ -193,7 +193,7 @@ def _contents(sight: Sight) -> tuple[npt.NDArray[Any], PointsMessage | None, Poi
 
 
 def _size(points: PointsMessage | None) -> tuple[int, int]:
-    """Height and width of the image in which points were found; of a smallest one where it is not stated."""
+    """Height and width of the image in which points were found; of a smallest one if it is unknown."""
     if points is None:
         return 480, 640
     width, height = points.image_size
@@ -207,7 +207,7 @@ def _size(points: PointsMessage | None) -> tuple[int, int]:
 
 
 def _rows(points: PointsMessage | None) -> list[list[float]]:
-    """Return id, u, v of each point, rounded to what a screen can show."""
+    """Return id, u, v of each point, rounded for display."""
     if points is None:
         return []
     uv = np.round(points.uv_px, 2).tolist()
@@ -222,7 +222,7 @@ def thinned(pixels: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], int]:
 
 
 def _stamp_ns(sample: Sample) -> int:
-    """Read the stamp of a message that begins with a std_msgs/Header; 0 where it is too short for one."""
+    """Read the stamp of a message that begins with a std_msgs/Header; 0 if it is too short."""
     if len(sample.payload) < _STAMP.size:
         return 0
     seconds, nanoseconds = _STAMP.unpack_from(sample.payload)

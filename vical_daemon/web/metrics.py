@@ -14,7 +14,7 @@ _NAME = re.compile(r"[^a-zA-Z0-9_]")
 def metrics(state: WebState) -> str:
     """Return all metrics: calibration per camera, level and every numeric counter per component.
 
-    A camera whose estimates have stopped is in no status; its age says so.
+    A camera whose estimates have stopped has no status; its age shows it.
     """
     families: dict[str, tuple[str, list[str]]] = {}
 

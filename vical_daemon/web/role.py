@@ -17,9 +17,9 @@ from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus, Subscription
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_string
 from vical_daemon.config.model import Config
-from vical_daemon.config.paths import make_private, runtime_directory, state_directory
+from vical_daemon.config.paths import state_directory
 from vical_daemon.service.health import StatusSender
-from vical_daemon.service.wall_clock import WallClock, shared_clock
+from vical_daemon.service.wall_clock import WallClock, service_clock
 from vical_daemon.web.images import CameraView
 from vical_daemon.web.server import PageServer
 from vical_daemon.web.state import WebState
@@ -37,7 +37,7 @@ class WebError(Exception):
 
 
 class _Feeds:
-    """Subscriptions of the page: calibrations and statuses always, images only while somebody looks."""
+    """Subscriptions of the page: calibrations and statuses always, images only while there are viewers."""
 
     def __init__(self, config: Config, bus: Bus, state: WebState) -> None:
         self._config, self._bus, self._state = config, bus, state
@@ -48,7 +48,7 @@ class _Feeds:
         self._always.append(bus.subscribe(f"{topics.ROOT}/{config.rig}/status/*", state.take))
         self._watched: dict[str, list[Subscription]] = {}
         for sample in bus.latest(f"{topics.ROOT}/{config.rig}/**"):
-            state.take(sample)  # what is known before the first message comes
+            state.take(sample)  # the last values from before the page started
 
     def watch(self, camera: str, on: bool) -> None:
         """Start or stop fetching images and points of one camera."""
@@ -79,15 +79,15 @@ def run(
 
     Args:
         config: The rig; host and port in `config.web` (port 0: any free one).
-        bus: Where data come from and commands go.
+        bus: Source of the data, and destination of commands.
         stop: Ends the role.
-        clock: Monotonic to UNIX time; None: the one that all processes of the service share.
+        clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
         ready: Called with the address once it is served.
 
     Raises:
         WebError: The address cannot be used.
     """
-    clock = clock or shared_clock(make_private(runtime_directory()))
+    clock = clock or service_clock()
     state = WebState(config.rig)
     feeds = _Feeds(config, bus, state)
     try:
@@ -117,7 +117,7 @@ async def _serve(
         port = await server.listen(host, port)
     except OSError as error:
         await server.close()
-        code = error.errno or 0  # above 0: of the kernel, whose word is shorter than asyncio's
+        code = error.errno or 0  # positive codes are the kernel's, whose text is shorter than asyncio's
         reason = os.strerror(code) if code > 0 else error.strerror or str(error)
         raise WebError(f"cannot serve the page on {host}:{port}: {reason}; set web.port") from error
     address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
@@ -144,7 +144,7 @@ async def _serve(
 
 
 def _foxglove(config: Config, bus: Bus) -> FoxgloveServer | None:
-    """Serve Foxglove too where the config asks for it; a taken port must not end the page."""
+    """Start the Foxglove server if the config asks for it; a used port must not stop the page."""
     if not config.web.foxglove_port:
         return None
     from vical_daemon.web.foxglove import FoxgloveError, FoxgloveServer
@@ -159,7 +159,7 @@ def _foxglove(config: Config, bus: Bus) -> FoxgloveServer | None:
 
 
 def read_token() -> str:
-    """Return the token that allows commands; "" where none is set: then nobody may."""
+    """Return the token that allows commands; "" if none is set: commands are disabled."""
     token = os.environ.get(TOKEN_VARIABLE, "")
     if token:
         return token.strip()

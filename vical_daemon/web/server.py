@@ -22,10 +22,10 @@ from vical_daemon.web.state import WebState
 
 TICK_S = 0.4
 VIEWERS_LIMIT = 32
-SLOW_S = 10.0  # a client that does not take one update within this is let go
+SLOW_S = 10.0  # a client that takes longer to receive an update is disconnected
 STATIC = Path(__file__).parent / "static"
 PICTURE_RATE_HZ = 2.0
-COMMANDS = {  # name on the page: role that is told, and the word it is told
+COMMANDS = {  # name on the page: role and command
     "record_start": ("record", "start"),
     "record_stop": ("record", "stop"),
     "reset": ("estimate", "reset"),
@@ -53,14 +53,14 @@ class PageServer:
     """Serves the page. All methods run in one event loop.
 
     Args:
-        state: What is shown.
+        state: State to show.
         views: Camera views by name.
-        watch: Called with (camera, True) when the first viewer of a camera comes, (camera, False) when
-            the last one goes: without viewers no image is fetched.
+        watch: Called with (camera, True) for the first viewer of a camera, (camera, False) after the
+            last one: without viewers no image is fetched.
         command: Called with (role, word) for a command; None: read-only.
-        token: What a client must show to command; "": nobody may.
-        picture_rate_hz: Pictures a second, at most.
-        hosts: Names under which the page may be asked for, beyond this computer's own.
+        token: Token that a client must send with a command; "": no client may command.
+        picture_rate_hz: Highest picture rate.
+        hosts: Further host names of the page, besides this computer's own.
     """
 
     def __init__(
@@ -87,8 +87,8 @@ class PageServer:
         self._malformed = Malformed()
         self._refusals = LogLimit(5, 60.0)
         self._refused = 0
-        self._shows = {
-            (name, kind): _Show(make)
+        self._broadcasts = {
+            (name, kind): _Broadcast(make)
             for name in views
             for kind, make in (("events", picture_event), ("mjpg", drawn_jpeg))
         }
@@ -106,7 +106,7 @@ class PageServer:
         return app
 
     async def listen(self, host: str, port: int) -> int:
-        """Begin to serve; return the port (0 asks for any free one).
+        """Start serving; return the port (0: any free port).
 
         Raises:
             OSError: The address cannot be used.
@@ -128,7 +128,7 @@ class PageServer:
             await self._runner.cleanup()
 
     def counters(self) -> dict[str, str]:
-        """Return what the status of the role says about the visitors."""
+        """Return counters of connections and requests."""
         return {
             "connections": str(self._gate.open if self._gate else 0),
             "connections_refused": str(self._gate.refused if self._gate else 0),
@@ -137,7 +137,7 @@ class PageServer:
         }
 
     async def run(self, stopped: Callable[[], bool]) -> None:
-        """Tick until `stopped` says so: digest the bus, wake the listeners."""
+        """Until `stopped`: process messages from the bus and wake the listeners, once per tick."""
         loop = asyncio.get_running_loop()
         pictures = [loop.create_task(self._make_pictures(name)) for name in self.views]
         try:
@@ -157,14 +157,14 @@ class PageServer:
             await asyncio.gather(*pictures, return_exceptions=True)
 
     async def _make_pictures(self, name: str) -> None:
-        """Make each picture once for all who look, and none while nobody does."""
-        shows = [show for (camera, _), show in self._shows.items() if camera == name]
+        """Make each picture once for all viewers, and none while there are no viewers."""
+        broadcasts = [broadcast for (camera, _), broadcast in self._broadcasts.items() if camera == name]
         while True:
-            wanted = [show for show in shows if show.viewers]
+            wanted = [broadcast for broadcast in broadcasts if broadcast.viewers]
             sight = self.views[name].next() if wanted else None
             if sight is not None:
-                for show in wanted:
-                    await show.make(sight)
+                for broadcast in wanted:
+                    await broadcast.make(sight)
             await asyncio.sleep(self._picture_s)
 
     async def _static(self, request: web.Request) -> web.StreamResponse:
@@ -184,7 +184,7 @@ class PageServer:
     async def _secure(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        """Refuse foreign names; add the security headers to every answer (streams have them already)."""
+        """Refuse unknown host names; add the security headers to every answer (streams have them already)."""
         assert self._gate is not None
         connection = request.protocol
         self._gate.busy(connection)
@@ -228,7 +228,7 @@ class PageServer:
         try:
             await self._send_events(response)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
-            pass  # the viewer left, or is too slow: it asks again
+            pass  # the viewer left, or is too slow: it reconnects
         finally:
             self._listeners -= 1
         return response
@@ -237,7 +237,7 @@ class PageServer:
         seen = -1
         while True:
             current = bool(self._update) and self._number == seen + 1
-            # A client that is new, or was too slow to have had every update, gets everything.
+            # A client that is new, or missed an update, gets the full state.
             body = self._update if current else _event("full", self._full())
             seen = self._number
             await asyncio.wait_for(response.write(body), SLOW_S)
@@ -249,39 +249,39 @@ class PageServer:
 
     async def _mjpeg(self, request: web.Request) -> web.StreamResponse:
         kind = "multipart/x-mixed-replace; boundary=frame"
-        return await self._show(request, "mjpg", kind, _part)
+        return await self._send_pictures(request, "mjpg", kind, _part)
 
     async def _picture_events(self, request: web.Request) -> web.StreamResponse:
-        return await self._show(request, "events", "text/event-stream", lambda event: event)
+        return await self._send_pictures(request, "events", "text/event-stream", lambda event: event)
 
-    async def _show(
+    async def _send_pictures(
         self, request: web.Request, kind: str, content_type: str, wrap: Callable[[bytes], bytes]
     ) -> web.StreamResponse:
         name = request.match_info["name"]
-        show = self._shows.get((name, kind))
-        if show is None:
+        broadcast = self._broadcasts.get((name, kind))
+        if broadcast is None:
             raise web.HTTPNotFound
-        if sum(other.viewers for other in self._shows.values()) >= VIEWERS_LIMIT:
+        if sum(other.viewers for other in self._broadcasts.values()) >= VIEWERS_LIMIT:
             raise web.HTTPServiceUnavailable(text="too many viewers")
         response = web.StreamResponse(headers={"Content-Type": content_type, **_HEADERS})
         await response.prepare(request)
-        self._look(name, show, 1)
+        self._count_viewer(name, broadcast, 1)
         try:
             seen = 0
             while True:
-                seen, picture = await show.after(seen)
+                seen, picture = await broadcast.after(seen)
                 await asyncio.wait_for(response.write(wrap(picture)), SLOW_S)
         except (ConnectionError, TimeoutError, asyncio.CancelledError):
-            pass  # the viewer left, or is too slow: it asks again
+            pass  # the viewer left, or is too slow: it reconnects
         finally:
-            self._look(name, show, -1)
+            self._count_viewer(name, broadcast, -1)
         return response
 
-    def _look(self, name: str, show: _Show, change: int) -> None:
-        """Count a viewer in or out; the first one of a camera makes us fetch its images."""
-        before = any(s.viewers for (camera, _), s in self._shows.items() if camera == name)
-        show.viewers += change
-        after = any(s.viewers for (camera, _), s in self._shows.items() if camera == name)
+    def _count_viewer(self, name: str, broadcast: _Broadcast, change: int) -> None:
+        """Count viewers; fetch the images of a camera while it has any."""
+        before = any(s.viewers for (camera, _), s in self._broadcasts.items() if camera == name)
+        broadcast.viewers += change
+        after = any(s.viewers for (camera, _), s in self._broadcasts.items() if camera == name)
         if before != after:
             self._watch(name, after)
 
@@ -305,8 +305,8 @@ class PageServer:
         return web.json_response({"sent": document["command"]})
 
 
-class _Show:
-    """The newest picture of one camera in one form, for any number of viewers."""
+class _Broadcast:
+    """Sends the newest picture of one camera, in one encoding, to any number of viewers."""
 
     def __init__(self, encode: Callable[[Sight], bytes | None]) -> None:
         self.viewers = 0
@@ -317,8 +317,8 @@ class _Show:
     async def make(self, sight: Sight) -> None:
         """Encode a picture and wake the viewers."""
         try:
-            picture = self._encode(sight)  # a millisecond: handing it to a thread would cost more
-        except (ValueError, IndexError) as error:  # an image that is not what it says
+            picture = self._encode(sight)  # takes 1 ms; a thread would cost more
+        except (ValueError, IndexError) as error:  # a malformed image
             _log.debug("picture: %s", error)
             return
         if picture is not None:
@@ -327,7 +327,7 @@ class _Show:
                 self._made.notify_all()
 
     async def after(self, seen: int) -> tuple[int, bytes]:
-        """Wait for a picture that is not number `seen`."""
+        """Wait for a newer picture than number `seen`."""
         async with self._made:
             await self._made.wait_for(lambda: self._number != seen)
             return self._number, self._picture

@@ -1,4 +1,4 @@
-"""What the page shows, kept from the bus. No I/O: messages go in, one JSON document a tick comes out."""
+"""The state that the page shows. No I/O: messages in, one JSON document per tick out."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from vical_daemon.estimation.wording import (
 from vical_daemon.service.liveness import FRESH_S
 
 HISTORY = 1500
-"""Rows kept of each camera: 1.6 MB, which five minutes of estimates at 5 Hz fill."""
+"""Rows kept of each camera: 1.6 MB, five minutes of estimates at 5 Hz."""
 SOURCES = 32
-"""Cameras, and roles, that are shown at most: whoever invents names must not fill the memory."""
+"""Cameras and roles shown, so that invented names do not fill memory."""
 STALE = "stale"
-"""Stands for the status of a camera whose estimates have stopped."""
+"""Status of a camera whose estimates have stopped."""
 EVENTS = 8  # announcements that the page shows
 # One row of the history; lists of three are flattened in this order.
 COLUMNS = (
@@ -51,15 +51,15 @@ Row = list[float | None]
 
 @dataclass(slots=True)
 class CameraState:
-    """The development of one camera.
+    """The history of one camera.
 
     Attributes:
         latest: The last message.
-        arrived_s: When it came, by the clock of the state.
+        arrived_s: Its arrival, by the clock of the state.
         rows: History, oldest first, thinned towards the past.
         fresh: Rows since the last tick.
-        restarted: The estimator began anew since the last tick.
-        events: The last announcements, oldest first.
+        restarted: The estimator was restarted since the last tick.
+        events: The last events, oldest first.
     """
 
     latest: CalibrationMessage
@@ -73,8 +73,8 @@ class CameraState:
 class WebState:
     """Collects calibrations and statuses; `take` may be called from any thread.
 
-    A source that has been silent for longer than `FRESH_S` is stale: its last words are shown as such, with
-    their age, and no status of it is repeated as if it still held.
+    A source that has been silent for longer than `FRESH_S` is stale: the page shows its last values with
+    their age, and does not repeat its status as current.
 
     Args:
         rig: Name of the rig.
@@ -91,17 +91,17 @@ class WebState:
         self.malformed = 0
 
     def take(self, sample: Sample) -> None:
-        """Keep a message for the next tick; does next to nothing, so that the bus is not held up."""
+        """Queue a message for the next tick; fast, so that the bus is not blocked."""
         with self._lock:
             self._arrived.append((self._clock(), sample))
 
     def tick(self, *, wanted: bool = True) -> dict[str, Any] | None:
-        """Digest what has arrived; return the update for everybody who is up to date, if it is `wanted`."""
+        """Process the queued messages; return the update since the last tick, if `wanted`."""
         with self._lock:
             arrived, self._arrived = self._arrived, deque(maxlen=4096)
         for arrived_s, sample in arrived:
             try:
-                self._digest(sample, arrived_s)
+                self._process(sample, arrived_s)
             except MessageError:
                 self.malformed += 1
         document = self._document(full=False) if wanted else None
@@ -110,12 +110,12 @@ class WebState:
         return document
 
     def full(self) -> dict[str, Any]:
-        """Return everything, for somebody who has just come."""
+        """Return the full state, for a new client."""
         return self._document(full=True)
 
     @property
     def statuses(self) -> dict[str, tuple[DiagnosticStatus, ...]]:
-        """Last status of every role; of one that is silent, marked as stale."""
+        """Last status of every role; of a silent role, marked as stale."""
         now_s = self._clock()
         return {
             role: statuses if not is_stale(now_s - arrived_s) else _silent(statuses, now_s - arrived_s)
@@ -124,15 +124,15 @@ class WebState:
 
     @property
     def calibrations(self) -> dict[str, tuple[CalibrationMessage, float]]:
-        """Last calibration of every camera, and how long ago it came, s."""
+        """Last calibration of every camera, and its age, s."""
         now_s = self._clock()
         return {name: (camera.latest, now_s - camera.arrived_s) for name, camera in self._cameras.items()}
 
-    def _digest(self, sample: Sample, arrived_s: float) -> None:
-        """Take in one message.
+    def _process(self, sample: Sample, arrived_s: float) -> None:
+        """Process one message.
 
         Raises:
-            MessageError: It is not what its key says, or one source too many.
+            MessageError: It does not match its key, or there are too many sources.
         """
         parsed = topics.parse_key(sample.key)
         if parsed is None:
@@ -196,7 +196,7 @@ class WebState:
         return document
 
     def _fault(self) -> dict[str, str] | None:
-        """The first component that says it does not work: until it does, no advice helps."""
+        """Return the first component that reports an error; until it is fixed, the page gives no advice."""
         for _, (_, statuses) in sorted(self._statuses.items()):
             for status in statuses:
                 if status.level >= Level.ERROR:
@@ -206,7 +206,7 @@ class WebState:
 
 
 def is_stale(age_s: float) -> bool:
-    """Whether a source whose last message came so long ago must be called silent."""
+    """Whether a source whose last message has this age is silent."""
     return age_s > FRESH_S
 
 
@@ -218,25 +218,25 @@ def _silent(statuses: tuple[DiagnosticStatus, ...], age_s: float) -> tuple[Diagn
 
 
 def _admit(name: str, known: dict[str, Any]) -> None:
-    """Let a source in that is known or for which there is room.
+    """Check that a source is known or that there is room for it.
 
     Raises:
-        MessageError: There is none.
+        MessageError: There is no room.
     """
     if name not in known and len(known) >= SOURCES:
         raise MessageError(f"{name}: more than {SOURCES} sources")
 
 
 def summary(message: CalibrationMessage, age_s: float = 0.0, fault: bool = False) -> dict[str, Any]:
-    """Return what the page says about one camera at this moment.
+    """Return what the page shows about one camera now.
 
     Args:
         message: The last message of the camera.
-        age_s: How long ago it came, s.
-        fault: A component does not work: then nothing is asked of the operator.
+        age_s: Its age, s.
+        fault: A component reports an error: then the page gives no advice.
     """
     estimate, camera = message.estimate, message.camera_estimate
-    # what to do stands in the guidance, once: a second advice beside it could name other axes
+    # the guidance alone gives advice: a second one could name other axes
     withheld = [direction_warning(weak) for weak in camera.withheld] if camera else []
     if camera and not withheld:
         withheld = list(camera.unobservable)  # of version 0.1.0
@@ -314,5 +314,5 @@ def _three(values: list[float]) -> list[float]:
 
 
 def finite(value: float) -> float | None:
-    """Return a number as JSON can hold it, rounded to what a page can show; None for nan and infinity."""
+    """Return a number for JSON, rounded for display; None for nan and infinity."""
     return float(f"{value:.7g}") if math.isfinite(value) else None

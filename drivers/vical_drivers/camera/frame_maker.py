@@ -1,4 +1,4 @@
-"""The last step of every camera driver: from an image and its raw stamp to a `Frame`, with losses told."""
+"""The last step of every camera driver: from an image and its raw stamp to a `Frame` with its losses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vical_drivers.samples import Frame
 
 
 class FrameMaker:
-    """Moves stamps to the middle of the exposure, and tells losses with the next good frame.
+    """Moves stamps to the middle of the exposure, and reports losses with the next good frame.
 
     Args:
         settings: Shutter, encoding and stamp rule.
@@ -35,7 +35,7 @@ class FrameMaker:
         self._gaps.restart()
 
     def numbered(self, t_raw_ns: int, missing_before: int) -> None:
-        """Take note of a frame that came, good or not: what is missing before it by number, and by stamp.
+        """Note a frame that came, good or corrupt, and the frames that are missing before it.
 
         Args:
             t_raw_ns: When it was stamped, on a clock that nobody sets, ns.
@@ -49,11 +49,11 @@ class FrameMaker:
             self.statistics.count("lost_in_camera", unnumbered)
 
     def lost(self, frames: int = 1) -> None:
-        """Frames that never came, or came spoilt; `Frame.dropped_before` of the next good one."""
+        """Note frames that never came, or came corrupt: `Frame.dropped_before` of the next good frame."""
         self._lost += frames
 
-    def spoilt(self, reason: str) -> None:
-        """Count a frame that came, but not whole, under its reason."""
+    def count_corrupt(self, reason: str) -> None:
+        """Count a corrupt frame under its reason."""
         self.statistics.count(reason)
         self.statistics.corrupt += 1
 

@@ -163,10 +163,10 @@ def check_camera(uri: str, *, timeout_s: float = 3.0, **wanted: Any) -> list[str
         source = open_camera(uri, **wanted)
     except DriverError as error:
         return [str(error)]
-    return judge_camera(source, uri, timeout_s, **wanted)
+    return check_open_camera(source, uri, timeout_s, **wanted)
 
 
-def judge_camera(source: FrameSource, uri: str, timeout_s: float = 3.0, **wanted: Any) -> list[str]:
+def check_open_camera(source: FrameSource, uri: str, timeout_s: float = 3.0, **wanted: Any) -> list[str]:
     """Do what `check_camera` does with a camera that is open already; closes it."""
     with source:
         problems = _compare(source.info, wanted)

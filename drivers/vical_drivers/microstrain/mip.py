@@ -17,8 +17,10 @@ from typing import NamedTuple
 
 import msgspec
 
+from vical_drivers.microstrain.stream_decoder import StreamDecoder
+
 SYNC = b"\x75\x65"
-SET_BASE, SET_3DM, SET_SYSTEM = 0x01, 0x0C, 0x7F
+SET_BASE, SET_3DM = 0x01, 0x0C
 """Command sets; replies come in the same set."""
 SET_SENSOR = 0x80
 """Data set of the inertial sensor."""
@@ -96,50 +98,14 @@ def idle() -> bytes:
     return encode(SET_BASE, (0x02, b""))
 
 
-class Decoder:
-    """Incremental decoder: feed any chunks, get the same packets.
-
-    Attributes:
-        checksum_errors: Packets lost to damage: one began where it was due and its checksum was wrong.
-        skipped_bytes: Bytes that belong to no packet.
-        records: Number of packets returned so far.
-    """
-
-    def __init__(self) -> None:
-        self.checksum_errors = 0
-        self.skipped_bytes = 0
-        self.records = 0
-        self._tail = b""
-        self._consumed = 0
-        self._packet_bytes = 0
-        # A capture may begin inside a packet: that is no damage.
-        self._in_step = False
-
-    @property
-    def pending(self) -> bytes:
-        """The bytes that wait for the rest of a packet, at most `MAX_LENGTH` - 1."""
-        return self._tail
-
-    @property
-    def offset(self) -> int:
-        """Number of stream bytes fed so far."""
-        return self._consumed + len(self._tail)
-
-    def feed(self, data: bytes) -> list[Packet]:
-        """Take the next bytes of the stream and return the packets they complete, in order."""
-        return self._parse(self._tail + data if self._tail else data, waiting=True)
-
-    def finish(self) -> list[Packet]:
-        """Return the packets hidden behind an incomplete one; call it at the end or after a silence.
-
-        What stays in `pending` is a partial packet with nothing good behind its beginning.
-        """
-        return self._parse(self._tail, waiting=False)
+class Decoder(StreamDecoder[Packet]):
+    """Decoder of MIP packets."""
 
     def _parse(self, buffer: bytes, *, waiting: bool) -> list[Packet]:
         out: list[Packet] = []
         position, size, base = 0, len(buffer), self._consumed
         kept: int | None = None
+        good_bytes = 0
         while True:
             start = buffer.find(SYNC, position)
             if start != position:
@@ -153,7 +119,7 @@ class Decoder:
             end = start + 6 + buffer[start + 3] if start + 4 <= size else size + 1
             if end <= size and (fields := _fields(buffer, start, end)) is not None:
                 out.append(Packet(buffer[start + 2], fields, base + end))
-                self._packet_bytes += end - start
+                good_bytes += end - start
                 position, kept, self._in_step = end, None, True
                 continue
             if end > size and _may_go_on(buffer, start):
@@ -165,14 +131,7 @@ class Decoder:
                 self.checksum_errors += self._in_step
             self._in_step = False
             position = start + 1
-        return self._keep(buffer, position if kept is None else kept, out)
-
-    def _keep(self, buffer: bytes, position: int, out: list[Packet]) -> list[Packet]:
-        self._tail = buffer[position:]
-        self._consumed += position
-        self.records += len(out)
-        self.skipped_bytes = self._consumed - self._packet_bytes
-        return out
+        return self._keep(buffer, position if kept is None else kept, out, good_bytes)
 
 
 def _fields(buffer: bytes, start: int, end: int) -> tuple[tuple[int, bytes], ...] | None:

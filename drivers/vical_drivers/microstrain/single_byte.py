@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from vical_drivers.microstrain.stream_decoder import StreamDecoder
+
 STANDARD_GRAVITY_MPS2 = 9.80665
 """One g in the device's unit of specific force, m/s^2."""
 TICK_HZ = 62_500
@@ -151,11 +153,6 @@ def _readable(name: str, value: float | bytes) -> object:
     return value.decode("ascii", "replace").strip(" \0") if name == "text" else value.hex()
 
 
-def checksum(data: bytes) -> int:
-    """Sum of the bytes modulo 65536; sent most significant byte first."""
-    return sum(data) & 0xFFFF
-
-
 class _Entry(NamedTuple):
     length: int
     unpack: struct.Struct
@@ -190,38 +187,19 @@ def _could_be_measured(floats: tuple[float, ...]) -> bool:
     return all(v != v or v == 0.0 or _SMALLEST < abs(v) < _LARGEST for v in floats)
 
 
-class Decoder:
-    """Incremental decoder: feed any chunks, get the same records.
+class Decoder(StreamDecoder[Record]):
+    """Decoder of single-byte records.
 
     Attributes:
         little_endian_floats: Set when sampling flag bit 4 is on; only floats change their order.
-        checksum_errors: Records lost to damage: the header stood where one was due, the sum was wrong.
-        skipped_bytes: Bytes that belong to no record.
-        records: Number of records returned so far.
     """
 
     def __init__(self, *, little_endian_floats: bool = False) -> None:
+        super().__init__()
         self.little_endian_floats = little_endian_floats
-        self.checksum_errors = 0
-        self.skipped_bytes = 0
-        self.records = 0
-        self._tail = b""
-        self._consumed = 0
-        # A capture may begin inside a record: that is no damage.
-        self._in_step = False
-
-    @property
-    def pending(self) -> bytes:
-        """The bytes that wait for the rest of a record, at most `MAX_LENGTH` - 1."""
-        return self._tail
-
-    @property
-    def offset(self) -> int:
-        """Number of stream bytes fed so far."""
-        return self._consumed + len(self._tail)
 
     def feed(self, data: bytes) -> list[Record]:
-        """Take the next bytes of the stream and return the records they complete, in order."""
+        """See `StreamDecoder.feed`."""
         if self._in_step and data and not self._tail and not self.little_endian_floats:
             # Nearly always one read brings one whole record: no need to look for anything.
             kind, size = data[0], len(data)
@@ -234,14 +212,7 @@ class Decoder:
                 self._consumed += size
                 self.records += 1
                 return [Record(kind, entry.unpack.unpack_from(data, 1), self._consumed)]
-        return self._parse(self._tail + data if self._tail else data, waiting=True)
-
-    def finish(self) -> list[Record]:
-        """Return the records hidden behind an incomplete one; call it at the end or after a silence.
-
-        What stays in `pending` is a partial record with nothing good behind its beginning.
-        """
-        return self._parse(self._tail, waiting=False)
+        return super().feed(data)
 
     def _parse(self, buffer: bytes, *, waiting: bool) -> list[Record]:
         out: list[Record] = []
@@ -272,15 +243,7 @@ class Decoder:
             position = end
             kept = None
             self._in_step = True
-        consumed = position if kept is None else kept
-        self.skipped_bytes += consumed - good_bytes
-        return self._keep(buffer, consumed, out)
-
-    def _keep(self, buffer: bytes, position: int, out: list[Record]) -> list[Record]:
-        self._tail = buffer[position:]
-        self._consumed += position
-        self.records += len(out)
-        return out
+        return self._keep(buffer, position if kept is None else kept, out, good_bytes)
 
     def _decode(self, buffer: bytes, position: int, end: int, entry: _Entry) -> tuple[Any, ...] | None:
         """Values of a record at `position`; None, and out of step, where there is none."""

@@ -1,40 +1,33 @@
 """What the host sends to a 3DM-GX3 in the single-byte protocol, as bytes. Commands carry no checksum.
 
-Whatever writes the EEPROM (100 000 cycles) has "store", "preset" or "eeprom" in its name and is never
-sent by the driver itself.
+A function that writes the EEPROM (100 000 cycles) has "store" in its name. The driver itself never sends it.
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 from vical_drivers.microstrain.single_byte import LAYOUTS, Record
 
 STOP_STREAM = bytes.fromhex("FA75B4")
 """Ends continuous mode; never answered."""
-RESET = bytes.fromhex("FE9E3A")
-"""Soft reset; temporary settings are lost; never answered."""
 GET_FIRMWARE = b"\xe9"
 SELF_TEST = b"\xda"
-MODE_ACTIVE, MODE_CONTINUOUS, MODE_IDLE, MODE_SLEEP, MODE_DEEP_SLEEP = 1, 2, 3, 4, 5
 MODE_NAMES = {1: "active", 2: "continuous", 3: "idle", 4: "sleep", 5: "deep sleep"}
 
 FLAG_ORIENTATION = 0x0001
 FLAG_CONING_SCULLING = 0x0002
 FLAG_LITTLE_ENDIAN_FLOATS = 0x0010
-FLAG_SUPPRESS_NAN = 0x0020
-FLAG_FINITE_SIZE = 0x0040
 FLAG_NO_MAGNETOMETER = 0x0100
 FLAG_NO_NORTH_COMPENSATION = 0x0400
 FLAG_NO_UP_COMPENSATION = 0x0800
-FLAG_QUATERNION = 0x1000
 FLAGS_INERTIAL_ONLY = FLAG_NO_MAGNETOMETER | FLAG_NO_NORTH_COMPENSATION | FLAG_NO_UP_COMPENSATION
 """Accelerometer and gyro alone, at any rate up to 1000 Hz."""
 
-READ, APPLY, STORE = 0, 1, 2
-"""Function selectors of the sampling and communication settings; `STORE` writes the EEPROM."""
+READ, APPLY = 0, 1
+"""Function selectors of the sampling and communication settings."""
 FIRST_VOLATILE_FIRMWARE = 1127
 """From 1.1.27 on, "apply" of the sampling settings does not write the EEPROM."""
 BAUD_RATES = (115_200, 230_400, 460_800, 921_600)
@@ -73,17 +66,6 @@ class Sampling:
         ours, theirs = self._items(), wanted._items()
         return ", ".join(f"{k} is {ours[k]}, not {theirs[k]}" for k in ours if ours[k] != theirs[k])
 
-    def clamped(self) -> Sampling:
-        """Return what the device makes of these: each value pulled into its range."""
-        return replace(
-            self,
-            decimation=min(max(self.decimation, 1), 1000),
-            filter_width=min(max(self.filter_width, 1), 32),
-            mag_filter_width=min(max(self.mag_filter_width, 1), 32),
-            up_s=min(max(self.up_s, 1), 1000),
-            north_s=min(max(self.north_s, 1), 1000),
-        )
-
     def _items(self) -> dict[str, int]:
         names = ("decimation", "flags", "filter_width", "mag_filter_width", "up_s", "north_s")
         return {name: getattr(self, name) for name in names}
@@ -92,16 +74,6 @@ class Sampling:
 def set_continuous(data_command: int) -> bytes:
     """Start streaming replies to `data_command` (0: stop, with an answer). Volatile."""
     return struct.pack(">4B", 0xC4, 0xC1, 0x29, data_command)
-
-
-def write_accel_bias(bias_g: tuple[float, float, float]) -> bytes:
-    """Set the accelerometer bias, g. Volatile."""
-    return struct.pack(">3B3f", 0xC9, 0xB7, 0x44, *bias_g)
-
-
-def write_gyro_bias(bias_rps: tuple[float, float, float]) -> bytes:
-    """Set the gyro bias, rad/s. Volatile."""
-    return struct.pack(">3B3f", 0xCA, 0x12, 0xA5, *bias_rps)
 
 
 def capture_gyro_bias(duration_ms: int) -> bytes:
@@ -115,18 +87,8 @@ def store_bias_in_eeprom(which: int) -> bytes:
 
 
 def set_mode(mode: int) -> bytes:
-    """Read (0) or set the mode, `MODE_*`."""
+    """Read (0) or set the mode, see `MODE_NAMES`."""
     return struct.pack(">4B", 0xD4, 0xA3, 0x47, mode)
-
-
-def preset_mode(mode: int = 0) -> bytes:
-    """Read (0) or write to the EEPROM the mode after power-up."""
-    return struct.pack(">4B", 0xD5, 0xBA, 0x89, mode)
-
-
-def preset_continuous(data_command: int = 0) -> bytes:
-    """Read (0) or write to the EEPROM what continuous mode streams."""
-    return struct.pack(">4B", 0xD6, 0xC6, 0x6B, data_command)
 
 
 def timer(function: int = 0, ticks: int = 0) -> bytes:
@@ -135,40 +97,19 @@ def timer(function: int = 0, ticks: int = 0) -> bytes:
 
 
 def communication(function: int = READ, baud: int = 0) -> bytes:
-    """Read, apply or store the UART's baud. The answer comes at the old baud; USB does not care."""
+    """Read or apply the UART's baud. The answer comes at the old baud; on USB it has no effect."""
     config = 0 if function == READ else 0x02
     return struct.pack(">5BIBB", 0xD9, 0xC3, 0x55, 1, function, baud, config, 0)
 
 
 def sampling(function: int = READ, settings: Sampling | None = None) -> bytes:
-    """Read, apply or store the sampling settings."""
+    """Read or apply the sampling settings."""
     s = settings or Sampling(0, 0, 0, 0, 0, 0)
     return struct.pack(
         ">3BBHHBBHHB5x",
         *(0xDB, 0xA8, 0xB9, function, s.decimation, s.flags),
         *(s.filter_width, s.mag_filter_width, s.up_s, s.north_s, 0),
     )
-
-
-def realign(up_tenths_s: int = 255, north_tenths_s: int = 255) -> bytes:
-    """Realign up and north within 1 .. 100 tenths of a second (255: leave). Firmware >= 1.1.27."""
-    return struct.pack(">6B4x", 0xDD, 0x54, 0x4C, 0, up_tenths_s, north_tenths_s)
-
-
-def read_eeprom(address: int) -> bytes:
-    """Read one word of the EEPROM."""
-    return struct.pack(">BBH", 0xE5, 0x00, address)
-
-
-def write_eeprom(address: int, word: int) -> bytes:
-    """Write one word of the EEPROM. The vendor warns against it: a wrong word disables the device.
-
-    Raises:
-        ValueError: The manual allows no such address.
-    """
-    if not (0x0000 <= address <= 0x00EF or 0x0400 <= address <= 0x042F):
-        raise ValueError(f"EEPROM address 0x{address:04X} is outside 0x0000 .. 0x00EF and 0x0400 .. 0x042F")
-    return struct.pack(">4BHH", 0xE4, 0xC1, 0x29, 0x00, address, word)
 
 
 def get_identity(index: int) -> bytes:

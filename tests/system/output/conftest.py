@@ -1,43 +1,27 @@
 """The page served over a LocalBus that is fed like a rig's."""
 
-import importlib.util
 import json
-import sys
 import threading
 import time
-from pathlib import Path
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from vical_mocks.harness import browser, web_feed
 
 from vical_daemon.bus.interface import LocalBus
-from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
-from vical_daemon.service.wall_clock import private_clock
-from vical_daemon.web import role as web
 
 
-def load(name):
-    """Import a module beside this file (tests have no packages)."""
-    unique = f"vical_output_{name}"
-    if unique not in sys.modules:
-        spec = importlib.util.spec_from_file_location(unique, Path(__file__).with_name(f"{name}.py"))
-        sys.modules[unique] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[unique])
-    return sys.modules[unique]
+@pytest.fixture(scope="session", name="web_feed")
+def web_feed_module():
+    return web_feed
 
 
-@pytest.fixture(scope="session")
-def web_feed():
-    return load("web_feed")
-
-
-@pytest.fixture(scope="session")
-def browser():
-    module = load("browser")
-    if module.find() is None:
+@pytest.fixture(scope="session", name="browser")
+def browser_module():
+    if browser.find() is None:
         pytest.skip("no Chromium here (apt-get install chromium)")
-    return module
+    return browser
 
 
 class Served:
@@ -48,18 +32,10 @@ class Served:
 
 
 @pytest.fixture
-def served(web_feed, monkeypatch):
+def served(monkeypatch):
     monkeypatch.setenv("VICAL_WEB_TOKEN", "open sesame")
     bus, stop, ready, addresses = LocalBus(), threading.Event(), threading.Event(), []
-    config = Config(
-        rig=web_feed.RIG,
-        imus={"imu0": ImuConfig(port="none")},
-        cameras={"cam0": CameraConfig(uri="none")},
-        web=WebConfig(enabled=True, port=0),
-    )
-    options = {"clock": private_clock(), "ready": lambda address: (addresses.append(address), ready.set())}
-    thread = threading.Thread(target=web.run, args=(config, bus, stop), kwargs=options)
-    thread.start()
+    thread = web_feed.serve_page(bus, stop, lambda address: (addresses.append(address), ready.set()))
     assert ready.wait(60)
     page = Served(bus, addresses[0])
     bus.subscribe("vical/*/command/*", lambda sample: page.commands.append(sample))
@@ -70,7 +46,7 @@ def served(web_feed, monkeypatch):
 
 
 @pytest.fixture
-def fed(served, web_feed):
+def fed(served):
     """Half a minute of history, then live data at 5 Hz (images at 10 Hz) until the test ends."""
     rng, stop = np.random.default_rng(0), threading.Event()
     for k in range(1, 150):

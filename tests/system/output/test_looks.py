@@ -13,7 +13,6 @@ import pytest
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 
-from benchmarks import pictures
 from vical_daemon.bus import messages as m
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
@@ -79,9 +78,7 @@ def test_terminal(web_feed, browser, keep, tmp_path):
     web_feed.publish_status(bus)
     console = Console(record=True, width=104, force_terminal=True, file=io.StringIO())
     console.print(live_table.screen(view.estimates, view.health))
-    pictures.picture(
-        browser, tmp_path, console.export_svg(title="vical watch", clear=False), keep / "terminal.png"
-    )
+    browser.draw_svg(console.export_svg(title="vical watch", clear=False), tmp_path, keep / "terminal.png")
     assert (keep / "terminal.png").stat().st_size > 10_000
     text = console.export_text()
     for needed in ("rig rig0", "converging", guidance, "time shift", "ms", "imu/imu0", "500.0 Hz, 0 lost"):

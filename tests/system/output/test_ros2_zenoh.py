@@ -14,7 +14,7 @@ from zenoh_ros2_sdk.session import ZenohSession
 from vical_daemon.bus.messages import Transform, encode_imu, encode_pose, encode_transforms
 from vical_daemon.bus.messages.schemas import ros2_schema
 from vical_daemon.bus.ros2_names import type_hash
-from vical_daemon.bus.zenoh_ros2 import Ros2Outlet
+from vical_daemon.bus.zenoh_ros2 import Ros2Publisher
 from vical_daemon.estimation.result import PoseEstimate
 
 pytestmark = pytest.mark.system
@@ -44,9 +44,9 @@ def subscribe(port, topic, type_name, callback):
 
 def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
     session, port = router
-    outlet = Ros2Outlet(session, namespace="/rig0")
+    publisher = Ros2Publisher(session, namespace="/rig0")
     static = Transform(T0_NS, "imu", "cam0", (0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
-    outlet.publish("vical/rig0/tf_static", encode_transforms([static]))
+    publisher.publish("vical/rig0/tf_static", encode_transforms([static]))
     heard, enough = [], threading.Event()
 
     def on_imu(message):
@@ -59,7 +59,7 @@ def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
         payload = encode_imu(T0_NS, "imu", (0.1, 0.2, 0.3), (0.0, 0.0, 9.8))
         end = time.monotonic() + 45
         while not enough.is_set() and time.monotonic() < end:
-            outlet.publish("vical/rig0/imu/imu", payload)
+            publisher.publish("vical/rig0/imu/imu", payload)
             time.sleep(0.01)
         assert enough.is_set()
         assert heard[0].linear_acceleration.z == 9.8
@@ -72,8 +72,8 @@ def test_an_unmodified_subscriber_hears_imu_and_late_static_transform(router):
     finally:
         subscriber.close()
         ZenohSession._instance = None
-        outlet.close()
-        outlet.close()
+        publisher.close()
+        publisher.close()
 
 
 def test_the_bus_of_a_process_speaks_ros_when_told(tmp_path):
@@ -126,10 +126,10 @@ def client_config(port):
 
 def test_attachments_count_up_and_static_messages_wait_for_late_joiners(router):
     session, port = router
-    outlet = Ros2Outlet(session, domain=3)
+    publisher = Ros2Publisher(session, domain=3)
     pose = PoseEstimate([0.1, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [[0.0] * 6] * 6)
     static = Transform(T0_NS, "imu", "cam0", (0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0))
-    outlet.publish("vical/rig0/tf_static", encode_transforms([static]))
+    publisher.publish("vical/rig0/tf_static", encode_transforms([static]))
     with zenoh.open(client_config(port)) as late:
         samples, statics = [], []
         plain = late.declare_subscriber("3/calibration/**", samples.append)
@@ -139,7 +139,7 @@ def test_attachments_count_up_and_static_messages_wait_for_late_joiners(router):
         )  # fmt: skip
         end = time.monotonic() + 45
         while (len(samples) < 3 or not statics) and time.monotonic() < end:
-            outlet.publish("vical/rig0/calibration/cam0/pose", encode_pose(T0_NS, "imu", pose))
+            publisher.publish("vical/rig0/calibration/cam0/pose", encode_pose(T0_NS, "imu", pose))
             time.sleep(0.02)
         sequences = [int.from_bytes(s.attachment.to_bytes()[:8], "little") for s in samples]
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
@@ -148,4 +148,4 @@ def test_attachments_count_up_and_static_messages_wait_for_late_joiners(router):
         assert statics
         plain.undeclare()
         advanced.undeclare()
-    outlet.close()
+    publisher.close()

@@ -1,11 +1,13 @@
 """The comparator has to be a fair one: started close to the truth a plain EKF reaches the bound."""
 
 import numpy as np
+from vical_mocks.cramer_rao.bound import bounds
+from vical_mocks.cramer_rao.information import BoundOptions
+from vical_mocks.harness.feed import StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
 from vical_mocks.rotations import exp_so3, log_so3
 
-from benchmarks.bound import BoundOptions, bounds
 from benchmarks.ekf import (
     BA,
     BG,
@@ -21,7 +23,6 @@ from benchmarks.ekf import (
     PlainEkf,
     V,
 )
-from benchmarks.feed import StartErrors, camera_prior, feed, imu_noise
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 

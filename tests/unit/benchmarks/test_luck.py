@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from vical_mocks.cramer_rao.bound import bounds
+from vical_mocks.harness.feed import feed
 from vical_mocks.points import simulate
 
-from benchmarks.bound import bounds
-from benchmarks.feed import feed
 from benchmarks.luck import draw_of
 from benchmarks.montecarlo import CASES, bound_options, bound_sigmas, make_run, make_subject, vector_of
 

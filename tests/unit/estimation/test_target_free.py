@@ -6,13 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from vical_mocks.harness.feed import (
+    CalibratorSubject,
+    StartErrors,
+    camera_prior,
+    feed,
+    imu_noise,
+    nees,
+    points_frame,
+)
+from vical_mocks.random_rigs import draw
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 from vical_mocks.trajectory import one_axis, still
 
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, points_frame
-from benchmarks.scores import nees
-from benchmarks.zoo import draw
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.carry import FULL

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise, nees
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
-from benchmarks.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
-from benchmarks.scores import nees
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.carry import IMU, LAG

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from vical_mocks.harness.feed import StartErrors, camera_prior, imu_noise, points_frame
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
-from benchmarks.feed import StartErrors, camera_prior, imu_noise, points_frame
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, Status

@@ -110,7 +110,6 @@ def test_something_that_moves_by_itself_is_dropped(pictures):
         left = 200 + 6 * k
         picture[140 : 140 + 192, left : left + 192] = patch
         found = tracker.detect(picture, stamp(k))
-    assert tracker.lost_epipolar > 0
     on_patch = (np.abs(found.uv_px - [left + 96, 236]) < 96).all(axis=1)
     assert on_patch.sum() <= 5
 

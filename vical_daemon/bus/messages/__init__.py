@@ -1,8 +1,8 @@
-"""What travels: ROS 2 messages in CDR, built and read without ROS.
+"""The messages on the bus: ROS 2 messages in CDR, built and read without ROS.
 
 The bytes on the bus are the bytes in the log. `encode_*` builds a message, `decode_*` reads one into a
-small frozen dataclass in our own names and units, and raises only `MessageError` whatever the bytes.
-`admit_*` does so, too, and refuses what no device measures: roles work with those.
+small frozen dataclass with our names and units. It raises only `MessageError`, for any bytes.
+`admit_*` also refuses values that no device measures. Roles use `admit_*`.
 """
 
 from vical_daemon.bus.messages.admission import (

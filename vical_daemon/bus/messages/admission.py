@@ -1,7 +1,8 @@
-"""Where messages enter a role: read, and refused if they hold what no device measures.
+"""Decoding with plausibility checks, for messages that enter a role.
 
-`decode_*` says what a message holds, for whoever looks at logs; `admit_*` says what a role may work with.
-Bounds, their units and sources: `estimation.plausible`. Stamps are judged by stream, see `stamp_gate`.
+`decode_*` returns any well-formed message, for reading logs. `admit_*` also refuses values that no device
+measures. Bounds, their units and sources: `estimation.plausible`. Stamps are checked per stream, see
+`stamp_gate`.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from vical_daemon.estimation import plausible
 
 
 class ImplausibleError(MessageError):
-    """A message that is well formed and says what cannot be."""
+    """A well-formed message with values that cannot be true."""
 
 
 def admit_imu(data: bytes) -> ImuMessage:
-    """Read a sensor_msgs/Imu to work with.
+    """Decode a sensor_msgs/Imu and check its values.
 
     Raises:
-        MessageError: No such message.
-        ImplausibleError: No device reads this.
+        MessageError: Not such a message.
+        ImplausibleError: No device measures such values.
     """
     message = decode_imu(data)
     _refuse(plausible.imu_problem(message.gyro_rps, message.specific_force_mps2))
@@ -33,11 +34,11 @@ def admit_imu(data: bytes) -> ImuMessage:
 
 
 def admit_points(data: bytes) -> PointsMessage:
-    """Read a vical_msgs/TargetPoints or FeatureTracks to work with.
+    """Decode a vical_msgs/TargetPoints or FeatureTracks and check its values.
 
     Raises:
-        MessageError: No such message.
-        ImplausibleError: No image shows this.
+        MessageError: Not such a message.
+        ImplausibleError: No image has such points.
     """
     message = decode_points(data)
     _refuse(plausible.points_problem(message.ids, message.uv_px, message.sigma_px, message.image_size))
@@ -45,10 +46,10 @@ def admit_points(data: bytes) -> PointsMessage:
 
 
 def admit_image(data: bytes) -> ImageMessage:
-    """Read a sensor_msgs/Image to work with.
+    """Decode a sensor_msgs/Image and check its size.
 
     Raises:
-        MessageError: No such message.
+        MessageError: Not such a message.
         ImplausibleError: No camera has this many pixels.
     """
     message = decode_image(data)
@@ -57,11 +58,11 @@ def admit_image(data: bytes) -> ImageMessage:
 
 
 def admit_calibration(data: bytes) -> CalibrationMessage:
-    """Read a vical_msgs/CalibrationEstimate to work with.
+    """Decode a vical_msgs/CalibrationEstimate and check its values.
 
     Raises:
-        MessageError: No such message.
-        ImplausibleError: No camera is like this.
+        MessageError: Not such a message.
+        ImplausibleError: No camera has such a calibration.
     """
     message = decode_calibration(data)
     known = message.camera_estimate
@@ -70,10 +71,10 @@ def admit_calibration(data: bytes) -> CalibrationMessage:
 
 
 def admit_stamp_sigma_s(microseconds: str) -> float:
-    """Read what a driver says of its stamps in its status, as s.
+    """Return the stamp sigma that a driver reports in its status, s.
 
     Raises:
-        ImplausibleError: No number, or none that a driver can mean.
+        ImplausibleError: Not a number, or not plausible.
     """
     try:
         sigma_s = 1e-6 * float(microseconds)

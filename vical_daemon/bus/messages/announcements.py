@@ -1,7 +1,7 @@
 """Events, guidance and weak directions as parts of a CalibrationEstimate message.
 
-Text travels beside the data. What a message of an older version does not have, or a newer one has and this
-program does not know, is read as text alone.
+A message holds the text as well as the data. Fields that are missing (older sender) or unknown (newer
+sender) are read as text only.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def write_events(writer: CdrWriter, events: Sequence[Event]) -> None:
 
 
 def read_events(reader: CdrReader, texts: Sequence[str]) -> list[Event]:
-    """Read a ``vical_msgs/Event[]``; a kind that is not known keeps its text."""
+    """Read a ``vical_msgs/Event[]``; an event of unknown kind keeps its text."""
     found: list[Event] = []
     for i in range(reader.count(_SMALLEST_EVENT)):
         kind, camera = reader.string(), reader.string()
@@ -66,7 +66,7 @@ def write_guidance(writer: CdrWriter, guidance: Guidance) -> None:
 
 
 def read_guidance(reader: CdrReader) -> Guidance:
-    """Read a ``vical_msgs/Guidance``; one that is not known says nothing."""
+    """Read a ``vical_msgs/Guidance``; an unknown one becomes empty guidance."""
     verb, letters, lack = reader.string(), reader.string(), reader.string()
     turned_about, rate_rps = reader.sequence().tolist(), _read_number(reader)
     camera, edges = reader.string(), reader.strings()
@@ -96,7 +96,7 @@ def write_directions(writer: CdrWriter, directions: Sequence[WeakDirection]) -> 
 
 
 def read_directions(reader: CdrReader) -> list[WeakDirection]:
-    """Read a ``vical_msgs/WeakDirection[]``; those of a block that is not known are left out."""
+    """Read a ``vical_msgs/WeakDirection[]``; directions of unknown blocks are skipped."""
     found = []
     for _ in range(reader.count(_SMALLEST_DIRECTION)):
         block = _known(Block, reader.string())

@@ -1,4 +1,4 @@
-"""vical_msgs/CalibrationEstimate: all that is known about one camera at one moment, without loss."""
+"""vical_msgs/CalibrationEstimate: the complete estimate of one camera at one moment."""
 
 from __future__ import annotations
 

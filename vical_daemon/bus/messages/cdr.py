@@ -1,8 +1,8 @@
 """CDR, the byte layout of ROS 2 messages: little endian, every number aligned to its own size.
 
 Offsets count from behind the 4-byte encapsulation header. Writing and reading are plain arithmetic on
-bytes; a reader believes nothing: whatever the bytes, it returns values that lie inside them or raises
-`MessageError`, and never allocates more than the bytes could hold.
+bytes. For any bytes, a reader returns values that lie inside them or raises `MessageError`, and never
+allocates more than the bytes could hold.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _NS_PER_S = 1_000_000_000
 
 
 class MessageError(ValueError):
-    """Bytes that are no message of the expected type, or values that no such message can hold."""
+    """Bytes that are not a message of the expected type, or values that do not fit into one."""
 
 
 class CdrWriter:
@@ -97,7 +97,7 @@ class CdrWriter:
 
 
 class CdrReader:
-    """Takes values from bytes in order; raises `MessageError` where they end or make no sense."""
+    """Reads values from bytes in order; raises `MessageError` if the bytes end or are invalid."""
 
     __slots__ = ("_data", "_end", "_position")
 
@@ -181,6 +181,6 @@ class CdrReader:
         return memoryview(self._data)[begin : begin + length]
 
     def end(self) -> None:
-        """Demand that the message ends here; other readers, rosbags among them, do so too."""
+        """Raise unless the message ends here; other readers, such as rosbags, check this too."""
         if self.remaining > PADDING:
             raise MessageError(f"message goes on for {self.remaining} bytes behind its last field")

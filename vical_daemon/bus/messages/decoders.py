@@ -1,4 +1,4 @@
-"""Which decoder reads which type: for those who must know that a message is one, not what it says."""
+"""Table of decoders by type, to check that bytes are a valid message of their type."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ DECODERS: dict[str, Callable[[bytes], object]] = {
 
 
 def check_message(type_name: str, data: bytes) -> None:
-    """Do nothing if these bytes are a message of this type.
+    """Raise unless these bytes are a message of this type.
 
     Args:
-        type_name: ROS 2 name of a type of ours, see the table of topics.
+        type_name: ROS 2 name of a type in the table of topics.
         data: CDR bytes.
 
     Raises:
-        MessageError: They are not; rosbags, mcap-ros2 or our own readers would stumble over them.
+        MessageError: They are not; rosbags, mcap-ros2 or our own readers would fail on them.
     """
     DECODERS[type_name](data)

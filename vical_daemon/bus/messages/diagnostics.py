@@ -12,7 +12,7 @@ STRING_TYPE = "std_msgs/msg/String"
 
 
 class Level(IntEnum):
-    """How well a component is; numbers as in diagnostic_msgs/DiagnosticStatus."""
+    """Health of a component; numbers as in diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
@@ -25,7 +25,7 @@ class DiagnosticStatus:
     """Health of one component.
 
     Attributes:
-        level: How well it is.
+        level: Its health.
         name: Component, e.g. ``imu/imu0``.
         message: One line for a person.
         hardware_id: Serial number of the device, "" where there is none.

@@ -15,7 +15,7 @@ _NS_PER_S = 1_000_000_000
 _BODY = struct.Struct(
     "<104x3d72x3d72x"
 )  # orientation and its covariance skipped, then value, covariance, ...
-ImuEncoder = Callable[[int, Sequence[float], Sequence[float]], bytes]
+EncodeImu = Callable[[int, Sequence[float], Sequence[float]], bytes]
 """Stamp (UNIX ns), angular rate (rad/s), specific force (m/s^2) to a message; see `encode_imu`."""
 
 
@@ -37,7 +37,7 @@ class ImuMessage:
 
 
 @lru_cache(maxsize=64)
-def imu_encoder(frame_id: str) -> ImuEncoder:
+def imu_encoder(frame_id: str) -> EncodeImu:
     """Return `encode_imu` for one imu: all that stays the same is packed once.
 
     Constant are the frame id, an orientation that is declared unknown (covariance[0] = -1, REP 145), and

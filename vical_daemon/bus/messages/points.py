@@ -1,4 +1,4 @@
-"""vical_msgs/TargetPoints and FeatureTracks: what was seen in one image."""
+"""vical_msgs/TargetPoints and FeatureTracks: the points found in one image."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class PointsMessage:
     Attributes:
         stamp_ns: Stamp of the image, UNIX ns.
         frame_id: Name of the camera.
-        image_size: width, height, px; (0, 0) where the source does not know.
+        image_size: width, height, px; (0, 0) if the source does not know it.
         ids: Point or feature ids, shape (n,), int64.
         uv_px: Raw distorted pixel coordinates (u right, v down), shape (n, 2).
-        sigma_px: One-sigma per axis, shape (n,), or None where the detector does not say.
+        sigma_px: One-sigma per axis, shape (n,), or None if the detector does not report it.
     """
 
     stamp_ns: int
@@ -34,7 +34,7 @@ class PointsMessage:
     sigma_px: FloatArray | None = None
 
     def to_frame(self) -> PointsFrame:
-        """Return what the estimator takes."""
+        """Return the points in the form that the estimator takes."""
         return PointsFrame(self.frame_id, self.stamp_ns, self.ids, self.uv_px, self.sigma_px)
 
 

@@ -1,4 +1,4 @@
-"""geometry_msgs/PoseWithCovarianceStamped and tf2_msgs/TFMessage: for those who know only ROS."""
+"""geometry_msgs/PoseWithCovarianceStamped and tf2_msgs/TFMessage, for plain ROS tools."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ros2msg definitions of everything that travels: what a log embeds so that others can read it.
+"""The ros2msg definitions of all messages; a log embeds them so that other tools can read it.
 
 Our own types are defined here; those of ROS come from rosbags' typestore (a text, no ROS needed).
 """
@@ -14,7 +14,7 @@ uint32 width             # px of the image, 0 unknown
 uint32 height
 int64[] ids              # {ids}
 float64[] uv_px          # u0 v0 u1 v1 ...: raw distorted pixels, u right, v down, centres at integers
-float64[] sigma_px       # one sigma per axis for each point; empty: not stated
+float64[] sigma_px       # one sigma per axis for each point; empty: unknown
 """
 
 DEFINITIONS: dict[str, str] = {
@@ -33,7 +33,7 @@ float64[] gyro_matrix            # 3x3 row by row
 float64[] accel_matrix           # 3x3 row by row
 """,
     "vical_msgs/msg/CameraCalibration": """\
-# Where a camera sits on the imu, how late it is, and its lens; empty arrays were not estimated
+# Mounting of a camera on the imu, its time shift and its lens; empty arrays were not estimated
 bool known
 geometry_msgs/Pose pose_imu_cam  # pose of the camera in the imu frame
 float64[36] covariance           # [px py pz rx ry rz], m, rad; rotation local (right): about the cam axes
@@ -61,7 +61,7 @@ string cause
 float64 cause_value
 """,
     "vical_msgs/msg/Guidance": """\
-# What to do next, as data; an empty verb: nothing is missing
+# The next motion to make, as data; empty verb: no motion is needed
 string verb                      # turn turn_faster turn_to_and_fro turn_and_move show
 string axes                      # of the camera, e.g. xy; x right, y down, z along the optical axis
 string lack                      # still slow one_axis steady_rate fast_changes edges
@@ -79,7 +79,7 @@ float64 limit                    # above which sigma it counts as unknown
 vical_msgs/Guidance guidance     # the motion that would reveal it
 """,
     "vical_msgs/msg/CalibrationEstimate": """\
-# Everything the estimator says about one camera at one moment
+# The complete estimate of one camera at one moment
 std_msgs/Header header           # stamp: newest data used; frame_id: camera
 string status                    # waiting initialising converging converged degenerate inconsistent
 string reason

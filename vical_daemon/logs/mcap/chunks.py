@@ -1,4 +1,4 @@
-"""Unpacks chunks of MCAP files, damaged or hostile ones too: what they say of themselves is not believed."""
+"""Unpacks chunks of MCAP files, also damaged or hostile ones: the sizes that they state are not trusted."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, crc, length o
 
 
 class SpentError(Exception):
-    """A file holds more than a recording of its size can; the message is the end of a sentence about it."""
+    """A file unpacks to more than a recording of its size can; the message completes a sentence about it."""
 
 
 class Budget:
-    """What may be unpacked from one file: a multiple of its size, so that reading ends.
+    """Limits what is unpacked from one file to a multiple of its size, so that reading ends.
 
     Args:
         file_bytes: Size of the file.
@@ -37,7 +37,7 @@ class Budget:
             unpacked: Bytes that came out of a chunk; 0: it is a record that is looked at.
 
         Raises:
-            SpentError: That was too much.
+            SpentError: The limit is exceeded.
         """
         self._unpacked += unpacked
         self._left -= unpacked or _RECORD_COST
@@ -54,12 +54,12 @@ def unpack_chunk(content: bytes, budget: Budget, *, whole: bool = True) -> bytes
 
     Args:
         content: The chunk record.
-        budget: What may be unpacked from this file.
+        budget: Limit of this file.
         whole: Checksum and sizes must be right; False: the chunk was never finished, give what unpacks.
 
     Raises:
-        ValueError: It is damaged or unpacks to more than it may.
-        SpentError: All chunks of the file together do.
+        ValueError: It is damaged or too large.
+        SpentError: All chunks of the file together are too large.
     """
     _, _, size, crc, name_length = _CHUNK.unpack_from(content)
     begin = _CHUNK.size + name_length
@@ -103,7 +103,7 @@ def decompress_lz4(packed: memoryview, limit: int) -> bytes:
 
 
 def _decompress_zstd(packed: memoryview, limit: int) -> bytes:
-    """Unpack piece by piece: the size that a frame states is not believed."""
+    """Unpack piece by piece: the size that a frame states is not trusted."""
     import zstandard
 
     pieces: list[bytes] = []

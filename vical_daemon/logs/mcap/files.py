@@ -1,4 +1,4 @@
-"""The file below an MCAP writer: knows its errors, its size, and who is writing it."""
+"""The file of an MCAP writer, with its errors, its size, and its lock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PART_SUFFIX = ".part"
 
 
 class LogError(Exception):
-    """A log cannot be written or read; the message is one line for a person."""
+    """A log cannot be written or read; the message is one line for the user."""
 
 
 class LockedFile:
@@ -27,7 +27,7 @@ class LockedFile:
         self.path = path
         self.error: OSError | None = None
         self._fd = -1
-        while self._fd < 0:  # whoever cleans up may take it for a leftover before it is locked
+        while self._fd < 0:  # a cleanup may remove it as a leftover before it is locked
             try:
                 self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
             except OSError as error:
@@ -68,20 +68,20 @@ class LockedFile:
             self.error = self.error or error
 
     def close(self) -> None:
-        """Give up file and lock; may be called twice."""
+        """Close the file and release the lock; may be called twice."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
 
 def describe(error: OSError) -> str:
-    """Return an operating system error in words."""
+    """Return the text of an operating system error."""
     return error.strerror or str(error)
 
 
 @contextmanager
 def _locked(path: Path, how: int) -> Iterator[int]:
-    """Hold the lock of a file that nobody is writing; BlockingIOError: somebody is."""
+    """Hold the lock of a file; BlockingIOError: another process is writing it."""
     access = os.O_RDWR if how == fcntl.LOCK_EX else os.O_RDONLY
     descriptor = os.open(path, access | os.O_NONBLOCK | os.O_CLOEXEC)  # it may be a pipe: do not wait
     try:
@@ -92,7 +92,7 @@ def _locked(path: Path, how: int) -> Iterator[int]:
 
 
 def is_being_written(path: Path) -> bool:
-    """Tell whether a living process holds the lock of a file."""
+    """Return whether a living process holds the lock of a file."""
     try:
         with _locked(path, fcntl.LOCK_SH):
             return False
@@ -115,7 +115,7 @@ def holds_data(path: Path) -> bool:
             path.unlink(missing_ok=True)
     except (BlockingIOError, FileNotFoundError):  # being written, or gone
         return False
-    except OSError:  # somebody else's: whoever reads it will say what is wrong, if anything
+    except OSError:  # another user's file: reading it later will report the error
         return True
     return False
 

@@ -1,4 +1,4 @@
-"""The folder of a recorder: one writer at a time, a quota, a reserve, and recovery of what a crash left."""
+"""The folder of a recorder: one writer at a time, quota, reserve, and recovery after a crash."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class LogFolder:
 
     @property
     def locked(self) -> bool:
-        """This process is the one that may write here."""
+        """Whether this process holds the lock of the folder."""
         return self._lock_fd >= 0
 
     def lock(self) -> bool:
-        """Become the recorder of this folder; False while another process is.
+        """Take the lock of this folder; False if another process holds it.
 
         Raises:
             LogError: The folder cannot be made or written.
@@ -72,11 +72,11 @@ class LogFolder:
             self._lock_fd = -1
 
     def recover(self) -> list[Recovery]:
-        """Make whole what a killed recorder left; call it with the lock held."""
+        """Recover the parts that a killed recorder left; call it with the lock held."""
         return recover_folder(self.path)
 
     def segments(self) -> list[Path]:
-        """Finished segments of ours, oldest first."""
+        """Finished segments of vical, oldest first."""
         dated = []
         for path in self.path.glob("*.mcap"):
             if _OURS.fullmatch(path.name):
@@ -103,11 +103,11 @@ class LogFolder:
         return deleted
 
     def free_bytes(self) -> int:
-        """Space left on the disk for us."""
+        """Free space on the disk, bytes."""
         return shutil.disk_usage(self.path).free
 
     def has_room(self, *, resuming: bool = False) -> bool:
-        """Whether the reserve is untouched; to resume a tenth more must be free, against fluttering."""
+        """Whether the reserve is free; to resume, 10 % more must be free (hysteresis)."""
         try:
             return self.free_bytes() > self._reserve_bytes * (1.1 if resuming else 1.0)
         except OSError:

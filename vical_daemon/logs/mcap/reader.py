@@ -1,4 +1,4 @@
-"""Reads MCAP files that may be cut, damaged or hostile: gives every message that is whole.
+"""Reads MCAP files that may be cut, damaged or hostile; yields every intact message.
 
 Records are taken from front to back, never through the index, so that a file without its end reads
 like any other. Nothing is believed: lengths must lie in the file, chunks must match their checksum,
@@ -69,8 +69,8 @@ class LogReader:
         metadata: Metadata records seen so far, (name, values) in order.
         attachments: Attachments seen so far.
         warnings: What is wrong with the file, one line each; complete after `bus/messages` has ended.
-        complete: The file ended as it should; valid after `bus/messages` has ended.
-        data_end: Offset behind the last whole record of data.
+        complete: The file ended correctly; valid after `bus/messages` has ended.
+        data_end: Offset after the last intact record.
     """
 
     path: Path
@@ -87,7 +87,7 @@ class LogReader:
         """Check that this is an MCAP file.
 
         Raises:
-            LogError: It cannot be read, or is something else.
+            LogError: It cannot be read, or is not an MCAP file.
         """
         try:
             with open_file(self.path) as file:
@@ -108,7 +108,7 @@ class LogReader:
         return list(self._channels.values())
 
     def messages(self) -> Iterator[LogMessage]:
-        """Yield every whole message in the order of the file; never raises on damage (see `warnings`).
+        """Yield every intact message in the order of the file; never raises on damage (see `warnings`).
 
         Raises:
             LogError: The disk refuses.
@@ -143,7 +143,7 @@ class LogReader:
         self._damaged = 0
 
     def _learn_from_summary(self, file: BinaryIO, size: int) -> None:
-        """Take topics from the end of the file, where they stand again: their own chunk may be damaged."""
+        """Read the topics from the summary at the end too, as their chunk may be damaged."""
         file.seek(max(0, size - _END.size))
         tail = file.read()
         if len(tail) < _END.size or not tail.endswith(MAGIC):
@@ -211,7 +211,7 @@ class LogReader:
             self._damaged += 1
 
     def _read_open_chunk(self, content: bytes) -> Iterator[LogMessage]:
-        """Take what can be taken from the chunk that was being written when the process died."""
+        """Read the messages of the chunk that was unfinished when the process died."""
         try:
             yield from self._read_records(unpack_chunk(content, self._budget, whole=False))
         except _DAMAGE:

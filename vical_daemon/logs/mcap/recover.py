@@ -1,4 +1,4 @@
-"""Makes an unfinished or damaged MCAP whole again."""
+"""Recovers unfinished or damaged MCAP files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TEMPORARY = ".recovering"
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What came out of a recovery; `output` is `source` itself where nothing was missing."""
+    """Result of a recovery; `output` is `source` itself if nothing was missing."""
 
     source: Path
     output: Path
@@ -38,7 +38,7 @@ class Recovery:
 
 
 def recover(source: Path, output: Path | None = None, *, even_empty: bool = False) -> Recovery:
-    """Rewrite every whole message, schema, metadata record and attachment into a sound file.
+    """Rewrite every intact message, schema, metadata record and attachment into a valid file.
 
     A file that is complete, under its final name, is left alone: there is no copy.
 
@@ -46,7 +46,7 @@ def recover(source: Path, output: Path | None = None, *, even_empty: bool = Fals
     middle of the recovery costs nothing.
 
     Args:
-        source: Damaged file; it is left as it is.
+        source: Damaged file; not changed.
         output: Name of the result; None: ``NAME.mcap`` for ``NAME.mcap.part``, else ``NAME.recovered.mcap``.
         even_empty: Write a log without a message, too.
 
@@ -105,7 +105,7 @@ def recover_folder(folder: Path) -> list[Recovery]:
 
 
 def _rewrite(reader: LogReader, output: Path) -> int:
-    """Copy all that is whole into a new file; returns the number of messages."""
+    """Copy everything intact into a new file; return the number of messages."""
     count = 0
     with output.open("wb") as file:
         writer = Writer(file, compression=CompressionType.LZ4)

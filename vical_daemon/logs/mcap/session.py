@@ -1,4 +1,4 @@
-"""One run of the recorder: segments that follow each other without a hole, each readable alone."""
+"""One run of the recorder: consecutive segments without a gap, each readable alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vical_daemon.logs.mcap.folder import LogFolder, run_name
 from vical_daemon.logs.mcap.writer import LogWriter
 
 _log = logging.getLogger(__name__)
-FLUSH_S = 0.8  # the recorder goes round each 0.1 s: so a crash costs less than a second
+FLUSH_S = 0.8  # the recorder ticks every 0.1 s, so a crash costs less than 1 s
 SYNC_S = 2.0
 
 
@@ -48,13 +48,13 @@ class LogSession:
         """Open the first segment.
 
         Args:
-            folder: Where, locked.
+            folder: The folder, locked.
             rig: First part of the names.
             now_ns: UNIX time, second part of the names.
             rotate_s: A new segment after so many seconds.
             rotate_bytes: A new segment after so many bytes.
-            metadata: Gives the metadata of a segment at its beginning.
-            attachments: Gives the attachments of a segment at its end.
+            metadata: Returns the metadata of a segment at its start.
+            attachments: Returns the attachments of a segment at its end.
 
         Raises:
             LogError: The disk refuses.
@@ -127,7 +127,7 @@ class LogSession:
             self.rotate(now_ns)
 
     def rotate(self, now_ns: int) -> None:
-        """Begin a new segment, then close the old one: nothing that arrives in between is lost.
+        """Start a new segment, then close the old one: messages in between are not lost.
 
         Raises:
             LogError: The disk refuses.

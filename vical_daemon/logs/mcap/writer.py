@@ -20,7 +20,7 @@ _ROS_TOPIC = re.compile(r"/[A-Za-z0-9_/]+")
 class LogWriter(Closing):
     """One MCAP file; not thread-safe but for `sync`.
 
-    While it grows it is called ``NAME.mcap.part``; `close` gives it its name. A crash leaves the part,
+    While open it is called ``NAME.mcap.part``; `close` renames it. A crash leaves the part,
     of which everything up to the last `flush` can be recovered.
     """
 
@@ -60,7 +60,7 @@ class LogWriter(Closing):
 
     @property
     def part_path(self) -> Path:
-        """Name of the file while it grows."""
+        """Name of the file while it is open."""
         return self._file.path
 
     @property
@@ -75,10 +75,10 @@ class LogWriter(Closing):
             key: Bus key, becomes the topic ``/key``.
             payload: CDR bytes.
             log_time_ns: When it was received, UNIX ns.
-            type_name: ROS 2 type; None: as the topics table says.
+            type_name: ROS 2 type; None: that of the topics table.
 
         Raises:
-            LogError: The disk refuses, or nobody knows the type of this key.
+            LogError: The disk refuses, or the type of this key is unknown.
         """
         channel = self._channels.get(key)
         if channel is None:
@@ -115,7 +115,7 @@ class LogWriter(Closing):
         )
 
     def flush(self) -> None:
-        """Finish the open chunk: what was written until now survives a killed process.
+        """Finish the open chunk: earlier messages survive a killed process.
 
         Raises:
             LogError: The disk refuses.
@@ -127,7 +127,7 @@ class LogWriter(Closing):
         self._file.sync()
 
     def _guard(self, call: Callable[..., None], *args: Any, **kwargs: Any) -> None:
-        """Call the native writer; whatever it raises, the file knows the true reason."""
+        """Call the native writer; the file has the true reason of any error."""
         try:
             call(*args, **kwargs)
         except Exception as error:

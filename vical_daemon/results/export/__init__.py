@@ -1,4 +1,4 @@
-"""The result in the form that other software reads, and Kalibr's files back again.
+"""Exports results in the formats of other software, and reads Kalibr's files.
 
 One `Rig` (plain data) in between: readers make it, writers turn it into text. Each writer states in its
 docstring which way its transform and its time shift point; `docs/how-to/export.md` has them side by side.

@@ -61,7 +61,7 @@ def write_imu(noise: ImuNoise, topic: str = "/imu0", note: str = "") -> str:
 
 
 def read_camchain(path: Path) -> Rig:
-    """Read camchain-imucam.yaml (every camera needs a way to the imu: its own T_cam_imu or a chain to one).
+    """Read camchain-imucam.yaml (every camera needs its own T_cam_imu, or a chain to one).
 
     Raises:
         ExportError: Not such a file; the message says which key is missing or wrong.

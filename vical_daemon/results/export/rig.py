@@ -1,4 +1,4 @@
-"""What is exported: a rig's calibration as plain data, independent of any file format."""
+"""A rig's calibration as plain data, independent of any file format."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RigCamera:
         readout_s: First to last row of a rolling shutter, s; 0: global shutter.
         topic: ROS topic of the images.
         rate_hz: Frames a second; None: not known.
-        unobservable: Directions that the motion did not reveal: their numbers are not to be trusted.
+        unobservable: Directions that the motion did not reveal: do not use their values.
     """
 
     name: str
@@ -69,7 +69,7 @@ class RigCamera:
 
     @property
     def sigmas(self) -> str:
-        """Standard deviations in words: lever arm along the axes of the imu, rotation about the camera's."""
+        """Standard deviations as text: lever arm along the axes of the imu, rotation about the camera's."""
         parts = []
         if self.covariance is not None:
             sigma = np.sqrt(np.diag(self.covariance))
@@ -108,8 +108,8 @@ class Rig:
         imu_topic: ROS topic of the imu.
         imu_frame: Name of the imu frame for ROS, as it is on the bus.
         note: One line on where the numbers come from.
-        status: Where the calibration stood (`Status`); empty: the source does not say.
-        reason: Why, in words.
+        status: Status of the calibration (`Status`); "": unknown.
+        reason: Reason of the status, as text.
         t_ns: Stamp of the newest data used, UNIX ns; 0: not known.
         devices: Serial numbers by device, e.g. ``camera/cam0``.
     """
@@ -131,7 +131,7 @@ class Rig:
 
     @property
     def header(self) -> str:
-        """What stands above the numbers in every file: source, status, date, devices and sigmas, in lines."""
+        """The header of every file: source, status, date, devices and sigmas."""
         lines = [self.note] if self.note else []
         if self.status:
             not_yet = "" if self.status == Status.CONVERGED else "NOT CONVERGED: "

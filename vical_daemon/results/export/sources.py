@@ -1,4 +1,4 @@
-"""Where a rig comes from: a result (JSON or the estimator's own), with what the result does not say."""
+"""Makes a rig from a result: from JSON, or from an estimate."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def rig_from_estimate(
     noise: ImuNoise | None = None,
     note: str = "",
 ) -> Rig:
-    """Make a rig from the estimator's answer.
+    """Make a rig from an estimate.
 
     Args:
-        estimate: The answer.
+        estimate: The estimate.
         resolutions: Image sizes by camera name (an estimate that came over the bus does not hold them).
         noise: Densities of the imu.
         note: Comment for the files.

@@ -1,4 +1,4 @@
-"""Numbers and matrices as text that every YAML reader takes for what they are."""
+"""Writes numbers and matrices so that every YAML reader reads them correctly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The calibration report: one self-contained HTML file that a person can judge, print and keep.
+"""The calibration report: one self-contained HTML file.
 
 `write_report` is what `vical calibrate --report` calls. Figures are drawn by `figures`, residual
 statistics computed by `residuals`, the page laid out by `page`, and what is needed to reproduce the

@@ -1,4 +1,4 @@
-"""What is needed to make the same result again: command, inputs and their hashes, versions, settings."""
+"""Provenance of a result, to reproduce it: command, inputs with hashes, versions, settings."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray
 
 
 class FrameResiduals(Protocol):
-    """What the report reads of a frame; the calibrator's FrameReport has it."""
+    """The fields of a frame that the report uses; see the calibrator's FrameReport."""
 
     @property
     def t_ns(self) -> int:

@@ -16,7 +16,7 @@ HEAD = ("quantity", "value", "1 sigma", "unit")
 
 
 def value(number: float, sigma: float | None) -> tuple[str, str]:
-    """Write a value with as many digits as its sigma deserves (two of the sigma).
+    """Write a value with the number of digits that shows two of its sigma.
 
     >>> value(12.34567, 0.0123)
     ('12.346', '0.012')
@@ -95,7 +95,7 @@ def imu_rows(result: dict[str, Any]) -> list[Row]:
 
 
 def warnings_of(result: dict[str, Any]) -> list[str]:
-    """Say in words what a reader of this result must know before using it."""
+    """Return warnings that apply before this result is used."""
     lines = []
     status = str(result.get("status", ""))
     if status != "converged":
@@ -122,5 +122,5 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
 
 
 def _text(event: dict[str, Any] | str) -> str:
-    """Text of an event; results of version 0.1.0 have nothing else."""
+    """Text of an event; results of version 0.1.0 have only text."""
     return event if isinstance(event, str) else str(event["text"])

@@ -1,4 +1,4 @@
-"""Puts the report together: figures as data URIs in one HTML file, on request also as PNG files."""
+"""Writes the report: figures as data URIs in one HTML file, optionally also as PNG files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class ReportError(ValueError):
-    """The report cannot be made or written; the message says why."""
+    """The report cannot be made or written; the message has the reason."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -196,7 +196,7 @@ class AravisCamera(Closing):
             image = self._decode(np.frombuffer(data, dtype=np.uint8))
         except CorruptImageError as error:
             _log.debug("corrupt image: %s", error)
-            self._frames.spoilt("corrupt_images")
+            self._frames.count_corrupt("corrupt_images")
             self._frames.lost()
             return None
         return self._frames.frame(image, raw, sequence=self._sequence, t_arrival_ns=fields["arrival_ns"])

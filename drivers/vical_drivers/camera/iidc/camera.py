@@ -4,7 +4,7 @@ A Point Grey camera writes the cycle time at which its shutter closed into each 
 read together with CLOCK_MONOTONIC at each frame and fitted (`cycle_clock`), and half the exposure is
 taken off. Any other camera is dated by the first packet of its frame. libdc1394 itself reports neither lost
 frames nor lost packets: the first are found by the embedded frame counter, or by gaps in the stamps, the
-others as `whole` says.
+others as `completeness` says.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from vical_drivers.camera.formats import Bytes, CorruptImageError, FrameDecoder,
 from vical_drivers.camera.frame_maker import FrameMaker
 from vical_drivers.camera.hotplug import wait_for_camera
 from vical_drivers.camera.iidc import abi
+from vical_drivers.camera.iidc.completeness import Completeness, check_completeness
 from vical_drivers.camera.iidc.dating import FrameDating
 from vical_drivers.camera.iidc.device import IidcDevice, frame_bytes, list_devices, pixel_format
 from vical_drivers.camera.iidc.embedded import EmbeddedInfo, parse_embedded
 from vical_drivers.camera.iidc.firewire import BusClock, find_node
 from vical_drivers.camera.iidc.modes import IidcMode, set_mode
-from vical_drivers.camera.iidc.whole import Wholeness, judge
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.closing import Closing
@@ -97,8 +97,8 @@ class IidcCamera(Closing):
         self._decode: FrameDecoder | None = None
         self._dating = FrameDating(self._settings.stamp, self._mode.rate_hz, self._frames.statistics)
         self._shutter_raw: int | None = None
-        self._held: _Taken | None = None  # the next frame decides whether it is whole
-        self._judged: deque[tuple[_Taken, str]] = deque()  # in order; with what is wrong, "" for a whole one
+        self._held: _Taken | None = None  # the next frame decides whether it is complete
+        self._checked: deque[tuple[_Taken, str]] = deque()  # in order; with the fault, "" for a complete one
         self._t_alive_ns = time.monotonic_ns()
 
     def _apply(self, device: IidcDevice) -> None:
@@ -215,7 +215,7 @@ class IidcCamera(Closing):
 
     def _next(self, timeout_s: float) -> Frame | None:
         device, bus = self._need()
-        frame_made = self._first_judged(device)
+        frame_made = self._next_checked(device)
         if frame_made is not None:
             return frame_made
         poller = select.poll()
@@ -245,28 +245,28 @@ class IidcCamera(Closing):
         taken = _Taken(
             data[:image_bytes], depth_bits, info, raw, self._dating.sequence, missing, t_arrival_ns
         )
-        verdict = judge(data, packet_bytes, info, self._frame_info, age_ns, self._mode.rate_hz)
-        self._sort(taken, verdict)
-        return self._first_judged(device)
+        verdict = check_completeness(data, packet_bytes, info, self._frame_info, age_ns, self._mode.rate_hz)
+        self._classify(taken, verdict)
+        return self._next_checked(device)
 
-    def _sort(self, taken: _Taken, verdict: Wholeness) -> None:
-        """Judge the frame that was held by the one that follows it, and that one by itself."""
+    def _classify(self, taken: _Taken, verdict: Completeness) -> None:
+        """Decide on the held frame by the one that follows it, and on that one by itself."""
         held, self._held = self._held, None
         if held is not None:
-            # before a gap a shifted image and one that was only fetched late look the same
-            self._judged.append((held, "doubtful_images" if taken.missing_before else ""))
-        if verdict is Wholeness.OPEN:
+            # before a gap, a shifted image and one that was only fetched late look the same
+            self._checked.append((held, "doubtful_images" if taken.missing_before else ""))
+        if verdict is Completeness.UNDECIDED:
             self._held = taken
         else:
-            self._judged.append((taken, "shifted_images" if verdict is Wholeness.SHIFTED else ""))
+            self._checked.append((taken, "shifted_images" if verdict is Completeness.SHIFTED else ""))
 
-    def _first_judged(self, device: IidcDevice) -> Frame | None:
-        """Make the next good frame of what was judged; what is not good is counted on the way."""
-        while self._judged:
-            taken, fault = self._judged.popleft()
+    def _next_checked(self, device: IidcDevice) -> Frame | None:
+        """Return the next good frame; count the bad ones before it."""
+        while self._checked:
+            taken, fault = self._checked.popleft()
             self._frames.lost(taken.missing_before)
             if fault:
-                self._frames.spoilt(fault)
+                self._frames.count_corrupt(fault)
                 self._frames.lost()
                 continue
             frame = self._make(device, taken)
@@ -312,7 +312,7 @@ class IidcCamera(Closing):
         try:
             return self._decode(data)
         except CorruptImageError as error:
-            self._frames.spoilt("corrupt_images")
+            self._frames.count_corrupt("corrupt_images")
             _log.debug("corrupt image: %s", error)
             return None
 

@@ -252,12 +252,12 @@ class V4l2Camera(Closing):
             self._frames.statistics.count("empty_buffers")
             return None
         if buffer.flags & abi.BUF_FLAG_ERROR:
-            self._frames.spoilt("flagged_buffers")
+            self._frames.count_corrupt("flagged_buffers")
             return None
         try:
             return session.decode(session.node.mappings[buffer.index].array[: buffer.bytes_used])
         except CorruptImageError as error:
-            self._frames.spoilt("corrupt_images")
+            self._frames.count_corrupt("corrupt_images")
             _log.debug("corrupt image sequence=%d: %s", buffer.sequence, error)
             return None
 

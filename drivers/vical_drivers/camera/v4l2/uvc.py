@@ -47,14 +47,12 @@ class PayloadHeader:
 
     Attributes:
         t_host_ns: Arrival, clock of the uvcvideo driver (CLOCK_MONOTONIC by default), ns.
-        host_sof: USB frame number of the host at arrival.
         pts: Ticks, 32 bit; None where the header has none.
         stc: Ticks, 32 bit; None where the header has none.
         device_sof: USB frame number at `stc`; None where the header has none.
     """
 
     t_host_ns: int
-    host_sof: int
     pts: int | None
     stc: int | None
     device_sof: int | None
@@ -64,7 +62,7 @@ def parse_metadata(data: bytes | memoryview) -> Iterator[PayloadHeader]:
     """Yield the payload headers of one UVCH buffer; stops at a header that is cut off or impossible."""
     at = 0
     while at + _ENTRY.size <= len(data):
-        t_ns, sof, length, flags = _ENTRY.unpack_from(data, at)
+        t_ns, _host_sof, length, flags = _ENTRY.unpack_from(data, at)
         end = at + _ENTRY.size - 2 + length  # the length counts itself and the flags
         need = 2 + (4 if flags & _HAS_PTS else 0) + (6 if flags & _HAS_SCR else 0)
         if length < need or end > len(data):
@@ -77,7 +75,7 @@ def parse_metadata(data: bytes | memoryview) -> Iterator[PayloadHeader]:
         if flags & _HAS_SCR:
             stc, device_sof = struct.unpack_from("<IH", data, at)
             device_sof &= 0x7FF
-        yield PayloadHeader(t_ns, sof, pts, stc, device_sof)
+        yield PayloadHeader(t_ns, pts, stc, device_sof)
         at = end
 
 

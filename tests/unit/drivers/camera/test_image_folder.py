@@ -11,7 +11,7 @@ import pytest
 from vical_drivers.camera import check_camera, open_camera
 from vical_drivers.errors import DeviceRefusedError
 
-from vical_daemon.acquire.camera import CameraRole
+from vical_daemon.acquire.camera import CameraEncoder
 from vical_daemon.bus.messages import decode_image as decode_image_message
 from vical_daemon.service.wall_clock import private_clock
 from vical_daemon.vision.image_codec import decode_image, encode_image
@@ -54,7 +54,7 @@ def test_a_frame_that_is_not_due_is_not_given(folder: Path) -> None:
 
 def test_the_service_can_publish_it(folder: Path) -> None:
     clock = private_clock()
-    role = CameraRole("rig0", "cam0", clock)
+    role = CameraEncoder("rig0", "cam0", clock)
     with open_camera(f"folder:{folder}", decoder=decode_image) as camera:
         payload = role.message(camera.read(1.0))
     assert payload is not None

@@ -11,10 +11,10 @@ import pytest
 from vical_drivers import errors
 from vical_drivers.camera.iidc import abi as iidc_abi
 from vical_drivers.camera.iidc import firewire
+from vical_drivers.camera.iidc.completeness import Completeness, check_completeness
 from vical_drivers.camera.iidc.cycle_clock import WRAP_NS, CycleClock, cycle_time_ns, image_cycle_time_ns
 from vical_drivers.camera.iidc.embedded import parse_embedded
 from vical_drivers.camera.iidc.firewire import IOC_GET_CYCLE_TIMER2, BusClock
-from vical_drivers.camera.iidc.whole import Wholeness, judge
 from vical_mocks import firewire_rig
 
 HERE = Path(__file__).parent
@@ -202,33 +202,37 @@ def image_of(counter: int, level: int = 0) -> bytearray:
     return image
 
 
-def verdict_on(image: bytearray, age_ns: int, items: int = ITEMS) -> Wholeness:
+def verdict_on(image: bytearray, age_ns: int, items: int = ITEMS) -> Completeness:
     data = np.frombuffer(bytes(image), dtype=np.uint8)
-    return judge(data, PACKET, parse_embedded(bytes(image[:64]), items), items, age_ns, RATE_HZ)
+    return check_completeness(data, PACKET, parse_embedded(bytes(image[:64]), items), items, age_ns, RATE_HZ)
 
 
 @pytest.mark.parametrize("lost", [1, 2, 50, 119])
 def test_the_header_of_the_next_image_tells_a_lost_packet(lost: int) -> None:
     shifted = image_of(COUNTER)[: -lost * PACKET] + image_of(COUNTER + 1)[: lost * PACKET]
-    assert verdict_on(shifted, age_ns=34_000_000) is Wholeness.SHIFTED
-    assert verdict_on(shifted, age_ns=16_000_000) is Wholeness.SHIFTED
+    assert verdict_on(shifted, age_ns=34_000_000) is Completeness.SHIFTED
+    assert verdict_on(shifted, age_ns=16_000_000) is Completeness.SHIFTED
     # without the counter only the time is left
-    assert verdict_on(shifted, age_ns=34_000_000, items=0x80000001) is Wholeness.OPEN
+    assert verdict_on(shifted, age_ns=34_000_000, items=0x80000001) is Completeness.UNDECIDED
 
 
 def test_an_image_that_was_complete_in_time_is_whole() -> None:
-    assert verdict_on(image_of(COUNTER), age_ns=30_000_000) is Wholeness.WHOLE
-    assert verdict_on(image_of(COUNTER), age_ns=33_000_000) is Wholeness.OPEN
-    assert verdict_on(image_of(COUNTER), age_ns=-5_000_000) is Wholeness.OPEN  # the wall clock was set
+    assert verdict_on(image_of(COUNTER), age_ns=30_000_000) is Completeness.COMPLETE
+    assert verdict_on(image_of(COUNTER), age_ns=33_000_000) is Completeness.UNDECIDED
+    assert (
+        verdict_on(image_of(COUNTER), age_ns=-5_000_000) is Completeness.UNDECIDED
+    )  # the wall clock was set
     data = np.zeros(100, dtype=np.uint8)
-    assert judge(data, 0, parse_embedded(b"", 0), 0, 1_000, 0.0) is Wholeness.OPEN  # rate unknown
+    assert (
+        check_completeness(data, 0, parse_embedded(b"", 0), 0, 1_000, 0.0) is Completeness.UNDECIDED
+    )  # rate unknown
 
 
 def test_pixels_that_read_like_the_next_counter_are_no_header() -> None:
     dark = image_of(COUNTER)
     for packet in range(1, PACKETS):  # a counter of 5 is three black pixels and one nearly black
         dark[packet * PACKET + 8 : packet * PACKET + 12] = (COUNTER + 1).to_bytes(4, "big")
-    assert verdict_on(dark, age_ns=16_000_000) is Wholeness.WHOLE
+    assert verdict_on(dark, age_ns=16_000_000) is Completeness.COMPLETE
     off_the_boundary = image_of(COUNTER)
     off_the_boundary[7 * PACKET + 3 : 7 * PACKET + 15] = header_of(COUNTER + 1, 2 * 10**9)
-    assert verdict_on(off_the_boundary, age_ns=16_000_000) is Wholeness.WHOLE
+    assert verdict_on(off_the_boundary, age_ns=16_000_000) is Completeness.COMPLETE

@@ -1,0 +1,1 @@
+"""The Cramer-Rao bound of a simulated recording, from its truth alone."""

@@ -1,0 +1,201 @@
+"""A calibration survives a restart, belongs to its devices, and a changed mounting is announced once."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
+from vical_daemon.calibrate.persistence import CalibrationPersistence, differences
+from vical_daemon.config.model import Config, loads
+from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
+from vical_daemon.estimation.wording import event_text
+from vical_daemon.service.wall_clock import private_clock
+
+
+def _camera(p_m=(0.08, 0.02, -0.03), turn_deg=0.0, shift_s=0.01, sigma=1e-4) -> CameraEstimate:
+    x, y, z, w = Rotation.from_euler("y", turn_deg, degrees=True).as_quat()
+    covariance = (np.eye(6) * sigma**2).tolist()
+    pose = PoseEstimate(list(p_m), [float(v) for v in (w, x, y, z)], covariance)
+    lens = ([500.0, 500.0, 320.0, 240.0], [1.0] * 4, "radtan", [0.1, 0.0, 0.0, 0.0], [0.01] * 4)
+    return CameraEstimate(pose, shift_s, 1e-5, *lens, 0.2)
+
+
+def _estimate(camera: CameraEstimate, status: Status = Status.CONVERGED) -> CalibrationEstimate:
+    return CalibrationEstimate(
+        1, status, "", 1.0, "", 60.0, 600, 6000, {"cam0": camera}, None, [0.0, 0.0, -9.8], 1.0, 0.0
+    )
+
+
+def _announce(bus: LocalBus, camera_serial: str = "C1") -> None:
+    for role, name, serial in (("imu", "imu/imu0", "I1"), ("camera", "camera/cam0", camera_serial)):
+        payload = encode_diagnostics(1, role, [DiagnosticStatus(Level.OK, name, "", serial)])
+        bus.publish(topics.STATUS.key("rig0", role), payload)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    return loads(
+        "imus: {imu0: {port: /dev/x, rate_hz: 100}}\ncameras: {cam0: {uri: 'v4l2:/dev/video0'}}\n"
+        f"target: t.yaml\nstore: {{directory: {tmp_path / 'store'}}}\n"
+    )
+
+
+def _remember(config: Config, camera: CameraEstimate, camera_serial: str = "C1") -> None:
+    bus = LocalBus()
+    persistence = CalibrationPersistence(config, bus, private_clock())
+    _announce(bus, camera_serial)
+    persistence.watch(_estimate(camera))
+    persistence.close(None)
+
+
+def _later(config: Config, camera_serial: str = "C1") -> CalibrationPersistence:
+    bus = LocalBus()
+    persistence = CalibrationPersistence(config, bus, private_clock())
+    _announce(bus, camera_serial)
+    return persistence
+
+
+def test_nothing_known_gives_what_the_config_says(config: Config) -> None:
+    prior = _later(config).priors()["cam0"]
+    assert prior.T_imu_cam is None and prior.resolution == (640, 480)
+
+
+def test_a_converged_calibration_is_the_prior_after_a_restart(config: Config) -> None:
+    _remember(config, _camera())
+    prior = _later(config).priors()["cam0"]
+    assert prior.T_imu_cam is not None and prior.timeshift_cam_imu_s == 0.01
+    np.testing.assert_array_equal(prior.T_imu_cam[1], [0.08, 0.02, -0.03])
+    assert prior.intrinsics == (500, 500, 320, 240)
+
+
+def test_it_is_not_used_for_another_camera(config: Config) -> None:
+    _remember(config, _camera())
+    assert _later(config, camera_serial="C2").priors()["cam0"].T_imu_cam is None
+
+
+def test_what_the_config_holds_fixed_wins(config: Config) -> None:
+    _remember(config, _camera())
+    lens = replace(config.cameras["cam0"].lens, intrinsics=(460.0, 460.0, 300.0, 200.0))
+    fixed = replace(
+        config,
+        cameras={"cam0": replace(config.cameras["cam0"], lens=lens)},
+        calibration=replace(config.calibration, fix=("intrinsics",)),
+    )
+    prior = _later(fixed).priors()["cam0"]
+    assert prior.intrinsics == (460, 460, 300, 200) and prior.distortion is None
+    assert prior.T_imu_cam is not None
+
+
+def test_nothing_is_stored_before_convergence(config: Config) -> None:
+    bus = LocalBus()
+    persistence = CalibrationPersistence(config, bus, private_clock())
+    _announce(bus)
+    persistence.watch(_estimate(_camera(), Status.CONVERGING))
+    persistence.close(_estimate(_camera(), Status.DEGENERATE))
+    assert _later(config).priors()["cam0"].T_imu_cam is None
+
+
+def test_serials_may_come_late_but_not_never(config: Config) -> None:
+    _remember(config, _camera())
+    bus = LocalBus()
+    persistence = CalibrationPersistence(config, bus, private_clock())
+    threading.Timer(0.2, _announce, [bus]).start()
+    assert persistence.priors()["cam0"].T_imu_cam is not None
+
+
+def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config: Config) -> None:
+    _remember(config, _camera(p_m=(0.5, 0.0, 0.0)), camera_serial="C2")  # known from another day
+    bus = LocalBus()
+    persistence = CalibrationPersistence(config, bus, private_clock())
+    _announce(bus, "C1")
+    assert persistence.priors()["cam0"].T_imu_cam is None
+    persistence.watch(_estimate(_camera()))
+    of_c1 = persistence.devices
+    for times in range(3):  # another camera in the same place
+        assert not persistence.replaced, times
+        _announce(bus, "C2")
+        assert persistence.devices == {}  # in doubt: no state is kept
+        persistence.save(_estimate(_camera(p_m=(0.2, 0.2, 0.2))))
+    assert persistence.replaced
+    persistence.save(_estimate(_camera(p_m=(0.3, 0.3, 0.3))))  # of the old one: under no name
+    prior = persistence.begin_again()["cam0"]
+    assert prior.T_imu_cam is not None
+    np.testing.assert_array_equal(prior.T_imu_cam[1], [0.5, 0.0, 0.0])
+    assert persistence.stored == ["cam0"] and not persistence.replaced
+    assert persistence.devices == {**of_c1, "camera/cam0": "C2"}
+    told = persistence.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
+    assert (
+        event_text(told[0])
+        == "camera/cam0 is another device now (serial C2, not C1): the calibration begins anew"
+    )
+    persistence.close(None)
+    for serial, p_m in (("C1", [0.08, 0.02, -0.03]), ("C2", [0.6, 0.0, 0.0])):
+        prior = _later(config, serial).priors()["cam0"]
+        assert prior.T_imu_cam is not None
+        np.testing.assert_array_equal(prior.T_imu_cam[1], p_m)
+
+
+def test_one_damaged_status_replaces_no_device(config: Config) -> None:
+    bus = LocalBus()
+    persistence = CalibrationPersistence(config, bus, private_clock())
+    for serial in ("C1", "C9", "C8", "C1", "C9", "C9", "C1", "C8"):
+        _announce(bus, serial)
+        assert not persistence.replaced
+    _announce(bus, "C1")
+    assert persistence.devices["camera/cam0"] == "C1"
+
+
+def test_a_changed_mounting_is_announced_once(config: Config) -> None:
+    _remember(config, _camera())
+    persistence = _later(config)
+    persistence.priors()
+    first = persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03), turn_deg=1.0)))
+    assert [event_text(e) for e in first.events] == [
+        "changed: cam0: moved by 10.0 +- 0.1 mm since the stored calibration",
+        "changed: cam0: turned by 1.00 +- 0.01 deg since the stored calibration",
+    ]
+    assert persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03)))).events == []
+
+
+def _differences(before: CameraEstimate, now: CameraEstimate) -> list[tuple[EventKind, float]]:
+    found = differences("cam0", before, now, 30.0)
+    assert all(e.camera == "cam0" and e.t_s == 30.0 and e.cause is Cause.STORED_DIFFERS for e in found)
+    return [(e.kind, round(e.value or 0.0, 5)) for e in found]
+
+
+def test_what_lies_within_the_sigmas_or_does_not_matter_is_no_change() -> None:
+    assert _differences(_camera(), _camera()) == []
+    assert _differences(_camera(), _camera(p_m=(0.081, 0.02, -0.03))) == []  # 7 sigma, but 1 mm
+    far = _camera(p_m=(0.09, 0.02, -0.03), sigma=5e-3)
+    assert _differences(_camera(sigma=5e-3), far) == []  # 1.4 sigma
+    assert _differences(_camera(), _camera(shift_s=0.0105)) == [(EventKind.TIMESHIFT_CHANGED, 5e-4)]
+    assert _differences(_camera(turn_deg=0.05), _camera()) == []
+    turned = [(EventKind.CAMERA_TURNED, round(math.radians(0.5), 5))]
+    assert _differences(_camera(turn_deg=0.5), _camera()) == turned
+
+
+def test_the_journal_gets_an_event_as_fields_and_its_name_from_its_kind(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[tuple[str, dict[str, object]]] = []
+    monkeypatch.setattr(
+        "vical_daemon.service.notify.event", lambda name, text, **more: written.append((name, more))
+    )
+    persistence = _later(config)
+    persistence.announce(Event(EventKind.BUMPED, cause=Cause.IMAGES_REFUSED))
+    persistence.announce(Event(EventKind.OTHER, said="bumped: only a text"))
+    persistence.announce(Event(EventKind.STAMP_JITTER, "cam0", 1e-3))
+    persistence.watch(_estimate(_camera(), Status.CONVERGING))
+    assert [name for name, _ in written] == ["bumped", "calibration", "calibration"]
+    assert written[2][1]["kind"] == "stamp_jitter"
+    assert (written[2][1]["camera"], written[2][1]["value"]) == ("cam0", 1e-3)

@@ -1,0 +1,92 @@
+"""Whatever images come, the detect role goes on: it refuses, counts, and restarts its detector."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vical_daemon.bus import messages as m
+from vical_daemon.bus import topics
+from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.bus.messages import Level
+from vical_daemon.config.model import Config, loads
+from vical_daemon.detect import role as detect
+from vical_daemon.detect.role import DetectRole
+from vical_daemon.service import notify
+
+MS = 1_000_000
+NOW = 1_800_000_000_000_000_000
+IMAGE = topics.IMAGE.key("rover", "cam0")
+
+
+@pytest.fixture
+def config() -> Config:
+    return loads(
+        "rig: rover\nimus: {imu0: {port: /dev/x}}\n"
+        "cameras: {cam0: {uri: 'v4l2:/dev/video0', size: [64, 48]}}\ntarget: t.yaml\n"
+    )
+
+
+def image(t_ns: int, size: tuple[int, int] = (64, 48)) -> Sample:
+    payload = m.encode_image(t_ns, "cam0", np.zeros((size[1], size[0]), np.uint8), "mono8")
+    return Sample(IMAGE, payload, 0)
+
+
+class TestDetect:
+    @pytest.mark.parametrize("stamp", [0, -(10**9), 2**31 * 10**9 - 1])
+    def test_a_stamp_of_nonsense_does_not_stop_the_images(self, config: Config, stamp: int) -> None:
+        role = DetectRole(config, "cam0", lambda picture, t_ns: None)
+        done = 0
+        for k in range(60):
+            if k % 20 == 10:
+                role.points(image(stamp))
+            done += bool(role.points(image(NOW + k * 50 * MS)))
+        assert done == 60
+
+    def test_images_of_another_size_are_refused_until_they_stay(self, config: Config) -> None:
+        role = DetectRole(config, "cam0", lambda picture, t_ns: None)
+        sizes = [(64, 48)] * 3 + [(1, 1), (64, 48), (1, 1), (1, 1)] + [(64, 48)] * 3 + [(32, 24)] * 4
+        done = [bool(role.points(image(NOW + k * 100 * MS, size))) for k, size in enumerate(sizes)]
+        assert done == [True] * 3 + [False, True, False, False] + [True] * 3 + [False, False, True, True]
+        assert role.status().values["malformed"] == "5"
+
+    def test_a_detector_that_raises_is_made_anew(
+        self, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        events: list[str] = []
+        monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append(text))
+
+        def raises(picture: Any, t_ns: int) -> None:
+            if t_ns == NOW:
+                raise RuntimeError("(-215:Assertion failed)\nin function 'cornerSubPix'")
+
+        role = DetectRole(config, "cam0", raises)
+        assert role.points(image(NOW)) == []
+        assert role.points(image(NOW + 100 * MS))
+        assert role.status().values["failures"] == "1"
+        (text,) = events
+        assert "cornerSubPix" in text and len(text.splitlines()) == 1
+
+    def test_a_worker_that_hangs_is_not_called_alive(
+        self, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        hang, stop, bus = threading.Event(), threading.Event(), LocalBus()
+        monkeypatch.setattr(detect, "STUCK_S", 0.1)
+        monkeypatch.setattr(detect, "make_detector", lambda *_: lambda picture, t_ns: hang.wait(60) and None)
+        worker = detect._Worker(config, "cam0", bus, stop)
+        worker.thread.start()
+        bus.publish(IMAGE, image(NOW).payload)
+        end_s = time.monotonic() + 30
+        while worker.status().level is not Level.STALE:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        hang.set()
+        while worker.status().level is Level.STALE:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        stop.set()
+        worker.close()
