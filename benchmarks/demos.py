@@ -63,9 +63,7 @@ def main(argv: list[str]) -> int:
         return float(np.median([r[key] for r in good if r.get(key) is not None] or [np.nan]))
 
     longer = sum(r["duration_s"] > args.seconds + 1.5 for r in good)
-    print(
-        "| demos | converged | went on | first answer s | converged after s | error / sigma |  (medians)"
-    )
+    print("| demos | converged | went on | first answer s | converged after s | error / sigma |  (medians)")
     print("|---|---|---|---|---|---|")
     print(
         f"| {args.seconds:g} s, {args.jobs} at once | {len(good)} of {len(results)} | {longer} "
