@@ -156,6 +156,9 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     frames: list[FrameReport] = []
     bus = LocalBus()
     estimator = make_estimator(job.config, job.priors)
+    stamp_sigma_s = job.recording.stamp_sigma_s.get(job.imu.name)
+    if stamp_sigma_s is not None:
+        estimator.stamps_known_to(stamp_sigma_s)
     keep = frames.extend if keep_frames else None
     events: list[Event] = []
 

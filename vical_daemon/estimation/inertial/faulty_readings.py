@@ -99,6 +99,7 @@ class SpikeFilter(Generic[T]):
         self._last: FloatArray = np.full(6, np.nan)
         self._before: FloatArray = np.full(6, np.nan)
         self._largest = np.zeros(2)  # error of prediction of late: gyro rad/s, accelerometer m/s^2
+        self._first: list[FloatArray] = []
         self._count = 0
 
     def sift(self, six: FloatArray, item: T) -> list[T]:
@@ -118,7 +119,7 @@ class SpikeFilter(Generic[T]):
             return [held_item, item]
         missed = self._missed(six)
         stands_out = missed > _SPIKE * self._largest
-        if self._count >= _LEARN and stands_out.sum() == 1:
+        if len(self._first) >= _LEARN and stands_out.sum() == 1:
             self.held = six, item
             return []
         self._note(six)
@@ -131,6 +132,12 @@ class SpikeFilter(Generic[T]):
 
     def _note(self, six: FloatArray) -> None:
         if self._count >= 2:
-            self._largest = np.maximum(self._missed(six), _FADES * self._largest)
+            missed = self._missed(six)
+            if len(self._first) < _LEARN:  # there may be spikes among the first readings
+                self._first.append(missed)
+                self._largest = 2.0 * np.median(self._first, axis=0)
+            else:  # one that was not noticed at most doubles it
+                missed = np.minimum(missed, 2.0 * self._largest)
+                self._largest = np.maximum(missed, _FADES * self._largest)
         self._before, self._last = self._last, six
         self._count += 1

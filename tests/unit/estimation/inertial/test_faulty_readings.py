@@ -73,6 +73,13 @@ def test_single_spikes_are_left_out_and_nothing_else() -> None:
     assert sifted(six) == np.setdiff1d(np.arange(len(six)), at).tolist()
 
 
+def test_a_spike_among_the_first_readings_does_not_hide_later_ones() -> None:
+    six = motion()
+    for at in (0, 5, 18, 60, 100, 140):
+        six[at, 2] += 10.0
+    assert set(range(len(six))) - set(sifted(six)) >= {60, 100, 140}
+
+
 def test_a_motion_that_begins_at_once_and_a_shock_are_taken() -> None:
     rest = np.random.default_rng(4).normal(GRAVITY, 2e-3, (1000, 6))
     onset = rest.copy()
