@@ -50,16 +50,18 @@ def vical_elsewhere(
     The program is loaded first: its files may lie where nobody may read them.
     """
     code = (
-        "import os, pathlib, sys\n"
+        "import importlib, os, pathlib, pkgutil, sys\n"
         "from vical_daemon.config import paths\n"
         f"paths.LOOPBACK_PORT = {port}\n"
         "from vical_daemon.bus import socket_paths\n"
         f"socket_paths.SERVICE_SOCKET = pathlib.Path({str(service)!r})\n"
-        "from vical_daemon.cli import bus_access, main, watch, web\n"
-        "import rich.live, vical_daemon.cli.live_table, vical_daemon.bus.messages, vical_daemon.web.role\n"
+        "from vical_daemon import cli\n"
+        "for module in pkgutil.iter_modules(cli.__path__, cli.__name__ + '.'):\n"
+        "    importlib.import_module(module.name)\n"
+        "import rich.live, vical_daemon.bus.messages, vical_daemon.web.role\n"
         "'localhost'.encode('idna')\n"
         f"os.setgroups({list(groups)!r}); os.setgid({NOBODY}); os.setuid({NOBODY})\n"
-        f"sys.exit(main({words!r}))\n"
+        f"sys.exit(cli.main({words!r}))\n"
     )
     environment = {key: os.environ[key] for key in ("PATH", "PYTHONPATH", "LANG") if key in os.environ}
     return subprocess.run(
