@@ -366,14 +366,19 @@ class Calibrator:
             self._restart(f)
 
     def _shift_stepped(self, f: CalibrationFilter, camera: str) -> bool:
-        """See whether images disagree because the time shift stepped; then go on with that alone unknown."""
+        """See whether images disagree because the time shift stepped; then go on with that alone unknown.
+
+        Asked of the calibration as it was before: images after the step have moved the present one, above all
+        its lens, until the misfit is no longer one of the time shift alone.
+        """
         assert self._buffer is not None
         if self.layout.cameras[camera].timeshift is None or f.unshown is not None:
             return False
-        fit = self._past.find_shift(f, camera, self._buffer, self.target)
+        before = self._past.filter(f)
+        fit = self._past.find_shift(before, camera, self._buffer, self.target)
         if fit is None or not fit.stepped:
             return False
-        self.filter = self._past.filter(f)
+        self.filter = before
         step_s = self._set_shift(self.filter, camera, fit)
         self._unproven = (f.state.t_s + _STANDS_S, camera, fit.timeshift_s - step_s)
         self._lose_motion()
