@@ -131,13 +131,14 @@ class CalibrationFilter:
     def _grow(self, moved: Moved, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
         n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
-        A = np.zeros((n, n + c + 9))
-        A[:, :n] = self.S
+        A = self.S.copy()
         A[:9, :d] = moved.linear
         self._drift_shifts(A, moved.seconds)
-        A[:9, n : n + c] = moved.curved
-        A[:9, n + c :] = unscented.root(Q)
-        self.S = unscented.lower_root(np.concatenate([A, self._random_walk(moved.seconds)], axis=1))
+        noise = np.zeros((n, c + 9))
+        noise[:9, :c] = moved.curved
+        noise[:9, c:] = unscented.root(Q)
+        noise = np.concatenate([noise, self._random_walk(moved.seconds)], axis=1)
+        self.S = unscented.lower_root_grown(A, noise, d)
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -266,7 +267,6 @@ class CalibrationFilter:
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
-        self.S = S
         turned = [ATTITUDE] + [c.rotation for c in self.layout.cameras.values() if c.rotation is not None]
         if max(float(np.abs(dx[s]).max()) for s in turned) > 1e-4:
             for s in turned:
@@ -274,8 +274,8 @@ class CalibrationFilter:
                 J = np.eye(3) + np.array(
                     [[0, half[2], -half[1]], [-half[2], 0, half[0]], [half[1], -half[0], 0]]
                 )
-                self.S[s] = J @ self.S[s]
-            self.S = unscented.lower_root(self.S)
+                unscented.turn_rows(S, s, J)
+        self.S = S
         self.state = retract(self.state, self.layout, dx)
 
     def plausible(self) -> bool:
