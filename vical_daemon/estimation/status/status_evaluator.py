@@ -174,7 +174,7 @@ class Judge:
             event = Event(EventKind.STAMP_JITTER, report.camera, float(jitter_s))
             self.announce(event, once=f"jitter {report.camera}")
         lens = f.agreement[report.camera]
-        if lens.model == RADTAN and lens.moved.any():
+        if lens.model == RADTAN and lens.moved.any() and f.layout.lens_free(report.camera):
             self.announce(Event(EventKind.LENS_TERM_MISSING, report.camera), once=f"lens {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
