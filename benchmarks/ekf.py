@@ -153,7 +153,7 @@ class EkfSubject:
         self._base_ns = 0
 
     def add_imu(self, t_ns: int, gyro: FloatArray, force: FloatArray) -> None:
-        """See `benchmarks.feed.Subject`."""
+        """See `vical_mocks.harness.feed.Subject`."""
         if not self._rows:
             self._base_ns = t_ns
         self._rows.append(np.concatenate([[(t_ns - self._base_ns) * 1e-9], gyro, force]))
@@ -162,7 +162,7 @@ class EkfSubject:
         self._follow()
 
     def add_points(self, frame: PointsFrame) -> None:
-        """See `benchmarks.feed.Subject`."""
+        """See `vical_mocks.harness.feed.Subject`."""
         self._frames.append(frame)
         if self.starter is None:
             return
@@ -173,7 +173,7 @@ class EkfSubject:
             self.starter = None
 
     def finish(self) -> None:
-        """See `benchmarks.feed.Subject`."""
+        """See `vical_mocks.harness.feed.Subject`."""
 
     def _start(self, product: CalibrationFilter) -> None:
         state, sigmas = product.state, product.sigmas()
@@ -229,7 +229,7 @@ class EkfSubject:
         return np.vstack([ends[:1], inner, ends[1:]])
 
     def look(self, run: SimulatedRun, t_s: float, record: Record) -> Snapshot | None:  # noqa: ARG002
-        """See `benchmarks.feed.Subject`."""
+        """See `vical_mocks.harness.feed.Subject`."""
         if self.filter is None:
             return None
         x = self.filter.x

@@ -28,9 +28,10 @@ from vical_mocks.tracks import simulate_tracks
 
 from benchmarks import runner, scores
 from benchmarks.ekf import EkfSubject
-from vical_daemon.estimation.measurements import CalibrationOptions
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 
 TIMES_S = (10.0, 30.0, 60.0)
+_OFF_FOCAL, _OFF_CENTRE_PX, _OFF_K1 = 0.005, 5.0, 0.01  # one sigma of a lens that is off
 _PLACES = (
     ("p_imu_cam", slice(0, 3)),
     ("r_imu_cam", slice(3, 6)),
@@ -60,6 +61,8 @@ class Case:
         readout_told: The readout of a rolling shutter is told.
         crooked: The board is not as stated: see `vical_mocks.points.crooked_board`.
         board_size: True size of the board over its stated size.
+        lens_off: The lens is held (`lens_known`) at values that are off by 0.5 % of f, 5 px of the centre,
+            0.01 of k1, one sigma each; "stated": and the estimator is told these sigmas.
         imu_off: One sigma of each entry of the imu's matrices, of which the gyro's is symmetric (what is not
             is a turn of the imu's frame).
     """
@@ -79,6 +82,7 @@ class Case:
     readout_told: bool = True
     crooked: bool = False
     board_size: float = 1.0
+    lens_off: str = ""
     imu_off: float = 0.0
 
     @property
@@ -126,6 +130,8 @@ CASES: dict[str, Case] = {
     "imu averages over 2 ms": Case(
         lens_known=True, simulation={"imu_average_s": 0.002, "imu_rate_hz": 500.0}, trials=20
     ),
+    "lens held, not this camera's": Case(lens_known=True, lens_off="silent", trials=50),
+    "lens held, not this camera's, sigmas stated": Case(lens_known=True, lens_off="stated", trials=20),
     "straight board, its shape found": Case(estimate=frozenset({"target_shape"}), trials=20),
     "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
     "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),
@@ -191,6 +197,8 @@ def make_run(case: Case, seed: int, seconds: float) -> SimulatedRun:
 def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject:
     """The estimator of one trial: "vical" or "ekf"."""
     prior = camera_prior(run, seed, case.start, exact_lens=case.lens_known)
+    if case.lens_off:
+        prior = with_lens_off(prior, seed, told=case.lens_off == "stated")
     if not case.readout_told:
         prior = replace(prior, readout_s=0.0)
     options = CalibrationOptions(
@@ -203,6 +211,30 @@ def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject
     if kind == "ekf":
         return EkfSubject(options, prior, run.points_m)
     return CalibratorSubject(options, prior, None if case.target_free else board_points())
+
+
+def with_lens_off(prior: CameraPrior, seed: int, *, told: bool) -> CameraPrior:
+    """A lens that is not quite this camera's; `told`: with how well it is known."""
+    assert prior.intrinsics is not None
+    assert prior.distortion is not None
+    rng = np.random.default_rng([seed, 64])
+    fx, fy, cx, cy = prior.intrinsics
+    grown = 1.0 + _OFF_FOCAL * rng.standard_normal()
+    du, dv = _OFF_CENTRE_PX * rng.standard_normal(2)
+    k1 = prior.distortion[0] + _OFF_K1 * rng.standard_normal()
+    off = replace(
+        prior,
+        intrinsics=(fx * grown, fy * grown, cx + du, cy + dv),
+        distortion=(k1, *prior.distortion[1:]),
+    )
+    if not told:
+        return off
+    rest = (0.0,) * (len(prior.distortion) - 1)
+    return replace(
+        off,
+        intrinsics_sigma=(_OFF_FOCAL * fx, _OFF_FOCAL * fy, _OFF_CENTRE_PX, _OFF_CENTRE_PX),
+        distortion_sigma=(_OFF_K1, *rest),
+    )
 
 
 def bound_options(case: Case, run: SimulatedRun) -> BoundOptions:

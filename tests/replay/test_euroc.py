@@ -17,25 +17,52 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def test_reaches_kalibrs_result_from_rough_intrinsics_alone(capsys):
-    arguments = ["--target", str(FOLDER / "target.yaml"), "--initial", str(FOLDER / "initial.yaml")]
-    code = main(["calibrate", str(FOLDER), *arguments, "--fix", "intrinsics", "--json", "--quiet"])
-    result = json.loads(capsys.readouterr().out)
+def calibrated(capsys, initial: Path, *more: str, code: int = 0) -> dict:
+    arguments = ["--target", str(FOLDER / "target.yaml"), "--initial", str(initial)]
+    assert main(["calibrate", str(FOLDER), *arguments, *more, "--json", "--quiet"]) == code
+    return json.loads(capsys.readouterr().out)
+
+
+def seven(result: dict) -> tuple[np.ndarray, Rotation, np.ndarray]:
+    """Lever arm (m) and time shift (s), mounting, and the sigmas of [p r shift]."""
     camera = result["cameras"]["cam0"]
+    pose, shift = camera["T_imu_cam"], camera["timeshift_cam_imu_s"]
+    sigma = np.sqrt([*np.diag(pose["covariance"]), camera["timeshift_sigma_s"] ** 2])
+    return np.array([*pose["p_m"], shift]), Rotation.from_quat(np.roll(pose["q_wxyz"], -1)), sigma
+
+
+def test_with_the_published_lens_it_reaches_kalibrs_result_and_says_that_the_lens_is_another(
+    capsys, tmp_path
+):
+    """Kalibr held the same lens. It is not this camera's, and what that does is in the sigmas."""
+    result = calibrated(capsys, FOLDER / "initial.yaml", "--fix", "intrinsics", code=3)
     kalibr = yaml.safe_load((FOLDER / "reference_kalibr.yaml").read_text())["cam0"]
     T_cam_imu = np.array(kalibr["T_cam_imu"])
     R, p = T_cam_imu[:3, :3].T, -T_cam_imu[:3, :3].T @ T_cam_imu[:3, 3]
-    found = Rotation.from_quat(np.roll(camera["T_imu_cam"]["q_wxyz"], -1)).as_matrix()
-    assert code == 0
-    assert result["status"] == "converged"
-    assert np.linalg.norm(np.array(camera["T_imu_cam"]["p_m"]) - p) < 1.5e-3
-    assert np.rad2deg(Rotation.from_matrix(R.T @ found).magnitude()) < 0.06
-    assert camera["timeshift_cam_imu_s"] == pytest.approx(kalibr["timeshift_cam_imu"], abs=5e-5)
+    place, mounting, sigma = seven(result)
+    assert np.linalg.norm(place[:3] - p) < 1.5e-3
+    assert np.rad2deg((Rotation.from_matrix(R).inv() * mounting).magnitude()) < 0.06
+    assert place[3] == pytest.approx(kalibr["timeshift_cam_imu"], abs=1.5 * sigma[6])
     assert result["frames"] > 1400
     assert len(result["trace"]) == pytest.approx(70, abs=3)
-    sigma = np.sqrt(np.diag(camera["T_imu_cam"]["covariance"]))
-    assert np.all(sigma[:3] > 2e-4)  # honest: a plain filter claims 0.08 mm here
-    assert np.all(sigma[:3] < 2e-3)
+    kinds = [event["kind"] for event in result["events"]]
+    assert kinds.count("fixed_lens") == 1
+    assert not {"stamp_jitter", "bumped", "lens_term_missing"} & set(kinds)
+    assert result["status"] == "converging"
+    assert "leave it free" in result["reason"]
+    assert result["cameras"]["cam0"]["intrinsics"] == [458.654, 457.296, 367.215, 248.375]
+
+    lens = (FOLDER / "initial.yaml").read_text().replace("radtan", "plumb_bob")
+    with_k3 = tmp_path / "initial.yaml"
+    with_k3.write_text(lens.replace("1.76187114e-05]", "1.76187114e-05, 0.0]"))
+    free_place, free_mounting, free_sigma = seven(calibrated(capsys, with_k3))
+    away = np.concatenate(
+        [(place - free_place)[:3], (free_mounting.inv() * mounting).as_rotvec(), [place[3] - free_place[3]]]
+    )
+    assert np.abs(away / np.hypot(sigma, free_sigma)).max() < 3.0
+    assert np.abs(away[3:6]).max() > np.deg2rad(0.3)
+    # as large as what the lens does, or as a free lens leaves open, and no larger
+    assert np.all(sigma < 2.0 * np.maximum(np.abs(away), free_sigma))
 
 
 def test_a_lens_that_radtan_does_not_quite_fit_is_no_knock(capsys):

@@ -245,7 +245,13 @@ def _merge(given: CameraPrior, stored: CameraPrior, fix: tuple[str, ...]) -> Cam
     """Return the stored prior, with the fixed parameters of the config."""
     merged = replace(stored, readout_s=given.readout_s or stored.readout_s)
     if "intrinsics" in fix:
-        merged = replace(merged, intrinsics=given.intrinsics, distortion=given.distortion)
+        merged = replace(
+            merged,
+            intrinsics=given.intrinsics,
+            distortion=given.distortion,
+            intrinsics_sigma=given.intrinsics_sigma,
+            distortion_sigma=given.distortion_sigma,
+        )
     if "extrinsics" in fix:
         merged = replace(merged, T_imu_cam=given.T_imu_cam)
     if "timeshift" in fix:

@@ -82,6 +82,8 @@ def _check_lens(path: str, camera: CameraConfig, fix: tuple[str, ...]) -> Iterat
     model = lens.distortion_model
     if lens.distortion_coeffs is not None and (text := coefficients_error(model, lens.distortion_coeffs)):
         yield f"{path}.distortion_coeffs", text
+    if lens.distortion_sigma is not None and (text := coefficients_error(model, lens.distortion_sigma)):
+        yield f"{path}.distortion_sigma", text
     needed = {
         "intrinsics": ("intrinsics", lens.intrinsics),
         "extrinsics": ("T_cam_imu", lens.T_cam_imu),

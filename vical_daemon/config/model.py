@@ -33,6 +33,7 @@ HostName = Annotated[
     str, Bound(pattern=r"[A-Za-z0-9._-]{1,253}|[0-9A-Fa-f:]{2,45}", hint="a name without port")
 ]
 Focal = Annotated[float, Bound(above=0, high=1e5)]
+Sigma = Annotated[float, Bound(low=0, high=1e5)]
 Pixels = Annotated[int, Bound(low=16, high=16384)]
 Matrix4 = tuple[
     tuple[float, float, float, float],
@@ -81,11 +82,16 @@ class ImuConfig:
 
 @dataclass(frozen=True, slots=True)
 class LensConfig:
-    """Prior knowledge of a lens and its mounting, with Kalibr's keys."""
+    """Prior knowledge of a lens and its mounting, with Kalibr's keys.
+
+    `intrinsics_sigma` (px) and `distortion_sigma` say how well a lens is known that `calibration.fix` holds.
+    """
 
     distortion_model: Literal["radtan", "plumb_bob", "equidistant"] = "radtan"
     intrinsics: tuple[Focal, Focal, float, float] | None = None
     distortion_coeffs: tuple[float, ...] | None = None
+    intrinsics_sigma: tuple[Sigma, Sigma, Sigma, Sigma] | None = None
+    distortion_sigma: tuple[Sigma, ...] | None = None
     T_cam_imu: Matrix4 | None = None
     timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
     readout_s: Annotated[float, Bound(low=0, high=0.2)] = 0.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from vical_daemon.config import validation as schema
 from vical_daemon.config.cross_checks import coefficients_error, rigid_error
-from vical_daemon.config.model import Config, Focal, LensConfig, Matrix4
+from vical_daemon.config.model import Config, Focal, LensConfig, Matrix4, Sigma
 from vical_daemon.config.strict_yaml import ConfigError, Document, Value, read
 from vical_daemon.config.validation import Bound
 from vical_daemon.estimation.geometry.camera_model import RADTAN
@@ -32,12 +32,14 @@ Density = Annotated[float, Bound(above=0, high=10.0)]
 
 @dataclass(frozen=True, slots=True)
 class _KalibrCamera:
-    """The keys of one camera in a Kalibr camchain; those below `resolution` are accepted and ignored."""
+    """Keys of one camera in a Kalibr camchain, and ours; those below `resolution` are ignored."""
 
     camera_model: Literal["pinhole"] = "pinhole"
     distortion_model: Literal["radtan", "plumb_bob", "equidistant", "none"] = "radtan"
     intrinsics: tuple[Focal, Focal, float, float] | None = None
     distortion_coeffs: tuple[float, ...] | None = None
+    intrinsics_sigma: tuple[Sigma, Sigma, Sigma, Sigma] | None = None
+    distortion_sigma: tuple[Sigma, ...] | None = None
     T_cam_imu: Matrix4 | None = None
     timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
     line_delay: Annotated[float, Bound(low=0, high=1e-3, hint="seconds a line")] | None = None
@@ -120,6 +122,8 @@ def camera_prior(config: Config, name: str) -> CameraPrior:
         T_imu_cam=_inverse(lens.T_cam_imu),
         timeshift_cam_imu_s=lens.timeshift_cam_imu,
         readout_s=lens.readout_s,
+        intrinsics_sigma=lens.intrinsics_sigma,
+        distortion_sigma=lens.distortion_sigma,
     )
 
 
@@ -150,6 +154,8 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
     coefficients = None if camera.distortion_model == "none" else camera.distortion_coeffs
     if coefficients is not None and (text := coefficients_error(model, coefficients)):
         raise ConfigError(schema.mistake(document, f"{name}.distortion_coeffs", text))
+    if camera.distortion_sigma is not None and (text := coefficients_error(model, camera.distortion_sigma)):
+        raise ConfigError(schema.mistake(document, f"{name}.distortion_sigma", text))
     if camera.T_cam_imu is not None and (text := rigid_error(camera.T_cam_imu)):
         raise ConfigError(schema.mistake(document, f"{name}.T_cam_imu", text))
     resolution = camera.resolution or (0, 0)
@@ -162,6 +168,8 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
         T_imu_cam=_inverse(camera.T_cam_imu),
         timeshift_cam_imu_s=camera.timeshift_cam_imu,
         readout_s=readout_s,
+        intrinsics_sigma=camera.intrinsics_sigma,
+        distortion_sigma=camera.distortion_sigma,
     )
 
 

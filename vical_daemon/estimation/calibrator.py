@@ -30,8 +30,8 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.held_lens import HeldLens
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, Layout, make_layout
-from vical_daemon.estimation.noise import target_alternative as target_doubt
 from vical_daemon.estimation.plausible import stamp_sigma_problem, usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
 from vical_daemon.estimation.selection import clock_drift
@@ -75,7 +75,8 @@ class Calibrator:
         self.priors = dict(cameras)
         self.target = np.asarray(target_points_m, dtype=np.float64)
         self._states = options.estimate | _ALWAYS
-        if "intrinsics" not in options.fix:  # else what is missed may as well be the lens
+        self._held = self._held_lenses()
+        if "intrinsics" not in options.fix or self._held:  # else what is missed may as well be the lens
             self._states |= {hypotheses.TARGET}
         self.layout = self._lay_out()
         self.judge = Judge(options, self.layout)
@@ -101,7 +102,17 @@ class Calibrator:
 
     def _lay_out(self) -> Layout:
         models = {name: prior.distortion_model for name, prior in self.priors.items()}
-        return make_layout(models, fix=self.options.fix, estimate=self._states, target_m=self.target)
+        return make_layout(
+            models, fix=self.options.fix, estimate=self._states, target_m=self.target, held=self._held
+        )
+
+    def _held_lenses(self) -> dict[str, HeldLens]:
+        """Lenses whose errors matter to something that is estimated, by camera."""
+        fix = self.options.fix
+        if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
+            return {}
+        lenses = {name: HeldLens.of(prior) for name, prior in self.priors.items()}
+        return {name: lens for name, lens in lenses.items() if lens is not None}
 
     def _new_starting(self, off: Collection[str] = ()) -> Starting:
         """For a rig of which it is known what is not as stated."""
@@ -338,9 +349,6 @@ class Calibrator:
         for block, event in self._beyond_doubt.look(f).items():
             self.judge.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
-        doubt = target_doubt.announcement(f.doubt)
-        if doubt is not None:
-            self.judge.announce(doubt, once=hypotheses.TARGET)
         return [report]
 
     def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
@@ -366,14 +374,19 @@ class Calibrator:
             self._restart(f)
 
     def _shift_stepped(self, f: CalibrationFilter, camera: str) -> bool:
-        """See whether images disagree because the time shift stepped; then go on with that alone unknown."""
+        """See whether images disagree because the time shift stepped; then go on with that alone unknown.
+
+        Asked of the calibration as it was before: images after the step have moved the present one, above all
+        its lens, until the misfit is no longer one of the time shift alone.
+        """
         assert self._buffer is not None
         if self.layout.cameras[camera].timeshift is None or f.unshown is not None:
             return False
-        fit = self._past.find_shift(f, camera, self._buffer, self.target)
+        before = self._past.filter(f)
+        fit = self._past.find_shift(before, camera, self._buffer, self.target)
         if fit is None or not fit.stepped:
             return False
-        self.filter = self._past.filter(f)
+        self.filter = before
         step_s = self._set_shift(self.filter, camera, fit)
         self._unproven = (f.state.t_s + _STANDS_S, camera, fit.timeshift_s - step_s)
         self._lose_motion()
@@ -406,6 +419,8 @@ class Calibrator:
         before = self._past.filter(f)
         sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
         for name, camera in sound.state.cameras.items() if sound else ():
+            if not self.layout.lens_free(name):
+                continue
             self.priors[name] = replace(
                 self.priors[name],
                 intrinsics=tuple(camera.intrinsics.tolist()),

@@ -39,7 +39,7 @@ class EventKind(StrEnum):
     ACCEL_LAG = "accel_lag"
     TARGET_SIZE = "target_size"
     TARGET_SHAPE = "target_shape"
-    TARGET_OR_LENS = "target_or_lens"
+    FIXED_LENS = "fixed_lens"
     ROLLING_SHUTTER = "rolling_shutter"
     LENS_TERM_MISSING = "lens_term_missing"
     DEVICE_REPLACED = "device_replaced"
@@ -273,11 +273,11 @@ REFERENCE: dict[EventKind, About] = {
         "m",
         "Once, at a probability above 99 %.",
     ),
-    EventKind.TARGET_OR_LENS: About(
-        "With the lens fixed: target file or lens is wrong. Value: largest distance of a corner from "
-        "where the target file puts it.",
-        "m",
-        "Once, at 5 sigma.",
+    EventKind.FIXED_LENS: About(
+        "The fixed lens is not this camera's; its values are kept and the sigmas allow for their errors. "
+        "Value: how far it projects points from where they appear, RMS over the image.",
+        "px",
+        "Once per camera, at a probability above 99 %.",
     ),
     EventKind.ROLLING_SHUTTER: About(
         "A rolling shutter that the config does not mention; its readout is estimated. Value: readout, where "

@@ -40,6 +40,8 @@ class CameraPrior:
         T_imu_cam: (R_imu_cam (3,3), p_imu_cam (3,)) or None: nothing known, found from the data.
         timeshift_cam_imu_s: t_imu = t_cam + shift, s; None: nothing known, found from the data.
         readout_s: Rolling-shutter readout, first to last row, s; 0: global shutter.
+        intrinsics_sigma: How well fx fy cx cy are known where they are held, px; None: exactly.
+        distortion_sigma: Likewise the coefficients.
     """
 
     resolution: tuple[int, int]
@@ -49,6 +51,8 @@ class CameraPrior:
     T_imu_cam: tuple[FloatArray, FloatArray] | None = None
     timeshift_cam_imu_s: float | None = None
     readout_s: float = 0.0
+    intrinsics_sigma: tuple[float, float, float, float] | None = None
+    distortion_sigma: tuple[float, ...] | None = None
 
     def coefficients(self) -> FloatArray:
         """The distortion as given, zeros where it is not, shape (d,)."""

@@ -46,7 +46,7 @@ class CameraEstimate:
         timeshift_cam_imu_s: t_imu = t_cam + timeshift_cam_imu_s, s.
         timeshift_sigma_s: Its standard deviation, s.
         intrinsics: fx fy cx cy, px.
-        intrinsics_sigma: Standard deviations, px (0 where held fixed).
+        intrinsics_sigma: Standard deviations, px (where held fixed: 0 unless images contradict the values).
         distortion_model: radtan, plumb_bob or equidistant.
         distortion: Its coefficients.
         distortion_sigma: Standard deviations.

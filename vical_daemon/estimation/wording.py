@@ -380,11 +380,11 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
             "its shape is estimated from now on"
         ),
     ),
-    EventKind.TARGET_OR_LENS: (
+    EventKind.FIXED_LENS: (
         "",
         lambda e: (
-            f"corners are up to {_of(e, 1e3, 'mm', '.1f')} from where the target file puts them: wrong "
-            "target file, bent board, or the fixed lens is not this camera's"
+            f"the fixed lens is not this camera's: points appear {_of(e, 1.0, 'px', '.1f')} (RMS) from where "
+            "it projects them; the sigmas allow for it; without `fix: [intrinsics]` the lens is estimated"
         ),
     ),
     EventKind.ROLLING_SHUTTER: ("", _rolling),

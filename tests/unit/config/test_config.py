@@ -81,6 +81,8 @@ def test_the_example_mentions_every_key_of_the_schema() -> None:
         ("lens:\n", "lens:\n      distortion_model: fov\n", "cameras.cam0.lens.distortion_model: the text 'fov' is none of radtan, plumb_bob, equidistant (config line 10)"),
         ("lens:\n", "lens:\n      distortion_coeffs: [0, 0, 0]\n", "cameras.cam0.lens.distortion_coeffs: expected 4 values (k1 k2 p1 p2 of radtan), found 3 (config line 10)"),
         ("lens:\n", "lens:\n      distortion_model: plumb_bob\n      distortion_coeffs: [0, 0, 0, 0]\n", "cameras.cam0.lens.distortion_coeffs: expected 5 values (k1 k2 p1 p2 k3 of plumb_bob), found 4 (config line 11)"),
+        ("lens:\n", "lens:\n      distortion_sigma: [0.1]\n", "cameras.cam0.lens.distortion_sigma: expected 4 values (k1 k2 p1 p2 of radtan), found 1 (config line 10)"),
+        ("lens:\n", "lens:\n      intrinsics_sigma: [-1, 1, 1, 1]\n", "cameras.cam0.lens.intrinsics_sigma.0: -1 is below 0 (config line 10)"),
         ("lens:\n", "lens:\n      T_cam_imu: [[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]\n", "cameras.cam0.lens.T_cam_imu: the upper left 3x3 block is not a rotation (config line 10)"),
         ("target: board.yaml", "calibration: {}", "calibration.mode: target needs `target: FILE` (`vical target` makes one), or mode: target_free (config line 11)"),
         ("target: board.yaml", "target: b.yaml\ncalibration: {fix: [extrinsics]}", "cameras.cam0.lens: calibration.fix holds extrinsics, so T_cam_imu must be given here (config line 9)"),
@@ -228,10 +230,13 @@ class TestInitial:
             "cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n  distortion_coeffs: [0.1, 0.2, 0.3, 0.4]\n"
             "  distortion_model: equidistant\n  intrinsics: [1, 2, 3, 4]\n  resolution: [640, 400]\n"
             "  rostopic: /cam0/image_raw\n  timeshift_cam_imu: -0.012\n  line_delay: 2.5e-5\n"
+            "  intrinsics_sigma: [0.5, 0.6, 0.7, 0.8]\n  distortion_sigma: [0.01, 0.02, 0.0, 0.0]\n"
             "cam1: {T_cn_cnm1: [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]], distortion_model: none, distortion_coeffs: []}\n",
         )
         cam0 = initial.cameras["cam0"]
         assert cam0.distortion == (0.1, 0.2, 0.3, 0.4) and cam0.distortion_model == "equidistant"
+        assert cam0.intrinsics_sigma == (0.5, 0.6, 0.7, 0.8)
+        assert cam0.distortion_sigma == (0.01, 0.02, 0.0, 0.0)
         assert cam0.readout_s == pytest.approx(0.01) and cam0.timeshift_cam_imu_s == -0.012
         assert initial.cameras["cam1"].distortion is None and initial.imu_noise is None
 
@@ -252,6 +257,7 @@ class TestInitial:
                 "cam0: {distortion_coeffs: [1, 2, 3, 4, 5]}",
                 r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5",
             ),
+            ("cam0: {distortion_sigma: [1]}", r"distortion_sigma: expected 4 values"),
             ("cam0: {camera_model: omni}", "none of pinhole"),
             ("camera: {}\nlidar0: {}", "unknown section"),
             ("cam0: 5", "unknown key"),

@@ -50,7 +50,6 @@ from vical_daemon.estimation.noise.consistency import Consistency, normalised
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
-from vical_daemon.estimation.noise.target_alternative import TargetDoubt
 
 _EYE = np.eye(3)
 _TINY = 1e-30 * np.eye(9)  # noise densities may be told as zero
@@ -72,7 +71,6 @@ class CalibrationFilter:
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
         shared: Measured errors that the corners of an image share, by camera.
-        doubt: Whether the target is as stated, by camera, where the lens is held; else empty.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
@@ -91,7 +89,6 @@ class CalibrationFilter:
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     shared: dict[str, SharedErrors] = field(default_factory=dict)
-    doubt: dict[str, TargetDoubt] = field(default_factory=dict)
     unshown: UnshownAxes | None = None
     drifting: set[str] = field(default_factory=set)
     off: set[str] = field(default_factory=set)
@@ -134,13 +131,14 @@ class CalibrationFilter:
     def _grow(self, moved: Moved, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
         n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
-        A = np.zeros((n, n + c + 9))
-        A[:, :n] = self.S
+        A = self.S.copy()
         A[:9, :d] = moved.linear
         self._drift_shifts(A, moved.seconds)
-        A[:9, n : n + c] = moved.curved
-        A[:9, n + c :] = unscented.root(Q)
-        self.S = unscented.lower_root(np.concatenate([A, self._random_walk(moved.seconds)], axis=1))
+        noise = np.zeros((n, c + 9))
+        noise[:9, :c] = moved.curved
+        noise[:9, c:] = unscented.root(Q)
+        noise = np.concatenate([noise, self._random_walk(moved.seconds)], axis=1)
+        self.S = unscented.lower_root_grown(A, noise, d)
 
     # ------------------------------------------------------------------ update
     def update(self, image: Image) -> FrameReport:
@@ -168,7 +166,7 @@ class CalibrationFilter:
         self._pay_for_jitter(image.camera)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
-        residual = fit.left * image.sigma_px[:, None]
+        residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
         self.consistency[image.camera].learn(
             lin.z[keep], innovation[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
         )
@@ -185,6 +183,21 @@ class CalibrationFilter:
             noise.sigma_px,
             predicted_px=predicted,
         )
+
+    def _by_held(self, lin: Linear) -> FloatArray:
+        """What residuals gain where lenses that are held are taken as stated, px, shape (n, 2), or 0."""
+        if not self.layout.held:
+            return np.zeros(())
+        lenses = self.layout.held.items()
+        rows = np.concatenate([self.S[self.layout.lens(name)] for name, _ in lenses])
+        off = [
+            np.concatenate([c.intrinsics, c.distortion]) - lens.values
+            for (_, lens), c in ((item, self.state.cameras[item[0]]) for item in lenses)
+        ]
+        L = unscented.root(rows @ rows.T)
+        weights = unscented.solve_lower(L, unscented.solve_lower(L, np.concatenate(off)), transposed=True)
+        moved = lin.ways @ (lin.by_error @ (self.S @ (rows.T @ weights)))
+        return np.asarray(moved.reshape(-1, 2))
 
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
         """The linearised image with the noise that its corners share."""
@@ -254,7 +267,6 @@ class CalibrationFilter:
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
-        self.S = S
         turned = [ATTITUDE] + [c.rotation for c in self.layout.cameras.values() if c.rotation is not None]
         if max(float(np.abs(dx[s]).max()) for s in turned) > 1e-4:
             for s in turned:
@@ -262,8 +274,8 @@ class CalibrationFilter:
                 J = np.eye(3) + np.array(
                     [[0, half[2], -half[1]], [-half[2], 0, half[0]], [half[1], -half[0], 0]]
                 )
-                self.S[s] = J @ self.S[s]
-            self.S = unscented.lower_root(self.S)
+                unscented.turn_rows(S, s, J)
+        self.S = S
         self.state = retract(self.state, self.layout, dx)
 
     def plausible(self) -> bool:
@@ -370,7 +382,7 @@ class CalibrationFilter:
             },
         )
         self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
-        self.agreement, self.doubt, self.walk = known.agreement, known.doubt, known.walk
+        self.agreement, self.walk = known.agreement, known.walk
         self.drifting, self.off, self.began_s = known.drifting, known.off, known.began_s
         for consistency in self.consistency.values():
             consistency.settle()

@@ -11,17 +11,16 @@ from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import shared_ways
-from vical_daemon.estimation.noise.target_alternative import TargetDoubt
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 
 
 def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> None:
-    """Take what an image says about shared errors, lens and target.
+    """Take what an image says about shared errors and lens.
 
     Args:
-        f: The filter, still as predicted; its `shared`, `agreement` and `doubt` learn.
+        f: The filter, still as predicted; its `shared` and `agreement` learn.
         image: The image.
         lin: The image about the prediction.
         fit: Its correction, not yet accepted.
@@ -34,12 +33,9 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
         level = f.consistency[image.camera].level
         by_shared = ways @ (lin.by_error @ shared_ways(f.state, f.layout, image.camera))
         shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
-    doubt = f.doubt.get(image.camera)
     if where.intrinsics is not None and where.distortion is not None and agreement is not None:
         by_lens = lin.by_error[:, where.intrinsics.start : where.distortion.stop]
         _ask_lens(f, agreement, image, lin, fit, by_lens)
-    elif doubt is not None and doubt.due(f.state.t_s):
-        _ask_target(f, doubt, image, lin, fit)
 
 
 def _ask_lens(
@@ -58,13 +54,3 @@ def _ask_lens(
     camera = f.state.cameras[image.camera]
     values = np.concatenate([camera.intrinsics, camera.distortion])
     agreement.learn(f.state.t_s, innovation, ways @ lin.by_error[:, :6], ways @ by_lens, values)
-
-
-def _ask_target(f: CalibrationFilter, doubt: TargetDoubt, image: Image, lin: Linear, fit: ImageFit) -> None:
-    """What an image would have the target's shape be, with the lens held."""
-    ways, innovation = whitened(image, lin, fit.keep)
-    by_pose = ways @ lin.by_error[:, :6]
-    # a point that moves in the world looks as if the camera moved the other way
-    by_place = -by_pose[:, 3:].reshape(-1, 2, 3)
-    by_shape = (by_place @ doubt.modes.fields(image.points[fit.keep])).reshape(len(ways), -1)
-    doubt.learn(f.state.t_s, innovation, by_pose, by_shape)

@@ -11,6 +11,8 @@ from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS, CameraSli
 from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
 
+_ROUNDING = 1e-9  # of the sigma of a lens that is off: less is arithmetic
+
 
 def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float) -> CameraEstimate:
     """One camera as it is known now.
@@ -20,7 +22,8 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     much as stretches of the data disagree about it (see `lens_agreement`), and as detectors allow
     (`lens_limit`).
     """
-    camera, where = f.state.cameras[name], f.layout.cameras[name]
+    camera, where, held = f.state.cameras[name], f.layout.cameras[name], f.layout.held.get(name)
+    lens = np.concatenate([camera.intrinsics, camera.distortion]) if held is None else held.values
     spread = float(np.sqrt(f.consistency[name].factor))
     sigma = spread * f.sigmas()
     lens_sigma = _lens_sigmas(f, name, spread)
@@ -33,10 +36,10 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         ),
         float(camera.timeshift_s),
         _timeshift_sigma(f, sigma, where),
-        camera.intrinsics.tolist(),
+        lens[:4].tolist(),
         lens_sigma[:4].tolist(),
         camera.distortion_model,
-        camera.distortion.tolist(),
+        lens[4:].tolist(),
         lens_sigma[4:].tolist(),
         float(reprojection_rms_px),
         float(f.corner_noise[name].sigma_px),
@@ -48,11 +51,15 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
 
 
 def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
-    """Of fx fy cx cy and the distortion, shape (n,); zeros where held."""
-    camera, where, agreement = f.state.cameras[name], f.layout.cameras[name], f.agreement[name]
+    """Of fx fy cx cy and the distortion, shape (n,); where held: as far as images contradict the values."""
+    camera, where = f.state.cameras[name], f.layout.cameras[name]
     if where.intrinsics is None or where.distortion is None:
         return np.zeros(4 + len(camera.distortion))
     raw = f.sigmas()
+    if name in f.layout.held:
+        told = spread * raw[f.layout.lens(name)]
+        return np.where(told > _ROUNDING * f.layout.held[name].off_sigma, told, 0.0)
+    agreement = f.agreement[name]
     filtered = np.maximum(np.sqrt(agreement.factors), spread) * np.concatenate(
         [raw[where.intrinsics], raw[where.distortion]]
     )

@@ -73,7 +73,7 @@ def attempt(data: StartData) -> StartResult:
     rough: dict[str, _Rough] = {}
     for name in data.priors:
         lens, poses = _poses(data, name)
-        needed = 20 if data.layout.cameras[name].intrinsics is None else 30
+        needed = 30 if data.layout.lens_free(name) else 20
         if len(poses) < needed:
             return StartResult(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
@@ -162,7 +162,7 @@ def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, 
     if data.layout.cameras[name].readout is not None:
         readout_s = readout(data.frames[name], lens, data.target, readout_s)
     frames = at_middle_row(data.frames[name], readout_s, rows)
-    if data.layout.cameras[name].intrinsics is not None:
+    if data.layout.lens_free(name):
         estimate_intrinsics(lens, [f for _, f in frames], data.target)
     cache = data.caches.setdefault(name, PoseCache())
     lens.readout_s = readout_s

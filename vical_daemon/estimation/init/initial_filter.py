@@ -24,7 +24,6 @@ from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import SharedErrors
-from vical_daemon.estimation.noise.target_alternative import TargetDoubt
 from vical_daemon.estimation.selection.clock_drift import SKEW_SIGMA
 from vical_daemon.estimation.selection.model_acceptance import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.selection.model_selection import (
@@ -75,18 +74,9 @@ def wide_filter(
         consistency,
         agreement,
         shared,
-        _doubts(layout),
         unshown,
         off=off,
     )
-
-
-def _doubts(layout: Layout) -> dict[str, TargetDoubt]:
-    """Whether the target is as stated is asked where its shape is no state."""
-    modes = layout.target_modes
-    if modes is None or layout.target_shape is not None:
-        return {}
-    return {name: TargetDoubt(modes) for name in layout.cameras}
 
 
 def _before_board_m(state: State, camera: str) -> float:
@@ -123,6 +113,8 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection
             s[where.timeshift], s[where.skew] = 5e-3, SKEW_SIGMA
         if where.intrinsics is not None and where.distortion is not None:
             s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
+            if name in layout.held:
+                s[where.intrinsics.start : where.distortion.stop] = layout.held[name].off_sigma
         if where.readout is not None:
             s[where.readout] = 0.01
     return s

@@ -174,7 +174,7 @@ def _about(
         p_world_imu=state.p_world_imu,
         v_world_imu=state.v_world_imu,
         cameras={name: replace(camera, skew=0.0) for name, camera in told.state.cameras.items()},
-        # expected as stated, not near what was found last
+        # expected as stated, not near what was found last (as a lens that is held is told)
         target_scale=state.target_scale,
         target_shape=state.target_shape,
         gyro_matrix=state.gyro_matrix,
@@ -188,6 +188,9 @@ def _about(
     for where in (trial.layout.target_shape, trial.layout.gyro_matrix, trial.layout.accel_matrix):
         if where is not None:
             narrow[where] = wide[where]
+    for name in trial.layout.held:
+        lens = trial.layout.lens(name)
+        narrow[lens] = wide[lens]
     for at in (trial.layout.accel_lag, trial.layout.target_scale):
         if at is not None:
             narrow[at] = wide[at]

@@ -14,6 +14,7 @@ from vical_daemon.estimation.geometry.camera_model import (
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 
 _NEWTON_STEPS = 25
+_PATCHES = (8, 6)
 _NEWTON_DONE = 1e-14  # step in normalised units (focal lengths); a millionth of a pixel is 1e-9
 
 
@@ -49,6 +50,16 @@ def unproject(
     sine_ratio = np.where(theta_d > 0.0, np.sin(theta) / np.where(theta_d > 0.0, theta_d, 1.0), 1.0)
     rays = np.concatenate((d * sine_ratio[..., None], np.cos(theta)[..., None]), axis=-1)
     return rays, ok
+
+
+def rays_over_image(
+    intrinsics: FloatArray, distortion: FloatArray, model: str, resolution: tuple[int, int]
+) -> FloatArray:
+    """Return rays through the centres of eight by six patches of an image, where they exist, shape (n, 3)."""
+    u, v = ((np.arange(n) + 0.5) * (size / n) for n, size in zip(_PATCHES, resolution, strict=True))
+    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    rays, ok = unproject(uv, intrinsics, distortion, model)
+    return np.asarray(rays[ok])
 
 
 def undistort(

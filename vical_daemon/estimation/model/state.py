@@ -15,6 +15,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.held_lens import HeldLens
 from vical_daemon.estimation.model.target_modes import MODES, TargetModes
 
 MOTION = slice(0, 9)  # attitude rad, position m, velocity m/s: what moves
@@ -57,6 +58,7 @@ class Layout:
         target_scale: Relative size of the board, index or None.
         target_shape: How far the board is off in each of its modes, m; None: as stated.
         target_modes: The ways in which it may be off; None: no target.
+        held: Lenses that are held and whose errors are states all the same, by camera.
     """
 
     size: int
@@ -68,6 +70,18 @@ class Layout:
     target_scale: int | None
     target_shape: slice | None = None
     target_modes: TargetModes | None = None
+    held: Mapping[str, HeldLens] = field(default_factory=dict)
+
+    def lens(self, camera: str) -> slice:
+        """Where fx fy cx cy and the distortion of a lens lie, which must be among the errors."""
+        where = self.cameras[camera]
+        assert where.intrinsics is not None
+        assert where.distortion is not None
+        return slice(where.intrinsics.start, where.distortion.stop)
+
+    def lens_free(self, camera: str) -> bool:
+        """Whether a lens is estimated, not held."""
+        return self.cameras[camera].intrinsics is not None and camera not in self.held
 
 
 def make_layout(
@@ -76,6 +90,7 @@ def make_layout(
     fix: frozenset[str],
     estimate: frozenset[str],
     target_m: FloatArray | None = None,
+    held: Mapping[str, HeldLens] | None = None,
 ) -> Layout:
     """Lay the error state out.
 
@@ -84,6 +99,7 @@ def make_layout(
         fix: Names as in `CalibrationOptions`.
         estimate: Likewise.
         target_m: Points of the target, m, shape (n, 3); None: no target.
+        held: Lenses whose errors are states although they are in `fix`, by camera.
     """
     at = _CORE
     gyro_matrix = accel_matrix = None
@@ -105,7 +121,7 @@ def make_layout(
     for name, model in models.items():
         position, rotation = take("extrinsics" not in fix, 3), take("extrinsics" not in fix, 3)
         shift, skew = take("timeshift" not in fix, 1), take("timeshift" not in fix, 1)
-        lens = "intrinsics" not in fix
+        lens = "intrinsics" not in fix or name in (held or {})
         intrinsics, distortion = take(lens, 4), take(lens, len(COEFFICIENTS[model]))
         readout = take("readout" in estimate, 1)
         blocks[name] = CameraSlices(
@@ -130,6 +146,7 @@ def make_layout(
         scale.start if scale else None,
         shape,
         modes,
+        dict(held or {}),
     )
 
 

@@ -89,6 +89,33 @@ def lower_root(columns: FloatArray) -> FloatArray:
     return L * np.where(L.diagonal() < 0.0, -1.0, 1.0)
 
 
+def lower_root_grown(A: FloatArray, columns: FloatArray, d: int) -> FloatArray:
+    """Return lower-triangular L with L L^T = A A^T + C C^T, in two smaller QRs than `lower_root` of [A C].
+
+    Args:
+        A: Square; its first `d` rows are zero from column `d` on, shape (n, n).
+        columns: C, shape (n, k).
+        d: Number of leading rows.
+    """
+    R = upper_root(np.concatenate([A[:, :d], columns], axis=1).T)
+    L = np.zeros_like(A)
+    L[:, :d] = R[:d].T * np.where(R.diagonal()[:d] < 0.0, -1.0, 1.0)
+    L[d:, d:] = lower_root(np.concatenate([A[d:, d:], R[d:, d:].T], axis=1))
+    return L
+
+
+def turn_rows(S: FloatArray, where: slice, J: FloatArray) -> None:
+    """Multiply rows of a lower-triangular S by a square J from the left, in place; S stays lower triangular.
+
+    Only the diagonal block of these rows loses its form; a rotation of its columns restores it.
+    """
+    Q, R = np.linalg.qr((J @ S[where, where]).T)
+    Q = Q * np.where(R.diagonal() < 0.0, -1.0, 1.0)
+    S[where, : where.start] = J @ S[where, : where.start]
+    S[where, where] = np.tril(J @ S[where, where] @ Q)
+    S[where.stop :, where] = S[where.stop :, where] @ Q
+
+
 def upper_root(rows: FloatArray) -> FloatArray:
     """Return R, zero below the diagonal, with R^T R = A^T A for A (m, n), by QR; shape (min(m, n), n)."""
     qr, _, _, _ = dgeqrf(rows)

@@ -6,13 +6,12 @@ import numpy as np
 
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.camera_rays import rays_over_image
 from vical_daemon.estimation.model.state import CameraState
 
 _SYSTEMATIC_PX = 0.003
 """Error that corners of one patch of the image share for ever, px; the curvature of edges alone makes up to
 0.005 px at the border of a picture (docs/detection.md)."""
-_PATCHES = (8, 6)
 
 
 def limit(camera: CameraState) -> FloatArray:
@@ -20,10 +19,8 @@ def limit(camera: CameraState) -> FloatArray:
 
     Least squares of the lens to patches, eight by six over the image, that are each off by as much.
     """
-    u, v = ((np.arange(n) + 0.5) * (size / n) for n, size in zip(_PATCHES, camera.resolution, strict=True))
-    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    rays, ok = unproject(uv, camera.intrinsics, camera.distortion, camera.distortion_model)
-    by = project_jacobians(rays[ok], camera.intrinsics, camera.distortion, camera.distortion_model)[2]
+    rays = rays_over_image(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)
+    by = project_jacobians(rays, camera.intrinsics, camera.distortion, camera.distortion_model)[2]
     flat = by.reshape(-1, by.shape[-1])
     size = np.linalg.norm(flat, axis=0)  # columns of px and of px per unit of distortion
     information = (flat / size).T @ (flat / size)

@@ -18,6 +18,7 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.selection.model_selection import lenses_known
 
 SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s, one sigma; two poor crystals."""
@@ -100,30 +101,29 @@ def let_drift(f: CalibrationFilter, camera: str, *, anew: bool) -> Event:
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
     """Return the filter as it is to be told: mean and covariance over both hypotheses, for each camera."""
     for name in f.layout.cameras:
-        f = _mixed(f, name, apart(f, name))
+        f = _mixed(f, name, apart(f, name), lenses_known(f))
     return f
 
 
 def as_if_alike(f: CalibrationFilter, camera: str) -> CalibrationFilter:
     """Return the filter on the assumption that this camera's clock does not drift."""
-    return _mixed(f, camera, 0.0)
+    return _mixed(f, camera, 0.0, f.S)
 
 
-def _mixed(f: CalibrationFilter, camera: str, p: float) -> CalibrationFilter:
+def _mixed(f: CalibrationFilter, camera: str, p: float, S: FloatArray) -> CalibrationFilter:
     """The mixture: with probability `p` what the filter says, else that conditioned on no drift.
 
     With k = P e / sigma the column of the drift and z = drift / sigma, conditioning moves the mean by -k z
     and takes k k' off P; the mixture goes (1 - p) of that way, and its covariance is
-    P - (1 - p)(1 - p z^2) k k'.
+    P - (1 - p)(1 - p z^2) k k'. The gain k / sigma is that of the covariance S S'.
     """
     index = f.layout.cameras[camera].skew
     if index is None or p == 1.0:
         return f
-    sigma = float(np.sqrt(f.S[index] @ f.S[index]))
-    u = f.S[index] / sigma
-    k = f.S @ u
+    sigma = float(np.sqrt(S[index] @ S[index]))
+    k = S @ (S[index] / sigma)
     z = f.state.cameras[camera].skew / sigma
     square = z * z / f.consistency[camera].factor  # of what is told, which is `factor` times P
     less = (1.0 - p) * (1.0 - p * square)
-    S: FloatArray = f.S - (1.0 - np.sqrt(1.0 - less)) * np.outer(k, u)
-    return replace(f, state=retract(f.state, f.layout, -(1.0 - p) * z * k), S=S)
+    mixed: FloatArray = f.S - (1.0 - np.sqrt(1.0 - less)) * np.outer(k / sigma, f.S[index])
+    return replace(f, state=retract(f.state, f.layout, -(1.0 - p) * z * k), S=mixed)

@@ -15,12 +15,14 @@ from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.selection.model_selection import (
     IMU,
     LAG,
+    OFF,
     SIZE,
     SURE,
     TARGET,
     Block,
     blocks,
     factor,
+    lens_block,
     not_zero,
     weights,
 )
@@ -31,6 +33,7 @@ KNOWN_SIZE_SIGMA = 0.1
 """Of the size of a target that is known to be off, or where it is asked for, relative."""
 _EVERY_S = 1.0
 _MEASURED = 400  # images
+_SEEN = 100  # images, as many as `consistency` wants
 _KINDS = {
     IMU: EventKind.IMU_INTRINSICS,
     LAG: EventKind.ACCEL_LAG,
@@ -60,7 +63,7 @@ def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
     (P^-1 - c E E')^-1 = P + P E (I/c - E' P E)^-1 E' P, and the mean moves by P E (I/c - E' P E)^-1 E' x.
     """
     entries = f.S[block.where]
-    c = block.sigma**-2.0 - sigma**-2.0
+    c = float(block.sigma[0]) ** -2.0 - sigma**-2.0
     L = root(np.eye(len(entries)) / c - entries @ entries.T)
     W = solve_lower(L, entries @ f.S.T).T
     dx = W @ solve_lower(L, block.values)
@@ -83,15 +86,39 @@ class BeyondDoubt:
             return {}
         self._next_s = f.state.t_s + _EVERY_S
         shares = weights(f)
-        # a lag is small beside what images that do not fit do: only once that is measured is it known
-        early = {LAG} if max(c.images for c in f.consistency.values()) < _MEASURED else set()
-        known = [n for n in blocks(f) if n not in f.off | early and not_zero(shares, n) > SURE]
+        every, images = blocks(f), max(c.images for c in f.consistency.values())
+        known = [
+            name
+            for name in every
+            if name not in f.off and not_zero(shares, name) > SURE and images >= _needed(name, every, shares)
+        ]
         return {name: _off(f, name) for name in known}
+
+
+def _needed(name: str, every: dict[str, Block], shares: dict[tuple[str, ...], float]) -> int:
+    """Images before a block is announced.
+
+    A lag is small beside what images that do not fit do: only once that is measured is it known. The same
+    holds for whatever seems to be off beside a fixed lens that is wrong; the first images may show either.
+    """
+    held = [other for other, block in every.items() if block.held]
+    if name in held:
+        return 0
+    if name == LAG or any(not_zero(shares, other) > OFF for other in held):
+        return _MEASURED
+    return _SEEN if held else 0
 
 
 def _off(f: CalibrationFilter, name: str) -> Event:
     """Let a block stand by itself; return the announcement."""
+    block = blocks(f)[name]
     f.off.add(name)
+    if block.held:
+        camera = next(c for c in f.layout.held if lens_block(c) == name)
+        found, held = f.state.cameras[camera], f.layout.held[camera]
+        values = np.concatenate([found.intrinsics, found.distortion])
+        off_px = held.displacement_px(values, found.distortion_model, found.resolution)
+        return Event(EventKind.FIXED_LENS, camera, off_px)
     if name in _KNOWN_SIGMA:
         _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
     if name == TARGET:  # what stretches said of the lens, they said with the target as stated

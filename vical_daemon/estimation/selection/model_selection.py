@@ -5,12 +5,14 @@ would make the answer up to three times less certain; to take those that are a l
 stated sigmas off. So the filter always has them among its states. That some of them, or all, are zero are
 hypotheses beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how
 far the states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the
-mixture.
-[docs/math/filter.md, eq. (18)]
+mixture. A lens that is held is one of these things; but what is told then is the calibration that belongs to
+the stated lens, and how far the mixture lies from that.
+[docs/math/filter.md, eq. (18) and (19)]
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -40,6 +42,7 @@ SURE = 0.99
 """Probability from which on a block is known to be off."""
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
+_RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as stated has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +52,36 @@ class Block:
     Attributes:
         where: Among the errors.
         values: As estimated, shape (n,).
-        sigma: Of their prior, each.
+        sigma: Of their prior, shape (n,).
+        stated: How well they are known where what they describe is as stated, shape (n,); zeros: exactly.
+        held: They are told as zero in any case.
     """
 
     where: slice
     values: FloatArray
-    sigma: float
+    sigma: FloatArray
+    stated: FloatArray
+    held: bool = False
+
+    @classmethod
+    def of(cls, where: slice, values: FloatArray, sigma: float) -> Block:
+        """Make one of values that are exactly zero where all is as stated."""
+        return cls(where, values, np.full(len(values), sigma), np.zeros(len(values)))
+
+    @property
+    def share(self) -> FloatArray:
+        """What is stated over the prior, shape (n,)."""
+        return self.stated / self.sigma
+
+    @property
+    def noise(self) -> FloatArray:
+        """Sigma of a measurement of zero that makes the prior what is stated, shape (n,)."""
+        return np.asarray(self.stated / np.sqrt(1.0 - self.share**2))
+
+
+def lens_block(camera: str) -> str:
+    """Name of the block of a lens that is held."""
+    return f"lens of {camera}"
 
 
 def blocks(f: CalibrationFilter) -> dict[str, Block]:
@@ -64,32 +91,59 @@ def blocks(f: CalibrationFilter) -> dict[str, Block]:
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         off = state.accel_matrix - np.eye(3)
         entries = np.concatenate([(state.gyro_matrix - np.eye(3)).ravel(), off[LOWER[:, 0], LOWER[:, 1]]])
-        found[IMU] = Block(slice(layout.gyro_matrix.start, layout.accel_matrix.stop), entries, ENTRY_SIGMA)
+        where = slice(layout.gyro_matrix.start, layout.accel_matrix.stop)
+        found[IMU] = Block.of(where, entries, ENTRY_SIGMA)
     if layout.accel_lag is not None:
         where = slice(layout.accel_lag, layout.accel_lag + 1)
-        found[LAG] = Block(where, np.array([state.accel_lag_s]), LAG_SIGMA_S)
+        found[LAG] = Block.of(where, np.array([state.accel_lag_s]), LAG_SIGMA_S)
     if layout.target_scale is not None:
         where = slice(layout.target_scale, layout.target_scale + 1)
-        found[SIZE] = Block(where, np.array([state.target_scale - 1.0]), SIZE_SIGMA)
+        found[SIZE] = Block.of(where, np.array([state.target_scale - 1.0]), SIZE_SIGMA)
     if layout.target_shape is not None and layout.target_modes is not None:
-        found[TARGET] = Block(layout.target_shape, state.target_shape, layout.target_modes.sigma_m)
+        found[TARGET] = Block.of(layout.target_shape, state.target_shape, layout.target_modes.sigma_m)
+    for name, lens in layout.held.items():
+        camera = state.cameras[name]
+        values = np.concatenate([camera.intrinsics, camera.distortion]) - lens.values
+        found[lens_block(name)] = Block(layout.lens(name), values, lens.off_sigma, lens.sigma, held=True)
     return found
 
 
-def log_bayes_factor(values: FloatArray, covariance: FloatArray, factor: float) -> float:
+def lenses_known(f: CalibrationFilter) -> FloatArray:
+    """Square root of the covariance, as it is told, if the errors of all lenses that are held were known."""
+    if not f.layout.held:
+        return f.S
+    scaled = [f.S[f.layout.lens(n)] / lens.off_sigma[:, None] for n, lens in f.layout.held.items()]
+    rows = np.concatenate(scaled)
+    L = root(rows @ rows.T + _RIDGE * np.eye(len(rows)))
+    U = solve_lower(L, rows)
+    return np.asarray(f.S - (f.S @ U.T) @ U)
+
+
+def log_bayes_factor(
+    values: FloatArray, covariance: FloatArray, factor: float, share: FloatArray | None = None
+) -> float:
     """Logarithm of how much more likely the data are if the values are not zero.
 
     Args:
         values: As estimated, over the sigmas of their prior, shape (n,).
         covariance: Of them, shape (n, n).
         factor: What was learnt beyond the prior is worth so many times less than the covariance says.
+        share: Not zero, but as near to it as that share of the prior's sigma, shape (n,); None: zero.
     """
-    unit = np.eye(len(values))
     information = np.linalg.inv(covariance)
-    tempered = unit + (information - unit) / factor
+    learnt = (information - np.eye(len(values))) / factor
     weighted = information @ values / factor
-    fits = float(weighted @ np.linalg.solve(tempered, weighted))
-    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(tempered)[1])
+    off = _log_evidence(learnt, weighted)
+    if share is None or not share.any():
+        return off
+    return off - _log_evidence(share[:, None] * learnt * share, share * weighted)
+
+
+def _log_evidence(learnt: FloatArray, weighted: FloatArray) -> float:
+    """Logarithm of how likely data are under a prior of unit variance, over that under exact zeros."""
+    total = np.eye(len(weighted)) + learnt
+    fits = float(weighted @ np.linalg.solve(total, weighted))
+    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(total)[1])
 
 
 def factor(f: CalibrationFilter) -> float:
@@ -111,13 +165,34 @@ def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
     doubtful = {name: block for name, block in blocks(f).items() if name not in f.off}
     if not doubtful:
         return {(): 1.0}
-    rows = np.concatenate([f.S[b.where] / b.sigma for b in doubtful.values()])
+    rows = np.concatenate([f.S[b.where] / b.sigma[:, None] for b in doubtful.values()])
     values = {name: b.values / b.sigma for name, b in doubtful.items()}
-    return posterior(values, rows @ rows.T, factor(f) * misfit(f))
+    shares = {name: b.share for name, b in doubtful.items() if b.stated.any()}
+    found = posterior(values, rows @ rows.T, factor(f) * misfit(f), shares)
+    for name, block in doubtful.items():
+        if block.held:
+            found = _beyond_prior(found, name)
+    return found
+
+
+def _beyond_prior(shares: dict[tuple[str, ...], float], name: str) -> dict[tuple[str, ...], float]:
+    """Count that a block is not zero by so much only as the data speak for it.
+
+    Of a lens that is held nobody asks to be told what one in twenty of them might do where the data say
+    nothing of it.
+    """
+    p = not_zero(shares, name)
+    if p in (0.0, 1.0):
+        return shares
+    q = max(0.0, (p - OFF) / (1.0 - OFF))
+    return {true: x * ((1.0 - q) / (1.0 - p) if name in true else q / p) for true, x in shares.items()}
 
 
 def posterior(
-    values: dict[str, FloatArray], covariance: FloatArray, less: float
+    values: dict[str, FloatArray],
+    covariance: FloatArray,
+    less: float,
+    shares: Mapping[str, FloatArray] | None = None,
 ) -> dict[tuple[str, ...], float]:
     """Probability of each hypothesis, named by the blocks that are zero; each is in nineteen rigs of twenty.
 
@@ -125,6 +200,7 @@ def posterior(
         values: Of each block, as estimated, over the sigma of its prior.
         covariance: Of all of them, in order, shape (n, n).
         less: As the factor of `log_bayes_factor`.
+        shares: As its `share`, of the blocks that have one.
     """
     ends = np.cumsum([len(x) for x in values.values()])
     places = {name: np.arange(end - len(x), end) for (name, x), end in zip(values.items(), ends, strict=True)}
@@ -134,7 +210,8 @@ def posterior(
         if true:
             at = np.concatenate([places[name] for name in true])
             zero = np.concatenate([values[name] for name in true])
-            logs[true] -= log_bayes_factor(zero, covariance[np.ix_(at, at)], less)
+            share = np.concatenate([(shares or {}).get(name, np.zeros(len(values[name]))) for name in true])
+            logs[true] -= log_bayes_factor(zero, covariance[np.ix_(at, at)], less, share)
     most = max(logs.values())
     total = sum(np.exp(x - most) for x in logs.values())
     return {true: float(np.exp(x - most) / total) for true, x in logs.items()}
@@ -163,28 +240,61 @@ def in_doubt(f: CalibrationFilter, name: str, *, converged: bool = False) -> boo
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
     """Return the filter as it is to be told: mean and covariance over all hypotheses.
 
-    With U the orthonormal rows of S that move the blocks which are zero, and d = S U' U S^-1 x, conditioning
-    takes S U' U S' off P and moves the mean by -d.
+    Where a lens is held the mean is that of the hypotheses with this lens exactly as stated; the covariance
+    is about that mean, of all that may be.
     """
     every = blocks(f)
-    n = f.layout.size
-    columns, shifts, shares = [], [], []
+    held = [name for name, block in every.items() if block.held]
+    columns, shifts, told, shares = [], [], [], []
     for true, p in weights(f).items():
         if p < _NEGLIGIBLE:
             continue
-        S, d = f.S, np.zeros(n)
-        if true:
-            rows = np.concatenate([f.S[every[name].where] for name in true])
-            L = root(rows @ rows.T)
-            U = solve_lower(L, rows)
-            d = f.S @ (U.T @ solve_lower(L, np.concatenate([every[name].values for name in true])))
-            S = f.S - (f.S @ U.T) @ U
+        S, d = _given(f, every, true)
         columns.append(np.sqrt(p) * S)
         shifts.append(d)
+        told.append(_given(f, every, {*true, *held}, exactly=held)[1] if held else d)
         shares.append(p)
-    if len(shares) == 1 and not shifts[0].any():
+    if len(shares) == 1 and not shifts[0].any() and not held:
         return f
     share, d = np.array(shares) / sum(shares), np.array(shifts)
-    mean = share @ d
+    mean = share @ np.array(told)
+    for name in held:
+        mean[every[name].where] = every[name].values
     apart = (np.sqrt(share / factor(f))[:, None] * (d - mean)).T  # of what is told, which is `factor` times P
     return replace(f, state=retract(f.state, f.layout, -mean), S=np.concatenate([*columns, apart], axis=1))
+
+
+def _given(
+    f: CalibrationFilter, every: Mapping[str, Block], true: Collection[str], exactly: Collection[str] = ()
+) -> tuple[FloatArray, FloatArray]:
+    """Square root of the covariance given that some blocks are as stated, and the mean's step, negated.
+
+    With E the rows of these blocks, R the noise with which they are said to be zero, L L' = E S S' E' + R and
+    U = L^-1 [E S, R^1/2], that takes [S 0] U' U [S 0]' off P and moves the mean by -d, d = [S 0] U' L^-1 x.
+
+    Args:
+        f: The filter.
+        every: Its blocks.
+        true: Those that are as stated.
+        exactly: Those of them that are exactly zero, however well they are stated.
+    """
+    n = f.layout.size
+    if not true:
+        return f.S, np.zeros(n)
+    given = [every[name] for name in every if name in true]
+    rows = np.concatenate([f.S[b.where] for b in given])
+    noise = np.concatenate(
+        [np.zeros(len(every[k].values)) if k in exactly else every[k].noise for k in every if k in true]
+    )
+    S = f.S
+    if noise.any():
+        rows = np.concatenate([rows, np.diag(noise)], axis=1)
+        S = np.concatenate([S, np.zeros((n, len(noise)))], axis=1)
+    L = root(rows @ rows.T)
+    U = solve_lower(L, rows)
+    d = S @ (U.T @ solve_lower(L, np.concatenate([b.values for b in given])))
+    S = S - (S @ U.T) @ U
+    for block in given:
+        if not block.stated.any():
+            S[block.where] = 0.0
+    return S, np.asarray(d)

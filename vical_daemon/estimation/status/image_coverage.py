@@ -31,7 +31,7 @@ class Cover:
     def saw(self, report: FrameReport, f: CalibrationFilter) -> None:
         """Take the corners that the filter used; pictures of a fisheye may be round, and are left out."""
         camera = f.state.cameras[report.camera]
-        if f.layout.cameras[report.camera].intrinsics is None or camera.distortion_model == EQUIDISTANT:
+        if not f.layout.lens_free(report.camera) or camera.distortion_model == EQUIDISTANT:
             return
         picture = self._pictures.setdefault(report.camera, PictureCover(camera.resolution))
         picture.add(report.uv_px[report.accepted])

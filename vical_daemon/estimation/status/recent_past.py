@@ -83,7 +83,8 @@ class RecentPast:
         known, rows = f.state.cameras[frames[0][1].camera], buffer.rows
         curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
         used = [(t, frame) for t, frame, ok in self._frames.get(frames[0][1].camera, ()) if ok]
-        before = _orientations([x for x in used if x[0] < frames[0][0]][-_BEFORE_IMAGES:], f, target)
+        sound_s = min(frames[0][0], f.state.t_s - known.timeshift_s)
+        before = _orientations([x for x in used if x[0] < sound_s][-_BEFORE_IMAGES:], f, target)
         level = 1.0 if before is None else level_at(curve, before, known.R_imu_cam, known.timeshift_s)
         return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
 

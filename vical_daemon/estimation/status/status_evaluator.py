@@ -174,7 +174,7 @@ class Judge:
             event = Event(EventKind.STAMP_JITTER, report.camera, float(jitter_s))
             self.announce(event, once=f"jitter {report.camera}")
         lens = f.agreement[report.camera]
-        if lens.model == RADTAN and lens.moved.any():
+        if lens.model == RADTAN and lens.moved.any() and f.layout.lens_free(report.camera):
             self.announce(Event(EventKind.LENS_TERM_MISSING, report.camera), once=f"lens {report.camera}")
 
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
@@ -281,11 +281,23 @@ class Judge:
                 )
             return Verdict(Status.CONVERGED)
         worst = lacking[0]
+        lens = self._lens_to_blame(f, missing)
+        if lens:
+            return Verdict(Status.CONVERGING, f"{direction_sigma(worst)}: {lens}: leave it free")
         patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > _PATIENCE_S
         if patient and worst.excess > _LOST:
             names = "; ".join(direction_sigma(g) for g in lacking[:3])
             return Verdict(Status.DEGENERATE, f"the motion does not show: {names}", worst.guidance)
         return Verdict(Status.CONVERGING, direction_sigma(worst), worst.guidance)
+
+    def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
+        """What is wrong with a lens that is held, if nothing were missing but for that; else empty."""
+        known = replace(f, S=hypotheses.lenses_known(f)) if f.layout.held else f
+        if known is f or any(self._missing(self._camera(n, known), n, known) for n in self.layout.cameras):
+            return ""
+        name = max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
+        how = "not this camera's" if hypotheses.lens_block(name) in f.off else "not known better"
+        return f"the fixed lens of {name} is {how}"
 
     def _before_start(self) -> Verdict:
         if self.bumped:

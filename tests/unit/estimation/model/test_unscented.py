@@ -55,6 +55,27 @@ def test_lower_root_keeps_the_product_and_a_rank_deficient_one_stays_finite():
     assert (np.diag(L) >= 0.0).all()
 
 
+@pytest.mark.parametrize(("d", "k"), [(4, 3), (4, 9), (7, 2), (2, 4)])
+def test_a_root_that_grew_in_its_first_rows_is_that_of_the_sum(d, k):
+    rng = np.random.default_rng(9)
+    A, C = random_root(rng, 7), rng.normal(size=(7, k))
+    A[:2, :d] = rng.normal(size=(2, d))  # what propagation leaves of the motion's rows
+    A[5] += 0.1 * A[6]  # a time shift drifts
+    L = unscented.lower_root_grown(A, C, d)
+    np.testing.assert_allclose(L, unscented.lower_root(np.concatenate([A, C], axis=1)), atol=1e-12)
+
+
+def test_rows_turned_in_place_are_those_of_the_whole_product():
+    rng = np.random.default_rng(10)
+    S, J = random_root(rng, 8), np.eye(3) + 0.1 * rng.normal(size=(3, 3))
+    for where in (slice(0, 3), slice(4, 7)):
+        product = S.copy()
+        product[where] = J @ S[where]
+        turned = S.copy()
+        unscented.turn_rows(turned, where, J)
+        np.testing.assert_allclose(turned, unscented.lower_root(product), atol=1e-12)
+
+
 def test_moments_of_a_quadratic_agree_with_monte_carlo():
     rng = np.random.default_rng(7)
     S = np.linalg.cholesky(np.array([[0.5, 0.1], [0.1, 0.3]]))

@@ -48,7 +48,7 @@ def test_a_fisheye_is_not_asked_for_edges_that_it_may_not_have(model, asked):
     camera = SimpleNamespace(distortion_model=model, resolution=(640, 480))
     f = SimpleNamespace(
         state=SimpleNamespace(cameras={"cam0": camera}),
-        layout=SimpleNamespace(cameras={"cam0": SimpleNamespace(intrinsics=slice(0, 4))}),
+        layout=SimpleNamespace(lens_free=lambda _: True),
     )
     uv = spread((100, 100), (540, 380))
     cover = Cover()

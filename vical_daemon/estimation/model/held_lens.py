@@ -1,0 +1,63 @@
+"""A lens that is held: its values stay, what is not known of it does not stay out of the sigmas.
+
+Its errors are states of the filter all the same. That it is as stated (exactly, or to the sigma that its user
+states) is a hypothesis beside it; what is told is the calibration that belongs to the stated values, and its
+covariance includes what the errors of these values do to it. [Schmidt, "Application of state-space methods to
+navigation problems", 1966: parameters that are considered; docs/math/filter.md, eq. (19)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation.geometry.camera_model import project
+from vical_daemon.estimation.measurements import CameraPrior, FloatArray
+from vical_daemon.estimation.model.camera_rays import rays_over_image
+
+_OFF_SHARE = 0.02  # of the focal length, of fx fy cx cy; EuRoC's published lens is 1.5 % off in cx
+_OFF_DISTORTION = 0.05  # EuRoC's k1: 0.045
+_WIDER = 3.0  # times the sigma that is stated: which may be too small
+
+
+@dataclass(frozen=True, slots=True)
+class HeldLens:
+    """What is known of a lens that is held: fx fy cx cy (px), distortion.
+
+    Attributes:
+        values: As stated, shape (n,).
+        sigma: How well they are known, as stated; zeros: exactly; shape (n,).
+        off_sigma: By how much a lens is off that is not as stated, one sigma, shape (n,).
+    """
+
+    values: FloatArray
+    sigma: FloatArray
+    off_sigma: FloatArray
+
+    @classmethod
+    def of(cls, prior: CameraPrior) -> HeldLens | None:
+        """Return the lens of a camera; None where none is given."""
+        if prior.intrinsics is None:
+            return None
+        values = np.concatenate([prior.intrinsics, prior.coefficients()])
+        n = len(values)
+        sigma = np.concatenate(
+            [prior.intrinsics_sigma or np.zeros(4), prior.distortion_sigma or np.zeros(n - 4)]
+        )
+        default = np.array([_OFF_SHARE * values[0]] * 4 + [_OFF_DISTORTION] * (n - 4))
+        return cls(values, sigma, np.maximum(default, _WIDER * sigma))
+
+    def displacement_px(self, found: FloatArray, model: str, resolution: tuple[int, int]) -> float:
+        """How far it projects points from where another lens does, RMS over the image, px.
+
+        Args:
+            found: fx fy cx cy, distortion of the other lens, shape (n,).
+            model: Distortion model of both.
+            resolution: Width and height, px.
+        """
+        rays = rays_over_image(found[:4], found[4:], model, resolution)
+        apart = project(rays, self.values[:4], self.values[4:], model) - project(
+            rays, found[:4], found[4:], model
+        )
+        return float(np.sqrt((apart**2).sum(axis=1).mean()))
