@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.camera_model import project
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import CameraPrior, FloatArray
 from vical_daemon.estimation.model.camera_rays import rays_over_image
 
@@ -48,16 +48,22 @@ class HeldLens:
         default = np.array([_OFF_SHARE * values[0]] * 4 + [_OFF_DISTORTION] * (n - 4))
         return cls(values, sigma, np.maximum(default, _WIDER * sigma))
 
-    def displacement_px(self, found: FloatArray, model: str, resolution: tuple[int, int]) -> float:
-        """How far it projects points from where another lens does, RMS over the image, px.
+    def displacement_px(
+        self, off: FloatArray, covariance: FloatArray, model: str, resolution: tuple[int, int]
+    ) -> tuple[float, float]:
+        """How far it projects points from where they appear, RMS over the image, and its sigma, px.
+
+        To first order: with J the derivatives by the lens at n places, the square is off' (J'J/n) off.
 
         Args:
-            found: fx fy cx cy, distortion of the other lens, shape (n,).
-            model: Distortion model of both.
+            off: Estimated errors of its values, shape (n,).
+            covariance: Of them, shape (n, n).
+            model: Distortion model.
             resolution: Width and height, px.
         """
-        rays = rays_over_image(found[:4], found[4:], model, resolution)
-        apart = project(rays, self.values[:4], self.values[4:], model) - project(
-            rays, found[:4], found[4:], model
-        )
-        return float(np.sqrt((apart**2).sum(axis=1).mean()))
+        rays = rays_over_image(self.values[:4], self.values[4:], model, resolution)
+        J = project_jacobians(rays, self.values[:4], self.values[4:], model)[2]
+        apart = J @ off
+        rms = float(np.sqrt((apart**2).sum(axis=1).mean()))
+        slope = np.einsum("pij,pi->j", J, apart) / (len(rays) * rms)
+        return rms, float(np.sqrt(slope @ covariance @ slope))

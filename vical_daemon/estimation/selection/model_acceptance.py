@@ -115,10 +115,11 @@ def _off(f: CalibrationFilter, name: str) -> Event:
     f.off.add(name)
     if block.held:
         camera = next(c for c in f.layout.held if lens_block(c) == name)
-        found, held = f.state.cameras[camera], f.layout.held[camera]
-        values = np.concatenate([found.intrinsics, found.distortion])
-        off_px = held.displacement_px(values, found.distortion_model, found.resolution)
-        return Event(EventKind.FIXED_LENS, camera, off_px)
+        known, rows = f.state.cameras[camera], f.S[block.where]
+        off_px, sigma_px = f.layout.held[camera].displacement_px(
+            block.values, factor(f) * (rows @ rows.T), known.distortion_model, known.resolution
+        )
+        return Event(EventKind.FIXED_LENS, camera, off_px, sigma_px)
     if name in _KNOWN_SIGMA:
         _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
     if name == TARGET:  # what stretches said of the lens, they said with the target as stated
