@@ -15,6 +15,8 @@ from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _LEARN = 20  # readings by which the usual interval is known
 _MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
+_UNSEEN_S = 0.5
+"""After a jump of the stamps an image is waited for so long, s: a slow camera takes two a second."""
 _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
@@ -57,6 +59,7 @@ class ImuIntake:
         self._last = np.full(6, np.nan)
         self._repeats = 0  # of the newest reading
         self._news: list[Event] = []
+        self._gap: Event | None = None  # forwards, until an image tells whether the clock was set
 
     @property
     def shift_s(self) -> float:
@@ -129,8 +132,9 @@ class ImuIntake:
             self._news.append(Event(EventKind.IMU_CLOCK_SET_BACK, value=back_s))
             held_s, t_s = held_s + back_s, t_s + back_s
         else:
+            self._believe_gap()
             kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
-            self._news.append(Event(kind, value=held_s - self._newest_s))
+            self._gap = Event(kind, value=held_s - self._newest_s)
         self._add(buffer, held_s, held)
         self.gap_end_s = buffer.newest_s
         self._add(buffer, t_s, reading)
@@ -140,7 +144,26 @@ class ImuIntake:
         self._newest_s = t_s
         buffer.append(self._steps.even(t_s), reading.gyro_rps, reading.specific_force_mps2)
 
+    def saw_image(self, ahead_s: float) -> None:
+        """Learn from an image whether stamps that jumped forwards mean a gap, or a clock that was set.
+
+        The clock: the jump is a step of the time shift, and reported as that.
+
+        Args:
+            ahead_s: By how much more its stamp is ahead of the newest reading than usual, s.
+        """
+        if self._gap is not None and ahead_s < -0.5 * (self._gap.value or 0.0):
+            self._gap = None
+        self._believe_gap()
+
+    def _believe_gap(self) -> None:
+        if self._gap is not None:
+            self._news.append(self._gap)
+            self._gap = None
+
     def news(self) -> list[Event]:
-        """What happened to the stream since the last call."""
+        """What happened to the stream since the last call; a gap after an image, or half a second."""
+        if self._newest_s > self.gap_end_s + _UNSEEN_S:
+            self._believe_gap()
         news, self._news = self._news + self._steps.news(), []
         return news

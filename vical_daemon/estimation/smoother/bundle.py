@@ -50,6 +50,7 @@ class Fit(NamedTuple):
         sigma_px: Pixel noise that was found.
         spread: Square root of the images that share an error.
         jitter_s: Standard deviation of the images' stamps, s; 0 where none is seen.
+        jitter_lasts: Images are late one like the next: their clock stepped, and did not jitter.
         steps: Iterations done.
         settled: The last of them changed nothing to speak of.
         used, refused: Observations.
@@ -65,6 +66,7 @@ class Fit(NamedTuple):
     sigma_px: float
     spread: float
     jitter_s: float
+    jitter_lasts: bool
     steps: int
     settled: bool
     used: int
@@ -276,7 +278,7 @@ class Bundle:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
         self.seen = seen
-        inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
+        inertial, jitter_s, lasts = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = calibration_difference(w, self.carry)[self.problem.active]
@@ -288,6 +290,7 @@ class Bundle:
             self.problem.sigma_px,
             self.problem.spread,
             jitter_s,
+            lasts,
             steps,
             settled,
             int(good.sum()),
