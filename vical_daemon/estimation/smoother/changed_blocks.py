@@ -5,7 +5,8 @@ answer x, r with covariance P is then held against what was known of a block bef
 
     d = (x - m) - K (r - r0),   d' (C + A P A')^-1 d ~ chi^2,   A = [I, -K]
 
-which is exact for Gaussians [docs/math/target_free.md, eq. (3)]: r is common to both sides, and the condition on it takes that into account.
+which is exact for Gaussians: r is common to both sides, and the condition on it takes that into account.
+[docs/math/target_free.md, eq. (3)]
 """
 
 from __future__ import annotations
