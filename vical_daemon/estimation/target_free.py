@@ -101,7 +101,9 @@ class TargetFreeCalibrator:
         self._imu = ImuIntake()
         self._images = ImageIntake()
         self._pending: list[Stamped] = []
+        self._fitted_s = -np.inf  # stamp of the last image that fitted
         self._set_by_s = 0.0  # added to the camera's stamps so far
+        self._confirmed = False  # a second window contradicts what was known
         self._seek_shift = False  # the time shift is to be found again, and its step has been reported
         self._newest_s = -np.inf  # stamp of the last image, used or not
         self._thinning = Thinning(MAX_RATE_HZ)
@@ -232,7 +234,7 @@ class TargetFreeCalibrator:
             self.judge.waiting(begun, self.starter.motion_missing)
             return False
         window, fit = begun.bundle.window, begun.fit
-        last = window.frames[-1][0]
+        self._fitted_s = last = window.frames[-1][0]
         self._pending = [x for x in self._pending if x[0] > last]
         self.window, self.carry, self.latest = window, begun.bundle.carry, fit.carry
         self._noise = (fit.sigma_px, fit.spread, fit.jitter_s)
@@ -266,7 +268,8 @@ class TargetFreeCalibrator:
     def _go_on(self, frames: list[Stamped], known: Carry) -> _Begun | str:
         """Start a window after a pause; where it contradicts what was known, find what has changed."""
         assert self._buffer is not None
-        begun = _DOES_NOT_FIT if self._seek_shift else self._begin(frames, known)
+        surely = self._seek_shift or self._confirmed
+        begun = _DOES_NOT_FIT if surely else self._begin(frames, known)
         if isinstance(begun, _Begun):
             return begun
         if begun is _DOES_NOT_FIT:
@@ -274,7 +277,7 @@ class TargetFreeCalibrator:
         if self.judge.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
             held, anew = self.starter.held, self._begin(frames, None)
             if isinstance(anew, _Begun):
-                self._closed = 0
+                self._closed, self._confirmed = 0, False
                 self.judge.changed()
             else:
                 self.starter.held = held
@@ -309,7 +312,7 @@ class TargetFreeCalibrator:
             self.judge.changed(change)
         elif reopened and not self._seek_shift:
             self.judge.stepped(float(change[SHIFT]))
-        self._seek_shift = False
+        self._seek_shift = self._confirmed = False
         return ended
 
     # ------------------------------------------------------------------ windows
@@ -317,14 +320,13 @@ class TargetFreeCalibrator:
         """Take images into the window and adjust it; close it when it is long enough."""
         assert self._buffer is not None
         assert self.carry is not None
-        before_s = window.frames[-1][0]
         added = window.extend(self._buffer, frames)
         done = {id(f) for _, f in frames[:added]}
         self._pending = [x for x in self._pending if id(x[1]) not in done]
         if added < len(frames):
             self._lost(Cause.INERTIAL_GAP, keep=True)
             return
-        against_s = frames[-1][0] - before_s
+        against_s = frames[-1][0] - self._fitted_s
         if len(window.frames) < 8:
             return
         bundle = Bundle(window, self.carry, *self._noise)
@@ -339,21 +341,27 @@ class TargetFreeCalibrator:
         if not self.judge.fits(fit):
             self._lost(*self.judge.misfit, against_s=against_s)
             return
-        stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise[2]
-        agree = self.judge.agrees(fit, self.carry, complete=_full(window)) and not stepped
-        if self._closed and not agree:
-            self._lost(Cause.WINDOW_CONTRADICTED, against_s=against_s)
-            return
         if self.starter.held is not None and has_turned(window.R, self.starter.held):
             self._start_whole()
             return
+        if self._closed and not self._agrees(fit, self.carry, complete=_full(window)):
+            self._lost(Cause.WINDOW_CONTRADICTED, against_s=against_s)
+            return
         self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread, fit.jitter_s)
-        self.judge.saw_fit(fit, window.frames[-1][0] + window.shift_s)
+        self._fitted_s = window.frames[-1][0]
+        self.judge.saw_fit(fit, self._fitted_s + window.shift_s)
         if _full(window):
             self._close(fit, bundle)
 
+    def _agrees(self, fit: Fit, carry: Carry, *, complete: bool) -> bool:
+        """Whether a window agrees with what was known of calibration and stamps, as far as it tells."""
+        if fit.parallax_deg < _MIN_PARALLAX_DEG:
+            return True
+        stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise[2]
+        return self.judge.agrees(fit, carry, complete=complete) and not stepped
+
     def _close(self, fit: Fit, bundle: Bundle) -> None:
-        """Carry what the window knows into the next; see whether it agrees with what was known before."""
+        """Carry what the window knows into the next."""
         window, carry = self.window, self.carry
         assert window is not None
         assert carry is not None
@@ -381,7 +389,7 @@ class TargetFreeCalibrator:
         )
         self.starter = Starter(self.options, self.prior)
         self.latest = None
-        self._closed = 0
+        self._closed, self._confirmed = 0, False
         self.judge.changed()
         self.window = self.carry = None
 
@@ -405,6 +413,9 @@ class TargetFreeCalibrator:
         """
         window = self.window
         self.window = None
+        if window is not None and against_s and self.judge.against_s:
+            self._confirmed = True
+            self._pending = [*window.frames, *self._pending]  # all of them after the change
         if window is not None and self.carry is not None:
             if keep and window.span_s > _LEAST_S:
                 self._closed += 1

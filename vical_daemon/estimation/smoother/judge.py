@@ -109,7 +109,7 @@ class FreeJudge:
 
     def started(self, t_s: float) -> None:
         """A window runs from `t_s` on."""
-        self._reason, self._against_since_s = "", None
+        self._reason = ""
         if self._started_s is None:
             self._started_s = t_s
         if self._bumped:
@@ -168,7 +168,7 @@ class FreeJudge:
     def stepped(self, step_s: float) -> None:
         """The time shift stepped, s; all else is kept."""
         self._announce(EventKind.TIMESHIFT_STEPPED, step_s)
-        self._quiet = Cause.NONE, None
+        self._quiet, self._against_since_s = (Cause.NONE, None), None
 
     def announce_all(self, events: Iterable[Event]) -> None:
         """Put events into the next estimate."""
@@ -222,6 +222,7 @@ class FreeJudge:
     def closed(self) -> None:
         """A window is complete and agreed."""
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
+        self._against_since_s = None
         if self.jitter_s >= ANNOUNCED_S:
             self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter")
 

@@ -92,6 +92,19 @@ def test_a_bump_while_all_is_seen_is_announced_soon():
     assert record.snapshots[-1].status == "converged"
 
 
+def test_a_bump_too_small_for_two_seconds_is_found_all_the_same():
+    rig = reference_rig(
+        5, timeshift_cam_imu_s=0.01, bumps=(Bump(14.0, (0.004, 0.0, 0.0), (0.0, 0.005, 0.0)),)
+    )
+    record = followed(simulate_tracks(5, 28.0, rig=rig, landmarks_m=room_landmarks(5, 200)))
+    announced = [t for t, e in record.events if e.kind is EventKind.BUMPED]
+    assert len(announced) == 1
+    for shot in record.snapshots:
+        if shot.status == "converged" and not 14.0 <= shot.t_s < 17.0:
+            assert np.max(np.abs(shot.error[:7]) / np.sqrt(np.diag(shot.covariance)[:7])) < 5.0, shot.t_s
+    assert record.snapshots[-1].status == "converged"
+
+
 def test_a_crowd_that_walks_past_is_no_bump():
     run = simulate_tracks(
         4, 24.0, rig=reference_rig(4, timeshift_cam_imu_s=0.01), landmarks_m=room_landmarks(4, 200)
