@@ -277,7 +277,7 @@ class TargetFreeCalibrator:
         if self.judge.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
             held, anew = self.starter.held, self._begin(frames, None)
             if isinstance(anew, _Begun):
-                self._closed, self._confirmed = 0, False
+                self._closed, self._confirmed, self._seek_shift = 0, False, False
                 self.judge.changed()
             else:
                 self.starter.held = held
