@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -103,6 +103,8 @@ CASES: dict[str, tuple[Change, float]] = {
     },
     "bump in a gap of 5 s": (partial(cut, "both", 5.0), 5.0),
 }
+UNDISTURBED = "undisturbed"
+CASES[UNDISTURBED] = (lambda run: run, 0.0)
 
 
 def simulated(case: str, seed: int, seconds: float, *, target_free: bool) -> SimulatedRun:
@@ -120,7 +122,24 @@ def simulated(case: str, seed: int, seconds: float, *, target_free: bool) -> Sim
 
 
 def trial(case: str, lens_known: bool, target_free: bool, seed: int) -> runner.Result:
-    """One recording with the disturbance of a case."""
+    """One recording with the disturbance of a case; after steps of a clock beside the one without."""
+    disturbed = recorded(case, seed, lens_known=lens_known, target_free=target_free)
+    result = judged(disturbed, case)
+    if "clock" in case:
+        apart_m = disturbed.snapshots[-1].error[:3] - _undisturbed_m(seed, lens_known, target_free)
+        result["apart_mm"] = 1e3 * float(np.linalg.norm(apart_m))
+    return result
+
+
+@cache
+def _undisturbed_m(seed: int, lens_known: bool, target_free: bool) -> Any:
+    """Error of the lever arm at the end of the recording without a disturbance, m, shape (3,)."""
+    plain = recorded(UNDISTURBED, seed, lens_known=lens_known, target_free=target_free)
+    return plain.snapshots[-1].error[:3]
+
+
+def recorded(case: str, seed: int, *, lens_known: bool, target_free: bool) -> Record:
+    """What is said about one recording with the disturbance of a case."""
     change, lasts_s = CASES[case]
     run = simulated(case, seed, AT_S + lasts_s + AFTER_S, target_free=target_free)
     options = CalibrationOptions(
@@ -131,15 +150,20 @@ def trial(case: str, lens_known: bool, target_free: bool, seed: int) -> runner.R
     prior = camera_prior(run, seed, StartErrors(), exact_lens=lens_known)
     points = None if target_free else run.points_m
     subject = Stepped(options, prior, points)
-    added_s = float(case.split("+")[1].split()[0]) if "clock" in case else 0.0
-    subject.sensor, subject.step_ns = case.split()[0], round(added_s * 1e9)
+    subject.sensor, subject.step_ns = case.split()[0], round(_added_s(case) * 1e9)
     subject.at_ns = run.options.epoch_ns + round(AT_S * 1e9)
-    record = feed(change(run), subject, 0.25)
-    return judged(record, lasts_s, added_s if case.startswith("imu") else -added_s)
+    return feed(change(run), subject, 0.25)
 
 
-def judged(record: Record, lasts_s: float, shift_moved_s: float) -> runner.Result:
+def _added_s(case: str) -> float:
+    """By how much a clock is set, s."""
+    return float(case.split("+")[1].split()[0]) if "clock" in case else 0.0
+
+
+def judged(record: Record, case: str) -> runner.Result:
     """What was reported, how far sigmas grew, when it had converged again, and whether it ever lied."""
+    lasts_s = CASES[case][1]
+    shift_moved_s = _added_s(case) * (1.0 if case.startswith("imu") else -1.0)
     seen_s = AT_S + lasts_s
     sigma_before = np.zeros(7)
     grown, lies = 0.0, []
@@ -186,13 +210,15 @@ def _row(case: str, results: list[runner.Result]) -> str:
     named = sum(any(kind in _DISTURBANCES for kind in r["reported"]) for r in results)
     bumps = [r["bumped_s"] for r in results if r["bumped_s"] is not None]
     worst = f", at most {max(bumps):.1f} s later" if bumps else ""
+    apart = [r["apart_mm"] for r in results if "apart_mm" in r]
     back = [r["back_s"] for r in told]
     grown = [r["grown"] for r in told if r["grown"]]
     return (
         f"| {case} | {len(results)} | {named} | {len(bumps)}{worst} "
         f"| {np.median(back) if back else np.nan:.1f} / {max(back, default=np.nan):.1f} "
         f"| {np.median(grown) if grown else np.nan:.3f} / {max(grown, default=np.nan):.3f} "
-        f"| {sum(bool(r['lies']) for r in results)} |"
+        f"| {sum(bool(r['lies']) for r in results)} "
+        f"| {f'{np.median(apart):.2f} / {max(apart):.2f}' if apart else ''} |"
     )
 
 
@@ -206,9 +232,10 @@ def main(argv: list[str]) -> int:
     code = runner.fingerprint("vical_daemon/estimation", "benchmarks/gaps.py", "mocks/vical_mocks")
     print(
         "| disturbance | rigs | reported | announced as bumped | converged again after s (median / worst) "
-        "| sigmas after over before (median / worst) | converged beyond 5 sigma |"
+        "| sigmas after over before (median / worst) | converged beyond 5 sigma "
+        "| lever arm from undisturbed mm (median / worst) |"
     )
-    print("|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|")
     mode = "free" if args.target_free else "known" if args.lens_known else "unknown"
     for case in args.case or CASES:
         results = runner.run_trials(

@@ -65,7 +65,8 @@ class Job:
         """Yield (key, payload) of the streams and the part of the recording that are used."""
         begin_ns = self.recording.begin_ns + round(self.skip_s * 1e9)
         end_ns = begin_ns + round(self.duration_s * 1e9)
-        for key, payload in self.recording.messages([self.imu, *self.cameras.values()]):
+        statuses = [topics.STATUS.key(self.recording.rig, "imu")]  # they say how well stamps are known
+        for key, payload in self.recording.messages([self.imu, *self.cameras.values()], statuses):
             stamp_ns = stamp_of(payload)
             if stamp_ns is not None and begin_ns <= stamp_ns <= end_ns:
                 yield key, payload
@@ -167,7 +168,8 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
         return estimate
 
     role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, inspect=listen, keep=keep)
-    for key in (job.imu.key, *(_points_key(job, name) for name in job.cameras)):
+    status_key = topics.STATUS.key(job.config.rig, "imu")
+    for key in (job.imu.key, status_key, *(_points_key(job, name) for name in job.cameras)):
         bus.subscribe(key, role.take)
     _attach_detectors(bus, job)
     count = job.imu.count + sum(stream.count for stream in job.cameras.values())

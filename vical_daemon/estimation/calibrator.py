@@ -152,6 +152,7 @@ class Calibrator:
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
         t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
+        self._imu.saw_image(self._images.ahead_s(frame.camera))
         self.judge.announce_all(self._images.news())
         if t_cam_s is None:
             self.judge.frames_ignored += 1

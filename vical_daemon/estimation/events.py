@@ -62,6 +62,7 @@ class Cause(StrEnum):
     CALIBRATION_CONTRADICTED = "calibration_contradicted"
     WINDOW_CONTRADICTED = "window_contradicted"
     NO_IMAGES = "no_images"
+    CLOCK_SET = "clock_set"
     INERTIAL_GAP = "inertial_gap"
     TOO_FEW_FEATURES = "too_few_features"
     FEATURES_CONTRADICT = "features_contradict"
@@ -160,7 +161,7 @@ REFERENCE: dict[EventKind, About] = {
         "The rig is no longer what was calibrated; calibration starts anew.",
         "",
         "After the first convergence, when images stop fitting the motion although pose and time shift were "
-        "found anew.",
+        "found anew. Target-free: when 2 s of images show another mounting.",
     ),
     EventKind.STARTED_OVER: About(
         "As `bumped`, but there was no converged calibration yet.", "", "Before the first convergence."
@@ -193,7 +194,7 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.TIMESHIFT_STEPPED: About(
         "The time shift jumped; everything else is kept. Value: new minus old.",
         "s",
-        "When images have agreed with the new time shift for 3 s.",
+        "When images have agreed with the new time shift for 3 s; target-free for 2 s.",
     ),
     EventKind.POSE_LOST: About(
         "The pose was lost and is taken from the images again; the calibration is kept.",
@@ -228,7 +229,9 @@ REFERENCE: dict[EventKind, About] = {
         "When 4 even readings have followed the step.",
     ),
     EventKind.IMU_GAP: About(
-        "Inertial readings were missing. Value: for how long.", "s", "When they resume."
+        "Inertial readings were missing. Value: for how long.",
+        "s",
+        "With the next image, at most 0.5 s later.",
     ),
     EventKind.IMU_REPEATED: About(
         "The IMU repeated one reading bit by bit. Value: for how long.", "s", "When new readings come."

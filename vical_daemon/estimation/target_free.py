@@ -9,8 +9,9 @@ window's own data moved the calibration, against how far they may, says whether 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +29,15 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.plausible import stamp_sigma_problem
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
-from vical_daemon.estimation.smoother.carry import DRIFT, FULL, LENS, SHIFT, Carry
+from vical_daemon.estimation.smoother.carry import (
+    DRIFT,
+    FULL,
+    LENS,
+    SHIFT,
+    Carry,
+    calibration_difference,
+)
+from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
 from vical_daemon.estimation.smoother.handover import afresh, aged, next_window
 from vical_daemon.estimation.smoother.judge import FreeJudge
 from vical_daemon.estimation.smoother.reports import window_reports
@@ -45,6 +54,16 @@ _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _STEPS_GROW, _STEPS_START = 12, 30
+_PATIENCE_S = 15.0  # in which a changed mounting or clock is looked for; then anything may have changed
+_MORE_JITTER = 2.0  # times that of the stamps before: no chance in windows of 30 images and more
+_DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
+
+
+class _Begun(NamedTuple):
+    """A window that has been started."""
+
+    bundle: Bundle
+    fit: Fit
 
 
 class TargetFreeCalibrator:
@@ -82,9 +101,12 @@ class TargetFreeCalibrator:
         self._imu = ImuIntake()
         self._images = ImageIntake()
         self._pending: list[Stamped] = []
+        self._fitted_s = -np.inf  # stamp of the last image that fitted
+        self._set_by_s = 0.0  # added to the camera's stamps so far
+        self._confirmed = False  # a second window contradicts what was known
+        self._seek_shift = False  # the time shift is to be found again, and its step has been reported
         self._newest_s = -np.inf  # stamp of the last image, used or not
         self._thinning = Thinning(MAX_RATE_HZ)
-        self._doubted: Carry | None = None
         self._reports: list[FrameReport] = []
 
     # ------------------------------------------------------------------ input
@@ -115,16 +137,28 @@ class TargetFreeCalibrator:
             return
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
         t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
+        self._imu.saw_image(self._images.ahead_s(frame.camera))
         self.judge.announce_all(self._images.news())
         if t_cam_s is None or t_cam_s <= self._newest_s:
             self.judge.frames_ignored += 1
             return
+        if self._images.offset_s(frame.camera) != self._set_by_s:
+            self._clock_was_set()
         self._newest_s = t_cam_s
         if not self._thinning.takes(t_cam_s):
             return
         self.judge.saw_points(t_cam_s, len(frame.ids))
         if len(frame.ids) >= 4:
             self._pending.append((t_cam_s, frame))
+
+    def _clock_was_set(self) -> None:
+        """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
+        self._set_by_s = self._images.offset_s(self.camera)
+        self._pending.clear()
+        if self.latest is not None:
+            self._lost(Cause.CLOCK_SET, keep=True)
+            self.judge.contradicted(0.0)
+        self._seek_shift = self.latest is not None
 
     @property
     def waiting(self) -> int:
@@ -184,33 +218,102 @@ class TargetFreeCalibrator:
         """Attempt to start from what waits; True when there is a window now."""
         assert self._buffer is not None
         end = self._buffer.newest_s - _LATE_S
-        known = self._doubted or self.latest
-        attempt = self.starter.attempt(self._buffer, self._pending, end, known, last=flush)
-        if attempt is None:
+        known = self.latest
+        self._buffer.cut(self._imu.gap_end_s)  # a start needs motion in one piece
+        frames = self.starter.stretch(self._buffer, self._pending, end, known, last=flush)
+        if frames is None:
             return False
-        if isinstance(attempt, str):
-            self.judge.waiting(attempt, self.starter.motion_missing)
+        begun: _Begun | str
+        if isinstance(frames, str):
+            begun = frames
+        elif known is None:
+            begun = self._begin(frames, None)
+        else:
+            begun = self._go_on(frames, known)
+        if isinstance(begun, str):
+            self.judge.waiting(begun, self.starter.motion_missing)
             return False
-        window = attempt
-        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma)
-        bundle = Bundle(window, carry, *self._noise)
-        fit = bundle.solve(self._buffer, _STEPS_START)
-        if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
-            self.judge.waiting(
-                "the first seconds do not fit together yet: keep moving in all directions", True
-            )
-            return False
-        last = window.frames[-1][0]
+        window, fit = begun.bundle.window, begun.fit
+        self._fitted_s = last = window.frames[-1][0]
         self._pending = [x for x in self._pending if x[0] > last]
-        self.window, self.carry, self.latest = window, carry, fit.carry
+        self.window, self.carry, self.latest = window, begun.bundle.carry, fit.carry
         self._noise = (fit.sigma_px, fit.spread, fit.jitter_s)
-        self._closed = 0 if known is None else self._closed
         self.judge.held = self.starter.held
         self.judge.started(window.frames[0][0])
         self.judge.saw_fit(fit, last + window.shift_s)
         if _full(window):
-            self._close(fit, bundle)
+            self._close(fit, begun.bundle)
         return True
+
+    def _begin(self, frames: list[Stamped], known: Carry | None) -> _Begun | str:
+        """Start a window from a stretch, with the calibration of before where there is one; or why not."""
+        assert self._buffer is not None
+        window = self.starter.window(self._buffer, frames, known)
+        if isinstance(window, str):
+            return window
+        return self._adjusted(window, known) or _DOES_NOT_FIT
+
+    def _adjusted(self, window: Window, known: Carry | None, reopened: Collection[int] = ()) -> _Begun | None:
+        """Adjust a first window with what is known but for some errors; None where it does not fit."""
+        assert self._buffer is not None
+        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened)
+        bundle = Bundle(window, carry, *self._noise)
+        fit = bundle.solve(self._buffer, _STEPS_START)
+        if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
+            return None
+        if known is not None and not self.judge.agrees(fit, carry, complete=False):
+            return None
+        return _Begun(bundle, fit)
+
+    def _go_on(self, frames: list[Stamped], known: Carry) -> _Begun | str:
+        """Start a window after a pause; where it contradicts what was known, find what has changed."""
+        assert self._buffer is not None
+        surely = self._seek_shift or self._confirmed
+        begun = _DOES_NOT_FIT if surely else self._begin(frames, known)
+        if isinstance(begun, _Begun):
+            return begun
+        if begun is _DOES_NOT_FIT:
+            self.judge.contradicted(frames[-1][0] - frames[0][0])
+        if self.judge.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
+            held, anew = self.starter.held, self._begin(frames, None)
+            if isinstance(anew, _Begun):
+                self._closed, self._confirmed, self._seek_shift = 0, False, False
+                self.judge.changed()
+            else:
+                self.starter.held = held
+            return anew
+        window = self.starter.window_anew(self._buffer, frames, known)
+        if isinstance(window, str):
+            return begun
+        free = self._adjusted(window, known, BOTH)
+        if free is None:
+            return begun
+        known = known.at(window.frames[0][0])
+        found = free.fit.carry.at(window.frames[0][0])
+        change = calibration_difference(window, known)
+        reopened = changed_blocks(
+            change,
+            found.calibration(),
+            known.calibration(),
+            self.active,
+            lambda square, dof: self.judge.excess(square, dof, change),
+        )
+        if self._seek_shift:
+            reopened = tuple({*reopened, *CLOCK})
+        if MOUNTING[0] in reopened and not self.judge.proven:
+            self._forget(known)
+            return begun
+        ended = self._adjusted(window, known, reopened)
+        if ended is None:
+            return begun
+        change = calibration_difference(window, known)
+        change[[k for k in BOTH if k not in reopened]] = 0.0
+        if MOUNTING[0] in reopened:
+            self.judge.changed(change)
+        elif reopened and not self._seek_shift:
+            self.judge.stepped(float(change[SHIFT]))
+        self._seek_shift = self._confirmed = False
+        return ended
 
     # ------------------------------------------------------------------ windows
     def _grow(self, window: Window, frames: list[Stamped]) -> None:
@@ -218,11 +321,12 @@ class TargetFreeCalibrator:
         assert self._buffer is not None
         assert self.carry is not None
         added = window.extend(self._buffer, frames)
-        done = {id(f) for _, f in frames}
+        done = {id(f) for _, f in frames[:added]}
         self._pending = [x for x in self._pending if id(x[1]) not in done]
         if added < len(frames):
             self._lost(Cause.INERTIAL_GAP, keep=True)
             return
+        against_s = frames[-1][0] - self._fitted_s
         if len(window.frames) < 8:
             return
         bundle = Bundle(window, self.carry, *self._noise)
@@ -232,21 +336,32 @@ class TargetFreeCalibrator:
             return
         if not fit.settled:  # gross outliers among the new features; the next images may tell
             if _full(window):
-                self._lost(Cause.FEATURES_CONTRADICT)
+                self._lost(Cause.FEATURES_CONTRADICT, against_s=against_s)
             return
         if not self.judge.fits(fit):
-            self._lost(*self.judge.misfit)
+            self._lost(*self.judge.misfit, against_s=against_s)
             return
         if self.starter.held is not None and has_turned(window.R, self.starter.held):
             self._start_whole()
             return
+        if self._closed and not self._agrees(fit, self.carry, complete=_full(window)):
+            self._lost(Cause.WINDOW_CONTRADICTED, against_s=against_s)
+            return
         self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread, fit.jitter_s)
-        self.judge.saw_fit(fit, window.frames[-1][0] + window.shift_s)
+        self._fitted_s = window.frames[-1][0]
+        self.judge.saw_fit(fit, self._fitted_s + window.shift_s)
         if _full(window):
             self._close(fit, bundle)
 
+    def _agrees(self, fit: Fit, carry: Carry, *, complete: bool) -> bool:
+        """Whether a window agrees with what was known of calibration and stamps, as far as it tells."""
+        if fit.parallax_deg < _MIN_PARALLAX_DEG:
+            return True
+        stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise[2]
+        return self.judge.agrees(fit, carry, complete=complete) and not stepped
+
     def _close(self, fit: Fit, bundle: Bundle) -> None:
-        """Carry what the window knows into the next; see whether it agrees with what was known before."""
+        """Carry what the window knows into the next."""
         window, carry = self.window, self.carry
         assert window is not None
         assert carry is not None
@@ -254,10 +369,6 @@ class TargetFreeCalibrator:
             self.latest = carry if self._closed else None
             self._lost(Cause.NO_PARALLAX)
             return
-        if self._closed and not self.judge.agrees(fit, carry):
-            self._disagreed(carry)
-            return
-        self._doubted = None
         self._closed += 1
         self.judge.closed()
         if bundle.seen is not None:
@@ -266,15 +377,9 @@ class TargetFreeCalibrator:
         self.carry = aged(fit.carry, noise, self.active, window.span_s, drifting=drifting)
         self.window = next_window(window, self.carry)
 
-    def _disagreed(self, carry: Carry) -> None:
-        """A window contradicts what was known: once may be a bad window, twice is a changed rig."""
-        if self._doubted is None:
-            self._doubted = carry
-            self.latest = carry
-            self._lost(Cause.WINDOW_CONTRADICTED)
-            return
-        self._doubted = None
-        lens = carry.camera
+    def _forget(self, known: Carry) -> None:
+        """What was kept over a change contradicts the images, too: start over, with the lens as a guess."""
+        lens = known.camera
         self.prior = replace(
             self.prior,
             intrinsics=tuple(lens.intrinsics.tolist()),
@@ -284,21 +389,33 @@ class TargetFreeCalibrator:
         )
         self.starter = Starter(self.options, self.prior)
         self.latest = None
-        self._closed = 0
+        self._closed, self._confirmed = 0, False
         self.judge.changed()
         self.window = self.carry = None
 
     def _start_whole(self) -> None:
         """After a partial start, the rig turns about a second axis: all of the calibration will show."""
-        self.window = self.carry = self.latest = self._doubted = None
+        self.window = self.carry = self.latest = None
         self._closed = 0
         self.starter.again()
         self.judge.lost(Cause.SECOND_AXIS, None, None)
 
-    def _lost(self, why: Cause, value: float | None = None, *, keep: bool = False) -> None:
-        """Go back to waiting; the calibration stays as before this window, or as adjusted last (`keep`)."""
+    def _lost(
+        self, why: Cause, value: float | None = None, *, keep: bool = False, against_s: float = 0.0
+    ) -> None:
+        """Go back to waiting; the calibration stays as before this window, or as adjusted last (`keep`).
+
+        Args:
+            why: Cause.
+            value: Its figure.
+            keep: The window as adjusted last was good.
+            against_s: For how long images have contradicted the calibration, s; 0: they do not.
+        """
         window = self.window
         self.window = None
+        if window is not None and against_s and self.judge.against_s:
+            self._confirmed = True
+            self._pending = [*window.frames, *self._pending]  # all of them after the change
         if window is not None and self.carry is not None:
             if keep and window.span_s > _LEAST_S:
                 self._closed += 1
@@ -307,13 +424,13 @@ class TargetFreeCalibrator:
                 self.latest = self.carry if self._closed else None
         self.carry = None
         self.starter.again()
-        self.judge.lost(why, value, self.latest)
+        self.judge.lost(why, value, self.latest, against_s)
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         gravity = [] if self.latest is None else [0.0, 0.0, -self.options.gravity_mps2]
-        known = self._doubted or self.latest
+        known = self.latest
         if known is not None and self._buffer is not None:
             known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
         estimate = self.judge.estimate(known, running=self.window is not None, gravity=gravity)

@@ -243,6 +243,7 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     ),
     Cause.WINDOW_CONTRADICTED: lambda _: "the last seconds do not fit the calibration; looking again",
     Cause.NO_IMAGES: lambda v: f"no usable images for {v:.1f} s",
+    Cause.CLOCK_SET: lambda _: "the camera's clock was set",
     Cause.INERTIAL_GAP: lambda _: "inertial data have a gap",
     Cause.TOO_FEW_FEATURES: lambda _: "too few features can be followed",
     Cause.FEATURES_CONTRADICT: lambda _: "the features of the last seconds contradict each other",

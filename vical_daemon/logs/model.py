@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from heapq import heappop, heappush
+from heapq import heappop, heappush, merge
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -19,6 +20,7 @@ Kind = Literal["imu", "image", "compressed", "points", "tracks"]
 _PREFERENCE: tuple[Kind, ...] = ("points", "tracks", "image", "compressed")
 _WINDOW_NS = 2_000_000_000
 _WINDOW_BYTES = 512 * 2**20
+_MARK_NS = 50_000_000
 
 
 class RecordingError(Exception):
@@ -113,17 +115,20 @@ class Recording(ABC):
         """From the first stamp to the last, over all streams."""
         return (max(stream.end_ns for stream in self.streams) - self.begin_ns) * 1e-9
 
-    def messages(self, streams: Iterable[Stream] | None = None) -> Iterator[tuple[str, bytes]]:
+    def messages(
+        self, streams: Iterable[Stream] | None = None, beside: Iterable[str] = ()
+    ) -> Iterator[tuple[str, bytes]]:
         """Yield (key, payload) in order of the stamps; at equal stamps imus first, then by key.
 
         Args:
             streams: Those to take; None: every imu and, of each camera, its stream in `cameras`.
+            beside: Keys of status messages to take, too, where the recording holds them.
 
         Raises:
             RecordingError: The disk refuses.
         """
         chosen = streams if streams is not None else [*self.imus.values(), *self.cameras.values()]
-        return self._messages({stream.key for stream in chosen})
+        return self._messages({stream.key for stream in chosen} | set(beside))
 
     @abstractmethod
     def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]: ...
@@ -163,7 +168,7 @@ def stream_statistics(t_ns: IntArray) -> tuple[int, int, int, float, float]:
 
 
 class Stamped(NamedTuple):
-    """One message on its way into stamp order."""
+    """One message on its way into stamp order; `is_imu` goes before others of the same stamp."""
 
     stamp_ns: int
     log_time_ns: int
@@ -172,7 +177,32 @@ class Stamped(NamedTuple):
     payload: bytes
 
 
-def in_stamp_order(items: Iterable[Stamped]) -> Iterator[tuple[str, bytes]]:
+class OutOfReach:
+    """Tells whether `in_stamp_order` would give a message too late, without doing it.
+
+    Attributes:
+        found: It would.
+    """
+
+    def __init__(self) -> None:
+        self.found = False
+        self._newest_log_ns = self._newest_ns = self._released_ns = 0
+        self._marks: deque[tuple[int, int]] = deque()  # log time, newest stamp until then
+
+    def saw(self, stamp_ns: int, log_time_ns: int) -> None:
+        """Take the next message of the log."""
+        self.found = self.found or stamp_ns < self._released_ns
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        if log_time_ns <= self._newest_log_ns:
+            return
+        self._newest_log_ns = log_time_ns
+        if not self._marks or log_time_ns > self._marks[-1][0] + _MARK_NS:
+            self._marks.append((log_time_ns, self._newest_ns))
+        while self._marks and log_time_ns - self._marks[0][0] > _WINDOW_NS:
+            self._released_ns = self._marks.popleft()[1]
+
+
+def in_stamp_order(items: Iterable[Stamped]) -> Iterator[Stamped]:
     """Sort messages by stamp with a look-ahead of 2 s of log time (or 512 MB).
 
     The order is exact for streams whose latencies differ by less than 2 s; memory is bounded for any.
@@ -186,7 +216,11 @@ def in_stamp_order(items: Iterable[Stamped]) -> Iterator[tuple[str, bytes]]:
         while heap and (newest_ns - heap[0][-1].log_time_ns > _WINDOW_NS or waiting_bytes > _WINDOW_BYTES):
             oldest = heappop(heap)[-1]
             waiting_bytes -= len(oldest.payload)
-            yield oldest.key, oldest.payload
+            yield oldest
     while heap:
-        oldest = heappop(heap)[-1]
-        yield oldest.key, oldest.payload
+        yield heappop(heap)[-1]
+
+
+def merged(streams: Iterable[Iterable[Stamped]]) -> Iterator[Stamped]:
+    """Merge streams that are each in order of their stamps; memory does not grow with their distance."""
+    return merge(*streams, key=lambda item: (item.stamp_ns, not item.is_imu, item.key))

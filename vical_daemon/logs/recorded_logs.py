@@ -24,18 +24,20 @@ from vical_daemon.bus.messages import (
     decode_imu,
     decode_points,
 )
-from vical_daemon.bus.topics import BY_KIND, PREDICTED, parse_key
+from vical_daemon.bus.topics import BY_KIND, PREDICTED, STATUS, parse_key
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.mcap import LogError, LogReader
 from vical_daemon.logs.model import (
     ImuArrays,
     Kind,
+    OutOfReach,
     Recording,
     RecordingError,
     Stamped,
     Stream,
     in_stamp_order,
+    merged,
     stream_statistics,
 )
 
@@ -101,6 +103,8 @@ class LogRecording(Recording):
         self._wanted = None if topics is None else set(topics)
         self._channels: dict[str, _Channel] = {}
         self._others: dict[str, str] = {}
+        self._statuses: dict[str, str] = {}  # key of each topic with our status messages
+        self._order = OutOfReach()
         self._scan()
         self._scanned = True
         for channel in self._channels.values():
@@ -131,6 +135,7 @@ class LogRecording(Recording):
                 channel.values += raw.payload[_GYRO]
                 channel.values += raw.payload[_FORCE]
             channel.stamps.append(stamp_ns)
+            self._order.saw(stamp_ns, raw.log_time_ns)
         for channel in self._channels.values():
             if channel.unreadable:
                 self.warnings.append(f"{channel.name}: {channel.unreadable} unreadable messages left out")
@@ -142,6 +147,8 @@ class LogRecording(Recording):
         ours_but_not_measured = parsed is not None and parsed.topic is PREDICTED
         if kind is None or ours_but_not_measured or raw.topic in self._others:
             self._others[raw.topic] = raw.type_name
+            if parsed is not None and parsed.topic is STATUS:
+                self._statuses[raw.topic] = raw.topic.removeprefix("/")
             return None
         if parsed is not None:
             self.rig = parsed.rig
@@ -192,23 +199,29 @@ class LogRecording(Recording):
         return f"{self.path}: no sensor data: expected {wanted}; found {what}"
 
     def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]:
-        return in_stamp_order(self._stamped(keys))
+        # one pass over the log, or one for each stream where they do not lie side by side in it
+        passes = [{key} for key in sorted(keys)] if self._order.found else [keys]
+        for item in merged(in_stamp_order(self._stamped(part)) for part in passes):
+            yield item.key, item.payload
 
     def _stamped(self, keys: set[str]) -> Iterator[Stamped]:
         rows = dict.fromkeys(self._channels, 0)
+        wanted = {topic: (c.key, c.kind == "imu") for topic, c in self._channels.items() if c.key in keys}
+        wanted |= {topic: (key, False) for topic, key in self._statuses.items() if key in keys}
         for raw in self._raw():
-            channel = self._channels.get(raw.topic)
-            stamp_ns = stamp_of(raw.payload)
-            if channel is None or channel.key not in keys or stamp_ns is None:
+            if raw.topic not in wanted:
                 continue
-            payload = raw.payload
-            if channel.even_ns is not None:
+            stamp_ns = stamp_of(raw.payload)
+            if stamp_ns is None:
+                continue
+            payload, channel = raw.payload, self._channels.get(raw.topic)
+            if channel is not None and channel.even_ns is not None:
                 if not _has_imu_size(payload):
                     continue
                 stamp_ns = int(channel.even_ns[rows[raw.topic]])
                 rows[raw.topic] += 1
                 payload = b"".join([payload[:4], _STAMP.pack(*divmod(stamp_ns, 10**9)), payload[12:]])
-            yield Stamped(stamp_ns, raw.log_time_ns, channel.key, channel.kind == "imu", payload)
+            yield Stamped(stamp_ns, raw.log_time_ns, *wanted[raw.topic], payload)
 
     def imu_arrays(self, name: str) -> ImuArrays:
         """See `Recording.imu_arrays`; malformed messages are skipped."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.cli import calibration_run, calibration_text, main
 from vical_daemon.config.priors import read_initial
@@ -99,6 +100,24 @@ def test_json_has_the_promised_keys_and_the_same_bits_through_an_mcap(
     assert 1 <= len(first["trace"]) <= 6
     assert "cam0 in the imu frame" in calibration_text.describe(first | {"cpu_s": 1.0})
     assert "what would help: nod" in calibration_text.describe(first | {"guidance": "nod"})
+
+
+def test_what_the_driver_said_of_its_stamps_counts_as_it_does_live(shortest: Path, tmp_path: Path, capsys):
+    status = DiagnosticStatus(Level.OK, "imu/imu0", values={"stamp_sigma_us": "500.0"})
+    log = tmp_path / "log.mcap"
+    messages = list(open_recording(shortest).messages())
+    with LogWriter(log) as writer:
+        for n, (key, payload) in enumerate(messages):
+            stamp_ns = stamp_of(payload)
+            writer.write(key, payload, stamp_ns)
+            if n % 200 == 0:
+                told = encode_diagnostics(stamp_ns, "imu", [status])
+                writer.write("vical/rig0/status/imu", told, stamp_ns)
+    plain = _calibrate(shortest, capsys)["cameras"]["cam0"]["timeshift_sigma_s"]
+    more = _arguments(shortest, "--json", "--accept", "converging")[2:]
+    assert main(["calibrate", str(log), *more]) == 0
+    told_s = json.loads(capsys.readouterr().out)["cameras"]["cam0"]["timeshift_sigma_s"]
+    assert plain < 4e-4 < 5e-4 <= told_s
 
 
 @pytest.fixture(scope="session")

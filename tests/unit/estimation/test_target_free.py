@@ -17,7 +17,7 @@ from vical_mocks.harness.feed import (
 )
 from vical_mocks.random_rigs import draw
 from vical_mocks.rig import reference_rig
-from vical_mocks.tracks import simulate_tracks
+from vical_mocks.tracks import room_landmarks, simulate_tracks
 from vical_mocks.trajectory import one_axis, still
 
 from vical_daemon.estimation.events import EventKind
@@ -117,6 +117,19 @@ def test_a_window_far_from_settled_throws_no_good_observations_out():
     options = CalibrationOptions(target_free=True, imu_noise=imu_noise(run))
     for shot in feed(run, CalibratorSubject(options, prior, None)).snapshots:
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
+
+
+def test_features_at_the_horizon_hold_up_no_window():
+    """Noise puts half of them beyond infinity, where no landmark may be."""
+    rig = reference_rig(11, timeshift_cam_imu_s=0.01)
+    near, way = room_landmarks(11, 150), np.random.default_rng(11).standard_normal((75, 3))
+    far = 5e3 * way / np.linalg.norm(way, axis=1, keepdims=True)
+    run = simulate_tracks(11, 14.0, rig=rig, camera_rate_hz=10.0, landmarks_m=np.concatenate([near, far]))
+    record = feed(run, subject_for(run))
+    assert record.snapshots[-1].status == "converged"
+    assert not any(e.kind is EventKind.WENT_ON for _, e in record.events)
+    last = record.snapshots[-1]
+    assert nees(last.error, last.covariance, 7) < chi2.isf(1e-4, 7)
 
 
 def test_says_what_the_commands_promise(followed):

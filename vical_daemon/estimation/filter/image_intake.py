@@ -36,6 +36,7 @@ class _Stream:
         stepped_s: Leads of the latest images, all far from the usual one.
         heard_s: Newest inertial reading when the last image arrived.
         images: Images so far.
+        off_s: Lead of the last image minus the usual one.
     """
 
     newest: PointsFrame
@@ -47,6 +48,7 @@ class _Stream:
     stepped_s: list[float] = field(default_factory=list)
     heard_s: float = -np.inf
     images: int = 1
+    off_s: float = 0.0
 
 
 @dataclass(slots=True)
@@ -94,10 +96,14 @@ class ImageIntake:
         self._measure(stream, frame, t_s)
         return t_s
 
+    def ahead_s(self, camera: str) -> float:
+        """By how much more the last image was ahead of the newest inertial reading than usual, s."""
+        return self._streams[camera].off_s if camera in self._streams else 0.0
+
     def _in_step(self, stream: _Stream, camera: str, lead_s: float, newest_imu_s: float) -> bool:
         """Whether a stamp is about where it usually is; a clock that has been set is followed."""
         heard, stream.heard_s = newest_imu_s > stream.heard_s, newest_imu_s
-        off_s = lead_s - stream.lead_s
+        off_s = stream.off_s = lead_s - stream.lead_s
         stream.images += 1
         if off_s > 0.0 and stream.images < _SETTLED:  # the first ones came late, held back until believed
             stream.lead_s, off_s = lead_s, 0.0
@@ -121,11 +127,17 @@ class ImageIntake:
         return True
 
     def _measure(self, stream: _Stream, frame: PointsFrame, t_s: float) -> None:
-        """Follow the usual interval; report a gap."""
+        """Follow the usual interval; report a gap.
+
+        Where stamps are as much further ahead of the inertial readings, it is the clock, not a gap: a step
+        of the time shift, and reported as that.
+        """
         gap_s = t_s - stream.newest_s
+        set_forwards = stream.off_s > 0.5 * gap_s
         if gap_s > max(_REPORTED_S, _GAP_PERIODS * stream.usual_s):
             kind = EventKind.IMAGE_REPEATED if stream.repeats else EventKind.IMAGE_GAP
-            self._news.append(Event(kind, frame.camera, gap_s))
+            if not set_forwards:
+                self._news.append(Event(kind, frame.camera, gap_s))
         elif gap_s > 0.0:
             seen = stream.usual_s
             stream.usual_s = gap_s if np.isinf(seen) else seen + _FOLLOW * (gap_s - seen)

@@ -17,6 +17,8 @@ from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 _LEARN = 20  # readings by which the usual interval is known
 _MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
 _CLIPPED_S = 5.0  # after the first clipped reading, their share is announced
+_UNSEEN_S = 0.5
+"""After a jump of the stamps an image is waited for so long, s: a slow camera takes two a second."""
 _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
@@ -66,6 +68,7 @@ class ImuIntake:
         self._clips = 0  # readings left out since the newest
         self._clipping: tuple[float, int, int] | None = None  # since when, and counts then
         self._news: list[Event] = []
+        self._gap: Event | None = None  # forwards, until an image tells whether the clock was set
 
     @property
     def spikes(self) -> int:
@@ -164,9 +167,10 @@ class ImuIntake:
             self._news.append(Event(EventKind.IMU_CLOCK_SET_BACK, value=back_s))
             held_s, t_s = held_s + back_s, t_s + back_s
         else:
+            self._believe_gap()
             kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
             if not self._clips:
-                self._news.append(Event(kind, value=held_s - self._newest_s))
+                self._gap = Event(kind, value=held_s - self._newest_s)
         self._add(buffer, held_s, held)
         self.gap_end_s = buffer.newest_s
         self._add(buffer, t_s, reading)
@@ -177,7 +181,26 @@ class ImuIntake:
         even_s = self._steps.even(t_s)
         buffer.append(even_s, reading.gyro_rps, reading.specific_force_mps2, broken=broken)
 
+    def saw_image(self, ahead_s: float) -> None:
+        """Learn from an image whether stamps that jumped forwards mean a gap, or a clock that was set.
+
+        The clock: the jump is a step of the time shift, and reported as that.
+
+        Args:
+            ahead_s: By how much more its stamp is ahead of the newest reading than usual, s.
+        """
+        if self._gap is not None and ahead_s < -0.5 * (self._gap.value or 0.0):
+            self._gap = None
+        self._believe_gap()
+
+    def _believe_gap(self) -> None:
+        if self._gap is not None:
+            self._news.append(self._gap)
+            self._gap = None
+
     def news(self) -> list[Event]:
-        """What happened to the stream since the last call."""
+        """What happened to the stream since the last call; a gap after an image, or half a second."""
+        if self._newest_s > self.gap_end_s + _UNSEEN_S:
+            self._believe_gap()
         news, self._news = self._news + self._steps.news(), []
         return news

@@ -35,6 +35,7 @@ _DONE = 1.0  # a step that promises less than this of the sum of squares is the 
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
+_FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _SMALL = 0.1  # of the sum of squares: where a step promises no more, outliers stand out
 _STUCK = 0.02  # of the sum of squares: where a step brought no more, outliers may be why
 
@@ -50,6 +51,7 @@ class Fit(NamedTuple):
         sigma_px: Pixel noise that was found.
         spread: Square root of the images that share an error.
         jitter_s: Standard deviation of the images' stamps, s; 0 where none is seen.
+        jitter_lasts: Images are late one like the next: their clock stepped, and did not jitter.
         steps: Iterations done.
         settled: The last of them changed nothing to speak of.
         used, refused: Observations.
@@ -65,6 +67,7 @@ class Fit(NamedTuple):
     sigma_px: float
     spread: float
     jitter_s: float
+    jitter_lasts: bool
     steps: int
     settled: bool
     used: int
@@ -188,8 +191,22 @@ class Bundle:
         g[at] -= s
         return H, g, inverse, at
 
+    def _bounded(self, normal: Normal) -> Normal:
+        """Normal equations with distances held that would go beyond infinity, where no landmark may be.
+
+        A step that counts on them never brings what it promises. [Bertsekas, "Projected Newton methods for
+        optimization problems with simple constraints", 1982]
+        """
+        held = (self.window.landmarks.inverse < _FAR) & (normal.gl[:, 2] > 0.0)
+        if not held.any():
+            return normal
+        V, W, gl = normal.V.copy(), normal.W.copy(), normal.gl.copy()
+        V[held, 2, :2] = V[held, :2, 2] = gl[held, 2] = W[held, 2] = 0.0
+        return normal._replace(V=V, W=W, gl=gl)
+
     def _step(self, normal: Normal, lam: float) -> _Step | None:
         """Step of states and landmarks; None where the matrix is not positive."""
+        normal = self._bounded(normal)
         for _ in range(6):
             try:
                 H, g, inverse, at = self._reduced(normal, lam)
@@ -276,7 +293,7 @@ class Bundle:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
         self.seen = seen
-        inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
+        inertial, jitter_s, lasts = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = calibration_difference(w, self.carry)[self.problem.active]
@@ -288,6 +305,7 @@ class Bundle:
             self.problem.sigma_px,
             self.problem.spread,
             jitter_s,
+            lasts,
             steps,
             settled,
             int(good.sum()),

@@ -87,8 +87,10 @@ class FreeDoubts:
         imu, enough = hypotheses.IMU, 0.5 if converged else hypotheses.OFF
         if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > enough:
             return hypotheses.IN_DOUBT[imu]
-        if not self.drifting and self._drift(carry, factor) > 1.0:
-            return CLOCKS_IN_DOUBT
+        if not self.drifting:
+            drift = self._drift(carry, factor)
+            if probability(drift) > 0.5 or (drift > 1.0 and not converged):
+                return CLOCKS_IN_DOUBT
         return ""
 
     def weighed(self, carry: Carry, factor: float, compared: bool) -> Doubts:

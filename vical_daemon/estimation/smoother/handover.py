@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.selection.clock_drift import SKEW_WALK
 from vical_daemon.estimation.smoother.carry import (
+    ARM,
     CALIBRATION,
     DRIFT,
     SHIFT,
@@ -25,7 +27,12 @@ _GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2 = 4e-4, 5e-3  # by which biases may have walked
 
 
 def afresh(
-    window: Window, known: Carry | None, active: BoolArray, held: FloatArray | None, imu_sigma: float
+    window: Window,
+    known: Carry | None,
+    active: BoolArray,
+    held: FloatArray | None,
+    imu_sigma: float,
+    reopened: Collection[int] = (),
 ) -> Carry:
     """Prior of a window that starts from nothing: wide, or with the calibration and biases known before.
 
@@ -35,6 +42,7 @@ def afresh(
         active: Which calibration errors are estimated, shape (FULL,).
         held: Axis along which the lever arm is held, see `Starter`.
         imu_sigma: Of the entries of the imu's matrices, where nothing is known.
+        reopened: Errors of the calibration of which nothing is known any more; of mounting and time shift.
     """
     wide = first_carry(window, active, start_sigmas(window.camera, imu_sigma))
     if known is None:
@@ -44,9 +52,16 @@ def afresh(
     keep[:3, :3] += _GYRO_BIAS_RPS**2 * np.eye(3)
     keep[3:6, 3:6] += _ACCEL_BIAS_MPS2**2 * np.eye(3)
     covariance = np.diag(np.diag(wide.root) ** -2.0)
-    covariance[5:, 5:] = keep
-    window.camera = replace(window.camera, timeshift_s=known.camera.timeshift_s)
-    return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
+    kept = 5 + np.flatnonzero([True] * 6 + [k not in reopened for k in np.flatnonzero(active)])
+    covariance[np.ix_(kept, kept)] = keep[np.ix_(kept - 5, kept - 5)]
+    camera, found = known.camera, window.camera
+    if SHIFT in reopened:
+        camera = replace(camera, timeshift_s=found.timeshift_s)
+    else:
+        window.camera = replace(found, timeshift_s=camera.timeshift_s)
+    if ARM.start in reopened:
+        camera = replace(camera, R_imu_cam=found.R_imu_cam, p_imu_cam=found.p_imu_cam)
+    return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=camera)
 
 
 def aged(carry: Carry, noise: ImuNoise, active: BoolArray, span_s: float, *, drifting: bool) -> Carry:

@@ -18,6 +18,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.smoother.window import IntArray, Window
 
+_SURE = 5.0  # sigmas
 _OPEN_S = 1.0  # as good as no prior, where a rig that stands still shows nothing
 
 
@@ -55,6 +56,15 @@ class Lateness:
         """Most likely tau for these states, and their variances if the states were exact, shapes (F,)."""
         inverse = cho_solve((self._root, True), np.eye(len(self._root)))
         return -inverse @ self._right, inverse.diagonal().copy()
+
+    def lasts(self) -> bool:
+        """Whether delays follow those before, beyond five sigma: then the clock stepped, and did not jitter.
+
+        The first autocorrelation of n independent values has a standard deviation of 1 / sqrt(n).
+        """
+        tau, _ = self.delays()
+        power = float((tau**2).sum())
+        return bool(float(tau[1:] @ tau[:-1]) * np.sqrt(len(tau)) > _SURE * power > 0.0)
 
     def by_states(self, J: FloatArray, at: IntArray, size: int) -> FloatArray:
         """B'J over all states, shape (F, size); `at` (F - 1, c): where the columns of J live."""

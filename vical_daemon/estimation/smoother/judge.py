@@ -44,6 +44,7 @@ _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
 _BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
 _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
+LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
 class FreeJudge:
@@ -65,7 +66,7 @@ class FreeJudge:
         self._steady = SteadyStatus()
         self._events = EventLog()
         self.misfit: tuple[Cause, float] = Cause.NONE, 0.0
-        self._contradiction: list[Event] = []
+        self._against_since_s: float | None = None  # images contradict what is known since then
         self._reason, self._motion_missing = "", False
         self._first_ns = self._newest_ns = 0
         self._first_frame_s: float | None = None
@@ -119,23 +120,55 @@ class FreeJudge:
             self._announce(EventKind.WENT_ON, cause=cause, cause_value=value)
             self._quiet = Cause.NONE, None
 
-    def lost(self, why: Cause, value: float | None, kept: Carry | None) -> None:
-        """The window was given up; `kept`: the calibration that stays."""
+    def lost(self, why: Cause, value: float | None, kept: Carry | None, against_s: float = 0.0) -> None:
+        """The window was given up.
+
+        Args:
+            why: Cause.
+            value: Its figure.
+            kept: The calibration that stays.
+            against_s: For how long images have contradicted it, s; 0: they do not.
+        """
+        if kept is not None and against_s:
+            self.contradicted(against_s)
         self._reason, self._motion_missing = cause_text(why, value), False
         if kept is not None and not self._quiet[0]:
             self._quiet = why, value
         if kept is None:
             self._started_s, self._windows, self._given_up = None, 0, (why, value)
+            self._against_since_s = None
             self._agreement.clear()
 
-    def changed(self) -> None:
-        """The rig is not what it was: windows contradict what was known."""
+    def contradicted(self, against_s: float) -> None:
+        """Images of the last `against_s` seconds contradict the calibration: not known yet why."""
+        if self._against_since_s is None:
+            self._against_since_s = self._elapsed_s - against_s
+
+    @property
+    def against_s(self) -> float:
+        """For how long images have contradicted the calibration, s; 0: they do not."""
+        return 0.0 if self._against_since_s is None else self._elapsed_s - self._against_since_s
+
+    @property
+    def proven(self) -> bool:
+        """Whether windows have confirmed the calibration since it was last found."""
+        return self._windows >= _ENOUGH_WINDOWS
+
+    def changed(self, change: FloatArray | None = None) -> None:
+        """The rig is not what it was; `change`: of the calibration's errors, shape (FULL,), where known."""
         why = Cause.CALIBRATION_CONTRADICTED
         self._announce(EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER, cause=why)
-        self.announce_all(self._contradiction)
+        if change is not None:
+            self.announce_all(_changes(self.camera, change, self.active))
         self._bumped, self._quiet, self.doubts.drifting = why, (Cause.NONE, None), False
-        self._started_s, self._windows = None, 0
+        self._started_s, self._windows, self._against_since_s = None, 0, None
         self._agreement.clear()
+        self._steady.reset(Status.CONVERGING)
+
+    def stepped(self, step_s: float) -> None:
+        """The time shift stepped, s; all else is kept."""
+        self._announce(EventKind.TIMESHIFT_STEPPED, step_s)
+        self._quiet, self._against_since_s = (Cause.NONE, None), None
 
     def announce_all(self, events: Iterable[Event]) -> None:
         """Put events into the next estimate."""
@@ -189,13 +222,19 @@ class FreeJudge:
     def closed(self) -> None:
         """A window is complete and agreed."""
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
+        self._against_since_s = None
         if self.jitter_s >= ANNOUNCED_S:
             self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter")
 
-    def agrees(self, fit: Fit, carry: Carry) -> bool:
+    def agrees(self, fit: Fit, carry: Carry, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.
 
         For consistent sigmas, cov(new - old) = P_old - P_new.
+
+        Args:
+            fit: Of the window.
+            carry: What was known before.
+            complete: It will not grow any more: it counts for the measured variance.
         """
         P_old = carry.covariance()[CALIBRATION:, CALIBRATION:]
         # at the first image, where the change was taken
@@ -207,22 +246,28 @@ class FreeJudge:
             return True
         d = vectors.T @ (fit.change / scale)
         statistic, dof = float((d[told] ** 2 / values[told]).sum()), int(told.sum())
-        factor = self.factor()
-        limit = float(chdtri(dof, _DOUBT)) * factor
-        if self._windows < _LEARNING:  # not enough seen yet to tell a poor model from a changed rig
-            limit *= 50.0
-        doubtful = statistic > limit and (factor < _MODEL_FITS or self._matters(fit.change))
-        self._agreement.append((min(statistic, limit), dof))
-        if doubtful:
-            self._contradiction = _changes(self.camera, fit.change, self.active)
-        return not doubtful
-
-    def _matters(self, change: FloatArray) -> bool:
-        """Whether a change is large enough to be a changed rig where the model itself fits poorly."""
         full = np.zeros(FULL)
-        full[np.flatnonzero(self.active)] = change
-        arm, turn, shift = np.linalg.norm(full[:3]), np.linalg.norm(full[3:6]), abs(full[6])
-        return bool(arm > _BIG_M or turn > _BIG_RAD or shift > _BIG_S)
+        full[np.flatnonzero(self.active)] = fit.change
+        agree = self.excess(statistic, dof, full) <= 1.0
+        if complete:
+            self._agreement.append((min(statistic, self._limit(dof)), dof))
+        return agree
+
+    def excess(self, square: float, dof: int, change: FloatArray) -> float:
+        """A sum of squares over the largest that may be chance, given how well windows have agreed so far.
+
+        Args:
+            square: Of a change of the calibration, over its covariance.
+            dof: Its degrees of freedom.
+            change: The change, shape (FULL,): where the model fits poorly, a small one is not a changed rig.
+        """
+        ratio = square / self._limit(dof)
+        return min(ratio, 1.0) if self.factor() >= _MODEL_FITS and not _matters(change) else ratio
+
+    def _limit(self, dof: int) -> float:
+        limit = float(chdtri(dof, _DOUBT)) * self.factor()
+        # at first not enough is seen to tell a poor model from a changed rig
+        return limit if self._windows >= _LEARNING else 50.0 * limit
 
     def factor(self) -> float:
         """Measured variance over the stated one, at least 1 (a prior of a few windows says 1)."""
@@ -250,7 +295,7 @@ class FreeJudge:
         if verdict.guidance and carry is not None:
             advice = excitation_advice(self._motion, carry.camera.R_imu_cam, carry.bias[:3])
             verdict = verdict._replace(guidance=advice or verdict.guidance)
-        _, reason, advice = self._steady.follow(verdict, self._elapsed_s)
+        told = self._steady.follow(verdict, self._elapsed_s)
         self._ever_converged |= self.status == Status.CONVERGED
         if camera is not None and self.status == Status.DEGENERATE:
             camera.withheld.extend(m for m in missing if m.excess > _LOST)
@@ -259,9 +304,9 @@ class FreeJudge:
         return CalibrationEstimate(
             self._newest_ns,
             self.status,
-            reason,
+            told.reason,
             self._progress(camera is not None, missing),
-            guidance_text(advice),
+            guidance_text(told.guidance),
             self._elapsed_s,
             self.frames_seen,
             self.imu_samples,
@@ -271,7 +316,7 @@ class FreeJudge:
             self.nis_per_dof(),
             refused / max(seen, 1),
             self._events.take(),
-            advice,
+            told.guidance,
         )
 
     def _camera(self, carry: Carry) -> CameraEstimate:
@@ -292,6 +337,8 @@ class FreeJudge:
             return self._before_start()
         if not running and self._windows == 0:
             return Verdict(Status.INITIALISING, self._reason)
+        if self._against_since_s is not None:
+            return Verdict(Status.CONVERGING, LOOKING_AGAIN, against_s=self.against_s)
         pause = "" if running else f" (paused: {self._reason or cause_text(*self._quiet)})"
         missing = self._steady.counted(missing)
         if not missing:
@@ -335,14 +382,18 @@ class FreeJudge:
         return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
 
 
-def _changes(camera: str, change: FloatArray, active: BoolArray) -> list[Event]:
-    """A change of the calibration as events: what moved by how much."""
-    full = np.zeros(FULL)
-    full[np.flatnonzero(active)] = change
+def _matters(change: FloatArray) -> bool:
+    """Whether a change, shape (FULL,), is large enough to be a changed rig."""
+    arm, turn, shift = np.linalg.norm(change[:3]), np.linalg.norm(change[3:6]), abs(change[6])
+    return bool(arm > _BIG_M or turn > _BIG_RAD or shift > _BIG_S)
+
+
+def _changes(camera: str, full: FloatArray, active: BoolArray) -> list[Event]:
+    """A change of the calibration, shape (FULL,), as events: what moved by how much; zero: it did not."""
     found = []
     if active[0]:
         found.append((EventKind.CAMERA_MOVED, float(np.linalg.norm(full[:3]))))
         found.append((EventKind.CAMERA_TURNED, float(np.linalg.norm(full[3:6]))))
     if active[6]:
         found.append((EventKind.TIMESHIFT_CHANGED, float(full[6])))
-    return [Event(kind, camera, value) for kind, value in found]
+    return [Event(kind, camera, value) for kind, value in found if value]

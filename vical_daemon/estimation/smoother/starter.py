@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
@@ -18,7 +20,10 @@ from vical_daemon.estimation.smoother.carry import Carry
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.smoother.window import Window
+from vical_daemon.estimation.temporal.camera_orientations import Orientations as CameraOrientations
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
+from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 
@@ -74,10 +79,10 @@ class Starter:
         """Start over: try soon."""
         self._next_s, self._every_s = -np.inf, _EVERY_S
 
-    def attempt(
+    def stretch(
         self, buffer: ImuBuffer, frames: Frames, end_s: float, known: Carry | None, *, last: bool
-    ) -> Window | str | None:
-        """Try when it is time to.
+    ) -> Frames | str | None:
+        """Choose the images of an attempt when it is time for one.
 
         Args:
             buffer: Inertial readings.
@@ -87,7 +92,7 @@ class Starter:
             last: End of the data: try now.
 
         Returns:
-            A window to adjust; why there is none; or None when it is not time to try.
+            The images; why there are none; or None when it is not time to try.
         """
         if end_s < self._next_s and not last:
             return None
@@ -104,12 +109,56 @@ class Starter:
         self.motion_missing = True
         if _still(usable):
             return "the camera stands still: move the rig to and fro while turning it"
+        return usable
+
+    def window(self, buffer: ImuBuffer, frames: Frames, known: Carry | None) -> Window | str:
+        """Make a window of a stretch, with the calibration of before where there is one.
+
+        Args:
+            buffer: Inertial readings.
+            frames: See `stretch`.
+            known: Calibration and biases of before, or None.
+
+        Returns:
+            A window to adjust, or why there is none.
+        """
         if known is None:
             self.held = None
-        found = self._rotations(buffer, usable) if known is None else _known(known)
+        found = self._rotations(buffer, frames, self.prior) if known is None else _known(known)
+        return found if isinstance(found, str) else self._structure(buffer, frames, found)
+
+    def window_anew(self, buffer: ImuBuffer, frames: Frames, known: Carry) -> Window | str:
+        """Make a window of a stretch with mounting and time shift found anew, and all else as known.
+
+        Args:
+            buffer: Inertial readings.
+            frames: See `stretch`.
+            known: Calibration and biases of before.
+
+        Returns:
+            A window to adjust, or why there is none.
+        """
+        if self.held is not None:
+            return "turns about one axis do not show what has changed"
+        c = known.camera
+        prior = replace(
+            self.prior,
+            intrinsics=_four(c.intrinsics),
+            distortion=_four(c.distortion),
+            T_imu_cam=(c.R_imu_cam, c.p_imu_cam),
+            timeshift_cam_imu_s=c.timeshift_s,
+            readout_s=c.readout_s,
+        )
+        found = self._rotations(buffer, frames, prior, known)
         if isinstance(found, str):
             return found
-        return self._structure(buffer, usable, found)
+        if found.about is not None:
+            return "turns about one axis do not show what has changed"
+        camera = replace(
+            _known(known).camera, R_imu_cam=found.camera.R_imu_cam, timeshift_s=found.camera.timeshift_s
+        )
+        imu = np.concatenate([found.imu[:6], known.imu])
+        return self._structure(buffer, frames, _Found(camera, imu, found.arm_sigma_m))
 
     def _structure(self, buffer: ImuBuffer, frames: Frames, found: _Found) -> Window | str:
         """Speed, scale, lever arm and points; after turns about one axis the mounting about it, too."""
@@ -130,20 +179,23 @@ class Starter:
         self.held = held
         return window
 
-    def _rotations(self, buffer: ImuBuffer, frames: Frames) -> _Found | str:
-        """Mounting, delay, lens and gyro bias from the epipolar constraint; or why not."""
-        camera = starting_camera(self.prior)
+    def _rotations(
+        self, buffer: ImuBuffer, frames: Frames, prior: CameraPrior, known: Carry | None = None
+    ) -> _Found | str:
+        """Mounting, delay, lens (unless `known`) and gyro bias from the epipolar constraint; or why not."""
+        camera = starting_camera(prior)
         rows = buffer.rows
         reach = (rows[:, 0] > frames[0][0] - 2.0) & (rows[:, 0] < frames[-1][0] + 2.0)
         t, gyro = rows[reach, 0], rows[reach, 1:4]
-        given = self.prior.T_imu_cam if "extrinsics" in self.options.fix else None
+        given = prior.T_imu_cam if "extrinsics" in self.options.fix else None
         inside = (t > frames[0][0]) & (t < frames[-1][0])
         one_axis = still_axis(t[inside], gyro[inside], np.zeros(3)) is not None
         if one_axis and given is None and frames[-1][0] - frames[0][0] < _PARTIAL_S:
             return "the rig turns about one axis only so far: turn it about a second one"
-        seeds, reason = self._seeds(t, gyro, frames, camera, look_around=not one_axis)
+        gyro_bias = np.zeros(3) if known is None else known.bias[:3]
+        seeds, reason = self._seeds(t, gyro - gyro_bias, frames, camera, prior, look_around=not one_axis)
         lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
-        free_lens = "intrinsics" not in self.options.fix
+        free_lens = known is None and "intrinsics" not in self.options.fix
         if free_lens and len(seeds) > _FULL_FITS:  # look around with the lens as given: three times quicker
             rough = [epipolar_fit(t, gyro, frames, lens, R, s, most=_ROUGH_STEPS) for R, s in seeds]
             seeds = _best_apart([f for f in rough if f is not None])
@@ -167,17 +219,24 @@ class Starter:
         if given is not None:
             camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in given)
             sigma = 1e-4
-        if self.prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
-            camera.timeshift_s = self.prior.timeshift_cam_imu_s
+        if prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
+            camera.timeshift_s = prior.timeshift_cam_imu_s
         return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + NUMBERS)]), sigma, about)
 
     def _seeds(
-        self, t: FloatArray, gyro: FloatArray, frames: Frames, camera: CameraState, *, look_around: bool
+        self,
+        t: FloatArray,
+        gyro: FloatArray,
+        frames: Frames,
+        camera: CameraState,
+        prior: CameraPrior,
+        *,
+        look_around: bool,
     ) -> tuple[list[tuple[FloatArray, float]], str]:
         """Places from which to start the fit, and what TD-ICP has to say against its own."""
         seeds: list[tuple[FloatArray, float]] = []
-        if self.prior.T_imu_cam is not None:
-            seeds.append((self.prior.T_imu_cam[0].copy(), self.prior.timeshift_cam_imu_s or 0.0))
+        if prior.T_imu_cam is not None:
+            seeds.append((prior.T_imu_cam[0].copy(), prior.timeshift_cam_imu_s or 0.0))
         chains = track_orientations(
             (f for _, f in frames), camera.intrinsics, camera.distortion, camera.distortion_model
         )
@@ -185,13 +244,18 @@ class Starter:
             return seeds, ""
         chain = max(chains, key=lambda c: len(c.t_cam_ns))
         t_cam = np.array([s for s, f in frames if f.t_cam_ns in set(chain.t_cam_ns.tolist())])
+        if prior.T_imu_cam is not None:
+            curve = GyroCurve.integrate(t, gyro, np.zeros(3))
+            stepped = nearest_shift(curve, _chained(t_cam, chain), *seeds[0], SEARCHED_S)
+            if stepped is not None:
+                seeds.append((seeds[0][0], stepped))
         result = td_icp(t, gyro, t_cam, chain.R_world_cam, chain.covariance)
         if result.timeshift_cam_imu_s is None or result.R_imu_cam is None or result.status == "refused":
             return seeds, result.reason
         R, shift = result.R_imu_cam, result.timeshift_cam_imu_s
         seeds.append((R, shift))
-        if self.prior.T_imu_cam is not None:
-            seeds.append((self.prior.T_imu_cam[0].copy(), shift))
+        if prior.T_imu_cam is not None:
+            seeds.append((prior.T_imu_cam[0].copy(), shift))
         if result.status != "ok" and look_around:  # one axis may be off by far
             tilt = np.deg2rad(20.0)
             seeds += [(R @ so3.exp(s * tilt * axis), shift) for axis in np.eye(3) for s in (-1.0, 1.0)]
@@ -243,6 +307,17 @@ def _known(known: Carry) -> _Found:
         c.skew,
     )
     return _Found(copy, np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
+
+
+def _chained(t_cam_s: FloatArray, chain: CameraOrientations) -> Orientations:
+    """Orientations strung together: their errors add up from the first on."""
+    walked = np.cumsum(np.trace(chain.covariance, axis1=1, axis2=2) / 3.0)
+    return Orientations(t_cam_s, chain.R_world_cam, np.sqrt(walked))
+
+
+def _four(values: FloatArray) -> tuple[float, float, float, float]:
+    a, b, c, d = (float(x) for x in values)
+    return a, b, c, d
 
 
 def _misfit(fit: EpipolarFit) -> float:

@@ -205,7 +205,8 @@ class Judge:
             first = next(iter(f.state.cameras.values()))
             advice = excitation_advice(self._motion, first.R_imu_cam, f.state.gyro_bias)
             verdict = verdict._replace(guidance=advice or verdict.guidance)
-        _, reason, advice = self._steady.follow(verdict, self._now_s)
+        told = self._steady.follow(verdict, self._now_s)
+        advice = told.guidance
         if not advice and f is not None and self.status != Status.INCONSISTENT:
             advice = self._cover.advice()
         self._ever_converged |= self.status == Status.CONVERGED
@@ -214,7 +215,7 @@ class Judge:
         return CalibrationEstimate(
             self._newest_ns,
             self.status,
-            reason,
+            told.reason,
             self._progress(missing),
             guidance_text(advice),
             self._now_s,

@@ -23,11 +23,13 @@ class Verdict(NamedTuple):
         status: Where.
         reason: Why, as text.
         guidance: What to do next.
+        against_s: For how long the data speak against a converged calibration already, s of data.
     """
 
     status: Status
     reason: str = ""
     guidance: Guidance = Guidance()
+    against_s: float = 0.0
 
 
 @dataclass(slots=True)
@@ -63,7 +65,7 @@ class SteadyStatus:
         """
         if self.status is Status.CONVERGED and verdict.status is Status.CONVERGING:
             if self._doubted_s is None:
-                self._doubted_s = now_s
+                self._doubted_s = now_s - verdict.against_s
             if now_s - self._doubted_s < _STANDS_S:
                 return Verdict(Status.CONVERGED)
         self.reset(verdict.status)

@@ -91,3 +91,11 @@ def test_cameras_are_followed_apart():
         intake.take(image("right"), s, s)
     assert intake.offset_s("left") == pytest.approx(-100.0)
     assert intake.offset_s("right") == 0.0
+
+
+@pytest.mark.parametrize("step_s", [0.6, 1.4])
+def test_a_clock_that_is_set_forwards_is_no_gap(step_s):
+    t = 0.05 * np.arange(100)
+    intake = ImageIntake()
+    feed(intake, np.where(t < 2.5, t, t + step_s), t)
+    assert intake.news() == []

@@ -102,3 +102,13 @@ def test_values_that_are_not_finite_are_counted():
     intake, added = feed(even(50), readings)
     assert len(added) == 48
     assert intake.refused == 2
+
+
+@pytest.mark.parametrize("forwards_s", [0.5, 3600.0])
+def test_a_clock_set_forwards_is_told_from_a_gap_by_the_next_image(forwards_s):
+    for ahead_s, said in ((-forwards_s, []), (0.01, [f"{forwards_s:.1f} s without inertial data"])):
+        intake, _ = feed(np.concatenate([even(300), even(10, 300 * PERIOD_NS + round(forwards_s * 1e9))]))
+        assert intake.news() == []  # not yet
+        intake.saw_image(ahead_s)
+        assert [event_text(e) for e in intake.news()] == said
+        assert intake.news() == []

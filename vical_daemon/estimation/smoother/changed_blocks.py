@@ -1,0 +1,74 @@
+"""After a change of the rig: was it the mounting, the clock, or both? Each block is tested by itself.
+
+A window is adjusted with mounting and time shift unknown and the rest r (lens, imu) as known before. Its
+answer x, r with covariance P is then held against what was known of a block before, N(m + K (r - r0), C):
+
+    d = (x - m) - K (r - r0),   d' (C + A P A')^-1 d ~ chi^2,   A = [I, -K]
+
+which is exact for Gaussians: r is common to both sides, and the condition on it takes that into account.
+[docs/math/target_free.md, eq. (3)]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.smoother.carry import FULL, SHIFT
+
+MOUNTING: tuple[int, ...] = tuple(range(6))
+CLOCK: tuple[int, ...] = (SHIFT,)
+BOTH: tuple[int, ...] = MOUNTING + CLOCK
+"""Blocks of the calibration's errors that may change by themselves; see `carry`."""
+
+
+def changed_blocks(
+    found: FloatArray,
+    found_covariance: FloatArray,
+    known_covariance: FloatArray,
+    active: BoolArray,
+    excess: Callable[[float, int], float],
+) -> tuple[int, ...]:
+    """The fewest blocks that must have changed; of as many, those that leave the rest fit best.
+
+    Args:
+        found: Calibration of a window that knew nothing of the blocks, minus the one known before,
+            shape (FULL,).
+        found_covariance: Of it, zero where not estimated, shape (FULL, FULL).
+        known_covariance: Of what was known before, likewise.
+        active: Which errors are estimated, shape (FULL,).
+        excess: Of a sum of squares and its degrees of freedom: above 1, it is no chance.
+
+    Returns:
+        Errors to reopen; empty: none has changed.
+    """
+    blocks = [block for block in (MOUNTING, CLOCK) if active[list(block)].any()]
+    rest = [k for k in range(FULL) if active[k] and k not in BOTH]
+    for count in range(len(blocks)):
+        scored = []
+        for reopened in combinations(blocks, count):
+            kept = [k for block in blocks if block not in reopened for k in block if active[k]]
+            square = _square(found, found_covariance, known_covariance, kept, rest)
+            scored.append((excess(square, len(kept)), sum(reopened, ())))
+        least, best = min(scored)
+        if least <= 1.0:
+            return best
+    return sum(blocks, ())
+
+
+def _square(
+    found: FloatArray, P: FloatArray, known: FloatArray, kept: Sequence[int], rest: Sequence[int]
+) -> float:
+    """The sum of squares of the test above, with as many degrees of freedom as `kept` is long."""
+    scale = np.sqrt(np.diag(known))  # pixels beside microseconds
+    scale = np.where(scale > 0.0, scale, 1.0)
+    whole, P, d = known / np.outer(scale, scale), P / np.outer(scale, scale), found / scale
+    K = np.linalg.solve(whole[np.ix_(rest, rest)], whole[np.ix_(rest, kept)]).T
+    C = whole[np.ix_(kept, kept)] - K @ whole[np.ix_(rest, kept)]
+    A = np.concatenate([np.eye(len(kept)), -K], axis=1)
+    both = [*kept, *rest]
+    e = A @ d[both]
+    return float(e @ np.linalg.solve(C + A @ P[np.ix_(both, both)] @ A.T, e))
