@@ -103,7 +103,9 @@ class _LogDevice(Closing):
                 raise DeviceLostError(str(error)) from None
             except StopIteration:
                 recording = self._playback.recording
-                ended = f"{recording.path} has ended after {recording.duration_s:.1f} s; start again to play it again"
+                ended = (
+                    f"{recording.path} has ended after {recording.duration_s:.1f} s; start again to replay it"
+                )
                 raise DataEndedError(ended) from None
         t_host_ns, payload = self._next
         _sleep_until(min(t_host_ns, end_ns))

@@ -27,7 +27,7 @@ _TEACHING = """\
 Start here:
   vical demo                                    compare the estimate with the truth, without hardware
   vical calibrate LOG --target target.yaml      calibrate from your own recording
-  vical devices && vical check -c vical.yaml    find the devices, and check the config
+  vical init                                    write a config from what is plugged in, and check it
   vical run -c vical.yaml                       acquire, stamp, record, calibrate, publish
 
 Every command takes --json (only machine-readable output on stdout) and --help.

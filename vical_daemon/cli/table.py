@@ -42,6 +42,7 @@ START, SERVICE, DEVICES, CALIBRATION, LOGS, RESULTS = (
 
 COMMANDS = (
     Command("demo", START, "run the whole system without hardware, and compare the estimate with the truth"),
+    Command("init", START, "write a commented config from what is plugged in, and check it"),
     Command("check", START, "check the config and the devices"),
     Command("doctor", START, "check this computer for causes of bad stamps"),
     Command("target", START, "write a board to print, to scale, and its target file"),

@@ -169,7 +169,7 @@ def test_a_recording_at_its_end_is_neither_lost_nor_opened_again(stop, monkeypat
     time.sleep(0.2)  # longer than a silent device is waited for
     health = loop.health()
     assert health.openings == 1 and health.loop_age_s < STUCK_S and told == ["recording_ended"]
-    outbox = Outbox(LocalBus(), 4, "out")
+    outbox = PublishQueue(LocalBus(), 4, "out")
     status = device_status("imu/imu0", health, outbox, 100.0)
     assert status.level is Level.WARN and status.message == "run.mcap has ended"
     outbox.close()
