@@ -24,6 +24,10 @@ class DeviceLostError(DriverError):
     """The device was there and went away (unplugged, powered off)."""
 
 
+class DataEndedError(DriverError):
+    """A recording played as a device is at its end: nothing more will come, however long one waits."""
+
+
 class DeviceReplacedError(DriverError):
     """Another device answers where a known one was; the source has closed itself: open it anew."""
 

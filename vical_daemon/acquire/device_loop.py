@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Protocol, Self, TypeVar
 
-from vical_drivers.errors import DeviceReplacedError, DriverError
+from vical_drivers.errors import DataEndedError, DeviceReplacedError, DriverError
 from vical_drivers.samples import DeviceInfo, Frame, FrameSource, SourceStats
 
 from vical_daemon.service import notify
@@ -74,7 +74,7 @@ class DeviceHealth:
     """How a device is, at one moment.
 
     Attributes:
-        state: opening, streaming, silent (open, but nothing comes) or lost.
+        state: opening, streaming, silent (open, but nothing comes), lost, or ended (a recording, played).
         problem: One line, empty when streaming.
         info: Who it is; None before it was opened once.
         stats: The source's own counters, of the present opening.
@@ -190,7 +190,8 @@ class DeviceLoop(Generic[T]):
                 self._flush()
                 if self._broken:
                     break
-                if self._t_loop_s - max(self._t_data_s, t_open_s) > self._silence_s:
+                silent_s = self._t_loop_s - max(self._t_data_s, t_open_s)
+                if silent_s > self._silence_s and self._health.state != "ended":
                     self._failed(DriverError(f"no data for {self._silence_s:g} s, opening it again"))
                     break
         finally:
@@ -200,12 +201,18 @@ class DeviceLoop(Generic[T]):
 
     def read_on(self) -> None:
         """Read once and deliver; for another thread while the loop's own is held up in `flush`."""
+        if self._health.state == "ended":
+            self._pause(self._read_timeout_s)
+            return
         with self._turn:
             source = self._source
             if source is None:  # closed while another thread waited for its turn
                 return
             try:
                 items = source.read(self._read_timeout_s)
+            except DataEndedError as error:
+                self._ended(str(error))
+                items = []
             except Exception as error:  # in whatever thread this is
                 # the source cannot tell what is left of it, or has closed itself
                 self._broken = isinstance(error, DeviceReplacedError) or not isinstance(error, DriverError)
@@ -240,6 +247,11 @@ class DeviceLoop(Generic[T]):
             _log.info("%s: back", self.name)
             notify.event("device_back", f"{self.name} is back", device=self.name)
         self._health = replace(self._health, state="streaming", problem="", info=source.info)
+
+    def _ended(self, text: str) -> None:
+        _log.info("%s: %s", self.name, text)
+        notify.event("recording_ended", f"{self.name}: {text}", device=self.name)
+        self._health = replace(self._health, state="ended", problem=text)
 
     def _failed(self, error: Exception) -> None:
         text = str(error) if isinstance(error, DriverError) else f"{type(error).__name__}: {error}"

@@ -51,6 +51,8 @@ def device_status(
 def _judge(health: DeviceHealth, outbox: Outbox | DirectOutbox, nominal_rate_hz: float) -> tuple[Level, str]:
     if health.loop_age_s > STUCK_S:
         return Level.STALE, f"its thread is stuck for {health.loop_age_s:.0f} s"
+    if health.state == "ended":
+        return Level.WARN, health.problem
     if health.state != "streaming":
         return Level.ERROR, health.problem or health.state
     if health.data_age_s > max(2.0, 5 / nominal_rate_hz):

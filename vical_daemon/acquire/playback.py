@@ -1,13 +1,12 @@
 """A recording played as if its devices were there: `port: log:FILE` and `uri: log:FILE` of the settings.
 
 Samples come when their time has come, with stamps of now on CLOCK_MONOTONIC. All devices of one recording
-share one time base, so that the time shift between them is the recorded one. The recording is played over
-and over: a rig whose motion jumps once in a while, which the estimator takes for a gap in the data.
+share one time base, so that the time shift between them is the recorded one. The recording is played once:
+the same data once more would be counted as new ones, and make sigmas small that are not.
 """
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 from collections.abc import Iterator
@@ -18,16 +17,13 @@ import numpy as np
 import numpy.typing as npt
 from vical_drivers.camera.statistics import FrameStatistics
 from vical_drivers.closing import Closing
-from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceRefusedError
+from vical_drivers.errors import DataEndedError, DeviceLostError, DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo, Frame, ImuSample, SourceStats
 
 from vical_daemon.bus.messages import MessageError, decode_compressed_image, decode_image, decode_imu
 from vical_daemon.config.model import LOG_SCHEME
 from vical_daemon.logs import Recording, RecordingError, Stream, open_recording
 from vical_daemon.logs.recorded_logs import stamp_of
-
-PAUSE_S = 2.0
-"""Between the end of a recording and its next beginning: longer than what a filter bridges by prediction."""
 
 _IMU_KINDS = ("imu",)
 _IMAGE_KINDS = ("image", "compressed")
@@ -42,12 +38,11 @@ class _Tape:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self._begin_ns = recording.begin_ns
-        self._period_ns = round((recording.duration_s + PAUSE_S) * 1e9)
         self._t_start_ns: int | None = None
         self._lock = threading.Lock()
 
-    def items(self, stream: Stream) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (number of the play, stamp on CLOCK_MONOTONIC in ns, message) of a stream, without an end.
+    def items(self, stream: Stream) -> Iterator[tuple[int, bytes]]:
+        """Yield (stamp on CLOCK_MONOTONIC in ns, message) of a stream.
 
         Whoever comes later joins in where the recording is by then.
         """
@@ -55,13 +50,11 @@ class _Tape:
         with self._lock:
             if self._t_start_ns is None:
                 self._t_start_ns = now_ns
-            t_start_ns = self._t_start_ns
-        for play in itertools.count((now_ns - t_start_ns) // self._period_ns):
-            offset_ns = t_start_ns + play * self._period_ns - self._begin_ns
-            for _, payload in self.recording.messages([stream]):
-                stamp_ns = stamp_of(payload)
-                if stamp_ns is not None and stamp_ns + offset_ns >= now_ns:
-                    yield play, stamp_ns + offset_ns, payload
+            offset_ns = self._t_start_ns - self._begin_ns
+        for _, payload in self.recording.messages([stream]):
+            stamp_ns = stamp_of(payload)
+            if stamp_ns is not None and stamp_ns + offset_ns >= now_ns:
+                yield stamp_ns + offset_ns, payload
 
 
 class _LogDevice(Closing):
@@ -90,12 +83,16 @@ class _LogDevice(Closing):
             details={"rate_hz": f"{self._stream.rate_hz:.3f}", "topic": self._stream.source},
         )
         self._statistics = FrameStatistics()
-        self._items: Iterator[tuple[int, int, bytes]] | None = None
-        self._next: tuple[int, int, bytes] | None = None
-        self._play: int | None = None
+        self._items: Iterator[tuple[int, bytes]] | None = None
+        self._next: tuple[int, bytes] | None = None
 
     def _due(self, end_ns: int) -> tuple[int, bytes] | None:
-        """Wait for the next message until `end_ns` (CLOCK_MONOTONIC); returns its stamp and the message."""
+        """Wait for the next message until `end_ns` (CLOCK_MONOTONIC); returns its stamp and the message.
+
+        Raises:
+            DataEndedError: That was the last one.
+            DeviceLostError: The recording cannot be read.
+        """
         if self._items is None:
             self._items = self._tape.items(self._stream)
         if self._next is None:
@@ -104,19 +101,20 @@ class _LogDevice(Closing):
             except RecordingError as error:
                 self._items = None  # the next read takes it up again
                 raise DeviceLostError(str(error)) from None
-        play, t_host_ns, payload = self._next
+            except StopIteration:
+                tape = self._tape.recording
+                ended = f"{tape.path} has ended after {tape.duration_s:.1f} s; start again to play it again"
+                raise DataEndedError(ended) from None
+        t_host_ns, payload = self._next
         _sleep_until(min(t_host_ns, end_ns))
         if t_host_ns > end_ns:
             return None
         self._next = None
-        if self._play is not None and play != self._play:
-            self._statistics.restart()
-        self._play = play
         self._statistics.add(t_host_ns, 0)
         return t_host_ns, payload
 
     def stats(self) -> SourceStats:
-        """Counters since it was opened; `reconnects`: how often the recording began again."""
+        """Counters since it was opened."""
         return self._statistics.snapshot()
 
     def close(self) -> None:
@@ -134,7 +132,15 @@ class LogImu(_LogDevice):
         """See `ImuSource.read`."""
         end_ns = time.monotonic_ns() + round(max(0.0, timeout_s) * 1e9)
         samples: list[ImuSample] = []
-        while len(samples) < _MOST_SAMPLES and (item := self._due(end_ns)) is not None:
+        while len(samples) < _MOST_SAMPLES:
+            try:
+                item = self._due(end_ns)
+            except DataEndedError:
+                if samples:
+                    break  # the next call says it
+                raise
+            if item is None:
+                break
             t_host_ns, payload = item
             end_ns = time.monotonic_ns()  # what is due by now comes along; nobody waits for more
             try:

@@ -141,6 +141,8 @@ def _control(text: str) -> tuple[str, float]:
 
 def _frames(source: FrameSource, args: argparse.Namespace) -> Iterator[Frame]:
     """Yield frames until one of the limits; Ctrl-C ends it in good order."""
+    from vical_drivers.errors import DataEndedError
+
     started = silent_since = time.monotonic()
     taken = 0
     with contextlib.suppress(KeyboardInterrupt):
@@ -148,7 +150,11 @@ def _frames(source: FrameSource, args: argparse.Namespace) -> Iterator[Frame]:
             now = time.monotonic()
             if args.seconds is not None and now - started >= args.seconds:
                 return
-            frame = _read(source)
+            try:
+                frame = _read(source)
+            except DataEndedError as error:
+                print(error, file=sys.stderr)
+                return
             if frame is not None:
                 taken += 1
                 silent_since = time.monotonic()

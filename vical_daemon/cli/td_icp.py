@@ -145,12 +145,13 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     t_imu, prior = seconds(t_ns, base), prior_of(initial, camera)
     stream = None
     if cameras[camera].kind == "tracks":
-        frames, lens = track_frames(recording, cameras[camera], prior, base)
+        frames, used = track_frames(recording, cameras[camera], prior, base)
+        lens = (used.lens.intrinsics, used.lens.distortion, used.lens.model)
         result = track_registration(t_imu, gyro, frames, lens, options)
     else:
-        stream = camera_stream(recording, cameras[camera], prior, args.target, base)
+        stream, used = camera_stream(recording, cameras[camera], prior, args.target, base)
         result = td_icp(t_imu, gyro, stream.t_s, stream.R_world_sensor, stream.rotation_sigma, options)
-    document: dict[str, Any] = {**result.to_json(), "imu": imu, "camera": camera}
+    document: dict[str, Any] = {**result.to_json(), "imu": imu, "camera": camera, "lens": used.to_json()}
     if args.watch is not None and stream is None:
         raise CliError("--watch needs a board: tracks of unknown points are fitted as a whole", EXIT_USAGE)
     if args.watch is not None and stream is not None and result.status != REFUSED:
@@ -158,7 +159,7 @@ def _single(args: argparse.Namespace, initial: Initial) -> int:
     if args.json:
         print(json.dumps(document))
     elif result.status != REFUSED:
-        print_single(imu, camera, result, document.get("watch", []))
+        print_single(imu, camera, result, used, document.get("watch", []))
     if result.status == REFUSED:
         raise CliError(f"no delay found: {result.reason}")
     if result.reason:
@@ -207,11 +208,12 @@ def _joint(args: argparse.Namespace, initial: Initial, names: list[str]) -> int:
     from vical_daemon.cli.td_icp_sensors import register
     from vical_daemon.estimation.temporal.td_icp import REFUSED
 
-    result = register(args, initial, names)
+    result, lenses = register(args, initial, names)
     if args.json:
-        print(json.dumps(result.to_json()))
+        used = {name: lens.to_json() for name, lens in lenses.items()}
+        print(json.dumps({**result.to_json(), "lenses": used}))
     elif result.status != REFUSED:
-        print_joint(result)
+        print_joint(result, lenses)
     if result.status == REFUSED:
         raise CliError(f"no delays found: {result.reason}")
     if result.reason:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vical_daemon.cli.td_icp_sources import LensUsed
     from vical_daemon.estimation.temporal.td_icp import TdIcpResult
     from vical_daemon.estimation.temporal.td_icp_joint import JointResult
     from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport
@@ -24,7 +25,9 @@ def report_json(report: DelayReport) -> dict[str, Any]:
     }
 
 
-def print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[str, Any]]) -> None:
+def print_single(
+    imu: str, camera: str, result: TdIcpResult, used: LensUsed, watch: list[dict[str, Any]]
+) -> None:
     """One imu and one camera, for people."""
     import numpy as np
 
@@ -40,6 +43,8 @@ def print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[st
     print(f"  R_imu_cam    q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f}")
     print(f"               ± {sigma_deg[0]:.3f} {sigma_deg[1]:.3f} {sigma_deg[2]:.3f} deg")
     print(f"  gyro bias    {bias[0]:+.3f} {bias[1]:+.3f} {bias[2]:+.3f} deg/s")
+    print(f"  lens         {lens_line(used)}")
+    print(f"               {used.origin}")
     print(f"  noise of one sighting  {np.rad2deg(result.camera_noise_rad):.3f} deg")
     if result.widened > 1.0:
         print(f"  sigmas widened {_because(result.widened)}")
@@ -50,7 +55,14 @@ def print_single(imu: str, camera: str, result: TdIcpResult, watch: list[dict[st
         print(f"  {row['t_s']:8.1f} s  {delay}  drift {drift}{jump}")
 
 
-def print_joint(result: JointResult) -> None:
+def lens_line(used: LensUsed) -> str:
+    """One line of numbers: px, then the distortion of the model."""
+    fx, fy, cx, cy = used.lens.intrinsics
+    distortion = " ".join(f"{k:+.4f}" for k in used.lens.distortion)
+    return f"fx {fx:.2f} fy {fy:.2f} cx {cx:.2f} cy {cy:.2f} px, {used.lens.model} {distortion}"
+
+
+def print_joint(result: JointResult, lenses: dict[str, LensUsed]) -> None:
     """Any number of sensors, for people."""
     import numpy as np
 
@@ -69,6 +81,8 @@ def print_joint(result: JointResult) -> None:
             f"  {name}: R_{result.reference}_{name} q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f} "
             f"± {sigma:.3f} deg, {sensor.pairs} orientations, {sensor.rejected} rejected"
         )
+        if name in lenses:
+            print(f"    lens {lens_line(lenses[name])} ({lenses[name].origin})")
         if sensor.widened > 1.0:
             print(f"    its sigmas widened {_because(sensor.widened)}")
 

@@ -11,7 +11,7 @@ import numpy as np
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.td_icp import choose_gyro, is_trajectory, open_input, options_of, prior_of
 from vical_daemon.cli.td_icp_orientations import pose_topic, trajectory_file
-from vical_daemon.cli.td_icp_sources import camera_stream, seconds
+from vical_daemon.cli.td_icp_sources import LensUsed, camera_stream, seconds
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
@@ -30,8 +30,10 @@ _INTEGRATED_HZ = 30.0  # of a gyro's attitude: what lies between adds nothing to
 _INTEGRATED_SIGMA_RAD = 3e-3  # only a start: the fit measures it
 
 
-def register(args: argparse.Namespace, initial: Initial, names: list[str]) -> JointResult:
-    """Collect the sensors' orientations and register them.
+def register(
+    args: argparse.Namespace, initial: Initial, names: list[str]
+) -> tuple[JointResult, dict[str, LensUsed]]:
+    """Collect the sensors' orientations and register them; also the lens of each camera.
 
     Args:
         args: Of the command.
@@ -46,22 +48,26 @@ def register(args: argparse.Namespace, initial: Initial, names: list[str]) -> Jo
     if is_trajectory(path):
         first, base = trajectory_file(path, None)
         others = [trajectory_file(Path(name), base)[0] for name in names if _file(name)]
-        return joint_of_orientations([first, *others], options)
+        return joint_of_orientations([first, *others], options), {}
     recording = _recording(args.input, names)
     imus = {} if recording is None else recording.imus
     gyros = [name for name in names if name in imus]
     base_ns = None if recording is None else recording.begin_ns
-    streams = []
+    streams, lenses = [], {}
     for name in names:
         if recording is not None and name in gyros[1:] and base_ns is not None:
             streams.append(_integrated(recording, name, base_ns))
+        elif recording is not None and name in recording.cameras and base_ns is not None:
+            camera, prior = recording.cameras[name], prior_of(initial, name)
+            stream, lenses[name] = camera_stream(recording, camera, prior, args.target, base_ns)
+            streams.append(stream)
         elif name not in gyros:
-            stream, base_ns = _stream(args, initial, recording, name, base_ns)
+            stream, base_ns = _other_stream(args, recording, name, base_ns)
             streams.append(stream)
     if gyros and recording is not None and base_ns is not None:
         imu, t_ns, gyro = choose_gyro(recording, gyros[0])
-        return joint_with_gyro(imu, seconds(t_ns, base_ns), gyro, streams, options)
-    return joint_of_orientations(streams, options)
+        return joint_with_gyro(imu, seconds(t_ns, base_ns), gyro, streams, options), lenses
+    return joint_of_orientations(streams, options), lenses
 
 
 def _integrated(recording: Recording, name: str, base_ns: int) -> OrientationStream:
@@ -86,14 +92,10 @@ def _recording(path: str, names: list[str]) -> Recording | None:
         raise
 
 
-def _stream(
-    args: argparse.Namespace, initial: Initial, recording: Recording | None, name: str, base_ns: int | None
+def _other_stream(
+    args: argparse.Namespace, recording: Recording | None, name: str, base_ns: int | None
 ) -> tuple[OrientationStream, int]:
-    """One sensor's orientations, and what was subtracted from its stamps (its first, without a base)."""
-    if recording is not None and name in recording.cameras and base_ns is not None:
-        camera = recording.cameras[name]
-        prior = prior_of(initial, name)
-        return camera_stream(recording, camera, prior, args.target, base_ns), base_ns
+    """What is no camera: orientations, and what was subtracted from its stamps (its first, without a base)."""
     if name.startswith("/") and not Path(name).is_file():
         return pose_topic(Path(args.input), name, base_ns)
     if Path(name).is_file():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,24 @@ from vical_daemon.logs import Recording, Stream
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+GIVEN = "--initial"
+
+
+@dataclass(frozen=True, slots=True)
+class LensUsed:
+    """The lens with which orientations were taken from images, and where it is from."""
+
+    lens: Lens
+    origin: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as `vical td-icp --json` prints it, with the names of `vical calibrate`."""
+        return {
+            "intrinsics": self.lens.intrinsics.tolist(),
+            "distortion_model": self.lens.model,
+            "distortion": self.lens.distortion.tolist(),
+            "origin": self.origin,
+        }
 
 
 def seconds(t_ns: IntArray, base_ns: int) -> FloatArray:
@@ -30,8 +49,8 @@ def seconds(t_ns: IntArray, base_ns: int) -> FloatArray:
 
 def camera_stream(
     recording: Recording, stream: Stream, prior: CameraPrior | None, target: str | None, base_ns: int
-) -> OrientationStream:
-    """Orientations of one camera of a recording.
+) -> tuple[OrientationStream, LensUsed]:
+    """Orientations of one camera of a recording, and the lens they were taken with.
 
     Args:
         recording: The data.
@@ -55,14 +74,18 @@ def camera_stream(
         if not chains:
             raise CliError(f"{stream.name}: too few features carry over from frame to frame")
         found = max(chains, key=lambda chain: len(chain.t_cam_ns))
-        return _stream(stream.name, found, base_ns)
-    found, _ = board_poses(recording, stream, lens, prior is None or prior.intrinsics is None, target)
-    return _stream(stream.name, found, base_ns)
+        return _stream(stream.name, found, base_ns), LensUsed(lens, GIVEN)
+    guess = prior is None or prior.intrinsics is None
+    found, fit = board_poses(recording, stream, lens, guess, target)
+    used = replace(lens, intrinsics=fit.intrinsics, distortion=fit.distortion)
+    start = "a guess from the image size" if guess else GIVEN
+    origin = f"estimated from {fit.views} views of the board, starting from {start}" if fit.views else start
+    return _stream(stream.name, found, base_ns), LensUsed(used, origin)
 
 
 def track_frames(
     recording: Recording, stream: Stream, prior: CameraPrior | None, base_ns: int
-) -> tuple[list[tuple[float, PointsFrame]], tuple[FloatArray, FloatArray, str]]:
+) -> tuple[list[tuple[float, PointsFrame]], LensUsed]:
     """Tracks with their stamps in seconds, and the lens.
 
     Raises:
@@ -70,9 +93,8 @@ def track_frames(
     """
     if prior is None or prior.intrinsics is None:
         raise CliError(f"{stream.name}: tracks need the lens: give --initial with its intrinsics", EXIT_USAGE)
-    lens = lens_of(stream, prior)
     frames = [((f.t_cam_ns - base_ns) * 1e-9, f) for f in recording.points_frames(stream.name)]
-    return frames, (lens.intrinsics, lens.distortion, lens.model)
+    return frames, LensUsed(lens_of(stream, prior), GIVEN)
 
 
 def board_poses(

@@ -18,7 +18,7 @@ import numpy as np
 from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.statistics import FrameStatistics
 from vical_drivers.closing import Closing
-from vical_drivers.errors import DeviceNotFoundError, DeviceRefusedError
+from vical_drivers.errors import DataEndedError, DeviceNotFoundError, DeviceRefusedError
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 from vical_drivers.user_files import read_file, read_text
 
@@ -97,7 +97,11 @@ class ImageFolder(Closing):
         )
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame when it is due; None after `timeout_s`, and at the end of the folder."""
+        """Return the next frame when it is due; None after `timeout_s`.
+
+        Raises:
+            DataEndedError: That was the last one.
+        """
         now_ns = time.monotonic_ns()
         end_ns = now_ns + round(max(0.0, timeout_s) * 1e9)
         while self._frames:
@@ -126,6 +130,10 @@ class ImageFolder(Closing):
                 encoding=self._settings.encoding,
                 stamp_rule="recorded",
                 dropped_before=dropped,
+            )
+        if not self._frames:
+            raise DataEndedError(
+                f"{self._folder}: it has ended; start again to play it again"
             )
         time.sleep(max(0, end_ns - time.monotonic_ns()) * 1e-9)
         return None

@@ -135,3 +135,22 @@ def test_observability_names_what_one_axis_does_not_show(tmp_path, capsys):
     assert advice["lever_arm"]["direction"] == "the optical axis"
     assert "rotate about another axis" in advice["lever_arm"]["advice"]
     assert "optical axis" in err
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_the_lens_that_was_used_is_told(tmp_path, capsys, run, given):
+    folder = _write(tmp_path, run)
+    initial = ["--initial", str(folder / "initial.yaml")] if given else []
+    code, answer, _ = _vical(capsys, "td-icp", folder, *initial)
+    assert code == 0
+    lens = answer["lens"]
+    assert lens["distortion_model"] == run.rig.lens.model and len(lens["distortion"]) == 4
+    assert lens["intrinsics"][0] == pytest.approx(run.rig.lens.intrinsics[0], rel=0.02)
+    start = "--initial" if given else "a guess from the image size"
+    assert lens["origin"].endswith(f"views of the board, starting from {start}")
+    assert main(["td-icp", str(folder), "--target", str(folder / "target.yaml"), *initial]) == 0
+    said = capsys.readouterr().out
+    assert f"lens         fx {lens['intrinsics'][0]:.2f} fy" in said and lens["origin"] in said
+    sensors = ["--sensors", "imu0,cam0"]
+    code, answer, _ = _vical(capsys, "td-icp", folder, *sensors, *initial)
+    assert code == 0 and answer["lenses"]["cam0"] == lens

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from vical_drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceReplacedError
+from vical_drivers.errors import DataEndedError, DeviceLostError, DeviceNotFoundError, DeviceReplacedError
 from vical_drivers.samples import DeviceInfo, SourceStats
 
 from vical_daemon.acquire.device_loop import DeviceLoop
@@ -157,6 +157,24 @@ def test_a_silent_device_is_opened_again(stop) -> None:
     loop = _loop(opener, got, stop, silence_s=0.1)
     _wait_for(lambda: got[:3] == [0, 1, 2])
     assert sources[0].closed and loop.health().openings >= 3
+
+
+def test_a_recording_at_its_end_is_neither_lost_nor_opened_again(stop, monkeypatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(notify, "event", lambda name, text, **_: told.append(name))
+    source = ScriptedSource([[1], DataEndedError("run.mcap has ended")])
+    got: list[int] = []
+    loop = _loop(lambda: source, got, stop, silence_s=0.05)
+    _wait_for(lambda: loop.health().state == "ended")
+    time.sleep(0.2)  # longer than a silent device is waited for
+    health = loop.health()
+    assert health.openings == 1 and health.loop_age_s < STUCK_S and told == ["recording_ended"]
+    outbox = Outbox(LocalBus(), 4, "out")
+    status = device_status("imu/imu0", health, outbox, 100.0)
+    assert status.level is Level.WARN and status.message == "run.mcap has ended"
+    outbox.close()
+    stop.set()
+    assert loop.join(2.0) and source.closed
 
 
 def test_stop_closes_the_device(stop) -> None:
