@@ -95,7 +95,7 @@ def _recording(path: str, names: list[str]) -> Recording | None:
 def _other_stream(
     args: argparse.Namespace, recording: Recording | None, name: str, base_ns: int | None
 ) -> tuple[OrientationStream, int]:
-    """What is no camera: orientations, and what was subtracted from its stamps (its first, without a base)."""
+    """A sensor that is no camera: its orientations, and what was subtracted from its stamps."""
     if name.startswith("/") and not Path(name).is_file():
         return pose_topic(Path(args.input), name, base_ns)
     if Path(name).is_file():
