@@ -27,7 +27,7 @@ _TEACHING = """\
 Start here:
   vical demo                                    no hardware needed; ends with truth beside the estimate
   vical calibrate LOG --target target.yaml      the same filter over a recording of yours
-  vical devices && vical check -c vical.yaml    what is plugged in, and does the config fit
+  vical init                                    what is plugged in, a config from that, and does it work
   vical run -c vical.yaml                       acquire, stamp, record, calibrate, publish
 
 Every command takes --json (machine output alone on stdout) and --help.

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, NOTHING_TO_RUN, CliError
 from vical_daemon.cli.options import add_config, add_json
@@ -47,26 +47,26 @@ def run(args: argparse.Namespace) -> int:
     except ConfigError as error:
         findings = [Finding("config", args.config, problem) for problem in error.problems]
         _print(findings, as_json=args.json)
-        raise CliError(_count(findings), EXIT_USAGE) from None
+        raise CliError(count(findings), EXIT_USAGE) from None
     if not config.imus and not config.cameras:
         finding = Finding("config", args.config, f"{args.config}: {NOTHING_TO_RUN}")
         _print([finding], as_json=args.json)
         raise CliError(finding.problem, EXIT_USAGE)
-    findings = [Finding("config", f"{args.config}: {_summary(config)}")]
-    for finding in _findings(config, devices=not args.no_devices):
+    findings = []
+    for finding in examine(config, args.config, devices=not args.no_devices):
         findings.append(finding)
         if not args.json:
             print_line(finding)
     if args.json:
         _print(findings, as_json=True)
     if any(finding.problem for finding in findings):
-        raise CliError(_count(findings))
+        raise CliError(count(findings))
     if not args.json:
         print("all is well")
     return 0
 
 
-def _count(findings: list[Finding]) -> str:
+def count(findings: list[Finding]) -> str:
     """Return the one line that stands on stderr when the check fails."""
     bad = [finding.problem for finding in findings if finding.problem]
     more = f" (and {len(bad) - 1} more, see above)" if len(bad) > 1 else ""
@@ -78,7 +78,15 @@ def _summary(config: Config) -> str:
     return f"rig {config.rig}, {imus}, {cameras}, {config.calibration.mode}"
 
 
-def _findings(config: Config, *, devices: bool) -> Iterator[Finding]:
+def examine(config: Config, name: str, *, devices: bool) -> Iterator[Finding]:
+    """Yield one finding for each thing that is looked at.
+
+    Args:
+        config: The rig.
+        name: Of its file.
+        devices: Open the devices, too.
+    """
+    yield Finding("config", f"{name}: {_summary(config)}")
     yield from _check_target(config)
     yield _check_disk(config)
     if not devices:
@@ -178,9 +186,14 @@ def _print(findings: list[Finding], *, as_json: bool) -> None:
         for finding in findings:
             print_line(finding)
         return
+    print(json.dumps(document(findings)))
+
+
+def document(findings: list[Finding]) -> dict[str, Any]:
+    """Return what `--json` prints."""
     problems = [finding.problem for finding in findings if finding.problem]
     checked = [{"what": f.what, "found": f.text, "problem": f.problem} for f in findings]
-    print(json.dumps({"ok": not problems, "problems": problems, "checked": checked}))
+    return {"ok": not problems, "problems": problems, "checked": checked}
 
 
 def print_line(finding: Finding) -> None:

@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """List serial ports with what answers there, then cameras."""
-    paths = _different([*args.port, *serial_ports()])
+    paths = different([*args.port, *serial_ports()])
     ports = [_unknown(path) for path in paths] if args.no_probe else probe_all(paths)
-    cameras, problem = _cameras()
+    cameras, problem = list_cameras()
     if args.json:
         print(json.dumps({"imus": ports, "cameras": [_camera(c) for c in cameras], "problem": problem}))
         return 0
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _different(paths: list[str]) -> list[str]:
+def different(paths: list[str]) -> list[str]:
     """Leave out second names of a port: asked at once under both, it would seem to be in use."""
     found = {os.path.realpath(path): path for path in reversed(paths)}
     return [path for path in dict.fromkeys(paths) if found[os.path.realpath(path)] == path]
@@ -132,12 +132,12 @@ def _print_ports(ports: list[dict[str, object]]) -> None:
         print("no serial port found; name one with --port")
 
 
-def _cameras() -> tuple[list[DeviceInfo], str]:
+def list_cameras() -> tuple[list[DeviceInfo], str]:
     """Cameras, or why they cannot be listed."""
     try:
-        from vical_drivers.camera.opening import list_cameras
+        from vical_drivers.camera import opening
 
-        return list(list_cameras()), ""
+        return list(opening.list_cameras()), ""
     except (DriverError, ImportError) as error:
         return [], str(error)
 

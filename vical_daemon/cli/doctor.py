@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from vical_daemon.cli.check import Finding, print_line
+from vical_daemon.cli.check import Finding, document, print_line
 from vical_daemon.cli.errors import CliError
 from vical_daemon.cli.options import add_json
 
@@ -38,8 +38,7 @@ def run(args: argparse.Namespace) -> int:
             print_line(finding)
     problems = [finding.problem for finding in findings if finding.problem]
     if args.json:
-        checked = [{"what": f.what, "found": f.text, "problem": f.problem} for f in findings]
-        print(json.dumps({"ok": not problems, "problems": problems, "checked": checked}))
+        print(json.dumps(document(findings)))
     if problems:
         more = f" (and {len(problems) - 1} more, see above)" if len(problems) > 1 else ""
         raise CliError(f"{problems[0]}{more}")

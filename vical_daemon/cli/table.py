@@ -42,6 +42,7 @@ START, SERVICE, DEVICES, CALIBRATION, LOGS, RESULTS = (
 
 COMMANDS = (
     Command("demo", START, "the whole system without hardware, truth beside the estimate at the end"),
+    Command("init", START, "write a commented config from what is plugged in, and check it"),
     Command("check", START, "read config and devices, say what is wrong"),
     Command("doctor", START, "what on this computer stands in the way of good stamps, and what to do"),
     Command("target", START, "a board to print, to scale, and its target YAML"),

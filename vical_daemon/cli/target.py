@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,8 +67,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A board that was written.
+
+    Attributes:
+        target: It.
+        size_mm: Width and height of the page, mm.
+        yaml_path: Where its target file is.
+        description: One line for a person.
+    """
+
+    target: Target
+    size_mm: tuple[float, float]
+    yaml_path: Path
+    description: str
+
+
 def run(args: argparse.Namespace) -> int:
     """Write the board and its YAML."""
+    _report(args, make(args))
+    return 0
+
+
+def make(args: argparse.Namespace) -> Made:
+    """Write the board and its YAML, and print nothing.
+
+    Raises:
+        CliError: The board does not fit, or a file cannot or must not be written.
+    """
     from vical_daemon.vision.board_sheet import SheetError, describe, lay_out
     from vical_daemon.vision.sheet_files import to_pdf, to_svg
     from vical_daemon.vision.target import TargetError
@@ -91,8 +119,7 @@ def run(args: argparse.Namespace) -> int:
             yaml_path.write_text(target.to_yaml(), encoding="utf-8")
     except OSError as error:
         raise CliError(f"{error.filename or args.out}: cannot be written ({error.strerror})") from None
-    _report(args, target, sheet.size_mm, yaml_path)
-    return 0
+    return Made(target, sheet.size_mm, yaml_path, describe(target).removeprefix("vical "))
 
 
 def _must_write(args: argparse.Namespace, yaml_path: Path, target: Target) -> bool:
@@ -182,19 +209,18 @@ def parse_length_m(text: str) -> float:
         raise CliError(f"length {text!r}: give metres, or a number with mm or cm", exit_code=2) from None
 
 
-def _report(args: argparse.Namespace, target: Target, size_mm: tuple[float, float], yaml_path: Path) -> None:
-    from vical_daemon.vision.board_sheet import describe
-
+def _report(args: argparse.Namespace, made: Made) -> None:
+    width, height = made.size_mm
     if args.json:
         row = {
             "board": str(args.out),
-            "yaml": str(yaml_path),
-            "kind": target.kind,
-            "points": len(target.points_m),
-            "page_mm": list(size_mm),
+            "yaml": str(made.yaml_path),
+            "kind": made.target.kind,
+            "points": len(made.target.points_m),
+            "page_mm": [width, height],
         }
         print(json.dumps(row))
         return
-    print(f"{args.out}: {describe(target).removeprefix('vical ')}, page {size_mm[0]:g} x {size_mm[1]:g} mm")
-    print(f"{yaml_path}: target file for --target")
+    print(f"{args.out}: {made.description}, page {width:g} x {height:g} mm")
+    print(f"{made.yaml_path}: target file for --target")
     print("Print at 100 %, glue it to something flat, measure the ruler; correct the YAML if it is off.")

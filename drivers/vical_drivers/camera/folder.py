@@ -132,9 +132,7 @@ class ImageFolder(Closing):
                 dropped_before=dropped,
             )
         if not self._frames:
-            raise DataEndedError(
-                f"{self._folder}: it has ended; start again to play it again"
-            )
+            raise DataEndedError(f"{self._folder}: it has ended; start again to play it again")
         time.sleep(max(0, end_ns - time.monotonic_ns()) * 1e-9)
         return None
 

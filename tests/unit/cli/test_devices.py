@@ -20,7 +20,7 @@ from vical_daemon.cli import devices, main
 @pytest.fixture(autouse=True)
 def no_ports_of_this_machine(monkeypatch):
     monkeypatch.setattr(devices, "serial_ports", list)
-    monkeypatch.setattr(devices, "_cameras", lambda: ([], ""))
+    monkeypatch.setattr(devices, "list_cameras", lambda: ([], ""))
 
 
 @pytest.fixture
