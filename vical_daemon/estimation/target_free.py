@@ -29,7 +29,7 @@ from vical_daemon.estimation.plausible import stamp_sigma_problem
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.carry import DRIFT, FULL, LENS, SHIFT, Carry
-from vical_daemon.estimation.smoother.handover import afresh, aged, next_window
+from vical_daemon.estimation.smoother.handover import afresh, aged, next_window, of_another_recording
 from vical_daemon.estimation.smoother.judge import FreeJudge
 from vical_daemon.estimation.smoother.reports import window_reports
 from vical_daemon.estimation.smoother.starter import Starter
@@ -86,6 +86,7 @@ class TargetFreeCalibrator:
         self._thinning = Thinning(MAX_RATE_HZ)
         self._doubted: Carry | None = None
         self._reports: list[FrameReport] = []
+        self._anew = False  # another recording has begun: what it starts with is to be found as in the first
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
@@ -110,7 +111,7 @@ class TargetFreeCalibrator:
         """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
         count, frame = len(frame.ids), cleaned(frame)
         nonsense = count > 0 and not len(frame.ids)  # its stamp is worth no more than its tracks
-        if frame.camera != self.camera or self._buffer is None or nonsense:
+        if frame.camera != self.camera or self._buffer is None or self._imu.between or nonsense:
             self.judge.frames_ignored += 1
             return
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
@@ -185,13 +186,21 @@ class TargetFreeCalibrator:
         assert self._buffer is not None
         end = self._buffer.newest_s - _LATE_S
         known = self._doubted or self.latest
-        attempt = self.starter.attempt(self._buffer, self._pending, end, known, last=flush)
+        hint = None if self._anew else known
+        attempt = self.starter.attempt(self._buffer, self._pending, end, hint, last=flush)
         if attempt is None:
             return False
         if isinstance(attempt, str):
             self.judge.waiting(attempt, self.starter.motion_missing)
             return False
         window = attempt
+        if self._anew and known is not None:
+            if self.starter.held is not None:
+                self.judge.waiting(
+                    "the rig turns about one axis only so far: turn it about a second one", True
+                )
+                return False
+            known = of_another_recording(known, window)
         carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma)
         bundle = Bundle(window, carry, *self._noise)
         fit = bundle.solve(self._buffer, _STEPS_START)
@@ -205,6 +214,7 @@ class TargetFreeCalibrator:
         self.window, self.carry, self.latest = window, carry, fit.carry
         self._noise = (fit.sigma_px, fit.spread, fit.jitter_s)
         self._closed = 0 if known is None else self._closed
+        self._anew = False
         self.judge.held = self.starter.held
         self.judge.started(window.frames[0][0])
         self.judge.saw_fit(fit, last + window.shift_s)
@@ -308,6 +318,26 @@ class TargetFreeCalibrator:
         self.carry = None
         self.starter.again()
         self.judge.lost(why, value, self.latest)
+
+    @property
+    def can_go_on(self) -> bool:
+        """Whether another recording can go on with this calibration: no direction of it is unknown."""
+        return self.latest is not None and self.starter.held is None
+
+    def next_recording(self) -> None:
+        """What comes from now on is another recording of the same rig; see `Calibrator.next_recording`."""
+        if self.can_go_on:
+            self._lost(Cause.NONE, keep=True)
+        if not self.can_go_on:
+            self.window = self.carry = self.latest = None
+            self._closed = 0
+        if self.latest is not None:
+            camera = self.latest.camera
+            self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + self._offset_s)
+        self._doubted, self._anew = None, self.latest is not None
+        self.starter.again()
+        self._imu.next_recording()
+        self._images, self._pending, self._newest_s = ImageIntake(), [], -np.inf
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

@@ -15,6 +15,7 @@ from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _LEARN = 20  # readings by which the usual interval is known
 _MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
+_APART_S = 10.0  # between recordings whose stamps overlap
 _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
@@ -38,9 +39,10 @@ class ImuIntake:
 
     Attributes:
         buffer: The readings, s since the first stamp; None before the first one.
-        base_ns: First stamp, ns.
+        base_ns: First stamp, ns; stamps of images are counted from it, too.
         refused: Readings left out: out of order, no possible values, or with a wrong stamp.
         repeated: Readings left out because they repeat the one before, bit by bit.
+        between: Another recording was announced, and no reading of it has been added yet.
         gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
     """
 
@@ -50,6 +52,7 @@ class ImuIntake:
         self.refused = 0
         self.repeated = 0
         self.gap_end_s = -np.inf
+        self.between = False
         self._steps = StampSteps()
         self._set_back_s = 0.0  # by how much the clock has been set back in all
         self._newest_s = -np.inf  # stamp as it came, plus what the clock has been set back
@@ -90,6 +93,9 @@ class ImuIntake:
             self.base_ns = t_imu_ns
             self.buffer = ImuBuffer(t_imu_ns)
         t_s = (t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
+        if self.between and t_s <= self._newest_s:  # the clock was set back in the recording before
+            self.base_ns -= round((self._newest_s + _APART_S - t_s) * 1e9)
+            t_s = self._newest_s + _APART_S
         added = self._in_order(self.buffer, t_s, reading)
         if added:
             self._repeats = 0
@@ -128,9 +134,10 @@ class ImuIntake:
             self._set_back_s += back_s
             self._news.append(Event(EventKind.IMU_CLOCK_SET_BACK, value=back_s))
             held_s, t_s = held_s + back_s, t_s + back_s
-        else:
+        elif not self.between:
             kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
             self._news.append(Event(kind, value=held_s - self._newest_s))
+        self.between = False
         self._add(buffer, held_s, held)
         self.gap_end_s = buffer.newest_s
         self._add(buffer, t_s, reading)
@@ -139,6 +146,12 @@ class ImuIntake:
     def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> None:
         self._newest_s = t_s
         buffer.append(self._steps.even(t_s), reading.gyro_rps, reading.specific_force_mps2)
+
+    def next_recording(self) -> None:
+        """Another recording follows: its stamps are as they should be, and the gap before it is no news."""
+        self._steps, self._set_back_s = StampSteps(), 0.0
+        self._newest_s = -np.inf if self.buffer is None else self.buffer.newest_s
+        self._held, self._repeats, self.between = None, 0, True
 
     def news(self) -> list[Event]:
         """What happened to the stream since the last call."""

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation.init.initial_filter import ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.selection.clock_drift import SKEW_WALK
 from vical_daemon.estimation.smoother.carry import (
+    BIASES,
     CALIBRATION,
     DRIFT,
     SHIFT,
@@ -47,6 +49,19 @@ def afresh(
     covariance[5:, 5:] = keep
     window.camera = replace(window.camera, timeshift_s=known.camera.timeshift_s)
     return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
+
+
+def of_another_recording(known: Carry, window: Window) -> Carry:
+    """What was known, for the first window of another recording: its biases are those that its start found.
+
+    The time between the recordings is not known, and taken as none. The window takes over what is known of
+    the imu's matrices; its links hold for others, and correct for that by their derivatives.
+    """
+    window.imu = known.imu.copy()
+    P = known.covariance()
+    P[BIASES], P[:, BIASES] = 0.0, 0.0
+    P[BIASES, BIASES] = np.diag(np.repeat([GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA], 3) ** 2)
+    return replace(known, bias=window.bias[0].copy(), root=root_of(P), t_cam_s=window.frames[0][0])
 
 
 def aged(carry: Carry, noise: ImuNoise, active: BoolArray, span_s: float, *, drifting: bool) -> Carry:
