@@ -1,7 +1,7 @@
 """Two recordings of one rig calibrated as one: honest, and as good as both together?
 
-Pairs of simulated recordings with the rig in common; motion, biases and the direction of gravity differ. And the
-halves of EuRoC's recording as two recordings, beside the whole.
+Pairs of simulated recordings with the rig in common; motion, biases and the direction of gravity differ. And
+the halves of EuRoC's recording as two recordings, beside the whole.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2, _LEAN_RAD = np.deg2rad(1.5), 0.15, 0.3  # by w
 
 
 def another(seed: int, *, leans: bool) -> Rig:
-    """The rig of `reference_rig` on another day: motion and biases of its own; the board `leans` elsewhere."""
+    """The rig of `reference_rig` on another day: its own motion and biases; the board `leans` elsewhere."""
     rng = np.random.default_rng([seed, 64])
     gravity = nominal_gravity()
     if leans:
@@ -116,7 +116,7 @@ def euroc() -> None:
     split = items[0][0] + int(euroc_halves.SPLIT_S * 1e9)
     halves = [[i for i in items if (i[0] < split) == first] for first in (True, False)]
     print(
-        "| EuRoC, lens | order | lever arm mm | rotation deg | time shift us | largest, in sigmas of the whole |"
+        "| EuRoC, lens | order | lever arm mm | rotation deg | time shift us | largest, sigmas of the whole |"
     )
     print("|---|---|---|---|---|---|")
     for lens, fix in (("fixed", frozenset({"intrinsics"})), ("free", frozenset[str]())):

@@ -46,6 +46,7 @@ COMMANDS = (
     Command("check", START, "read config and devices, say what is wrong"),
     Command("doctor", START, "what on this computer stands in the way of good stamps, and what to do"),
     Command("target", START, "a board to print, to scale, and its target YAML"),
+    Command("completion", START, "completion for bash or zsh, as a script to source"),
     Command("run", SERVICE, "the daemon, or single roles of it"),
     Command("watch", SERVICE, "subscribe to calibration updates and show them live"),
     Command("web", SERVICE, "a page with the live calibration, on loopback"),

@@ -134,9 +134,9 @@ def test_two_halves_are_the_whole(first) -> None:
     assert (halves_sigma < 1.3 * whole_sigma).all()  # two starts in 16 s
 
 
-@pytest.mark.parametrize("later_s", [-86_400.0, -8.0, 0.0, 1e6])
+@pytest.mark.parametrize("later_s", [-86_400.0, 0.0, 16.01, 1e6])
 def test_clocks_need_not_have_anything_to_do_with_each_other(first, second, later_s) -> None:
-    """Another boot: stamps that overlap, or lie before those of the recording before."""
+    """Another boot: stamps that overlap, lie before those of the recording before, or seem to go on."""
     c = calibrator(first)
     feed(c, items(first))
     c.next_recording()

@@ -15,7 +15,7 @@ from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _LEARN = 20  # readings by which the usual interval is known
 _MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
-_APART_S = 10.0  # between recordings whose stamps overlap
+_APART_S = 10.0  # between recordings, at least: longer than any gap that is bridged
 _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
@@ -93,7 +93,7 @@ class ImuIntake:
             self.base_ns = t_imu_ns
             self.buffer = ImuBuffer(t_imu_ns)
         t_s = (t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
-        if self.between and t_s <= self._newest_s:  # the clock was set back in the recording before
+        if self.between and t_s < self._newest_s + _APART_S:  # stamps overlap, or go on as if it were one
             self.base_ns -= round((self._newest_s + _APART_S - t_s) * 1e9)
             t_s = self._newest_s + _APART_S
         added = self._in_order(self.buffer, t_s, reading)
