@@ -1,15 +1,24 @@
 #!/bin/bash
 # first_hour.sh FOLDER [SUITE]: the first hour of a newcomer on a bare Debian (bookworm), from `apt install` to a calibration
 # of the emulated rig, with times. The transcript goes to stdout as Markdown; docs/tutorial/first_hour.md is one of them.
-# Run as root in a checkout, whose committed state is used; needs debootstrap. FOLDER takes the Debian (1 GB) and is kept.
+# Run as root in a checkout, whose committed state is used; needs debootstrap. FOLDER takes the Debian (1 GB), which is made
+# anew by each run from SUITE.tar there.
 # MIRROR=URL: where Debian comes from, if not from debootstrap's default. CERTIFICATES=FILE: for pip behind a proxy.
 set -euo pipefail
 folder=${1:?a folder for the bare Debian} suite=${2:-bookworm}
 root=$folder/$suite here=$(git -C "$(dirname "$0")" rev-parse --show-toplevel)
 [ "$(id -u)" = 0 ] || { echo "run it as root: it makes a chroot" >&2; exit 2; }
 command -v debootstrap >/dev/null || { echo "debootstrap is missing: apt install debootstrap" >&2; exit 2; }
-mkdir -p "$root"
-[ -x "$root/usr/bin/apt-get" ] || debootstrap --variant=minbase "$suite" "$root" ${MIRROR:+"$MIRROR"} >&2
+for place in proc dev tmp; do
+    ! mountpoint -q "$root/$place" || { echo "$root/$place is still mounted: umount -l it first" >&2; exit 1; }
+done
+rm -rf --one-file-system "$root" && mkdir -p "$root"
+if [ -f "$root.tar" ]; then
+    tar -C "$root" -xf "$root.tar"
+else
+    debootstrap --variant=minbase "$suite" "$root" ${MIRROR:+"$MIRROR"} >&2
+    tar -C "$root" -cf "$root.tar" .
+fi
 
 mounted=()
 clean_up() { for ((k = ${#mounted[@]} - 1; k >= 0; k--)); do umount -l "${mounted[k]}" || true; done; }
@@ -20,10 +29,7 @@ hang "$root/dev" --rbind /dev
 mount --make-rslave "$root/dev"
 hang "$root/tmp" -t tmpfs -o mode=1777 tmpfs
 cp /etc/resolv.conf /etc/hosts "$root/etc/"
-rm -rf "$root/vical.git"
 git clone -q --bare "$here" "$root/vical.git"
-rm -rf "$root/home/ann"
-chroot "$root" id ann >/dev/null 2>&1 && chroot "$root" userdel ann
 chroot "$root" useradd --create-home --shell /bin/bash ann
 
 cat >"$root/tmp/as_root" <<'STEPS'
@@ -56,10 +62,12 @@ cat >"$root/tmp/transcript" <<'RUNNER'
 export LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive PIP_DEFAULT_TIMEOUT=180
 say() { printf '\n%s\n' "$1"; }
 run() { # command, lines of its output that are shown
-    local begin=$EPOCHREALTIME code=0
+    local begin=$EPOCHREALTIME code=0 output
+    output=$(mktemp)
     printf '\n```console\n$ %s\n' "$1"
-    eval "$1" >/tmp/output 2>&1 || code=$?
-    head -n "$2" /tmp/output
+    eval "$1" >"$output" 2>&1 || code=$?
+    head -n "$2" "$output"
+    rm "$output"
     [ "$code" = 0 ] || printf '(exit code %s)\n' "$code"
     printf '```\n\n*%s s*\n' "$(awk -v a="$begin" -v b="$EPOCHREALTIME" 'BEGIN { printf "%.1f", b - a }')"
 }
@@ -73,5 +81,5 @@ fi
 begin=$SECONDS
 "${environment[@]}" HOME=/root chroot "$root" bash /tmp/transcript /tmp/as_root
 "${environment[@]}" HOME=/home/ann chroot --userspec=ann:ann "$root" bash /tmp/transcript /tmp/as_ann
-printf '\nAll of it: %s s, on %s with %s cores, %s.\n' $((SECONDS - begin)) "$(uname -m)" "$(nproc)" \
+printf '\nAll of it: %s s, on %s with %s cores, %s.\n' $((SECONDS - begin)) "$(uname -m)" "$(getconf _NPROCESSORS_ONLN)" \
     "$(. "$root/etc/os-release" && echo "$PRETTY_NAME")"

@@ -446,9 +446,10 @@ class Calibrator:
         """
         if not self.can_go_on:
             self.filter = None
-        for name in self.priors:
-            if self.filter is not None:
-                self.filter.state.cameras[name].timeshift_s += self._offset_s(name)
+        for name, where in self.layout.cameras.items() if self.filter is not None else ():
+            self.filter.state.cameras[name].timeshift_s += self._offset_s(name)
+            if where.timeshift is not None:  # the driver will have to find its device's clock once more
+                self.filter.reopen(where.timeshift, abs(self._imu.stepped_s))
         self._imu.next_recording()
         self._images, self._offsets_s = ImageIntake(), {}
         self._pending = FrameQueue(list(self.priors))

@@ -86,6 +86,7 @@ class TargetFreeCalibrator:
         self._thinning = Thinning(MAX_RATE_HZ)
         self._doubted: Carry | None = None
         self._reports: list[FrameReport] = []
+        self._stepped_s = 0.0  # by how much stamps of the imu were moved in the recording before
         self._anew = False  # another recording has begun: what it starts with is to be found as in the first
 
     # ------------------------------------------------------------------ input
@@ -200,7 +201,7 @@ class TargetFreeCalibrator:
                     "the rig turns about one axis only so far: turn it about a second one", True
                 )
                 return False
-            known = of_another_recording(known, window)
+            known = of_another_recording(known, window, self._stepped_s)
         carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma)
         bundle = Bundle(window, carry, *self._noise)
         fit = bundle.solve(self._buffer, _STEPS_START)
@@ -336,6 +337,7 @@ class TargetFreeCalibrator:
             self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + self._offset_s)
         self._doubted, self._anew = None, self.latest is not None
         self.starter.again()
+        self._stepped_s = abs(self._imu.stepped_s)
         self._imu.next_recording()
         self._images, self._pending, self._newest_s = ImageIntake(), [], -np.inf
 

@@ -66,6 +66,11 @@ class ImuIntake:
         """Time shift by the stamps as they come now, minus the time shift by the even axis, s."""
         return self._steps.total_s - self._set_back_s
 
+    @property
+    def stepped_s(self) -> float:
+        """By how much all steps of even stamps have moved them, s."""
+        return self._steps.total_s
+
     def take(
         self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]
     ) -> list[Reading]:

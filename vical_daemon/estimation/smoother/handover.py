@@ -51,8 +51,13 @@ def afresh(
     return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=known.camera)
 
 
-def of_another_recording(known: Carry, window: Window) -> Carry:
+def of_another_recording(known: Carry, window: Window, stepped_s: float) -> Carry:
     """What was known, for the first window of another recording: its biases are those that its start found.
+
+    Args:
+        known: At the end of the recording before.
+        window: As the start left it.
+        stepped_s: By how much the imu's stamps were moved there, s: they may begin as far off here.
 
     The time between the recordings is not known, and taken as none. The window takes over what is known of
     the imu's matrices; its links hold for others, and correct for that by their derivatives.
@@ -61,6 +66,9 @@ def of_another_recording(known: Carry, window: Window) -> Carry:
     P = known.covariance()
     P[BIASES], P[:, BIASES] = 0.0, 0.0
     P[BIASES, BIASES] = np.diag(np.repeat([GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA], 3) ** 2)
+    if known.active[SHIFT]:
+        place = CALIBRATION + int(known.active[:SHIFT].sum())
+        P[place, place] += stepped_s**2
     return replace(known, bias=window.bias[0].copy(), root=root_of(P), t_cam_s=window.frames[0][0])
 
 
