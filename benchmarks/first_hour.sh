@@ -49,7 +49,7 @@ run 'vical init --emulated' 12
 say 'The service, in the background; in real life in a terminal of its own, with the page at http://127.0.0.1:8080/.'
 vical run -c vical.yaml --quiet 2>run.log &
 service=$!
-run 'vical watch -c vical.yaml --until-converged --timeout 180 >/dev/null && echo converged' 3
+run 'vical watch -c vical.yaml --until-converged --timeout 300 >/dev/null && echo converged' 3
 say 'The calibration is stored as soon as it is `converged`. This is what other software gets:'
 run 'vical export store --format kalibr -o camchain.yaml && head -12 camchain.yaml' 16
 kill -INT $service && wait $service
