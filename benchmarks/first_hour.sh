@@ -31,6 +31,7 @@ hang "$root/tmp" -t tmpfs -o mode=1777 tmpfs
 cp /etc/resolv.conf /etc/hosts "$root/etc/"
 git clone -q --bare "$here" "$root/vical.git"
 chroot "$root" useradd --create-home --shell /bin/bash ann
+chroot "$root" chown -R ann: /vical.git
 
 cat >"$root/tmp/as_root" <<'STEPS'
 say 'A bare Debian has neither Python nor git.'
@@ -44,7 +45,7 @@ cd ~/vical && PATH=$PWD/.venv/bin:$PATH
 run 'vical doctor' 20
 mkdir rig && cd rig
 say 'Nothing is plugged in here, so `vical init` alone would say so and name the option that does without.'
-run 'vical init' 6
+run 'vical init' 6 1
 run 'vical init --emulated' 12
 say 'The service, in the background; in real life in a terminal of its own, with the page at http://127.0.0.1:8080/.'
 vical run -c vical.yaml --quiet 2>run.log &
@@ -52,7 +53,7 @@ service=$!
 run 'vical watch -c vical.yaml --until-converged --timeout 300 >/dev/null && echo converged' 3
 say 'The calibration is stored as soon as it is `converged`. This is what other software gets:'
 run 'vical export store --format kalibr -o camchain.yaml && head -12 camchain.yaml' 16
-kill -INT $service && wait $service
+kill -INT $service && wait $service || true
 say 'The same offline, from a recording: two demos of the same rig are one calibration.'
 run 'for k in 1 2; do vical demo --seconds 15 --seed $k --out rec$k --quiet >/dev/null || true; done; ls rec1' 8
 run 'vical calibrate rec1/*.mcap rec2/*.mcap --target rec1/target.yaml -o result.json --report report.html && ls -s report.html' 40
@@ -61,7 +62,7 @@ cat >"$root/tmp/transcript" <<'RUNNER'
 # transcript STEPS: runs the steps and prints them as Markdown, with the seconds each took.
 export LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive PIP_DEFAULT_TIMEOUT=180
 say() { printf '\n%s\n' "$1"; }
-run() { # command, lines of its output that are shown
+run() { # command, lines of its output that are shown, exit code that is expected (0)
     local begin=$EPOCHREALTIME code=0 output
     output=$(mktemp)
     printf '\n```console\n$ %s\n' "$1"
@@ -69,6 +70,7 @@ run() { # command, lines of its output that are shown
     head -n "$2" "$output"
     rm "$output"
     [ "$code" = 0 ] || printf '(exit code %s)\n' "$code"
+    [ "$code" = "${3:-0}" ] || { echo "$1: exit code $code" >&2; exit 1; }
     printf '```\n\n*%s s*\n' "$(awk -v a="$begin" -v b="$EPOCHREALTIME" 'BEGIN { printf "%.1f", b - a }')"
 }
 . "$1"

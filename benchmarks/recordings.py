@@ -121,16 +121,15 @@ def euroc() -> None:
     print("|---|---|---|---|---|---|")
     for lens, fix in (("fixed", frozenset({"intrinsics"})), ("free", frozenset[str]())):
         options = CalibrationOptions(fix=fix, imu_noise=euroc_halves.NOISE)
-        whole = _together([items], options, points)
+        whole = as_one([items], options, points)
         for order, parts in (("first, second", halves), ("second, first", halves[::-1])):
-            print(
-                f"| {lens} | {order} | {_difference(whole, _together(parts, options, points))} |", flush=True
-            )
+            print(f"| {lens} | {order} | {_difference(whole, as_one(parts, options, points))} |", flush=True)
 
 
-def _together(
+def as_one(
     parts: Sequence[euroc_halves.Items], options: CalibrationOptions, points: np.ndarray
 ) -> CameraEstimate:
+    """Calibrate stretches of EuRoC's recording as recordings of one rig."""
     subject = CalibratorSubject(options, euroc_halves.PRIOR, points)
     for number, part in enumerate(parts):
         if number:
@@ -145,14 +144,20 @@ def _together(
     return answer
 
 
-def _difference(whole: CameraEstimate, parts: CameraEstimate) -> str:
+def in_sigmas(whole: CameraEstimate, parts: CameraEstimate) -> tuple[np.ndarray, np.ndarray]:
+    """Difference [lever arm m, mounting rad, time shift s] and the same over the sigmas of `whole`, (7,)."""
     R = [matrix_of_quaternion(x.T_imu_cam.q_wxyz) for x in (whole, parts)]
     moved, turn = np.subtract(parts.T_imu_cam.p_m, whole.T_imu_cam.p_m), log_so3(R[0].T @ R[1])
     shift_s = parts.timeshift_cam_imu_s - whole.timeshift_cam_imu_s
     sigma = np.sqrt([*np.diag(whole.T_imu_cam.covariance), whole.timeshift_sigma_s**2])
-    largest = np.abs(np.concatenate([moved, turn, [shift_s]]) / sigma).max()
-    arm_mm, turn_deg = 1e3 * np.linalg.norm(moved), np.rad2deg(np.linalg.norm(turn))
-    return f"{arm_mm:.2f} | {turn_deg:.3f} | {1e6 * abs(shift_s):.0f} | {largest:.2f}"
+    difference = np.concatenate([moved, turn, [shift_s]])
+    return difference, difference / sigma
+
+
+def _difference(whole: CameraEstimate, parts: CameraEstimate) -> str:
+    d, z = in_sigmas(whole, parts)
+    arm_mm, turn_deg = 1e3 * np.linalg.norm(d[:3]), np.rad2deg(np.linalg.norm(d[3:6]))
+    return f"{arm_mm:.2f} | {turn_deg:.3f} | {1e6 * abs(d[6]):.0f} | {np.abs(z).max():.2f}"
 
 
 def main(argv: list[str]) -> int:
