@@ -446,10 +446,14 @@ class Calibrator:
         """
         if not self.can_go_on:
             self.filter = None
-        for name, where in self.layout.cameras.items() if self.filter is not None else ():
-            self.filter.state.cameras[name].timeshift_s += self._offset_s(name)
-            if where.timeshift is not None:  # the driver will have to find its device's clock once more
-                self.filter.reopen(where.timeshift, abs(self._imu.stepped_s))
+        f = self.filter
+        for name, where in self.layout.cameras.items():
+            if f is not None:
+                f.state.cameras[name].timeshift_s += self._offset_s(name)
+            if (
+                f is not None and where.timeshift is not None
+            ):  # the driver has to find its device's clock again
+                f.reopen(where.timeshift, abs(self._imu.stepped_s))
         self._imu.next_recording()
         self._images, self._offsets_s = ImageIntake(), {}
         self._pending = FrameQueue(list(self.priors))
@@ -458,10 +462,10 @@ class Calibrator:
         self._seek_shift.clear()
         self._starting.anew()
         self._held_back, self._lost = HeldBack(), None
-        if self.filter is not None:
+        if f is not None:
             self.watch.shift_reopened()
             self._lost = RecordingStart(self.target, {})
-            self._seek_shift |= self.filter.drifting  # who knows how far, in the time between
+            self._seek_shift |= f.drifting  # who knows how far, in the time between
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
