@@ -450,9 +450,7 @@ class Calibrator:
         for name, where in self.layout.cameras.items():
             if f is not None:
                 f.state.cameras[name].timeshift_s += self._offset_s(name)
-            if (
-                f is not None and where.timeshift is not None
-            ):  # the driver has to find its device's clock again
+            if f is not None and where.timeshift is not None:  # drivers find the clock once more
                 f.reopen(where.timeshift, abs(self._imu.stepped_s))
         self._imu.next_recording()
         self._images, self._offsets_s = ImageIntake(), {}
