@@ -19,10 +19,12 @@ from vical_daemon.estimation.filter.image_intake import (
     by_present_stamps,
     trace_by_present_stamps,
 )
+from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.init.initializer import LATE_S, Starting
 from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.init.relinearisation import Frames
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -97,6 +99,7 @@ class Calibrator:
         self._unproven: tuple[float, str, float] | None = None
         self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
+        self._reports: list[FrameReport] = []  # of the images of a start
         self._size = 1.0  # of the target over the stated one, where it is by far not that
 
     def _lay_out(self) -> Layout:
@@ -215,8 +218,32 @@ class Calibrator:
         self.judge.started(self.filter.state.t_s, found.reason)
         self.watch.started(self.filter.state.t_s)
         self._starting.anew()
-        for t, frame in [*found.frames, *later]:
+        frames = found.frames
+        if isinstance(self.filter, LinearisedFilter):
+            frames = self._take_start(self.filter, frames)
+            self.filter = self.filter.plain()
+        for t, frame in [*frames, *later]:
             self._pending.push(t, frame)
+
+    def _take_start(self, f: LinearisedFilter, frames: Frames) -> Frames:
+        """Take the images of a start; return those that readings do not cover yet."""
+        assert self._buffer is not None
+        for k, (t_cam_s, frame) in enumerate(frames):
+            if t_cam_s + f.state.cameras[frame.camera].timeshift_s > self._buffer.newest_s:
+                return frames[k:]
+            report = self._step(f, frame, t_cam_s)
+            if report is None:
+                self.judge.frames_ignored += 1
+                continue
+            if f.unshown is not None:
+                self._starting.take([(t_cam_s, frame)])
+                f.unshown.follow(f)
+            self._used_ns[frame.camera] = frame.t_cam_ns
+            now = f.plain()
+            self._past.saw(now, report, frame, t_cam_s)
+            self.judge.saw_frame(report, now)
+            self._reports.append(report)
+        return []
 
     def _estimate_readout(self, camera: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
@@ -234,7 +261,7 @@ class Calibrator:
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
-        reports: list[FrameReport] = []
+        reports, self._reports = self._reports, []
         while self.filter is not None and self._buffer is not None:
             shifts = {name: c.timeshift_s for name, c in self.filter.state.cameras.items()}
             item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)

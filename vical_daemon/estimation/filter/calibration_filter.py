@@ -31,6 +31,7 @@ from vical_daemon.estimation.filter.linearise import (
 from vical_daemon.estimation.filter.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.filter.unobservable_directions import UnshownAxes
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
+from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
@@ -125,11 +126,15 @@ class CalibrationFilter:
             moved = move_by_derivatives(self.state, self.layout, S, segment)
         else:
             moved = move_by_sigma_points(self.state, self.layout, S, segment)
-        Q = moved.influence.noise(self.imu_noise) + _TINY
+        Q = self._noise(moved.influence)
         if not straight:
             share = np.sqrt((moved.curved**2).sum(axis=1) / np.diag(Q)).max()
             self._motion_straight.measured(sigmas, float(share))
         return moved, Q
+
+    def _noise(self, influence: Influence) -> FloatArray:
+        """Covariance of the noise gathered on the way, shape (9, 9)."""
+        return influence.noise(self.imu_noise) + _TINY
 
     def _grow(self, moved: Moved, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
@@ -384,6 +389,11 @@ class CalibrationFilter:
             _motion_straight=Straightness(),
             _view_straight={},
         )
+
+    @property
+    def mean(self) -> State:
+        """The most likely state; `state` is where the filter is linearised, which is the same here."""
+        return self.state
 
     def sigmas(self) -> FloatArray:
         """Standard deviation of every error, shape (n,)."""

@@ -13,8 +13,9 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.initial_filter import wide_filter
 from vical_daemon.estimation.init.readout_start import looks_rolling
-from vical_daemon.estimation.init.relinearisation import Frames, Step, rehearsed
+from vical_daemon.estimation.init.relinearisation import Frames, Rehearsed, Step, rehearsed
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache
+from vical_daemon.estimation.init.window_start import window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import Layout
 
@@ -57,7 +58,16 @@ class Starting:
         step: Propagates a filter to an image and corrects it.
     """
 
-    def __init__(self, options: CalibrationOptions, layout: Layout, target: FloatArray, step: Step) -> None:
+    def __init__(
+        self,
+        options: CalibrationOptions,
+        layout: Layout,
+        target: FloatArray,
+        step: Step,
+        *,
+        by_window: bool = True,
+    ) -> None:
+        self._by_window = by_window
         self._options, self._layout, self._target, self._step = options, layout, target, step
         self._frames: dict[str, Frames] = {name: [] for name in layout.cameras}
         self._caches: dict[str, PoseCache] = {}
@@ -130,7 +140,11 @@ class Starting:
             still_axes=result.still_axes,
             turn_axis_cam=result.turn_axis_cam,
         )
-        found = rehearsed(result.state, frames, make, self._step)
+        if self._by_window:
+            started = window_start(result.state, result.poses, frames, make, self._step, buffer, self._target)
+            found = None if started is None else Rehearsed(*started)
+        else:
+            found = rehearsed(result.state, frames, make, self._step)
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)
