@@ -24,7 +24,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.init.initializer import LATE_S, Starting
 from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
-from vical_daemon.estimation.init.relinearisation import Frames
+from vical_daemon.estimation.init.window_start import Frames
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -208,21 +208,19 @@ class Calibrator:
         if self._size != 1.0:
             self.judge.announce(Event(EventKind.TARGET_SIZE, value=self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
-        self.filter = found.filter
-        self.filter.began_s, self.filter.stamp_sigma_s = found.filter.state.t_s, self._stamp_sigma_s
+        f = found.filter
+        f.began_s, f.stamp_sigma_s = f.state.t_s, self._stamp_sigma_s
         if self._stale is not None and self._stale.layout is self.layout:
-            self.filter.keep_from(self._stale)
-            self._kept_until_s = self.filter.state.t_s + _PROVEN_S
+            f.keep_from(self._stale)
+            self._kept_until_s = f.state.t_s + _PROVEN_S
         self._stale = None
         self._held_back, self._lost, self._past = HeldBack(), None, RecentPast()
-        self.judge.started(self.filter.state.t_s, found.reason)
-        self.watch.started(self.filter.state.t_s)
+        self.judge.started(f.state.t_s, found.reason)
+        self.watch.started(f.state.t_s)
         self._starting.anew()
-        frames = found.frames
-        if isinstance(self.filter, LinearisedFilter):
-            frames = self._take_start(self.filter, frames)
-            self.filter = self.filter.plain()
-        for t, frame in [*frames, *later]:
+        left = self._take_start(f, found.frames)
+        self.filter = f.plain()
+        for t, frame in [*left, *later]:
             self._pending.push(t, frame)
 
     def _take_start(self, f: LinearisedFilter, frames: Frames) -> Frames:

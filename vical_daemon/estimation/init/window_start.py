@@ -25,10 +25,11 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import SeenPose
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.inertial_links import Link, Links, make_link
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
-from vical_daemon.estimation.smoother.inertial_links import Link, Links, make_link
+from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is told
 _LEAST_IMAGES = 3
@@ -41,6 +42,7 @@ _RATE_S = 0.03  # of readings before an instant: they show its angular accelerat
 _OUTLIER = 6.0  # sigmas at which a corner weighs a quarter
 _RAYLEIGH = 1.1774  # median of the length of two standard normal errors
 _LEAST_PX, _MOST_PX = 0.005, 20.0  # corner noise
+_MOST_RATIO = 5.0  # of one image's squared innovation over its prediction
 _FAR = 0.03  # a target so much larger or smaller is another one: its prior is too narrow
 _SURE = 5.0  # sigmas
 
@@ -91,6 +93,7 @@ def window_start(
     if window is None or not window.solve():
         return None
     trial = window.filter(make(deepcopy(state)))
+    trial.shared = window.shared_errors()
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
     if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().plausible():
         return None
@@ -141,6 +144,22 @@ class _View(NamedTuple):
     seen: BoolArray
     ways: FloatArray
     by_error: FloatArray
+
+
+class _Apart(NamedTuple):
+    """One image against all others, over its noise; see `SharedErrors.learn`.
+
+    Attributes:
+        innovation: Shape (2n,).
+        by_shared: Shape (2n, 3).
+        by_states: Shape (3, k).
+        ratio: Squared innovation over its prediction, by degree of freedom.
+    """
+
+    innovation: FloatArray
+    by_shared: FloatArray
+    by_states: FloatArray
+    ratio: float
 
 
 class _Linked(NamedTuple):
@@ -250,6 +269,41 @@ class _Window:
         for name, noise in prior.corner_noise.items():
             noise.sigma_px = noise.guess_px = self.sigma_px[name]
         return LinearisedFilter.about(self.state, [n.at for n in self._nodes], prior)
+
+    def shared_errors(self) -> dict[str, SharedErrors]:
+        """What the corners of an image share, from how it differs from what all other images say of it."""
+        out = {name: SharedErrors() for name in self.sigma_px}
+        now = self._present()
+        if now is None:
+            return out
+        H, _ = self._normal(now)
+        P = cho_solve((cholesky(H, lower=True), True), np.eye(len(H)))
+        seen: dict[str, list[_Apart]] = {name: [] for name in out}
+        for view in now.views:
+            seen[view.camera].append(self._apart(view, P))
+        for name, images in seen.items():
+            # as in `Consistency`: where images of any kind miss, that in these ways is nothing of its own
+            level = float(np.mean([min(x.ratio, _MOST_RATIO) for x in images] or [1.0]))
+            for x in images:
+                out[name].learn(x.innovation, x.by_shared, x.by_states, max(level, 1.0))
+            out[name].begin()
+        return out
+
+    def _apart(self, view: _View, P: FloatArray) -> _Apart:
+        """An image against all others; `P`: covariance of all unknowns."""
+        W, r = self._whitened(view)
+        A, b = W.T @ W, W.T @ r
+        at = self._places(view.node)
+        spread = view.by_error @ P[at[:, None], at] @ view.by_error.T
+        others = np.linalg.solve(np.eye(len(A)) - spread @ A, spread)  # (spread^-1 - A)^-1
+        values, vectors = np.linalg.eigh(0.5 * (others + others.T))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        innovation = r + W @ (others @ b)
+        node = self._nodes[view.node]
+        by_shared = W @ view.by_error @ shared_ways(self._at(node, view.camera), self._layout, view.camera)
+        moved, M = W.T @ innovation, A @ root
+        ratio = float(moved @ np.linalg.lstsq(A + M @ M.T, moved, rcond=None)[0]) / len(A)
+        return _Apart(innovation, by_shared, (by_shared.T @ W) @ root, ratio)
 
     # ------------------------------------------------------------------ values
     def _at(self, node: _Node, camera: str) -> State:
@@ -363,11 +417,8 @@ class _Window:
             g[at] += J.T @ r
 
         for view in now.views:
-            sigma = self.sigma_px[view.camera] * view.relative
-            far = (view.residual**2).sum(axis=1) / sigma**2
-            weight = np.where(view.seen, 1.0 / (1.0 + far / _OUTLIER**2), 0.0) / sigma
-            W, r = view.ways * np.repeat(weight, 2)[:, None], (view.residual * weight[:, None]).ravel()
-            at = np.concatenate([np.arange(9 * view.node, 9 * view.node + 9), constants])
+            W, r = self._whitened(view)
+            at = self._places(view.node)
             H[at[:, None], at] += view.by_error.T @ (W.T @ W) @ view.by_error
             g[at] += view.by_error.T @ (W.T @ r)
         for k, (e, by_motion, by_constants) in enumerate(zip(*now.linked, strict=True)):
@@ -376,6 +427,18 @@ class _Window:
         H[9 * F :, 9 * F :] += self._information
         g[9 * F :] -= self._information @ self.offset
         return H, g
+
+    def _places(self, node: int) -> IntArray:
+        """Where the motion of an instant and the constants are among the unknowns, shape (9 + c,)."""
+        first = 9 * len(self._nodes)
+        return np.concatenate([np.arange(9 * node, 9 * node + 9), np.arange(first, first + len(self.offset))])
+
+    def _whitened(self, view: _View) -> tuple[FloatArray, FloatArray]:
+        """Ways and residuals over the noise; corners that do not belong hardly count (Geman and McClure)."""
+        sigma = self.sigma_px[view.camera] * view.relative
+        far = (view.residual**2).sum(axis=1) / sigma**2
+        weight = np.where(view.seen, 1.0 / (1.0 + far / _OUTLIER**2), 0.0) / sigma
+        return view.ways * np.repeat(weight, 2)[:, None], (view.residual * weight[:, None]).ravel()
 
     def _cost(self, now: _Present) -> float:
         """Sum of squares; of corners that do not belong only a part (Geman and McClure)."""

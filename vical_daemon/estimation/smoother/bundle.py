@@ -14,6 +14,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.inertial_links import Links
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.carry import (
     FULL,
@@ -25,7 +26,6 @@ from vical_daemon.estimation.smoother.carry import (
     tangents,
 )
 from vical_daemon.estimation.smoother.inertial import links_left
-from vical_daemon.estimation.smoother.inertial_links import Links
 from vical_daemon.estimation.smoother.normal import Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window

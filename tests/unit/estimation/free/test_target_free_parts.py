@@ -11,6 +11,7 @@ from vical_mocks.tracks import simulate_tracks
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
+from vical_daemon.estimation.model.inertial_links import Links, make_link
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
 from vical_daemon.estimation.smoother.carry import (
@@ -24,7 +25,6 @@ from vical_daemon.estimation.smoother.carry import (
     tangents,
 )
 from vical_daemon.estimation.smoother.inertial import Order
-from vical_daemon.estimation.smoother.inertial_links import Links, make_link
 from vical_daemon.estimation.smoother.jitter import Lateness
 from vical_daemon.estimation.smoother.quality import correlation
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart

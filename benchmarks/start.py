@@ -1,7 +1,7 @@
-"""The start of a calibration, by one window and as before: when, how far off, how sure, at what cost?
+"""The start of a calibration: when, how far off, how sure, at what cost?
 
-    python -m benchmarks window_start --trials 30
-    python -m benchmarks window_start --case "318" --case "EuRoC, lens free"
+    python -m benchmarks start --trials 30
+    python -m benchmarks start --case "318" --case "EuRoC, lens free"
 
 Rigs of the zoo with the lens told and not told (the zoo itself tells it to three of ten), the reference rig,
 the slow rig of seed 318 with several draws of its noise, and the real EuRoC recording begun every five
@@ -36,12 +36,10 @@ from benchmarks.feed import (
     points_frame,
 )
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.init.initializer import Starting
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.vision.target import load_target
 
-KINDS = ("rehearsals", "window")
 SECONDS = 12.0
 _LOOKS_S = (5.0, 10.0)
 _EVERY_S = 5.0
@@ -50,19 +48,7 @@ Look = dict[str, Any]
 Item = tuple[float, PointsFrame | tuple[int, Any, Any]]
 
 
-class _Chosen(Calibrator):
-    """A calibrator with one of the two starts."""
-
-    kind = "window"
-
-    def _new_starting(self, off: Any = ()) -> Starting:
-        options = replace(self.options, estimate=self.options.estimate | set(off))
-        by_window = self.kind == "window"
-        return Starting(options, self.layout, self.target, self._step, by_window=by_window)
-
-
 def follow(
-    kind: str,
     items: Iterator[Item],
     options: CalibrationOptions,
     prior: CameraPrior,
@@ -70,7 +56,7 @@ def follow(
     truth: Any,
 ) -> runner.Result:
     """Feed a recording; note the first answer, those at 5 and 10 s, and what the start has cost."""
-    calibrator = type("_Kind", (_Chosen,), {"kind": kind})(options, {CAMERA: prior}, target)
+    calibrator = Calibrator(options, {CAMERA: prior}, target)
     looks: dict[str, Look] = {}
     cpu_s, longest_s, converged_s, t_s = 0.0, 0.0, None, 0.0
     for t_s, item in items:
@@ -112,7 +98,7 @@ def _look(estimate: CalibrationEstimate, t_s: float, truth: Any) -> Look:
 
 
 # ---------------------------------------------------------------------- simulated rigs
-def simulated(kind: str, which: str, lens_known: bool, seed: int) -> runner.Result:
+def simulated(which: str, lens_known: bool, seed: int) -> runner.Result:
     """One simulated rig."""
     if which == "reference":
         case = montecarlo.CASES["reference, lens known" if lens_known else "reference"]
@@ -133,7 +119,7 @@ def simulated(kind: str, which: str, lens_known: bool, seed: int) -> runner.Resu
         lens = run.rig.lens
         return error_against_truth(run, t_s, p, R, shift, lens.intrinsics, lens.distortion)[:7]
 
-    return follow(kind, _simulated_items(run), options, prior, run.points_m, truth)
+    return follow(_simulated_items(run), options, prior, run.points_m, truth)
 
 
 def _simulated_items(run: SimulatedRun) -> Iterator[Item]:
@@ -182,7 +168,7 @@ def euroc_reference(folder: Path, lens_known: bool) -> tuple[Any, Any, float]:
     return _pose(euroc_halves.calibrate(items, options, _recording(folder)[1]).camera)
 
 
-def euroc(kind: str, folder: Path, lens_known: bool, part: int, length_s: float = SECONDS) -> runner.Result:
+def euroc(folder: Path, lens_known: bool, part: int) -> runner.Result:
     """The recording begun `part` times five seconds after its beginning."""
     arm, mounting, shift_s = euroc_reference(folder, lens_known)
     fix = frozenset({"intrinsics"}) if lens_known else frozenset()
@@ -193,14 +179,13 @@ def euroc(kind: str, folder: Path, lens_known: bool, part: int, length_s: float 
         return np.concatenate([p - arm, (mounting.inv() * R).as_rotvec(), [s - shift_s]])
 
     begin_s = _EVERY_S * part
-    items = euroc_items(folder, begin_s, begin_s + length_s)
-    return follow(kind, items, options, euroc_halves.PRIOR, _recording(folder)[1], truth)
+    items = euroc_items(folder, begin_s, begin_s + SECONDS)
+    return follow(items, options, euroc_halves.PRIOR, _recording(folder)[1], truth)
 
 
 # ---------------------------------------------------------------------- tables
 _COLUMNS = (
     "case",
-    "start",
     "answered",
     "first answer s: median, last",
     "CPU to it s: median, most (longest call)",
@@ -215,14 +200,14 @@ _COLUMNS = (
 )
 
 
-def rows(name: str, kind: str, results: list[runner.Result]) -> None:
+def rows(name: str, results: list[runner.Result]) -> None:
     """Print a case: one row at the first answer, at 5 and at 10 s."""
     answered = [r for r in results if r["looks"]]
     first = np.array([r["looks"]["first"]["t_s"] for r in answered] or [np.nan])
     cpu, longest = (np.array([r[k] for r in results]) for k in ("cpu_s", "longest_s"))
     converged = [r["converged_s"] for r in results if r["converged_s"] is not None]
     begin = (
-        f"| {name} | {kind} | {len(answered)}/{len(results)} | {np.median(first):.1f}, {first.max():.1f} "
+        f"| {name} | {len(answered)}/{len(results)} | {np.median(first):.1f}, {first.max():.1f} "
         f"| {np.median(cpu):.2f}, {cpu.max():.2f} ({np.median(longest):.2f}) "
         f"| {np.median(converged or [np.nan]):.1f} ({len(converged)}) "
     )
@@ -244,41 +229,31 @@ def rows(name: str, kind: str, results: list[runner.Result]) -> None:
 
 
 def cases(folder: Path, trials: int, first_seed: int) -> dict[str, tuple[Any, range]]:
-    """By name: what runs one of its trials (kind first, seed last), and the seeds."""
+    """By name: what runs one of its trials, and the seeds."""
     seeds = range(first_seed, first_seed + trials)
     found: dict[str, tuple[Any, range]] = {}
     for told, known in (("lens told", True), ("lens free", False)):
-        found[f"zoo, {told}"] = (partial(_simulated, "zoo", known), seeds)
-        found[f"reference, {told}"] = (partial(_simulated, "reference", known), seeds)
-    found[f"{_SLOW}, lens free"] = (partial(_simulated, "slow", False), range(min(trials, 16)))
+        found[f"zoo, {told}"] = (partial(simulated, "zoo", known), seeds)
+        found[f"reference, {told}"] = (partial(simulated, "reference", known), seeds)
+    found[f"{_SLOW}, lens free"] = (partial(simulated, "slow", False), range(min(trials, 16)))
     if folder.is_dir():
         for told, known in (("lens held", True), ("lens free", False)):
-            found[f"EuRoC, {told}"] = (partial(_euroc, folder, known), range(13))
+            found[f"EuRoC, {told}"] = (partial(euroc, folder, known), range(13))
     return found
-
-
-def _simulated(which: str, lens_known: bool, kind: str, seed: int) -> runner.Result:
-    return simulated(kind, which, lens_known, seed)
-
-
-def _euroc(folder: Path, lens_known: bool, kind: str, part: int) -> runner.Result:
-    return euroc(kind, folder, lens_known, part)
 
 
 def main(argv: list[str]) -> int:
     """Run the study."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks window_start", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks start", description=__doc__)
     runner.add_arguments(parser, trials=30, seconds=SECONDS)
     parser.add_argument("--folder", type=Path, default=euroc_halves.FOLDER, help="the EuRoC recording")
     args = parser.parse_args(argv)
     code = runner.fingerprint(
-        "vical_daemon/estimation", "benchmarks/window_start.py", "benchmarks/zoo.py", "mocks/vical_mocks"
+        "vical_daemon/estimation", "benchmarks/start.py", "benchmarks/zoo.py", "mocks/vical_mocks"
     )
     print(f"| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|")
     for name, (trial, seeds) in cases(args.folder, args.trials, args.first_seed).items():
         if args.case and not any(wanted in name for wanted in args.case):
             continue
-        for kind in KINDS:
-            file = f"start_{kind}_{runner.slug(name)}"
-            rows(name, kind, runner.run_trials(file, partial(trial, kind), seeds, args, code))
+        rows(name, runner.run_trials(f"start_{runner.slug(name)}", trial, seeds, args, code))
     return 0
