@@ -29,6 +29,7 @@ from vical_daemon.estimation.model.inertial_links import Link, Links, make_link
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
+from vical_daemon.estimation.noise.corner_noise import relative_noise
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is told
@@ -366,9 +367,7 @@ class _Window:
 
     def _view(self, k: int, t_cam_s: float, frame: PointsFrame) -> _View | None:
         node, name = self._nodes[k], frame.camera
-        relative = np.ones(len(frame.ids))
-        if frame.sigma_px is not None and len(frame.ids):
-            relative = np.clip(frame.sigma_px / np.sqrt(np.mean(frame.sigma_px**2)), 0.3, 10.0)
+        relative = relative_noise(frame.sigma_px, len(frame.ids))
         image = Image(
             name, frame.t_cam_ns, t_cam_s, frame.ids, self._target[frame.ids], frame.uv_px, relative
         )
