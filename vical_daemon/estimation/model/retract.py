@@ -192,6 +192,6 @@ def _moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> C
 
 
 def orthonormal(R: FloatArray) -> FloatArray:
-    """One Newton step towards the nearest rotation: rounding never accumulates, however long it runs."""
-    out: FloatArray = 1.5 * R - 0.5 * R @ (R.T @ R)
+    """One Newton step towards the nearest rotation, (..., 3, 3): rounding never accumulates."""
+    out: FloatArray = 1.5 * R - 0.5 * R @ (R.swapaxes(-1, -2) @ R)
     return out

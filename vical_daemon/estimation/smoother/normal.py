@@ -9,6 +9,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.inertial_links import Links
@@ -23,7 +24,6 @@ from vical_daemon.estimation.smoother.carry import (
     TURN,
     Carry,
     calibration_difference,
-    tangents,
 )
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
 from vical_daemon.estimation.smoother.jitter import first_guess
