@@ -51,7 +51,7 @@ class CameraPrior:
     readout_s: float = 0.0
 
     def start_intrinsics(self) -> FloatArray:
-        """Focal lengths and centre, fx fy cx cy: as given, or of a lens of 60 degrees across; px, shape (4,)."""
+        """Focal lengths and centre, px: as given, or of a lens of 60 degrees across; fx fy cx cy, (4,)."""
         width, height = self.resolution
         guess = (0.87 * width, 0.87 * width, 0.5 * (width - 1), 0.5 * (height - 1))
         return np.array(guess if self.intrinsics is None else self.intrinsics, dtype=np.float64)

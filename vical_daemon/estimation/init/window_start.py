@@ -266,7 +266,12 @@ class _Window:
         return False
 
     def filter(self, prior: CalibrationFilter) -> LinearisedFilter:
-        """A filter that knows what `prior` knows, linearised about the window; `prior` is used up."""
+        """A filter that knows what `prior` knows, linearised about the window; `prior` is used up.
+
+        The window's own motion is the mean of the prior of the motion, which is wide enough for that.
+        """
+        t_s, R, p, v = self._nodes[0].at
+        prior.state = replace(prior.state, t_s=t_s, R_world_imu=R, p_world_imu=p, v_world_imu=v)
         for name, noise in prior.corner_noise.items():
             noise.sigma_px = noise.guess_px = self.sigma_px[name]
         return LinearisedFilter.about(self.state, [n.at for n in self._nodes], prior)
