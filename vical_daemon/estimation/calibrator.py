@@ -238,6 +238,7 @@ class Calibrator:
                 f.unshown.follow(f)
             self._used_ns[frame.camera] = frame.t_cam_ns
             now = f.plain()
+            self._ask_held_back(now, frame, t_cam_s)
             self._past.saw(now, report, frame, t_cam_s)
             self.judge.saw_frame(report, now)
             self._reports.append(report)
@@ -347,9 +348,7 @@ class Calibrator:
             f.unshown.follow(f)
         needed_s = min(f.state.t_s, self._starting.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
-        ratio = self._held_back_ratio(frame, t_cam_s)
-        if ratio is not None:
-            self.judge.held_back(ratio, f.consistency[frame.camera].scale)
+        self._ask_held_back(f, frame, t_cam_s)
         if not f.plausible():
             self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
             self._restart(f)
@@ -368,11 +367,12 @@ class Calibrator:
             self.judge.announce(doubt, once=hypotheses.TARGET)
         return [report]
 
-    def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
-        """How well an image was predicted that the held-back copy of the filter has not used."""
-        assert self.filter is not None
+    def _ask_held_back(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
+        """Judge how well an image was predicted that the held-back copy of the filter has not used."""
         assert self._buffer is not None
-        return self._held_back.follow(self.filter, frame, t_cam_s, self.target, self._buffer)
+        ratio = self._held_back.follow(f, frame, t_cam_s, self.target, self._buffer)
+        if ratio is not None:
+            self.judge.held_back(ratio, f.consistency[frame.camera].scale)
 
     def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""
