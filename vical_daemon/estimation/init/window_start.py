@@ -94,7 +94,10 @@ def window_start(
     if window is None or not window.solve():
         return None
     trial = window.filter(make(deepcopy(state)))
-    trial.shared = window.shared_errors()
+    try:
+        trial.shared = window.shared_errors()
+    except np.linalg.LinAlgError:  # an image that nothing else says anything of
+        return None
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
     if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().plausible():
         return None
@@ -308,7 +311,8 @@ class _Window:
         node = self._nodes[view.node]
         by_shared = W @ view.by_error @ shared_ways(self._at(node, view.camera), self._layout, view.camera)
         moved, M = W.T @ innovation, A @ root
-        ratio = float(moved @ np.linalg.lstsq(A + M @ M.T, moved, rcond=None)[0]) / len(A)
+        explained, _, rank, _ = np.linalg.lstsq(A + M @ M.T, moved, rcond=None)
+        ratio = float(moved @ explained) / max(int(rank), 1)
         return _Apart(innovation, by_shared, (by_shared.T @ W) @ root, ratio)
 
     # ------------------------------------------------------------------ values

@@ -22,14 +22,10 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.init import initializer
 from vical_daemon.estimation.init.window_start import window_start
-from vical_daemon.estimation.measurements import CalibrationOptions
+from vical_daemon.estimation.measurements import CalibrationOptions, ImuNoise
 from vical_daemon.estimation.model.retract import difference, retract
 
 SEED = 4
-
-
-class Kept(Exception):
-    """What a start was given."""
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +145,14 @@ def test_difference_is_the_inverse_of_retract(given):
     np.testing.assert_allclose(
         difference(retract(f.state, f.layout, dx), f.state, f.layout), dx, rtol=1e-6, atol=1e-9
     )
+
+
+def test_an_imu_that_is_said_to_have_no_noise_starts():
+    run = simulate(SEED, 6.0, timeshift_cam_imu_s=0.03)
+    prior = camera_prior(run, SEED, StartErrors(), exact_lens=True)
+    options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
+    record = feed(run, CalibratorSubject(options, prior, run.points_m))
+    assert record.snapshots or record.statuses[-1][2]
 
 
 @pytest.mark.parametrize("seconds", [11.0, 11.25])
