@@ -14,6 +14,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter import noise_updates as lessons
 from vical_daemon.estimation.filter.image_update import (
+    ImageFit,
     corner_gate,
     curved_share,
     frame_limit,
@@ -32,7 +33,7 @@ from vical_daemon.estimation.filter.propagate import Moved, move_by_derivatives,
 from vical_daemon.estimation.filter.unobservable_directions import UnshownAxes
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.rates import Rates, rates_after
@@ -154,12 +155,12 @@ class CalibrationFilter:
         lin = self._linearise(image)
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
-        keep = lin.valid & corner_gate(image, innovation, lin)
+        keep = lin.valid & self._belonging(image, innovation, lin)
         if keep.sum() < 4:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
-        if fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level):
+        if self._surprising(fit):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
                 image,
@@ -190,6 +191,14 @@ class CalibrationFilter:
             noise.sigma_px,
             predicted_px=predicted,
         )
+
+    def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
+        """Which corners are where they may be expected, shape (n,)."""
+        return corner_gate(image, innovation, lin)
+
+    def _surprising(self, fit: ImageFit) -> bool:
+        """Whether a whole image is not where it may be expected."""
+        return fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level)
 
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
         """The linearised image with the noise that its corners share."""

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.image_update import ImageFit, corner_gate
 from vical_daemon.estimation.filter.linearise import Image, Linear, by_derivatives, by_small_steps
 from vical_daemon.estimation.filter.propagate import move_by_derivatives
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.rates import rates_after
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, State, grp_from_rotation
@@ -129,6 +130,15 @@ class LinearisedFilter(CalibrationFilter):
         lin = derive(self.state, self.layout, self.rates, image, self.S)
         lin.z = lin.z + (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
         return self._with_shared(image, lin)
+
+    def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
+        """By the reference: it has been adjusted to all images, while the mean may have lost its way."""
+        by_mean = (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
+        return corner_gate(image, innovation + by_mean, lin)
+
+    def _surprising(self, fit: ImageFit) -> bool:  # noqa: ARG002
+        """Corners have been compared with the reference; errors over a hole in the images are no news."""
+        return False
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the mean; the reference stays."""
