@@ -24,6 +24,9 @@ _VALUES = 64
 """Different values close to the extreme that are counted."""
 _SPIKE = 10.0
 """Times the largest error of prediction of late by which a reading must stand out."""
+_HARMFUL = np.array([0.1, 1.0])
+"""Smaller spikes are left in, rad/s and m/s^2: at 100 Hz one such reading turns the attitude by 1 mrad and
+changes the velocity by 10 mm/s, about what one image leaves open."""
 _FADES = 1.0 - 1.0 / 200.0
 """Of that largest error, a reading: some hundred readings are remembered."""
 _LEARN = 20
@@ -118,7 +121,7 @@ class SpikeFilter(Generic[T]):
             self._note(six)
             return [held_item, item]
         missed = self._missed(six)
-        stands_out = missed > _SPIKE * self._largest
+        stands_out = missed > np.maximum(_SPIKE * self._largest, _HARMFUL)
         if len(self._first) >= _LEARN and stands_out.sum() == 1:
             self.held = six, item
             return []
