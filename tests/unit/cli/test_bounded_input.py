@@ -68,8 +68,8 @@ READERS = [
     ("camera stream FILE", ""),
     ("camera snapshot FILE -o OUT", ""),
 ]
-# `devices`: its --port is opened as `imu info` opens its own; the others read no file that a user names.
-NO_FILES = {"demo", "devices", "doctor", "install-service"}
+# `devices`, `init`: --port is opened as `imu info` opens its own; the others read no file that a user names.
+NO_FILES = {"demo", "devices", "doctor", "init", "install-service"}
 
 
 def test_every_command_is_looked_at() -> None:
