@@ -81,8 +81,10 @@ def test_reset_forgets_everything(running):
     running.bus.publish(command, b"")
     before = running.counts[-1]
     running.until(lambda: running.counts[-1] > before)
+    assert min(running.counts[-2:]) >= before  # neither an unknown word nor an empty message resets
     running.bus.publish(command, encode_string("reset"))
     running.until(lambda: running.counts[-1] < before)
+    assert running.counts[-1] < before
 
 
 def test_another_device_begins_anew_and_is_told(running):
