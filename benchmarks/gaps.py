@@ -163,7 +163,7 @@ def recorded(case: str, seed: int, *, lens_known: bool, target_free: bool) -> Re
     from a copy.
     """
     change, lasts_s = CASES[case]
-    before, record = pickle.loads(_before(seed, lens_known, target_free))  # noqa: S301  our own, just made
+    before, record = pickle.loads(_before(seed, lens_known, target_free))
     subject = Stepped.__new__(Stepped)
     subject.calibrator = before.calibrator
     run = simulated(case, seed, target_free=target_free)

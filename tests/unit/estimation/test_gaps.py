@@ -35,7 +35,7 @@ def stream(run):
 
 
 def calibrate(run, change=lambda items: items, so_far=None):
-    """Feed a recording, or what follows after `COMMON_S`; the last estimate, all events, and all estimates."""
+    """Feed a recording, or what follows `COMMON_S`; the last estimate, all events, and all estimates."""
     c, events, shots = pickle.loads(so_far) if so_far else (calibrator(run), [], [])
     items = change(stream(run))
     follow(c, events, shots, [x for x in items if x[0] >= COMMON_S] if so_far else items)
