@@ -2,9 +2,9 @@
 
 What a textbook would do: error state with local attitude error, inertial propagation sample by sample with a
 first-order transition, one linearisation per image, per-corner gates with the stated corner noise, no
-iteration, no sigma points, no measured noise. It starts from the product's own start (the rehearsed answer at
-the first image, with five times its sigmas), so that the comparison is about the filter and not about who
-finds the mounting.
+iteration, no sigma points, no measured noise. It starts from the product's own start (its answer after
+the images of the start, with its sigmas), so that the comparison is about the filter and not about who finds
+the mounting.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class PlainEkf:
 
 
 class _Starter(Calibrator):
-    """The product up to its start: the filter that it would now run stands at its first image."""
+    """The product up to its start: the filter that it would now run has taken the images of the start."""
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:  # noqa: ARG002
         return []

@@ -19,10 +19,12 @@ from vical_daemon.estimation.filter.image_intake import (
     by_present_stamps,
     trace_by_present_stamps,
 )
+from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.init.initializer import LATE_S, Starting
 from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.init.window_start import Frames
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -98,6 +100,7 @@ class Calibrator:
         self._unproven: tuple[float, str, float] | None = None
         self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
+        self._reports: list[FrameReport] = []  # of the images of a start
         self._size = 1.0  # of the target over the stated one, where it is by far not that
 
     def _lay_out(self) -> Layout:
@@ -217,18 +220,41 @@ class Calibrator:
         if self._size != 1.0:
             self.judge.announce(Event(EventKind.TARGET_SIZE, value=self._size - 1.0), once=hypotheses.SIZE)
         later = self._pending.take_all()
-        self.filter = found.filter
-        self.filter.began_s, self.filter.stamp_sigma_s = found.filter.state.t_s, self._stamp_sigma_s
+        f = found.filter
+        f.began_s, f.stamp_sigma_s = f.state.t_s, self._stamp_sigma_s
         if self._stale is not None and self._stale.layout is self.layout:
-            self.filter.keep_from(self._stale)
-            self._kept_until_s = self.filter.state.t_s + _PROVEN_S
+            f.keep_from(self._stale)
+            self._kept_until_s = f.state.t_s + _PROVEN_S
         self._stale = None
         self._held_back, self._lost, self._past = HeldBack(), None, RecentPast()
-        self.judge.started(self.filter.state.t_s, found.reason)
-        self.watch.started(self.filter.state.t_s)
+        self.judge.started(f.state.t_s, found.reason)
+        self.watch.started(f.state.t_s)
         self._starting.anew()
-        for t, frame in [*found.frames, *later]:
+        left = self._take_start(f, found.frames)
+        self.filter = f.plain()
+        for t, frame in [*left, *later]:
             self._pending.push(t, frame)
+
+    def _take_start(self, f: LinearisedFilter, frames: Frames) -> Frames:
+        """Take the images of a start; return those that readings do not cover yet."""
+        assert self._buffer is not None
+        for k, (t_cam_s, frame) in enumerate(frames):
+            if t_cam_s + f.state.cameras[frame.camera].timeshift_s > self._buffer.newest_s:
+                return frames[k:]
+            report = self._step(f, frame, t_cam_s)
+            if report is None:
+                self.judge.frames_ignored += 1
+                continue
+            if f.unshown is not None:
+                self._starting.take([(t_cam_s, frame)])
+                f.unshown.follow(f)
+            self._used_ns[frame.camera] = frame.t_cam_ns
+            now = f.plain()
+            self._ask_held_back(now, frame, t_cam_s)
+            self._past.saw(now, report, frame, t_cam_s)
+            self.judge.saw_frame(report, now)
+            self._reports.append(report)
+        return []
 
     def _estimate_readout(self, camera: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
@@ -246,7 +272,7 @@ class Calibrator:
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
-        reports: list[FrameReport] = []
+        reports, self._reports = self._reports, []
         while self.filter is not None and self._buffer is not None:
             shifts = {name: c.timeshift_s for name, c in self.filter.state.cameras.items()}
             item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
@@ -334,9 +360,7 @@ class Calibrator:
             f.unshown.follow(f)
         needed_s = min(f.state.t_s, self._starting.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
-        ratio = self._held_back_ratio(frame, t_cam_s)
-        if ratio is not None:
-            self.judge.held_back(ratio, f.consistency[frame.camera].scale)
+        self._ask_held_back(f, frame, t_cam_s)
         if not f.plausible():
             self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
             self._restart(f)
@@ -352,11 +376,12 @@ class Calibrator:
         self._act(self.watch.look(report, f), frame)
         return [report]
 
-    def _held_back_ratio(self, frame: PointsFrame, t_cam_s: float) -> float | None:
-        """How well an image was predicted that the held-back copy of the filter has not used."""
-        assert self.filter is not None
+    def _ask_held_back(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
+        """Judge how well an image was predicted that the held-back copy of the filter has not used."""
         assert self._buffer is not None
-        return self._held_back.follow(self.filter, frame, t_cam_s, self.target, self._buffer)
+        ratio = self._held_back.follow(f, frame, t_cam_s, self.target, self._buffer)
+        if ratio is not None:
+            self.judge.held_back(ratio, f.consistency[frame.camera].scale)
 
     def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""

@@ -54,6 +54,12 @@ class CameraPrior:
     intrinsics_sigma: tuple[float, float, float, float] | None = None
     distortion_sigma: tuple[float, ...] | None = None
 
+    def start_intrinsics(self) -> FloatArray:
+        """Focal lengths and centre, px: as given, or of a lens of 60 degrees across; fx fy cx cy, (4,)."""
+        width, height = self.resolution
+        guess = (0.87 * width, 0.87 * width, 0.5 * (width - 1), 0.5 * (height - 1))
+        return np.array(guess if self.intrinsics is None else self.intrinsics, dtype=np.float64)
+
     def coefficients(self) -> FloatArray:
         """The distortion as given, zeros where it is not, shape (d,)."""
         given = self.distortion or (0.0,) * len(COEFFICIENTS[self.distortion_model])

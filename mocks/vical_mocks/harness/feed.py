@@ -247,7 +247,9 @@ class CalibratorSubject:
             return claimed
         rows, places = self._rows(inner.layout.cameras[CAMERA])
         joint = self.calibrator.judge.weighed(inner).covariance(rows)
-        correlation = joint / np.sqrt(np.outer(np.diag(joint), np.diag(joint)))
+        spread = np.sqrt(np.diag(joint))
+        spread[spread == 0.0] = 1.0  # a fixed lens that is surely right
+        correlation = joint / np.outer(spread, spread)
         sigma = np.sqrt(np.diag(claimed))[places]
         full = np.zeros((15, 15))
         full[np.ix_(places, places)] = correlation * np.outer(sigma, sigma)

@@ -14,6 +14,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter import noise_updates as lessons
 from vical_daemon.estimation.filter.image_update import (
+    ImageFit,
     corner_gate,
     curved_share,
     frame_limit,
@@ -31,7 +32,8 @@ from vical_daemon.estimation.filter.linearise import (
 from vical_daemon.estimation.filter.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.filter.unobservable_directions import UnshownAxes
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.inertial.imu_model import Influence
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.rates import Rates, rates_after
@@ -122,11 +124,15 @@ class CalibrationFilter:
             moved = move_by_derivatives(self.state, self.layout, S, segment)
         else:
             moved = move_by_sigma_points(self.state, self.layout, S, segment)
-        Q = moved.influence.noise(self.imu_noise) + _TINY
+        Q = self._noise(moved.influence)
         if not straight:
             share = np.sqrt((moved.curved**2).sum(axis=1) / np.diag(Q)).max()
             self._motion_straight.measured(sigmas, float(share))
         return moved, Q
+
+    def _noise(self, influence: Influence) -> FloatArray:
+        """Covariance of the noise gathered on the way, shape (9, 9)."""
+        return influence.noise(self.imu_noise) + _TINY
 
     def _grow(self, moved: Moved, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
@@ -147,12 +153,12 @@ class CalibrationFilter:
         lin = self._linearise(image)
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
-        keep = lin.valid & corner_gate(image, innovation, lin)
+        keep = lin.valid & self._belonging(image, innovation, lin)
         if keep.sum() < 4:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
-        if fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level):
+        if self._surprising(fit):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
                 image,
@@ -190,14 +196,23 @@ class CalibrationFilter:
             return np.zeros(())
         lenses = self.layout.held.items()
         rows = np.concatenate([self.S[self.layout.lens(name)] for name, _ in lenses])
+        cameras = self.mean.cameras
         off = [
-            np.concatenate([c.intrinsics, c.distortion]) - lens.values
-            for (_, lens), c in ((item, self.state.cameras[item[0]]) for item in lenses)
+            np.concatenate([cameras[name].intrinsics, cameras[name].distortion]) - lens.values
+            for name, lens in lenses
         ]
         L = unscented.root(rows @ rows.T)
         weights = unscented.solve_lower(L, unscented.solve_lower(L, np.concatenate(off)), transposed=True)
         moved = lin.ways @ (lin.by_error @ (self.S @ (rows.T @ weights)))
         return np.asarray(moved.reshape(-1, 2))
+
+    def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
+        """Which corners are where they may be expected, shape (n,)."""
+        return corner_gate(image, innovation, lin)
+
+    def _surprising(self, fit: ImageFit) -> bool:
+        """Whether a whole image is not where it may be expected."""
+        return fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level)
 
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
         """The linearised image with the noise that its corners share."""
@@ -396,6 +411,11 @@ class CalibrationFilter:
             _motion_straight=Straightness(),
             _view_straight={},
         )
+
+    @property
+    def mean(self) -> State:
+        """The most likely state; `state` is where the filter is linearised, which is the same here."""
+        return self.state
 
     def sigmas(self) -> FloatArray:
         """Standard deviation of every error, shape (n,)."""

@@ -11,7 +11,7 @@ all rows of an image goes through fourteen columns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from vical_daemon.estimation.model.target_view import view
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
 _FAR_PX = 1e5  # pixels of a point beside the camera, not before it
+_STEP = 1e-3  # of a sigma: so small that differences are derivatives
 _TRUST = 100  # images for which a measurement of the second-order part holds
 
 
@@ -141,6 +142,13 @@ def by_sigma_points(
     by_error = unscented.solve_lower(S, np.eye(len(S)))
     unit, none = np.eye(len(S)), np.zeros((len(S), 0))
     return Linear((flat[0] + m.shift).reshape(-1, 2), m.linear, by_error, unit, m.curved, valid, none)
+
+
+def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
+    """The same to first order about the nominal state, by differences; for rolling shutters."""
+    steps = np.diag(_STEP * np.sqrt((S**2).sum(axis=1)))
+    lin = by_sigma_points(state, layout, rates, image, np.zeros(len(S)), steps)
+    return replace(lin, spread=lin.by_error @ S, curved=np.zeros((len(lin.ways), 0)))
 
 
 def by_derivatives(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:

@@ -50,7 +50,7 @@ def _ask_lens(
     ways, innovation = whitened(image, lin, fit.keep)
     shape = f.layout.target_shape
     if shape is not None and "target_shape" not in f.off:
-        innovation = innovation + ways @ (lin.by_error[:, shape] @ f.state.target_shape)
-    camera = f.state.cameras[image.camera]
+        innovation = innovation + ways @ (lin.by_error[:, shape] @ f.mean.target_shape)
+    camera = f.mean.cameras[image.camera]
     values = np.concatenate([camera.intrinsics, camera.distortion])
     agreement.learn(f.state.t_s, innovation, ways @ lin.by_error[:, :6], ways @ by_lens, values)

@@ -278,3 +278,15 @@ def right_jacobian_inverse(rotvec: FloatArray) -> FloatArray:
     alpha = np.where(small, 1.0 - series * a2, safe * np.cos(safe) / np.sin(safe))
     gamma = np.where(small, series, (1.0 - alpha) / np.where(small, 1.0, a2))
     return _polynomial(alpha, np.full_like(alpha, 0.5), gamma, v)
+
+
+def tangents(unit: FloatArray) -> FloatArray:
+    """Two unit vectors across each unit vector, shape (n, 3, 2): a Householder frame of the nearer half."""
+    x, y, z = unit[:, 0], unit[:, 1], unit[:, 2]
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    out = np.empty((len(unit), 3, 2))
+    out[:, :, 0] = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    out[:, :, 1] = np.stack([b, sign + y * y * a, -y], axis=1)
+    return out

@@ -1,1 +1,1 @@
-"""From nothing to a running filter: a closed-form start, then rehearsals that learn the noise."""
+"""From nothing to a running filter: a closed form, one window about it, and the filter about the window."""

@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.initial_filter import wide_filter
 from vical_daemon.estimation.init.readout_start import looks_rolling
-from vical_daemon.estimation.init.relinearisation import Frames, Step, rehearsed
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache
+from vical_daemon.estimation.init.window_start import Frames, Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import Layout
 
@@ -36,10 +36,10 @@ class Attempt:
         reason: Why there is none, or what the motion does not show.
         motion_missing: It is motion that is missing, not time.
         rolling: Name of a camera that has a rolling shutter of which nothing was said.
-        size: See `Rehearsed`.
+        size: See `WindowStart`.
     """
 
-    filter: CalibrationFilter | None
+    filter: LinearisedFilter | None
     frames: Frames
     reason: str
     motion_missing: bool = False
@@ -130,7 +130,7 @@ class Starting:
             still_axes=result.still_axes,
             turn_axis_cam=result.turn_axis_cam,
         )
-        found = rehearsed(result.state, frames, make, self._step)
+        found = window_start(result.state, result.poses, frames, make, self._step, buffer, self._target)
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)

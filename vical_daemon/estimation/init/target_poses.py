@@ -28,10 +28,8 @@ class Lens:
     @classmethod
     def from_prior(cls, prior: CameraPrior) -> Lens:
         """Take what is given; a lens of 60 degrees across where nothing is."""
-        width, height = prior.resolution
-        guess = (0.87 * width, 0.87 * width, 0.5 * (width - 1), 0.5 * (height - 1))
         return cls(
-            np.array(prior.intrinsics if prior.intrinsics is not None else guess, dtype=np.float64),
+            prior.start_intrinsics(),
             prior.coefficients(),
             prior.distortion_model,
             prior.resolution,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class StartResult:
             None: everything is known.
         turn_axis_cam: Of a rig that turned about it at one rate all the time, camera frame, shape (3,): the
             delay and the mounting about this axis are guessed, too; None: not so.
+        poses: Of all images used, by camera and in order.
     """
 
     state: State | None
@@ -37,6 +38,7 @@ class StartResult:
     motion_missing: bool = False
     still_axes: FloatArray | None = None
     turn_axis_cam: FloatArray | None = None
+    poses: list[SeenPose] = field(default_factory=list)
 
 
 def motion_start(
@@ -64,11 +66,13 @@ def motion_start(
     """
     state: State | None = None
     size, still = 0.0, None
+    used: list[SeenPose] = []
     for name, poses in seen.items():
         camera = cameras[name]
         # Only the latest stretch: the double integral drifts, and what was long ago costs more than it gives.
         since = max(buffer.oldest_s, poses[-1].t_cam_s + camera.timeshift_s - _STRETCH_S)
         inside = [p for p in poses if since < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
+        used += inside
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
         held = None if turn_axis_cam is None else np.eye(3)
@@ -89,7 +93,7 @@ def motion_start(
             "check the target's size in its YAML and the unit of the accelerometer"
         )
         return StartResult(None, why)
-    return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam)
+    return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used)
 
 
 def _linear(

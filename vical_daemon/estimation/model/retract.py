@@ -20,6 +20,7 @@ from vical_daemon.estimation.model.state import (
     CameraState,
     Layout,
     State,
+    grp_from_rotation,
     rotation_from_grp,
     rotation_of_grp,
     tilted_gravity,
@@ -134,6 +135,46 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
     )
 
 
+def difference(state: State, origin: State, layout: Layout) -> FloatArray:
+    """Errors that move `origin` to `state`, shape (n,): the inverse of `retract`."""
+    dx = np.zeros(layout.size)
+    dx[ATTITUDE] = grp_from_rotation(origin.R_world_imu.T @ state.R_world_imu)
+    dx[POSITION], dx[VELOCITY] = (
+        state.p_world_imu - origin.p_world_imu,
+        state.v_world_imu - origin.v_world_imu,
+    )
+    dx[GYRO_BIAS], dx[ACCEL_BIAS] = state.gyro_bias - origin.gyro_bias, state.accel_bias - origin.accel_bias
+    across = np.cross(origin.gravity, state.gravity)
+    sine, cosine = float(np.linalg.norm(across)), float(origin.gravity @ state.gravity)
+    dx[GRAVITY] = origin.tilt.T @ across * (np.arctan2(sine, cosine) / max(sine, 1e-12))
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        dx[layout.gyro_matrix] = (state.gyro_matrix - origin.gyro_matrix).ravel()
+        dx[layout.accel_matrix] = (state.accel_matrix - origin.accel_matrix)[LOWER[:, 0], LOWER[:, 1]]
+    if layout.accel_lag is not None:
+        dx[layout.accel_lag] = state.accel_lag_s - origin.accel_lag_s
+    if layout.target_scale is not None:
+        dx[layout.target_scale] = state.target_scale - origin.target_scale
+    if layout.target_shape is not None:
+        dx[layout.target_shape] = state.target_shape - origin.target_shape
+    for name, where in layout.cameras.items():
+        a, b = state.cameras[name], origin.cameras[name]
+        if where.rotation is not None and where.position is not None:
+            dx[where.rotation] = grp_from_rotation(b.R_imu_cam.T @ a.R_imu_cam)
+            dx[where.position] = a.p_imu_cam - b.p_imu_cam
+        if where.timeshift is not None:
+            dx[where.timeshift] = a.timeshift_s - b.timeshift_s
+        if where.skew is not None:
+            dx[where.skew] = a.skew - b.skew
+        if where.intrinsics is not None and where.distortion is not None:
+            dx[where.intrinsics], dx[where.distortion] = (
+                a.intrinsics - b.intrinsics,
+                a.distortion - b.distortion,
+            )
+        if where.readout is not None:
+            dx[where.readout] = a.readout_s - b.readout_s
+    return dx
+
+
 def _moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> CameraState:
     R, p, K, D = camera.R_imu_cam, camera.p_imu_cam, camera.intrinsics, camera.distortion
     shift, readout, skew = camera.timeshift_s, camera.readout_s, camera.skew
@@ -151,6 +192,6 @@ def _moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> C
 
 
 def orthonormal(R: FloatArray) -> FloatArray:
-    """One Newton step towards the nearest rotation: rounding never accumulates, however long it runs."""
-    out: FloatArray = 1.5 * R - 0.5 * R @ (R.T @ R)
+    """One Newton step towards the nearest rotation, (..., 3, 3): rounding never accumulates."""
+    out: FloatArray = 1.5 * R - 0.5 * R @ (R.swapaxes(-1, -2) @ R)
     return out

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
+from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.held_lens import HeldLens
 from vical_daemon.estimation.model.target_modes import MODES, TargetModes
@@ -287,12 +288,8 @@ def grp_from_rotation(R: FloatArray) -> FloatArray:
 
 def tilt_basis(gravity: FloatArray) -> FloatArray:
     """Two unit vectors across gravity to begin with, shape (3, 2): the directions in which it can tilt."""
-    x, y, z = gravity / np.sqrt(gravity @ gravity)
-    # Householder frame of the nearer half
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return np.array([[1.0 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
+    basis: FloatArray = tangents(gravity[None] / np.sqrt(gravity @ gravity))[0]
+    return basis
 
 
 def tilted_gravity(gravity: FloatArray, basis: FloatArray, tilt: FloatArray) -> FloatArray:

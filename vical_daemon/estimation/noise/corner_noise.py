@@ -12,6 +12,13 @@ _GUESS_DOF, _GUESS_FADES = 100.0, 300.0  # degrees of freedom
 _LEAST_PX = 0.005
 
 
+def relative_noise(stated_px: FloatArray | None, n: int) -> FloatArray:
+    """Noise of each corner of an image over their usual one, as the detector states it, shape (n,)."""
+    if stated_px is None or not len(stated_px):
+        return np.ones(n)
+    return np.asarray(np.clip(stated_px / np.sqrt(np.mean(stated_px**2)), 0.3, 10.0))
+
+
 @dataclass(slots=True)
 class CornerNoise:
     """Running estimate of the noise per axis of one camera's corners.
@@ -37,10 +44,7 @@ class CornerNoise:
 
     def sigmas(self, stated_px: FloatArray | None, n: int) -> FloatArray:
         """Noise of each corner: the measured level, shared out by the detector's own weights."""
-        if stated_px is None or not len(stated_px):
-            return np.full(n, self.sigma_px)
-        relative = stated_px / np.sqrt(np.mean(stated_px**2))
-        return np.asarray(self.sigma_px * np.clip(relative, 0.3, 10.0))
+        return self.sigma_px * relative_noise(stated_px, n)
 
     def learn(self, whitened_rest: float, dof: int) -> None:
         """Take in the unexplained sum of squares of one frame (whitened by the present sigma)."""

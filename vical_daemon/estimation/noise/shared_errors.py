@@ -20,7 +20,6 @@ from vical_daemon.estimation.noise.variance_components import Observed, variance
 
 _MEMORY = 400  # images
 _LEAST = 20
-_LEAST_ASSUMED = 10
 _EVERY = 5  # images between two looks at all that is remembered
 _SELDOM_FROM, _SELDOM = 100, 4  # later it changes little: one look in so many
 _SIGNIFICANT = 5.0  # standard deviations above what images without such errors would give
@@ -48,20 +47,11 @@ class SharedErrors:
     _b: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS)))
     _allowed: FloatArray = field(default_factory=lambda: np.zeros(_MEMORY))  # s^2, when the image was used
     _counts: BoolArray = field(default_factory=lambda: np.zeros(_MEMORY, dtype=bool))
-    _assumed: bool = False
-
-    @classmethod
-    def assumed(cls, jitter_s: float) -> SharedErrors:
-        """A jitter that is allowed for until `begin` puts in its place what the images said."""
-        return cls(jitter_s, _assumed=True)
 
     def begin(self) -> None:
         """Go on with what was learnt, in a filter that has used none of these images."""
-        if self._assumed:
-            self.jitter_s = self.shift_px = 0.0
-            if self.images >= _LEAST_ASSUMED:
-                self._look(0.0, 0.0)
-            self._assumed = False
+        if self.images >= _LEAST:
+            self._look_again()
         self._counts[:] = False
 
     @property
@@ -89,12 +79,16 @@ class SharedErrors:
         self._allowed[place], self._counts[place] = self.jitter_s**2, True
         self.images += 1
         every = _EVERY * (_SELDOM if self.images > _SELDOM_FROM else 1)
-        if not self._assumed and self.images >= _LEAST and self.images % every == 0:
-            jitters, shifts = self.jitter_s > 0.0, self.shift_px > 0.0
-            self._look(
-                _STILL_SIGNIFICANT if jitters else _SIGNIFICANT,
-                _STILL_SIGNIFICANT if shifts else _SIGNIFICANT,
-            )
+        if self.images >= _LEAST and self.images % every == 0:
+            self._look_again()
+
+    def _look_again(self) -> None:
+        """Estimate both, where they show."""
+        jitters, shifts = self.jitter_s > 0.0, self.shift_px > 0.0
+        self._look(
+            _STILL_SIGNIFICANT if jitters else _SIGNIFICANT,
+            _STILL_SIGNIFICANT if shifts else _SIGNIFICANT,
+        )
 
     def _look(self, jitter_needs: float, shift_needs: float) -> None:
         """Estimate both from all that is remembered."""

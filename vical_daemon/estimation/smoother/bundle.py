@@ -12,8 +12,11 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.inertial_links import Links
+from vical_daemon.estimation.model.retract import orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.carry import (
     FULL,
@@ -22,10 +25,8 @@ from vical_daemon.estimation.smoother.carry import (
     calibration_difference,
     carried_out,
     moved,
-    tangents,
 )
 from vical_daemon.estimation.smoother.inertial import links_left
-from vical_daemon.estimation.smoother.inertial_links import Links
 from vical_daemon.estimation.smoother.normal import Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
@@ -228,7 +229,7 @@ class Bundle:
         dx, dl = step.states, step.landmarks
         w, order = self.window, self.problem.order()
         d = dx[order.frames]
-        w.R = orthonormal_all(w.R @ so3.exp(d[:, :3]))
+        w.R = orthonormal(w.R @ so3.exp(d[:, :3]))
         w.p, w.v = w.p + d[:, 3:6], w.v + d[:, 6:]
         w.bias = w.bias + dx[order.knots]
         full = np.zeros(FULL)
@@ -314,8 +315,3 @@ class Bundle:
             len(seen.begin),
             parallax_deg(w, seen),
         )
-
-
-def orthonormal_all(R: FloatArray) -> FloatArray:
-    """One Newton step towards the nearest rotation for each of a batch (`retract.orthonormal`)."""
-    return np.asarray(1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.imu_scale import NUMBERS
 from vical_daemon.estimation.model.retract import orthonormal
@@ -137,18 +138,6 @@ def held_along(carry: Carry, axis: FloatArray) -> Carry:
     row[0, CALIBRATION : CALIBRATION + 3] = axis / _HELD_M
     stacked = np.vstack([carry.root, row])
     return replace(carry, root=np.linalg.qr(stacked)[1])
-
-
-def tangents(bearing: FloatArray) -> FloatArray:
-    """Two directions across each unit vector, shape (n, 3, 2); smooth but at one pole."""
-    x, y, z = bearing[:, 0], bearing[:, 1], bearing[:, 2]
-    sign = np.where(z < 0.0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    out = np.empty((len(bearing), 3, 2))
-    out[:, :, 0] = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    out[:, :, 1] = np.stack([b, sign + y * y * a, -y], axis=1)
-    return out
 
 
 def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Carry:

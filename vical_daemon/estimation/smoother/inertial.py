@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.smoother.inertial_links import Links
+from vical_daemon.estimation.model.inertial_links import Links
 from vical_daemon.estimation.smoother.jitter import Lateness
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
 

@@ -9,8 +9,10 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.model.inertial_links import Links
 from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.smoother.carry import (
     ARM,
@@ -22,10 +24,8 @@ from vical_daemon.estimation.smoother.carry import (
     TURN,
     Carry,
     calibration_difference,
-    tangents,
 )
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
-from vical_daemon.estimation.smoother.inertial_links import Links
 from vical_daemon.estimation.smoother.jitter import first_guess
 from vical_daemon.estimation.smoother.window import IntArray, Seen, Window
 

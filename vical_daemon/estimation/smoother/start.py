@@ -19,8 +19,8 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.inertial_links import Link, make_link
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.inertial_links import Link, make_link
 from vical_daemon.estimation.smoother.window import Landmarks, Window, rays_of
 
 _ROUNDS = 8

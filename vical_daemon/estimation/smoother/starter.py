@@ -264,14 +264,12 @@ class Starter:
 
 def starting_camera(prior: CameraPrior) -> CameraState:
     """Camera as given; a lens of 60 degrees across where nothing is."""
-    width, height = prior.resolution
-    guess = (0.87 * width, 0.87 * width, 0.5 * (width - 1), 0.5 * (height - 1))
     R, p = (np.eye(3), np.zeros(3)) if prior.T_imu_cam is None else prior.T_imu_cam
     return CameraState(
         np.array(R, np.float64),
         np.array(p, np.float64),
         prior.timeshift_cam_imu_s or 0.0,
-        np.array(prior.intrinsics if prior.intrinsics is not None else guess, np.float64),
+        prior.start_intrinsics(),
         prior.coefficients(),
         prior.distortion_model,
         prior.resolution,

@@ -19,8 +19,8 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.imu_scale import matrices
+from vical_daemon.estimation.model.inertial_links import Link, Links, make_link
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.inertial_links import Link, Links, make_link
 
 KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
 MAX_LANDMARKS = 220

@@ -9,8 +9,10 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
+from vical_daemon.estimation.model.inertial_links import Links, make_link
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
 from vical_daemon.estimation.smoother.carry import (
@@ -21,10 +23,8 @@ from vical_daemon.estimation.smoother.carry import (
     first_carry,
     later,
     moved,
-    tangents,
 )
 from vical_daemon.estimation.smoother.inertial import Order
-from vical_daemon.estimation.smoother.inertial_links import Links, make_link
 from vical_daemon.estimation.smoother.jitter import Lateness
 from vical_daemon.estimation.smoother.quality import correlation
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart

@@ -18,6 +18,7 @@ from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
+_ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be told as zero
 _EYE = np.eye(3)
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 
@@ -70,7 +71,8 @@ def make_link(
     if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
     motion, errors, by_imu = _integrated(segment, imu[:6], imu[6:])
-    root = np.linalg.inv(np.linalg.cholesky(errors.noise(noise)[_ORDER[:, None], _ORDER]))
+    covariance = errors.noise(noise)[_ORDER[:, None], _ORDER] + _ROUNDING
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
     return Link(
         float(motion.t_s[-1]),
         motion.dR[0, -1],
