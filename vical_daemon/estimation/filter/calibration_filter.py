@@ -27,7 +27,6 @@ from vical_daemon.estimation.filter.linearise import (
     Straightness,
     by_derivatives,
     by_sigma_points,
-    project_errors,
 )
 from vical_daemon.estimation.filter.propagate import Moved, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.filter.unobservable_directions import UnshownAxes
@@ -253,14 +252,6 @@ class CalibrationFilter:
             lin.z[keep], (image.uv - lin.z)[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
         )
         return None if normal is None else float(normal @ normal) / len(normal)
-
-    def predict_pixels(self, camera: str, t_cam_s: float, points: FloatArray) -> FloatArray:
-        """Where points should appear with the nominal state, px, shape (n, 2)."""
-        nominal = np.zeros((1, self.layout.size))
-        uv: FloatArray = project_errors(
-            self.state, self.layout, self.rates, camera, t_cam_s, points, None, nominal
-        )[0]
-        return uv
 
     def _linearise(self, image: Image) -> Linear:
         """The image about the nominal state, with the spread of the prior."""

@@ -38,11 +38,6 @@ def hat(v: FloatArray) -> FloatArray:
     return np.asarray((v @ _SKEW).reshape(*v.shape, 3))
 
 
-def vee(S: FloatArray) -> FloatArray:
-    """Return the vector of a skew matrix, the inverse of `hat`, shape (..., 3)."""
-    return np.stack((S[..., 2, 1], S[..., 0, 2], S[..., 1, 0]), axis=-1)
-
-
 def _polynomial(alpha: FloatArray, beta: FloatArray, gamma: FloatArray, v: FloatArray) -> FloatArray:
     """Return `alpha I + beta hat(v) + gamma v v'`, the form of all functions of hat(v)."""
     out = (gamma[..., None] * v)[..., :, None] * v[..., None, :]
@@ -154,31 +149,6 @@ def quat_multiply(p: FloatArray, q: FloatArray) -> FloatArray:
 def quat_conjugate(q: FloatArray) -> FloatArray:
     """Return the inverse rotations of unit quaternions, shape (..., 4)."""
     out: FloatArray = np.asarray(q, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
-    return out
-
-
-def quat_rotate(q: FloatArray, v: FloatArray) -> FloatArray:
-    """Rotate vectors: `matrix_from_quat(q) @ v` without building the matrix.
-
-    Args:
-        q: Unit quaternions w x y z of R_a_b, shape (..., 4).
-        v: Vectors in b, shape (..., 3); broadcast against q.
-
-    Returns:
-        Vectors in a, shape (..., 3).
-    """
-    q = np.asarray(q, dtype=np.float64)
-    v = np.asarray(v, dtype=np.float64)
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    vx, vy, vz = v[..., 0], v[..., 1], v[..., 2]
-    # t = 2 u x v;  v' = v + w t + u x t
-    tx = 2.0 * (y * vz - z * vy)
-    ty = 2.0 * (z * vx - x * vz)
-    tz = 2.0 * (x * vy - y * vx)
-    out = np.empty((*np.shape(tx), 3))
-    out[..., 0] = vx + w * tx + (y * tz - z * ty)
-    out[..., 1] = vy + w * ty + (z * tx - x * tz)
-    out[..., 2] = vz + w * tz + (x * ty - y * tx)
     return out
 
 

@@ -30,7 +30,6 @@ class LinearStart:
         gravity: Acceleration of free fall, m/s^2, as found (not yet of the right length).
         accel_bias: m/s^2.
         sigma_p_imu_cam: Standard deviations, m, shape (3,).
-        rms_m: RMS of the position residuals, m.
     """
 
     p_imu_cam: FloatArray
@@ -38,7 +37,6 @@ class LinearStart:
     gravity: FloatArray
     accel_bias: FloatArray
     sigma_p_imu_cam: FloatArray
-    rms_m: float
 
 
 def linear_start(
@@ -93,8 +91,7 @@ def linear_start(
     residual = (y - rows @ x).reshape(-1, 3)
     variance = float(np.mean(residual**2))
     cov = np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)
-    rms = float(np.sqrt(np.mean((residual / w[:, None]) ** 2)))
-    return LinearStart(x[9:12], x[3:6], x[6:9], x[12:15], np.sqrt(np.diag(cov)[9:12]), rms)
+    return LinearStart(x[9:12], x[3:6], x[6:9], x[12:15], np.sqrt(np.diag(cov)[9:12]))
 
 
 def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:

@@ -98,7 +98,8 @@ def test_update_equals_the_linear_kalman_update_with_numeric_jacobians(recording
     f, buffer, base = build(recording, scale=0.2)
     image = one_frame(recording, f, buffer, base)
     layout, S = f.layout, f.S.copy()
-    z = f.predict_pixels("cam0", image.t_cam_s, image.points)
+    nominal = np.zeros((1, layout.size))
+    z = project_errors(f.state, layout, f.rates, "cam0", image.t_cam_s, image.points, None, nominal)[0]
     H = np.zeros((2 * len(z), layout.size))
     for k in range(layout.size):
         h = 1e-6 * np.eye(layout.size)[k]
