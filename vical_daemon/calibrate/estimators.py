@@ -35,6 +35,11 @@ class Estimator(Protocol):
         """Images that have been neither used nor rejected yet."""
         ...
 
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Readings and images that were not used, by cause."""
+        ...
+
     def process(self) -> Sequence[Any]:
         """Process the data that have arrived."""
         ...

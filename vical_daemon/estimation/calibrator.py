@@ -133,10 +133,8 @@ class Calibrator:
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
-        refused = self._imu.refused
         for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
             self.judge.saw_imu(*reading)
-        self.judge.imu_refused += self._imu.refused - refused
         self.judge.announce_all(self._imu.news())
 
     @property
@@ -177,6 +175,11 @@ class Calibrator:
     def waiting(self) -> int:
         """Images that wait for inertial data."""
         return len(self._pending)
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Readings and images that were not used, by cause."""
+        return {**self._imu.left_out, "images_ignored": self.judge.frames_ignored}
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:

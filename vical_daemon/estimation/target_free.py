@@ -118,10 +118,8 @@ class TargetFreeCalibrator:
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
-        refused = self._imu.refused
         for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
             self.judge.saw_imu(reading.t_imu_ns, reading.gyro_rps)
-        self.judge.imu_refused += self._imu.refused - refused
         self.judge.announce_all(self._imu.news())
 
     @property
@@ -164,6 +162,11 @@ class TargetFreeCalibrator:
     def waiting(self) -> int:
         """Images that wait for inertial data; before there is a window, all are tried again and again."""
         return 0 if self.window is None else len(self._pending)
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Readings and images that were not used, by cause."""
+        return {**self._imu.left_out, "images_ignored": self.judge.frames_ignored}
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:

@@ -48,7 +48,7 @@ class TargetFreeRig:
         if not cameras:
             raise ValueError("no camera to calibrate")
         self.parts = {name: TargetFreeCalibrator(options, {name: prior}) for name, prior in cameras.items()}
-        self.frames_ignored = 0  # of cameras that nobody asked for
+        self._strangers = 0  # images of cameras that nobody asked for
 
     def stamps_known_to(self, sigma_s: float) -> None:
         """Take how well the imu's driver knows its device's clock now, one sigma, s."""
@@ -64,7 +64,7 @@ class TargetFreeRig:
         """Take the tracks of one image; those of unknown cameras are only counted."""
         part = self.parts.get(frame.camera)
         if part is None:
-            self.frames_ignored += 1
+            self._strangers += 1
         else:
             part.add_points(frame)
 
@@ -72,6 +72,12 @@ class TargetFreeRig:
     def waiting(self) -> int:
         """Images that wait for inertial data."""
         return sum(part.waiting for part in self.parts.values())
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Readings (all cameras take the same) and images that were not used, by cause."""
+        counts = [part.left_out for part in self.parts.values()]
+        return {**counts[0], "images_ignored": self._strangers + sum(c["images_ignored"] for c in counts)}
 
     def process(self) -> list[FrameReport]:
         """Do what can be done with what has arrived; reports on the images of windows that are complete."""

@@ -43,6 +43,7 @@ class Recorded:
         self.frames = self.imu_samples = 0
         self.sigma_s: float | None = None
         self.waiting = 0
+        self.left_out: dict[str, int] = {}
         self.hangs = self.fails = False
 
     def stamps_known_to(self, sigma_s: float) -> None:

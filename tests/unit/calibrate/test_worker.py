@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -60,6 +60,7 @@ class FakeEstimator:
         self.fed.append((frame.camera, frame.t_cam_ns))
 
     waiting = 0
+    left_out: ClassVar[dict[str, int]] = {"imu_spikes": 3}
 
     def process(self) -> list[Any]:
         return ["verdict"]

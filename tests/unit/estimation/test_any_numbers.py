@@ -116,7 +116,7 @@ def test_impossible_readings_change_nothing(run: SimulatedRun) -> None:
             else:
                 c.add_imu(stamp, *content)
         answers.append(c.estimate().cameras["cam0"])
-    assert c.judge.imu_refused == 20
+    assert c.left_out["imu_refused"] == 20
     assert answers[1] == answers[0]
 
 

@@ -117,7 +117,7 @@ def test_a_blind_camera_holds_up_no_other_and_is_named(pair):
 def test_strangers_are_counted_and_no_camera_is_refused(pair):
     rig = rig_of(pair)
     rig.add_points(points_frame(pair["left"].frames[0], camera="rear"))
-    assert rig.frames_ignored == 1
+    assert rig.left_out["images_ignored"] == 1
     with pytest.raises(ValueError, match="no camera"):
         TargetFreeRig(CalibrationOptions(target_free=True), {})
     options = CalibrationOptions(target_free=True, estimate=frozenset({"target_scale"}))

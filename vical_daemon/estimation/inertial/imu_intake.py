@@ -71,9 +71,14 @@ class ImuIntake:
         self._gap: Event | None = None  # forwards, until an image tells whether the clock was set
 
     @property
-    def spikes(self) -> int:
-        """Readings left out because neither their neighbours nor the other sensor support them."""
-        return self._spikes.spikes
+    def left_out(self) -> dict[str, int]:
+        """Readings left out, by cause; spikes: neither neighbours nor the other sensor support them."""
+        return {
+            "imu_refused": self.refused,
+            "imu_repeated": self.repeated,
+            "imu_clipped": self.clipped,
+            "imu_spikes": self._spikes.spikes,
+        }
 
     @property
     def shift_s(self) -> float:

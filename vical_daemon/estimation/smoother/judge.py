@@ -62,7 +62,7 @@ class FreeJudge:
     ) -> None:
         self.options, self.camera, self.active = options, camera, active
         self._motion = RunningMotion()
-        self.imu_samples = self.imu_refused = self.frames_ignored = self.frames_seen = 0
+        self.imu_samples = self.frames_ignored = self.frames_seen = 0
         self._steady = SteadyStatus()
         self._events = EventLog()
         self.misfit: tuple[Cause, float] = Cause.NONE, 0.0

@@ -56,7 +56,6 @@ class Judge:
         self._imu_asked = "imu_intrinsics" in options.estimate
         self._motion = RunningMotion()
         self.imu_samples = 0
-        self.imu_refused = 0
         self.frames = 0
         self.frames_seen = 0
         self.frames_ignored = 0
