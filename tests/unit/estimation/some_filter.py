@@ -8,18 +8,16 @@ from vical_mocks.points import board_points
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import ImuNoise
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, SIZE_SIGMA
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import LOWER, CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.selection.model_selection import (
-    ENTRY_SIGMA,
     IMU,
     LAG,
-    LAG_SIGMA_S,
     SIZE,
-    SIZE_SIGMA,
     TARGET,
 )
 

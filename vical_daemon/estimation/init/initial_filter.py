@@ -10,6 +10,16 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.unobservable_directions import UNKNOWN_M, UnshownAxes
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.model.priors import (
+    ACCEL_BIAS_SIGMA_MPS2,
+    ENTRY_SIGMA,
+    GYRO_BIAS_SIGMA_RPS,
+    KNOWN_OFF_SIGMA,
+    KNOWN_SIZE_SIGMA,
+    LAG_SIGMA_S,
+    SIZE_SIGMA,
+    SKEW_SIGMA,
+)
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -24,17 +34,7 @@ from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import SharedErrors
-from vical_daemon.estimation.selection.clock_drift import SKEW_SIGMA
-from vical_daemon.estimation.selection.model_acceptance import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA
-from vical_daemon.estimation.selection.model_selection import (
-    ENTRY_SIGMA,
-    IMU,
-    LAG,
-    LAG_SIGMA_S,
-    SIZE,
-    SIZE_SIGMA,
-    TARGET,
-)
+from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET
 
 
 def wide_filter(
@@ -96,7 +96,7 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection
         before_m = min(_before_board_m(state, name) for name in layout.cameras)
         lever_arm, position, angle = min(0.15, 0.35 * before_m), min(0.1, 0.25 * before_m), 0.1
     s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
-    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
+    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, 0.1
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA
     if layout.accel_lag is not None:

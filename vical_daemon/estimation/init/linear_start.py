@@ -16,8 +16,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import strapdown
 from vical_daemon.estimation.measurements import FloatArray
-
-_ACCEL_BIAS_PRIOR = 0.3  # m/s^2, the datasheet's worst turn-on bias several times over
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +82,7 @@ def linear_start(
     rows = (A * w[:, None, None]).reshape(-1, 15)
     y = ((p_world_cam - D) * w[:, None]).ravel()
     prior = np.zeros((6, 15))
-    prior[:3, 12:15] = eye / _ACCEL_BIAS_PRIOR
+    prior[:3, 12:15] = eye / ACCEL_BIAS_SIGMA_MPS2
     if held_axes is not None:
         prior[3:, 9:12] = held_axes.T @ held_axes / HELD_M
     A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(6)])

@@ -17,18 +17,14 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.priors import OFF, SKEW_SIGMA, SURE
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.selection.model_selection import lenses_known
 
-SKEW_SIGMA = 1e-4
-"""Drift of clocks that do not run alike, s/s, one sigma; two poor crystals."""
 CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
 SKEW_WALK = 1e-8
 """How such a drift wanders (temperature), s/s per sqrt(s)."""
-_APART = 0.05  # share of rigs whose clocks do not run alike
 _LEAST_S = 1.0
-SURE = 0.99
-"""Probability from which on a drift is announced."""
 
 
 def apart(f: CalibrationFilter, camera: str) -> float:
@@ -48,7 +44,7 @@ def evidence(skew: float, variance: float) -> float:
 
 def probability(bayes_factor: float) -> float:
     """Return the probability of a drift."""
-    odds = _APART / (1.0 - _APART) * bayes_factor
+    odds = OFF / (1.0 - OFF) * bayes_factor
     return odds / (1.0 + odds)
 
 

@@ -9,15 +9,14 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA, OFF, SURE
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.selection.model_selection import (
     IMU,
     LAG,
-    OFF,
     SIZE,
-    SURE,
     TARGET,
     Block,
     blocks,
@@ -27,10 +26,6 @@ from vical_daemon.estimation.selection.model_selection import (
     weights,
 )
 
-KNOWN_OFF_SIGMA = 1e-2
-"""Prior of the entries of an IMU that is known to be off, or where its matrices are asked for."""
-KNOWN_SIZE_SIGMA = 0.1
-"""Of the size of a target that is known to be off, or where it is asked for, relative."""
 _EVERY_S = 1.0
 _MEASURED = 400  # images
 _SEEN = 100  # images, as many as `consistency` wants

@@ -20,26 +20,17 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, OFF, SIZE_SIGMA
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import LOWER
 from vical_daemon.estimation.model.unscented import root, solve_lower
 
 IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
-ENTRY_SIGMA = 2e-3
-"""Scale or alignment of an IMU that is not as it says, one sigma of each entry."""
 IN_DOUBT = {
     IMU: "sigmas are small; whether the imu's scale and alignment are true is not sure yet",
     SIZE: "sigmas are small; whether the target is as large as stated is not sure yet",
     TARGET: "sigmas are small; whether the target is as stated is not sure yet",
 }
-SIZE_SIGMA = 0.02
-"""Of a target that is not as large as stated, relative, one sigma; pages fitted to the paper: 3 to 6 %."""
-LAG_SIGMA_S = 3e-4
-"""By how much the delays of accelerometer and gyro differ in an IMU where they do, one sigma, s."""
-OFF = 0.05
-"""Share of rigs of which any one of these is not as stated, to begin with."""
-SURE = 0.99
-"""Probability from which on a block is known to be off."""
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
 _RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as stated has none

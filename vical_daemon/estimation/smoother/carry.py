@@ -14,6 +14,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.imu_scale import NUMBERS
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.model.retract import orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.window import Window
@@ -124,7 +125,8 @@ def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
         active: Which of the calibration errors are estimated, shape (FULL,).
         sigmas: Of the calibration errors, shape (FULL,).
     """
-    wide = np.concatenate([[1.0] * 2, [5.0] * 3, [0.02] * 3, [0.3] * 3, sigmas[np.flatnonzero(active)]])
+    biases = [GYRO_BIAS_SIGMA_RPS] * 3 + [ACCEL_BIAS_SIGMA_MPS2] * 3
+    wide = np.concatenate([[1.0] * 2, [5.0] * 3, biases, sigmas[np.flatnonzero(active)]])
     R, t_s = window.R[0], window.frames[0][0]
     root, speed = np.diag(1.0 / wide), R.T @ window.v[0]
     return Carry(R.copy(), speed, np.zeros(6), window.camera, root, active, t_s, window.imu)

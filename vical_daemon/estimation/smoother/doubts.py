@@ -6,22 +6,22 @@ import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, LAG_SIGMA_S, OFF, SURE
 from vical_daemon.estimation.selection import model_selection as hypotheses
 from vical_daemon.estimation.selection.clock_drift import (
     CLOCKS_IN_DOUBT,
-    SURE,
     evidence,
     probability,
     stamps_variance,
 )
-from vical_daemon.estimation.selection.model_acceptance import KNOWN_OFF_SIGMA, known_off
+from vical_daemon.estimation.selection.model_acceptance import known_off
 from vical_daemon.estimation.smoother.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, Carry
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
 _SURELY_ROLLING = 5.0  # sigmas
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
 _WHERE = {hypotheses.IMU: np.arange(FULL)[IMU], hypotheses.LAG: np.arange(FULL)[LAG]}
-_SIGMA = {hypotheses.IMU: hypotheses.ENTRY_SIGMA, hypotheses.LAG: hypotheses.LAG_SIGMA_S}
+_SIGMA = {hypotheses.IMU: ENTRY_SIGMA, hypotheses.LAG: LAG_SIGMA_S}
 
 Weights = dict[tuple[str, ...], float]
 
@@ -46,7 +46,7 @@ class FreeDoubts:
         self._camera = camera
         self._off = asked & set(_WHERE)
         self.imu_asked = hypotheses.IMU in asked
-        self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else hypotheses.ENTRY_SIGMA
+        self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
         self.drifting = False
         self.rolling = rolling
         self.stamp_sigma_s = 0.0
@@ -73,7 +73,7 @@ class FreeDoubts:
                 events.append(Event(EventKind.ROLLING_SHUTTER, self._camera, float(readout_s), sigma_s))
         if compared:
             weights = self._weights(carry, factor)
-            known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > hypotheses.SURE}
+            known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > SURE}
             news = [(name, _WHERE[name]) for name in sorted(known - self._off)]
             events += [known_off(name, _numbers(carry)[at], sigmas[at]) for name, at in news]
             self._off |= known
@@ -84,7 +84,7 @@ class FreeDoubts:
 
         For `converged` see `hypotheses.in_doubt`.
         """
-        imu, enough = hypotheses.IMU, 0.5 if converged else hypotheses.OFF
+        imu, enough = hypotheses.IMU, 0.5 if converged else OFF
         if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > enough:
             return hypotheses.IN_DOUBT[imu]
         if not self.drifting:

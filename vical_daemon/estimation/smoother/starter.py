@@ -13,9 +13,8 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
+from vical_daemon.estimation.model.priors import LAG_SIGMA_S, SKEW_SIGMA
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.selection.clock_drift import SKEW_SIGMA
-from vical_daemon.estimation.selection.model_selection import LAG_SIGMA_S
 from vical_daemon.estimation.smoother.carry import Carry
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart, NoStartError

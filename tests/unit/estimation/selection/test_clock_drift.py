@@ -11,11 +11,11 @@ from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.priors import SKEW_SIGMA
 from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.selection.clock_drift import (
-    SKEW_SIGMA,
     apart,
     as_if_alike,
     averaged,

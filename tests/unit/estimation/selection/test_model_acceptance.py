@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
-from vical_daemon.estimation.selection.model_acceptance import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA, BeyondDoubt
+from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA
+from vical_daemon.estimation.selection.model_acceptance import BeyondDoubt
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, off
 from vical_daemon.estimation.wording import event_text
 

@@ -12,14 +12,11 @@ from vical_mocks.rig import reference_rig
 from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, SIZE_SIGMA, SURE
 from vical_daemon.estimation.selection.model_selection import (
-    ENTRY_SIGMA,
     IMU,
     LAG,
-    LAG_SIGMA_S,
     SIZE,
-    SIZE_SIGMA,
-    SURE,
     TARGET,
     averaged,
     in_doubt,

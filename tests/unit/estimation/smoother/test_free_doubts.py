@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.selection.model_selection import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.smoother.carry import CALIBRATION, FULL, IMU, INERTIAL, LAG, Carry, root_of
 from vical_daemon.estimation.smoother.doubts import FreeDoubts
 from vical_daemon.estimation.smoother.snapshot import camera_estimate

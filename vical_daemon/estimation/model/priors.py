@@ -1,0 +1,28 @@
+"""What is taken as known before any data: one table for calibration with a target and without.
+
+Prior sigmas are many times what a start is worth, so that its data do not count twice.
+[docs/math/filter.md, eq. (16), (18) and (20)]
+"""
+
+from __future__ import annotations
+
+GYRO_BIAS_SIGMA_RPS = 0.02
+"""1.1 deg/s: four times the initial bias error of the datasheet (3DM-GX3-25: 0.25 deg/s)."""
+ACCEL_BIAS_SIGMA_MPS2 = 0.3
+"""Fifteen times the initial bias error of the datasheet (3DM-GX3-25: 0.002 g)."""
+SKEW_SIGMA = 1e-4
+"""Drift of clocks that do not run alike, s/s; two poor crystals."""
+ENTRY_SIGMA = 2e-3
+"""Scale or alignment of an IMU that is not as it says, each entry."""
+KNOWN_OFF_SIGMA = 1e-2
+"""The same of an IMU that is known to be off, or whose matrices are asked for."""
+LAG_SIGMA_S = 3e-4
+"""By how much the delays of accelerometer and gyro differ in an IMU where they do, s."""
+SIZE_SIGMA = 0.02
+"""Of a target that is not as large as stated, relative; pages fitted to the paper: 3 to 6 %."""
+KNOWN_SIZE_SIGMA = 0.1
+"""Of the size of a target that is known to be off, or where it is asked for, relative."""
+OFF = 0.05
+"""Share of rigs of which any one thing is not as stated, clocks that do not run alike included."""
+SURE = 0.99
+"""Probability from which on something is known, and announced."""
