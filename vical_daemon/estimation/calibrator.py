@@ -22,9 +22,9 @@ from vical_daemon.estimation.filter.image_intake import (
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
+from vical_daemon.estimation.init.board_window import Frames
 from vical_daemon.estimation.init.initializer import LATE_S, Starting
 from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
-from vical_daemon.estimation.init.window_start import Frames
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,

@@ -11,10 +11,11 @@ import numpy as np
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
+from vical_daemon.estimation.init.board_window import Frames
 from vical_daemon.estimation.init.initial_filter import wide_filter
 from vical_daemon.estimation.init.readout_start import looks_rolling
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache
-from vical_daemon.estimation.init.window_start import Frames, Step, window_start
+from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import Layout
 

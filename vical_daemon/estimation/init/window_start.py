@@ -1,53 +1,32 @@
-"""The start by one window: inertial bundle adjustment of the first seconds, with the target's points known.
+"""The start by one window: the first seconds are adjusted, and a filter takes their images about the result.
 
-Unknowns are the motion at some of the images, and the filter's own constant errors with its own prior and
-its own model of an image; links are those of the calibration without a target. All is linearised anew until
-nothing changes: where the closed form had put lever arm and mounting no longer matters. The filter then
-takes all images, linearised about what was found. [docs/math/filter.md, eq. (20)]
+What the corners of an image share (late stamps, shifts of the whole image) is measured in the window, by
+comparing each image with what all others say of it. [docs/math/filter.md, eq. (20) and (21)]
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.linearise import Image, by_small_steps, view_derivatives
-from vical_daemon.estimation.filter.linearised_filter import Instant, LinearisedFilter
-from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.board_window import BoardWindow, Frames, View
 from vical_daemon.estimation.init.target_poses import SeenPose
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.model.inertial_links import Link, Links, make_link
-from vical_daemon.estimation.model.rates import Rates, rates_after
-from vical_daemon.estimation.model.retract import orthonormal, retract
-from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
-from vical_daemon.estimation.noise.corner_noise import relative_noise
+from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 
-_IMAGES = 50  # of each camera: they say where all is linearised, not what is told
-_LEAST_IMAGES = 3
-_MOST_STEPS = 20
-_DONE = 0.1  # a step that promises less than this of the sum of squares is the last
-_TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
-_EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
-_RELINK_S = 3e-4  # of change of the time shift: links are integrated between the new instants
-_RATE_S = 0.03  # of readings before an instant: they show its angular acceleration
-_OUTLIER = 6.0  # sigmas at which a corner weighs a quarter
-_RAYLEIGH = 1.1774  # median of the length of two standard normal errors
-_LEAST_PX, _MOST_PX = 0.005, 20.0  # corner noise
 _MOST_RATIO = 5.0  # of one image's squared innovation over its prediction
 _FAR = 0.03  # a target so much larger or smaller is another one: its prior is too narrow
 _SURE = 5.0  # sigmas
 
-Frames = list[tuple[float, PointsFrame]]
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
 
@@ -90,12 +69,12 @@ def window_start(
     Returns:
         The start, or None where the data do not hold together.
     """
-    window = _Window.begin(state, poses, frames, make(deepcopy(state)), buffer, target)
+    window = BoardWindow.begin(state, poses, frames, make(deepcopy(state)), buffer, target)
     if window is None or not window.solve():
         return None
     trial = window.filter(make(deepcopy(state)))
     try:
-        trial.shared = window.shared_errors()
+        trial.shared = shared_errors(window)
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
@@ -119,37 +98,6 @@ def _size(f: CalibrationFilter) -> float | None:
     return size if abs(size - 1.0) > max(_FAR, _SURE * sigma) else None
 
 
-@dataclass(slots=True)
-class _Node:
-    """One instant with the images taken then, and the motion there."""
-
-    frames: Frames
-    at: Instant
-    rates: Rates
-
-
-class _View(NamedTuple):
-    """One image about the present values.
-
-    Attributes:
-        node: Index of its instant.
-        camera: Its name.
-        residual: Measured minus predicted, px, shape (n, 2).
-        relative: Noise of each corner over that of the camera, shape (n,).
-        seen: Corners that can be predicted, shape (n,).
-        ways: See `Linear`, shape (2n, k).
-        by_error: See `Linear`, shape (k, size).
-    """
-
-    node: int
-    camera: str
-    residual: FloatArray
-    relative: FloatArray
-    seen: BoolArray
-    ways: FloatArray
-    by_error: FloatArray
-
-
 class _Apart(NamedTuple):
     """One image against all others, over its noise; see `SharedErrors.learn`.
 
@@ -166,347 +114,39 @@ class _Apart(NamedTuple):
     ratio: float
 
 
-class _Linked(NamedTuple):
-    """Links about the present values: errors (F - 1, 9), derivatives by both motions and the constants."""
-
-    e: FloatArray
-    by_motion: FloatArray  # (F - 1, 9, 18)
-    by_constants: FloatArray  # (F - 1, 9, c)
-
-
-class _Present(NamedTuple):
-    """All of a window about the present values."""
-
-    views: list[_View]
-    linked: _Linked
-
-
-class _Window:
-    """Present values of a window. Order of the unknowns: motion of each instant (9), constants.
-
-    Attributes:
-        state: Its constants count; the motion is that of the nodes.
-        offset: Of the constants from the mean of the prior, shape (c,).
-        sigma_px: Corner noise by camera.
-    """
-
-    def __init__(
-        self,
-        state: State,
-        nodes: list[_Node],
-        links: list[Link],
-        prior: CalibrationFilter,
-        buffer: ImuBuffer,
-        target: FloatArray,
-    ) -> None:
-        self.state, self._nodes, self._buffer, self._target = state, nodes, buffer, target
-        self._links = Links.stack(links)
-        self._layout, self._noise, self._S = prior.layout, prior.imu_noise, prior.S
-        root = np.linalg.inv(prior.S[MOTION.stop :, MOTION.stop :])
-        self._information = root.T @ root
-        self.offset = np.zeros(len(root))
-        self.sigma_px = {name: noise.sigma_px for name, noise in prior.corner_noise.items()}
-
-    @classmethod
-    def begin(
-        cls,
-        state: State,
-        poses: Sequence[SeenPose],
-        frames: Frames,
-        prior: CalibrationFilter,
-        buffer: ImuBuffer,
-        target: FloatArray,
-    ) -> _Window | None:
-        """Choose images, and put the rig at each where the pose of the camera has it."""
-        nodes = _nodes(state, poses, frames, buffer)
-        if len(nodes) < _LEAST_IMAGES:
-            return None
-        links = _integrated(nodes, state, prior.imu_noise, buffer)
-        if links is None:
-            return None
-        g = state.gravity
-        for (a, b), link in zip(pairwise(nodes), links, strict=True):
-            T = link.dt_s
-            a.at = a.at._replace(v=(b.at.p - a.at.p - a.at.R @ link.dp) / T - 0.5 * T * g)
-        last, link = nodes[-2].at, links[-1]
-        nodes[-1].at = nodes[-1].at._replace(v=last.v + link.dt_s * g + last.R @ link.dv)
-        out = cls(replace(state), nodes, links, prior, buffer, target)
-        out._find_rates()
+def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
+    """What the corners of an image share, from how it differs from what all other images say of it."""
+    out = {name: SharedErrors() for name in window.sigma_px}
+    now = window.present()
+    if now is None:
         return out
-
-    # ------------------------------------------------------------------ the loop
-    def solve(self) -> bool:
-        """Levenberg-Marquardt until nothing changes; False where that is not reached."""
-        now, damping = self._present(), 0.0
-        for _ in range(_MOST_STEPS):
-            if now is None:
-                return False
-            self._learn_noise(now.views)
-            H, g = self._normal(now)
-            H[np.diag_indices_from(H)] *= 1.0 + damping
-            try:
-                root = cholesky(H, lower=True, overwrite_a=True, check_finite=False)
-            except np.linalg.LinAlgError:
-                damping = max(10.0 * damping, 1e-9)
-                continue
-            dx = cho_solve((root, True), g, check_finite=False)
-            cost = self._cost(now)
-            before = self.state, self.offset, [n.at for n in self._nodes], self._links
-            self._move(dx)
-            if self._stale() and not self._relink():
-                return False
-            trial = self._present()
-            if trial is None or not self._cost(trial) < cost + _DONE:
-                self.state, self.offset, motion, self._links = before
-                for node, at in zip(self._nodes, motion, strict=True):
-                    node.at = at
-                self._find_rates()
-                damping = max(10.0 * damping, 1e-9)
-                continue
-            if float(g @ dx) < _DONE and not damping:
-                return self._relink()
-            now, damping = trial, 0.1 * damping if damping > 1e-9 else 0.0
-        return False
-
-    def filter(self, prior: CalibrationFilter) -> LinearisedFilter:
-        """A filter that knows what `prior` knows, linearised about the window; `prior` is used up.
-
-        The window's own motion is the mean of the prior of the motion, which is wide enough for that.
-        """
-        t_s, R, p, v = self._nodes[0].at
-        prior.state = replace(prior.state, t_s=t_s, R_world_imu=R, p_world_imu=p, v_world_imu=v)
-        for name, noise in prior.corner_noise.items():
-            noise.sigma_px = noise.guess_px = self.sigma_px[name]
-        return LinearisedFilter.about(self.state, [n.at for n in self._nodes], prior)
-
-    def shared_errors(self) -> dict[str, SharedErrors]:
-        """What the corners of an image share, from how it differs from what all other images say of it."""
-        out = {name: SharedErrors() for name in self.sigma_px}
-        now = self._present()
-        if now is None:
-            return out
-        H, _ = self._normal(now)
-        P = cho_solve((cholesky(H, lower=True), True), np.eye(len(H)))
-        seen: dict[str, list[_Apart]] = {name: [] for name in out}
-        for view in now.views:
-            seen[view.camera].append(self._apart(view, P))
-        for name, images in seen.items():
-            # as in `Consistency`: where images of any kind miss, that in these ways is nothing of its own
-            level = float(np.mean([min(x.ratio, _MOST_RATIO) for x in images] or [1.0]))
-            for x in images:
-                out[name].learn(x.innovation, x.by_shared, x.by_states, max(level, 1.0))
-            out[name].begin()
-        return out
-
-    def _apart(self, view: _View, P: FloatArray) -> _Apart:
-        """An image against all others; `P`: covariance of all unknowns."""
-        W, r = self._whitened(view)
-        A, b = W.T @ W, W.T @ r
-        at = self._places(view.node)
-        spread = view.by_error @ P[at[:, None], at] @ view.by_error.T
-        others = np.linalg.solve(np.eye(len(A)) - spread @ A, spread)  # (spread^-1 - A)^-1
-        values, vectors = np.linalg.eigh(0.5 * (others + others.T))
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        innovation = r + W @ (others @ b)
-        node = self._nodes[view.node]
-        by_shared = W @ view.by_error @ shared_ways(self._at(node, view.camera), self._layout, view.camera)
-        moved, M = W.T @ innovation, A @ root
-        explained, _, rank, _ = np.linalg.lstsq(A + M @ M.T, moved, rcond=None)
-        ratio = float(moved @ explained) / max(int(rank), 1)
-        return _Apart(innovation, by_shared, (by_shared.T @ W) @ root, ratio)
-
-    # ------------------------------------------------------------------ values
-    def _at(self, node: _Node, camera: str) -> State:
-        """The state at an instant; the time shift has drifted until then."""
-        known = self.state.cameras[camera]
-        known = replace(known, timeshift_s=self._shift_s(camera, node.at.t_s))
-        t_s, R, p, v = node.at
-        return replace(
-            self.state, t_s=t_s, R_world_imu=R, p_world_imu=p, v_world_imu=v, cameras={camera: known}
-        )
-
-    def _shift_s(self, camera: str, t_s: float) -> float:
-        known = self.state.cameras[camera]
-        return known.timeshift_s + known.skew * (t_s - self._nodes[0].at.t_s)
-
-    def _find_rates(self) -> None:
-        for node in self._nodes:
-            t_s = node.at.t_s
-            segment = self._buffer.segment(max(t_s - _RATE_S, self._buffer.oldest_s), t_s)
-            if segment is not None:
-                node.rates = rates_after(self._at(node, node.frames[0][1].camera), segment, node.rates)
-
-    def _stale(self) -> bool:
-        """Whether time shifts have left the instants for which links hold."""
-        return any(abs(self._late_s(n)) > _RELINK_S for n in self._nodes)
-
-    def _late_s(self, node: _Node) -> float:
-        t_cam_s, frame = node.frames[0]
-        return t_cam_s + self._shift_s(frame.camera, node.at.t_s) - node.at.t_s
-
-    def _relink(self) -> bool:
-        """Move the instants to where time shifts have them; False where readings do not reach."""
-        for node, d in zip(self._nodes, [self._late_s(n) for n in self._nodes], strict=True):
-            t_s, R, p, v = node.at
-            R = orthonormal(R @ so3.exp_one(d * node.rates.omega))
-            p = p + d * (v + 0.5 * d * node.rates.accel)
-            node.at = Instant(t_s + d, R, p, v + d * node.rates.accel)
-        links = _integrated(self._nodes, self.state, self._noise, self._buffer)
-        if links is None:
-            return False
-        self._links = Links.stack(links)
-        self._find_rates()
-        return True
-
-    def _move(self, dx: FloatArray) -> None:
-        motion, constants = dx[: -len(self.offset)].reshape(-1, 9), dx[-len(self.offset) :]
-        full = np.concatenate([np.zeros(MOTION.stop), constants])
-        self.state, self.offset = retract(self.state, self._layout, full), self.offset + constants
-        for node, d in zip(self._nodes, motion, strict=True):
-            t_s, R, p, v = node.at
-            node.at = Instant(t_s, orthonormal(R @ so3.exp_one(d[:3])), p + d[3:6], v + d[6:])
-        self._find_rates()
-
-    # ------------------------------------------------------------------ one linearisation
-    def _present(self) -> _Present | None:
-        """Everything about the present values; None where an image shows too few corners."""
-        views = [self._view(k, t, frame) for k, node in enumerate(self._nodes) for t, frame in node.frames]
-        good = [v for v in views if v is not None]
-        return _Present(good, self._linked()) if len(good) == len(views) else None
-
-    def _view(self, k: int, t_cam_s: float, frame: PointsFrame) -> _View | None:
-        node, name = self._nodes[k], frame.camera
-        relative = relative_noise(frame.sigma_px, len(frame.ids))
-        image = Image(
-            name, frame.t_cam_ns, t_cam_s, frame.ids, self._target[frame.ids], frame.uv_px, relative
-        )
-        state, where = self._at(node, name), self._layout.cameras[name]
-        if where.readout is not None or state.cameras[name].readout_s:
-            lin = by_small_steps(state, self._layout, node.rates, image, self._S)
-            uv, ways, by_error = np.where(lin.valid[:, None], lin.z, np.nan), lin.ways, lin.by_error
-        else:
-            uv, ways, by_error = view_derivatives(state, self._layout, node.rates, image)
-        if where.timeshift is not None and where.skew is not None:
-            since_s = node.at.t_s - self._nodes[0].at.t_s
-            by_error[:, where.skew] = since_s * by_error[:, where.timeshift]
-        seen: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
-        if seen.sum() < 4:
-            return None
-        residual = np.where(seen[:, None], frame.uv_px - np.where(seen[:, None], uv, 0.0), 0.0)
-        ways = np.where(np.repeat(seen, 2)[:, None], ways, 0.0)
-        return _View(k, name, residual, relative, seen, ways, by_error)
-
-    def _linked(self) -> _Linked:
-        s, layout, links = self.state, self._layout, self._links
-        R, p, v = (np.array([getattr(n.at, name) for n in self._nodes]) for name in "Rpv")
-        numbers = _numbers(s)
-        e, J = links.errors(R, p, v, np.broadcast_to(numbers, (len(R) - 1, len(numbers))), s.gravity)
-        T = links.dt[:, None, None]
-        tilt = np.swapaxes(R[:-1], 1, 2) @ (-so3.hat(s.gravity) @ s.tilt)
-        by_tilt = np.concatenate([np.zeros_like(tilt), -T * tilt, -0.5 * T * T * tilt], axis=1)
-        full = np.zeros((len(e), 9, layout.size))
-        full[:, :, GRAVITY] = links.root @ by_tilt
-        full[:, :, GYRO_BIAS.start : ACCEL_BIAS.stop] = J[:, :, 18:24]
-        if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-            full[:, :, layout.gyro_matrix.start : layout.accel_matrix.stop] = J[:, :, 24:39]
-        if layout.accel_lag is not None:
-            full[:, :, layout.accel_lag] = J[:, :, 39]
-        return _Linked(e, J[:, :, :18], full[:, :, MOTION.stop :])
-
-    def _normal(self, now: _Present) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix and right side of the step."""
-        c, F = len(self.offset), len(self._nodes)
-        n = 9 * F + c
-        H, g = np.zeros((n, n)), np.zeros(n)
-        constants = np.arange(9 * F, n)
-
-        def add(J: FloatArray, r: FloatArray, at: IntArray) -> None:
-            H[at[:, None], at] += J.T @ J
-            g[at] += J.T @ r
-
-        for view in now.views:
-            W, r = self._whitened(view)
-            at = self._places(view.node)
-            H[at[:, None], at] += view.by_error.T @ (W.T @ W) @ view.by_error
-            g[at] += view.by_error.T @ (W.T @ r)
-        for k, (e, by_motion, by_constants) in enumerate(zip(*now.linked, strict=True)):
-            at = np.concatenate([np.arange(9 * k, 9 * k + 18), constants])
-            add(np.concatenate([by_motion, by_constants], axis=1), -e, at)
-        H[9 * F :, 9 * F :] += self._information
-        g[9 * F :] -= self._information @ self.offset
-        return H, g
-
-    def _places(self, node: int) -> IntArray:
-        """Where the motion of an instant and the constants are among the unknowns, shape (9 + c,)."""
-        first = 9 * len(self._nodes)
-        return np.concatenate([np.arange(9 * node, 9 * node + 9), np.arange(first, first + len(self.offset))])
-
-    def _whitened(self, view: _View) -> tuple[FloatArray, FloatArray]:
-        """Ways and residuals over the noise; corners that do not belong hardly count (Geman and McClure)."""
-        sigma = self.sigma_px[view.camera] * view.relative
-        far = (view.residual**2).sum(axis=1) / sigma**2
-        weight = np.where(view.seen, 1.0 / (1.0 + far / _OUTLIER**2), 0.0) / sigma
-        return view.ways * np.repeat(weight, 2)[:, None], (view.residual * weight[:, None]).ravel()
-
-    def _cost(self, now: _Present) -> float:
-        """Sum of squares; of corners that do not belong only a part (Geman and McClure)."""
-        cost = float((now.linked.e**2).sum() + self.offset @ self._information @ self.offset)
-        for view in now.views:
-            far = (view.residual**2).sum(axis=1) / (self.sigma_px[view.camera] * view.relative) ** 2
-            # what is lost from sight costs as much as a gross outlier
-            cost += float(np.where(view.seen, far / (1.0 + far / _OUTLIER**2), _OUTLIER**2).sum())
-        return cost
-
-    def _learn_noise(self, views: list[_View]) -> None:
-        """Corner noise from the median of the residuals, as far as poses have not taken them up."""
-        for name in self.sigma_px:
-            own = [v for v in views if v.camera == name]
-            if not own:
-                continue
-            lengths = [np.linalg.norm(v.residual[v.seen], axis=1) / v.relative[v.seen] for v in own]
-            size = np.concatenate(lengths)
-            share = max(1.0 - 6.0 * len(own) / (2.0 * len(size)), 0.05)
-            sigma = float(np.median(size)) / _RAYLEIGH / np.sqrt(share)
-            self.sigma_px[name] = float(np.clip(sigma, _LEAST_PX, _MOST_PX))
+    H, _ = window.normal(now)
+    P = cho_solve((cholesky(H, lower=True), True), np.eye(len(H)))
+    seen: dict[str, list[_Apart]] = {name: [] for name in out}
+    for view in now.views:
+        seen[view.camera].append(_apart(window, view, P))
+    for name, images in seen.items():
+        # as in `Consistency`: where images of any kind miss, that in these ways is nothing of its own
+        level = float(np.mean([min(x.ratio, _MOST_RATIO) for x in images] or [1.0]))
+        for x in images:
+            out[name].learn(x.innovation, x.by_shared, x.by_states, max(level, 1.0))
+        out[name].begin()
+    return out
 
 
-def _nodes(state: State, poses: Sequence[SeenPose], frames: Frames, buffer: ImuBuffer) -> list[_Node]:
-    """Evenly chosen images with poses, by instant; velocities are still to be found."""
-    originals = {(f.camera, f.t_cam_ns): (t, f) for t, f in frames}  # poses are of rows put right
-    chosen: list[tuple[float, SeenPose]] = []
-    for name, camera in state.cameras.items():
-        own = [p for p in poses if p.frame.camera == name]
-        chosen += [(p.t_cam_s + camera.timeshift_s, p) for p in own[:: max(1, -(-len(own) // _IMAGES))]]
-    nodes: list[_Node] = []
-    for t_s, seen in sorted(chosen, key=lambda item: item[0]):
-        item = originals.get((seen.frame.camera, seen.frame.t_cam_ns))
-        if item is None or not buffer.oldest_s + _EDGE_S < t_s < buffer.newest_s - _EDGE_S:
-            continue
-        if nodes and t_s - nodes[-1].at.t_s < _TOGETHER_S:
-            nodes[-1].frames.append(item)
-            continue
-        camera = state.cameras[seen.frame.camera]
-        R = seen.R_target_cam @ camera.R_imu_cam.T
-        p = seen.p_target_cam - R @ camera.p_imu_cam
-        nodes.append(_Node([item], Instant(t_s, R, p, np.zeros(3)), Rates(np.zeros(3), np.zeros(3))))
-    return nodes
-
-
-def _numbers(s: State) -> FloatArray:
-    """[biases, entries of the imu's matrices, lag] as links take them, shape (22,)."""
-    gyro, accel = s.gyro_matrix - np.eye(3), s.accel_matrix - np.eye(3)
-    return np.concatenate(
-        [s.gyro_bias, s.accel_bias, gyro.ravel(), accel[LOWER[:, 0], LOWER[:, 1]], [s.accel_lag_s]]
-    )
-
-
-def _integrated(nodes: list[_Node], state: State, noise: ImuNoise, buffer: ImuBuffer) -> list[Link] | None:
-    """Links between the instants; None where these are not in order or readings do not reach."""
-    links: list[Link] = []
-    for a, b in pairwise(nodes):
-        apart = b.at.t_s - a.at.t_s > 0.5 * _TOGETHER_S
-        link = make_link(buffer, a.at.t_s, b.at.t_s, _numbers(state), noise) if apart else None
-        if link is None:
-            return None
-        links.append(link)
-    return links
+def _apart(window: BoardWindow, view: View, P: FloatArray) -> _Apart:
+    """An image against all others; `P`: covariance of all unknowns."""
+    W, r = window.whitened(view)
+    A, b = W.T @ W, W.T @ r
+    at = window.places(view.node)
+    spread = view.by_error @ P[at[:, None], at] @ view.by_error.T
+    others = np.linalg.solve(np.eye(len(A)) - spread @ A, spread)  # (spread^-1 - A)^-1
+    values, vectors = np.linalg.eigh(0.5 * (others + others.T))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    innovation = r + W @ (others @ b)
+    node = window.nodes[view.node]
+    by_shared = W @ view.by_error @ shared_ways(window.at(node, view.camera), window.layout, view.camera)
+    moved, M = W.T @ innovation, A @ root
+    explained, _, rank, _ = np.linalg.lstsq(A + M @ M.T, moved, rcond=None)
+    ratio = float(moved @ explained) / max(int(rank), 1)
+    return _Apart(innovation, by_shared, (by_shared.T @ W) @ root, ratio)
