@@ -29,7 +29,7 @@ def diagnose_input(job: Job) -> str:
         prior = job.priors[name]
         try:
             lens = lens_of(stream, prior)
-            poses, _ = board_poses(job.recording, stream, lens, prior.intrinsics is None, job.config.target)
+            poses, _ = board_poses(job.recording, stream, lens, job.config.target)
         except CliError as error:
             return str(error)
         t_cam_s = seconds(poses.t_cam_ns, int(imu.t_ns[0]))

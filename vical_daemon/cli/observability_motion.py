@@ -13,7 +13,7 @@ from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.td_icp import choose_gyro, prior_of
 from vical_daemon.cli.td_icp_sources import board_poses, lens_of, seconds
 from vical_daemon.config.priors import Initial, read_initial
-from vical_daemon.estimation.init.lens_refinement import LensFit
+from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
@@ -46,7 +46,7 @@ def motion_of(args: argparse.Namespace, blocks: frozenset[str]) -> tuple[Motion,
     if stream.kind == "tracks":
         raise CliError(f"{name}: tracks of unknown points do not give the motion; a board is needed")
     lens = lens_of(stream, prior)
-    poses, fit = board_poses(recording, stream, lens, prior is None or prior.intrinsics is None, args.target)
+    poses, fit = board_poses(recording, stream, lens, args.target)
     imu, t_ns, gyro = choose_gyro(recording, args.imu)
     force = recording.imu_arrays(imu).specific_force_mps2
     base = int(t_ns[0])
@@ -62,7 +62,11 @@ def motion_of(args: argparse.Namespace, blocks: frozenset[str]) -> tuple[Motion,
     motion, frames = _rebuild(
         t_imu, gyro, force, t_cam + result.timeshift_cam_imu_s, poses, result, p_imu_cam
     )
-    return motion, _setup(fit, lens.model, lens.resolution, result, p_imu_cam, blocks, args.target), frames
+    return (
+        motion,
+        _setup(lens, 0.5 if fit is None else fit.corner_sigma_px, result, p_imu_cam, blocks, args.target),
+        frames,
+    )
 
 
 def _without_motion(poses: Orientations, result: TdIcpResult) -> TdIcpResult:
@@ -133,9 +137,8 @@ def _longest(t: FloatArray) -> slice:
 
 
 def _setup(
-    fit: LensFit,
-    model: str,
-    resolution: tuple[int, int],
+    lens: Lens,
+    corner_sigma_px: float,
     result: TdIcpResult,
     p_imu_cam: FloatArray,
     blocks: frozenset[str],
@@ -145,15 +148,14 @@ def _setup(
 
     from vical_daemon.vision.target import load_target
 
-    corner = fit.corner_sigma_px if np.isfinite(fit.corner_sigma_px) else 0.5
     return Setup(
         result.R_imu_cam,
         p_imu_cam,
-        fit.intrinsics,
-        fit.distortion,
+        lens.intrinsics,
+        lens.distortion,
         load_target(Path(target)).points_m,
-        model=model,
-        resolution=resolution,
+        model=lens.model,
+        resolution=lens.resolution,
         estimate=blocks,
-        corner_sigma_px=max(corner, 0.05),
+        corner_sigma_px=max(corner_sigma_px, 0.05),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.init.lens_refinement import LensFit, refine_lens
+from vical_daemon.estimation.init.intrinsics_start import LensFit, estimate_intrinsics
 from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.camera_orientations import Orientations, target_orientations
@@ -23,6 +22,7 @@ from vical_daemon.logs import Recording, Stream
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 GIVEN = "--initial"
+_LENS_VIEWS = 60  # where the board stands in the image is then seen in many places: half a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +76,10 @@ def camera_stream(
         found = max(chains, key=lambda chain: len(chain.t_cam_ns))
         return _stream(stream.name, found, base_ns), LensUsed(lens, GIVEN)
     guess = prior is None or prior.intrinsics is None
-    found, fit = board_poses(recording, stream, lens, guess, target)
-    used = replace(lens, intrinsics=fit.intrinsics, distortion=fit.distortion)
+    found, fit = board_poses(recording, stream, lens, target)
     start = "a guess from the image size" if guess else GIVEN
-    origin = f"estimated from {fit.views} views of the board, starting from {start}" if fit.views else start
-    return _stream(stream.name, found, base_ns), LensUsed(used, origin)
+    origin = f"estimated from {len(fit.views)} views of the board, starting from {start}" if fit else start
+    return _stream(stream.name, found, base_ns), LensUsed(lens, origin)
 
 
 def track_frames(
@@ -98,15 +97,14 @@ def track_frames(
 
 
 def board_poses(
-    recording: Recording, stream: Stream, lens: Lens, guess: bool, target: str | None
-) -> tuple[Orientations, LensFit]:
+    recording: Recording, stream: Stream, lens: Lens, target: str | None
+) -> tuple[Orientations, LensFit | None]:
     """Find the board in a camera's frames, improve the lens by them, and return the camera's poses.
 
     Args:
         recording: The data.
         stream: The camera, images or points.
-        lens: Start.
-        guess: The lens is only guessed from the image size.
+        lens: Start; improved in place.
         target: Target file.
 
     Raises:
@@ -124,10 +122,8 @@ def board_poses(
         raise CliError(
             f"{stream.name}: point ids go beyond the target's {len(points_m)} points; wrong target file?"
         )
-    if guess:
-        estimate_intrinsics(lens, frames, points_m)
-    fit = refine_lens(frames, points_m, lens.intrinsics, lens.distortion, lens.model)
-    return target_orientations(frames, points_m, fit.intrinsics, fit.distortion, lens.model), fit
+    fit = estimate_intrinsics(lens, frames, points_m, _LENS_VIEWS)
+    return target_orientations(frames, points_m, lens.intrinsics, lens.distortion, lens.model), fit
 
 
 def lens_of(stream: Stream, prior: CameraPrior | None) -> Lens:

@@ -27,23 +27,26 @@ _Poses = list[tuple[FloatArray, FloatArray]]
 _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])
 
 
-def estimate_intrinsics(lens: Lens, frames: list[PointsFrame], target: FloatArray) -> float:
+def estimate_intrinsics(
+    lens: Lens, frames: list[PointsFrame], target: FloatArray, most: int = MOST_VIEWS
+) -> LensFit | None:
     """Improve a lens in place by a bundle adjustment over spread-out views (Gauss-Newton, Levenberg damping).
 
     Args:
         lens: Start values; overwritten.
         frames: Views of the target.
         target: Its points, m, shape (n, 3).
+        most: Views used.
 
     Returns:
-        RMS residual, px; not-a-number when too few views show a pose (the lens is then left alone).
+        The fit; None when too few views show a pose (the lens is then left alone).
     """
-    fit = fit_lens([frames[k] for k in spread(frames, lens)], lens, target)
+    fit = fit_lens([frames[k] for k in spread(frames, lens, most)], lens, target)
     if fit is None:
-        return float("nan")
+        return None
     if np.isfinite(fit.rms_px) and 0.3 * lens.intrinsics[0] < fit.theta[0] < 3.0 * lens.intrinsics[0]:
         lens.intrinsics, lens.distortion = fit.theta[:4], fit.theta[4:]
-    return fit.rms_px
+    return fit
 
 
 class LensFit(NamedTuple):
@@ -62,6 +65,13 @@ class LensFit(NamedTuple):
     rms_px: float
     views: list[PointsFrame]
     which: list[int]
+
+    @property
+    def corner_sigma_px(self) -> float:
+        """Noise of a corner per axis, px: the residuals without what lens and poses have taken up."""
+        numbers = 2 * sum(len(v.ids) for v in self.views)
+        free = max(numbers - 6 * len(self.views) - len(self.theta), 1)
+        return float(self.rms_px * np.sqrt(numbers / free))
 
 
 def fit_lens(views: list[PointsFrame], lens: Lens, target: FloatArray) -> LensFit | None:
@@ -120,10 +130,10 @@ def _without_outliers(
     return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])
 
 
-def spread(frames: list[PointsFrame], lens: Lens) -> list[int]:
-    """Choose views with many points that differ most in where the board lies in the image, 24 at most."""
+def spread(frames: list[PointsFrame], lens: Lens, most: int = MOST_VIEWS) -> list[int]:
+    """Choose views with many points that differ most in where the board lies in the image."""
     usable = [k for k, f in enumerate(frames) if len(f.ids) >= _LEAST_POINTS]
-    if len(usable) <= MOST_VIEWS:
+    if len(usable) <= most:
         return usable
     good = [frames[k] for k in usable]
     width, height = lens.resolution
@@ -132,7 +142,7 @@ def spread(frames: list[PointsFrame], lens: Lens) -> list[int]:
     ) / np.array([width, height, width, height, width, height])
     chosen = [int(np.argmax([len(f.ids) for f in good]))]
     distance = np.linalg.norm(features - features[chosen[0]], axis=1)
-    while len(chosen) < MOST_VIEWS:
+    while len(chosen) < most:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
     return sorted(usable[i] for i in chosen)

@@ -83,7 +83,8 @@ def _numbers(frames: Frames) -> float:
 
 def _bent(frames: Frames, lens: Lens, target: FloatArray, readout_s: float) -> float:
     """RMS by which the images miss a flat board, px, if their rows are read like that."""
-    return estimate_intrinsics(replace(lens), _upright(frames, readout_s, lens), target)
+    fit = estimate_intrinsics(replace(lens), _upright(frames, readout_s, lens), target)
+    return float("nan") if fit is None else fit.rms_px
 
 
 def _upright(frames: Frames, readout_s: float, lens: Lens) -> list[PointsFrame]:

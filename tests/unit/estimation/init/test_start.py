@@ -89,8 +89,8 @@ def test_the_first_lens_is_not_bent_by_outliers(dirty):
     focal = []
     for run in (clean, dirty):
         lens = Lens.from_prior(CameraPrior((640, 480), (540.0, 540.0, 320.0, 240.0)))
-        rms = estimate_intrinsics(lens, [points_frame(f) for f in run.frames], run.points_m)
-        assert rms == pytest.approx(0.5, rel=0.3)
+        fit = estimate_intrinsics(lens, [points_frame(f) for f in run.frames], run.points_m)
+        assert fit.rms_px == pytest.approx(0.5, rel=0.3)
         focal.append(lens.intrinsics[0])
     assert focal == pytest.approx([520.0, 520.0], abs=6.0)
 
