@@ -65,14 +65,17 @@ def make_link(
         noise: Densities.
 
     Returns:
-        The link; None where readings are missing.
+        The link; None where readings are missing, or none that a device could give.
     """
     segment = buffer.segment(from_s, to_s)
     if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
     motion, errors, by_imu = _integrated(segment, imu[:6], imu[6:])
     covariance = errors.noise(noise)[_ORDER[:, None], _ORDER] + _ROUNDING
-    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        return None
     return Link(
         float(motion.t_s[-1]),
         motion.dR[0, -1],
