@@ -9,7 +9,7 @@ from vical_daemon.bus import topics
 from vical_daemon.config.model import Config, ConfigError
 from vical_daemon.config.priors import calibration_options, camera_prior
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
@@ -49,6 +49,10 @@ class Estimator(Protocol):
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return the history of one camera's calibration."""
+        ...
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return how well the IMU alone predicted images before they were used."""
         ...
 
 

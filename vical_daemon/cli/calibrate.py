@@ -138,7 +138,9 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
 
 
 def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any]) -> None:
+    from vical_daemon.cli.calibration_run import images_at
     from vical_daemon.results import report
+    from vical_daemon.vision.target import load_target
 
     inputs = [Path(p) for p in (args.input, args.target, args.initial) if p]
     settings = {"fix": args.fix, "estimate": args.estimate}
@@ -149,6 +151,8 @@ def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[s
         result | {"trace": outcome.traces},
         outcome.frames,
         image_sizes={name: prior.resolution for name, prior in job.priors.items()},
+        target_m=load_target(Path(args.target)).points_m if args.target else None,
+        images=lambda camera, stamps_ns: images_at(job, camera, stamps_ns),
         provenance=report.collect(" ".join(sys.argv), inputs, settings),
     )
     print(f"report: {args.report}", file=sys.stderr)

@@ -74,11 +74,12 @@ class Job:
 
 @dataclass(slots=True)
 class Outcome:
-    """What came out: the last estimate, the trace of each camera, and the verdict on every frame."""
+    """What came out: last estimate, trace of each camera, verdict on every frame, held-out checks."""
 
     estimate: CalibrationEstimate
     traces: dict[str, list[dict[str, Any]]]
     frames: list[FrameReport] = field(default_factory=list)
+    held_out: list[dict[str, float]] = field(default_factory=list)
 
 
 def make_job(
@@ -185,7 +186,8 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     publish(bus, role.finish())
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
-    return Outcome(replace(role.latest, events=events), traces, frames)
+    checks = [asdict(check) for check in estimator.held_out()]
+    return Outcome(replace(role.latest, events=events), traces, frames, checks)
 
 
 def document(job: Job, outcome: Outcome) -> dict[str, Any]:
@@ -202,8 +204,32 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     result["trace"] = outcome.traces[first]
     if len(job.cameras) > 1:
         result["traces"] = outcome.traces
+    result["held_out"] = outcome.held_out
     result["cpu_s"] = time.process_time()
     return result
+
+
+def images_at(job: Job, camera: str, stamps_ns: Sequence[int]) -> dict[int, bytes]:
+    """Return the images of one camera with these stamps as JPEG files, small enough for a page.
+
+    Empty where the recording holds no images, only points.
+    """
+    shown = job.cameras[camera].name
+    streams = [s for s in job.recording.streams if s.name == shown and s.kind in ("image", "compressed")]
+    if not streams:
+        return {}
+    from vical_daemon.vision.image_codec import encode_image
+    from vical_daemon.web.images import QUALITY, pixels_of, thinned
+
+    wanted, found = set(stamps_ns), {}
+    for key, payload in job.recording.messages(streams[:1]):
+        stamp_ns = stamp_of(payload)
+        if stamp_ns in wanted:
+            small, _ = thinned(pixels_of(Sample(key, payload, 0)))
+            found[stamp_ns] = encode_image(small, "jpeg", quality=QUALITY)
+            if len(found) == len(wanted):
+                break
+    return found
 
 
 def suspects(job: Job) -> str:

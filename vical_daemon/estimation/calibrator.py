@@ -33,7 +33,7 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import HeldLens
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, Layout, make_layout
 from vical_daemon.estimation.plausible import stamp_sigma_problem, usable_points
-from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.selection import model_selection as hypotheses
 from vical_daemon.estimation.selection.model_acceptance import BeyondDoubt
@@ -469,3 +469,7 @@ class Calibrator:
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
         return trace_by_present_stamps(self.judge.trace(camera), self._offset_s(camera))
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return how well the IMU alone predicted images before they were used, oldest first."""
+        return list(self.judge.held_out)

@@ -27,7 +27,7 @@ from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.plausible import stamp_sigma_problem
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.carry import (
     DRIFT,
@@ -440,6 +440,10 @@ class TargetFreeCalibrator:
     def _offset_s(self) -> float:
         """Time shift by the stamps as they come now, minus that of the windows, s."""
         return self._imu.shift_s + self._images.offset_s(self.camera)
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return nothing: there is no such check without a target."""
+        return []
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration developed."""

@@ -16,7 +16,7 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.result import CalibrationEstimate, ImuEstimate, Status, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, ImuEstimate, Status, TracePoint
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 # What the rig as a whole is: the first of these that any camera is.
@@ -84,6 +84,10 @@ class TargetFreeRig:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         return together({name: part.estimate() for name, part in self.parts.items()})
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return nothing: there is no such check without a target."""
+        return []
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration of one camera developed."""

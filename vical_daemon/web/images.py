@@ -188,7 +188,7 @@ def _contents(sight: Sight) -> tuple[npt.NDArray[Any], PointsMessage | None, Poi
         MessageError: One of its messages is malformed.
     """
     read = [None if s is None else decode_points(s.payload) for s in (sight.points, sight.predicted)]
-    pixels = np.zeros(_size(read[0]), np.uint8) if sight.image is None else _pixels(sight.image)
+    pixels = np.zeros(_size(read[0]), np.uint8) if sight.image is None else pixels_of(sight.image)
     return pixels, read[0], read[1]
 
 
@@ -229,7 +229,12 @@ def _stamp_ns(sample: Sample) -> int:
     return int(seconds) * 10**9 + int(nanoseconds)
 
 
-def _pixels(sample: Sample) -> npt.NDArray[Any]:
+def pixels_of(sample: Sample) -> npt.NDArray[Any]:
+    """Return the pixels of an image message, plain or compressed: grey (h, w) or BGR (h, w, 3).
+
+    Raises:
+        MessageError: It is malformed.
+    """
     parsed = topics.parse_key(sample.key)
     if parsed is not None and parsed.topic is topics.COMPRESSED:
         from vical_daemon.vision.image_codec import decode_image as decode_file
