@@ -22,6 +22,7 @@ from vical_daemon.bus.messages import (
     decode_image,
     decode_points,
 )
+from vical_daemon.web.meters import light
 
 WIDTH_LIMIT = 800  # px; wider images are thinned for display
 QUALITY = 70
@@ -150,16 +151,18 @@ def picture_event(sight: Sight) -> bytes | None:
         pixels, points, predicted = _contents(sight)
     except MessageError:
         return None
-    jpeg = b""
+    jpeg, brightness = b"", None
     if sight.image is not None:
         from vical_daemon.vision.image_codec import encode_image
 
-        jpeg = encode_image(thinned(pixels)[0], "jpeg", quality=QUALITY)
+        small, _ = thinned(pixels)
+        jpeg, brightness = encode_image(small, "jpeg", quality=QUALITY), light(small)
     document = {
         "stamp_s": round(sight.stamp_ns * 1e-9, 3),
         "size": [pixels.shape[1], pixels.shape[0]],
         "detected": _rows(points),
         "predicted": _rows(predicted),
+        "light": brightness,
         "jpeg": base64.b64encode(jpeg).decode(),
     }
     return b"event: picture\ndata: " + msgspec.json.encode(document) + b"\n\n"

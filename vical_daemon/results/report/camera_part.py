@@ -55,9 +55,8 @@ class CameraPart:
         self.target_m, self.images, self.gallery = target_m, images, gallery
         self.points = gather(frames, name)
         self.size = self._size(size)
-        self.lens = tuple(
-            np.array(self.camera[key], dtype=np.float64) for key in ("intrinsics", "distortion")
-        )
+        self.K = np.array(self.camera["intrinsics"], dtype=np.float64)
+        self.D = np.array(self.camera["distortion"], dtype=np.float64)
         self.model = str(self.camera.get("distortion_model") or RADTAN)
         pose = self.camera["T_imu_cam"]
         self.R = so3.matrix_from_quat(np.array(pose["q_wxyz"], dtype=np.float64))
@@ -76,7 +75,7 @@ class CameraPart:
         """Where the board was; empty where it is not known."""
         if self.target_m is None:
             return []
-        return board_views(self.frames, self.name, self.target_m, *self.lens, self.model)
+        return board_views(self.frames, self.name, self.target_m, self.K, self.D, self.model)
 
     def sections(self) -> list[str]:
         """Return the sections, the most important first."""
@@ -120,7 +119,7 @@ class CameraPart:
             return []
         covariance, maps, words = np.array(joint, dtype=np.float64), [], []
         for distance, title in _DISTANCES:
-            sigma = over_image(self.size, distance, self.R, *self.lens, self.model, order, covariance)
+            sigma = over_image(self.size, distance, self.R, self.K, self.D, self.model, order, covariance)
             if not np.isfinite(sigma).any() or not np.nanmax(sigma) > 0:
                 continue
             maps.append((f"Point at {title}: sigma, px", sigma))
@@ -143,7 +142,8 @@ class CameraPart:
         tilt = np.degrees([v.tilt_rad for v in self.views])
         text = (
             f"The board was {min(distance):.2f} to {max(distance):.2f} m away and tilted by "
-            f"{tilt.min():.0f}° to {tilt.max():.0f}° (half of the images: above {np.median(tilt):.0f}°); {len(self.views)} images."
+            f"{tilt.min():.0f}° to {tilt.max():.0f}° (half of the images: above {np.median(tilt):.0f}°);"
+            f" {len(self.views)} images."
         )
         drawn = self.gallery.add(
             f"{self.name}-poses", coverage_figures.poses(self.views), "poses of the board"

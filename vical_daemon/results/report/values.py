@@ -165,9 +165,9 @@ def held_out_text(checks: Sequence[dict[str, float]], noise: dict[str, float] | 
     ratio = [float(check["ratio"]) for check in checks]
     rms, median = math.sqrt(sum(ratio) / len(ratio)), math.sqrt(float(np.median(ratio)))
     text = (
-        f"{len(ratio)} times the IMU alone predicted an image 0.3 s ahead that had not been used yet. The "
-        f"errors are {rms:.2f} times (RMS) and {median:.2f} times (median) those that the stated noise of IMU "
-        "and corners predicts."
+        f"{len(ratio)} times the IMU alone predicted an image 0.3 s ahead that was not used yet. The "
+        f"errors are {rms:.2f} times (RMS) and {median:.2f} times (median) those that the stated noise of "
+        "IMU and corners predicts."
     )
     if noise:
         text += (
