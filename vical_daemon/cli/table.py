@@ -47,7 +47,9 @@ COMMANDS = (
     Command("doctor", START, "check this computer for causes of bad stamps"),
     Command("target", START, "write a board to print, to scale, and its target file"),
     Command("run", SERVICE, "run the daemon, or single roles of it"),
-    Command("command", SERVICE, "accept or discard the live calibration, begin anew, start or stop recording"),
+    Command(
+        "command", SERVICE, "accept or discard the live calibration, begin anew, start or stop recording"
+    ),
     Command("watch", SERVICE, "show the calibration live in the terminal"),
     Command("web", SERVICE, "serve a page with the live calibration, on loopback"),
     Command("install-service", SERVICE, "install or remove systemd units, udev rules and the user"),

@@ -99,10 +99,10 @@ class Scene {
     this.legend(rig, extent, box);
   }
 
-  view() { // rows of the rotation into the screen: right, down, away; z of the frame is up in the rig's view
+  view() { // rows of the rotation into the screen: right, down, away; up is z of the imu, or what the camera sees as up
     const { yaw, pitch } = this.turn, [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
-    const up = this.data.rig && this.room ? [0, -1, 0] : [0, 0, 1];
-    const side = this.room ? [1, 0, 0] : [1, 0, 0];
+    const { path } = this.data, room = this.room && path && path.length;
+    const up = room ? [0, path[path.length - 1].R[1][1] > 0 ? -1 : 1, 0] : [0, 0, 1], side = [1, 0, 0];
     const depth = [up[1] * side[2] - up[2] * side[1], up[2] * side[0] - up[0] * side[2], up[0] * side[1] - up[1] * side[0]];
     const right = add(side.map((v) => v * cy), depth, sy);
     const away = add(depth.map((v) => v * cy), side, -sy);
