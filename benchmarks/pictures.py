@@ -64,10 +64,10 @@ def live_page(work: Path, out: Path, seconds: float) -> Path:
         await page.open(address)
         await page.wait("document.getElementById('status').classList.contains('converged')", seconds + 15)
         await page.wait(f"page.latest.cam0.duration_s > {0.7 * seconds}", seconds + 15)
-        await page.wait("document.querySelectorAll('#corners path').length === 2")
+        await page.wait("document.querySelectorAll('#corners .detected, #corners .predicted').length === 2")
         await page.screenshot(out / "page.png")
         await page.open(address, 390, 844, dark=True)
-        await page.wait("document.querySelectorAll('#corners path').length === 2")
+        await page.wait("document.querySelectorAll('#corners .detected, #corners .predicted').length === 2")
         await page.screenshot(out / "phone.png")
 
     try:

@@ -74,7 +74,7 @@ def test_a_tilt_is_named_by_the_edge_that_is_nearer():
         nearest = ("left", "right", "upper", "lower")[int(np.argmin((board @ R.T)[:, 2]))]
         assert tilt_name(-R[:, 2]) == f"its {nearest} edge nearer"
     assert tilt_name(np.array([0.0, 0.05, -1.0]) / np.hypot(0.05, 1.0)) == "head-on"
-    assert np.isfinite(project(board + [0, 0, 1], *LENS)).all()
+    assert np.isfinite(project(board + np.array([0, 0, 1]), *LENS)).all()
 
 
 def test_meters_show_information_over_what_is_needed(web_feed):
@@ -97,7 +97,7 @@ def test_meters_show_information_over_what_is_needed(web_feed):
 def test_blur_is_speed_times_exposure():
     motion, grid = Motion(), np.random.default_rng(0).uniform(0, 400, (40, 2))
     for k in range(20):
-        motion.add(0.05 * k, np.arange(40), grid + [10.0 * k, 0.0])
+        motion.add(0.05 * k, np.arange(40), grid + np.array([10.0 * k, 0.0]))
     assert motion.speed_px_s == pytest.approx(200.0)
     assert motion.rate_hz == pytest.approx(20.0)
     found = blur(motion.speed_px_s, 0.0115)

@@ -11,6 +11,8 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.results.report.board_views import BoardView
 from vical_daemon.results.report.figures import AXES, INK, SOFT, Drawing, Y, Z, band, panels, style
 
+_REACH = 6.0  # times the median: top of the scale of the projection uncertainty
+
 
 def biases(trace: Sequence[dict[str, Any]]) -> Drawing:
     """Draw the biases of gyro and accelerometer over time, with bands of one sigma."""
@@ -41,7 +43,7 @@ def held_out(checks: Sequence[dict[str, float]]) -> Drawing:
     axes.plot(t, np.sqrt(ratio), ".", color=Z, markersize=4)
     axes.axhline(1.0, color=INK, linewidth=0.8)
     axes.set_ylim(0, max(2.0, 1.1 * float(np.sqrt(ratio.max()))))
-    style(axes, "Error of images predicted by the IMU alone, expected = 1", "time, s")
+    style(axes, "Errors over the expected ones", "time, s")
     return figure
 
 
@@ -81,14 +83,17 @@ def projection(maps: Sequence[tuple[str, FloatArray]], size: tuple[int, int]) ->
     width = 4.8
     figure, (row,) = panels(0.8 + 3.5 * size[1] / size[0], 1, len(maps), width=width * len(maps), right=0.45)
     for axes, (title, sigma) in zip(row, maps, strict=True):
-        top = float(np.nanpercentile(sigma, 99))
+        # Corners where no corner of the board was seen would flatten the rest of the map.
+        top = min(float(np.nanmax(sigma)), _REACH * float(np.nanmedian(sigma)))
         extent = (0, size[0], size[1], 0)
         shown = axes.imshow(sigma, extent=extent, cmap="viridis", vmin=0, vmax=top, aspect="equal")
         axes.figure.colorbar(shown, ax=axes).ax.tick_params(labelsize=8, colors=INK)
         centres_x = (np.arange(sigma.shape[1]) + 0.5) * size[0] / sigma.shape[1]
         centres_y = (np.arange(sigma.shape[0]) + 0.5) * size[1] / sigma.shape[0]
-        lines = axes.contour(centres_x, centres_y, sigma, levels=4, colors="white", linewidths=0.7)
-        axes.clabel(lines, fontsize=8, fmt="%.2g")
+        levels = np.linspace(float(np.nanmin(sigma)), top, 6)[1:-1]
+        if levels[0] < levels[-1]:
+            lines = axes.contour(centres_x, centres_y, sigma, levels=levels, colors="white", linewidths=0.7)
+            axes.clabel(lines, fontsize=8, fmt="%.2g")
         style(axes, title)
         axes.grid(visible=False)
     return figure

@@ -108,7 +108,7 @@ def _inline(svg: str, prefix: str) -> str:
 
     def sized(match: re.Match[str]) -> str:
         width = float(match.group(2)) * _SHOWN_WIDTH
-        flow = f"flex:{width:.0f} 1 {0.8 * width:.0f}px;max-width:{width:.0f}px"
+        flow = f"flex:{width:.0f} 1 {0.55 * width:.0f}px;max-width:{width:.0f}px"
         return f'<svg{match.group(1)} role="img" style="{flow}"'
 
     return _SIZE.sub(sized, svg, count=1).strip()

@@ -156,7 +156,7 @@ def event_rows(events: Sequence[dict[str, Any] | str]) -> list[tuple[str, str]]:
     for event in events:
         when = event.get("t_s") if isinstance(event, dict) else None
         text = event if isinstance(event, str) else str(event["text"])
-        rows.append(("" if when is None else f"{float(when):.1f} s", text))
+        rows.append(("" if when is None else f"{float(when):.1f}\N{NO-BREAK SPACE}s", text))
     return rows
 
 

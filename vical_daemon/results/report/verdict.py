@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import Status
@@ -56,7 +57,15 @@ def verdict(result: Mapping[str, Any]) -> Verdict:
         word = "Converged, with reservations."
     several = len(cameras) > 1
     known = [(f"{name}: " if several else "") + _known(camera) for name, camera in cameras.items()]
-    causes = [(f"{name}: " if several else "") + main_cause(camera) for name, camera in cameras.items()]
+    held = {
+        event.get("camera")
+        for event in result.get("events") or []
+        if isinstance(event, dict) and event["kind"] == EventKind.FIXED_LENS
+    }
+    causes = [
+        (f"{name}: " if several else "") + main_cause(camera, lens_held=name in held)
+        for name, camera in cameras.items()
+    ]
     return Verdict(word, known, warnings + causes)
 
 
@@ -73,15 +82,21 @@ def _known(camera: Mapping[str, Any]) -> str:
     return f"Known to 1 sigma, in the worst direction: {', '.join(words)}."
 
 
-def main_cause(camera: Mapping[str, Any]) -> str:
-    """Say what limits the lever arm most, and so what would improve it."""
+def main_cause(camera: Mapping[str, Any], *, lens_held: bool = False) -> str:
+    """Say what limits the lever arm most, and so what would improve it.
+
+    Args:
+        camera: Of the result.
+        lens_held: The lens was held although images contradict it.
+    """
     p, _ = _blocks(camera)
     if _worst(p) <= 0:
         return "The lever arm was fixed."
     if lens_share(camera) > _SHARE:
+        show = "bring the board to the edges of the image, tilted, near and far"
         return (
-            f"{100 * lens_share(camera):.0f} % of the variance of the lever arm comes from the lens: bring "
-            "the board to the edges of the image, tilted, near and far."
+            f"{100 * lens_share(camera):.0f} % of the variance of the lever arm comes from the lens: "
+            f"{'leave it free' if lens_held else show}."
         )
     R = so3.matrix_from_quat(np.array(camera["T_imu_cam"]["q_wxyz"], dtype=np.float64))
     _, vectors = np.linalg.eigh(p)

@@ -295,4 +295,4 @@ for (const button of document.querySelectorAll(".range button")) {
 
 window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { drawCharts(); scene.draw(); });
 setInterval(watchSilence, 1000);
-listen();
+document.addEventListener("DOMContentLoaded", listen); // when meters.js and decide.js have been read, too

@@ -261,6 +261,7 @@ def test_the_verdict_says_how_well_and_what_helps(result):
     ]
     said = verdict(result)
     assert (said.word, said.advice[0]) == ("Converged, with reservations.", "the fixed lens is off: free it")
+    assert "comes from the lens: leave it free" in said.advice[-1]
     assert not any("without images" in line for line in said.advice)
     for status, word in (
         ("degenerate", "Incomplete"),
@@ -337,8 +338,8 @@ def test_a_full_result_fills_every_section(result, tmp_path):
     write_report(path, result, frames, target_m=target, images=lambda name, stamps: {stamps[0]: b"abc"})
     text = path.read_text()
     for needed in (
-        "what limits the accuracy", "projection uncertainty", "poses of the board", "fit worst", "3.0 s",
-        "are 1.10 times (RMS)", "T_imu_cam0 = [[", "T_cam0_imu = [[", '"board":', "biases0",
+        "what limits the accuracy", "projection uncertainty", "poses of the board", "fit worst",
+        "3.0\N{NO-BREAK SPACE}s",        "are 1.10 times (RMS)", "T_imu_cam0 = [[", "T_cam0_imu = [[", '"board":', "biases0",
     ):  # fmt: skip
         assert needed in text, needed
     assert len(text) < 3_000_000
