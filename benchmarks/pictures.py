@@ -10,6 +10,7 @@ real recording lies beside the checkout, its report is taken as well.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import io
 import re
 import subprocess
@@ -21,6 +22,7 @@ from typing import Any
 from vical_mocks.harness import browser
 
 from vical_daemon.cli import live_table
+from vical_daemon.cli.errors import EXIT_NOT_CONVERGED
 from vical_daemon.cli.watch import View
 from vical_daemon.logs.mcap import LogReader
 
@@ -48,7 +50,7 @@ def main(argv: list[str]) -> int:
         if EUROC.is_dir():
             known = ["--target", str(EUROC / "target.yaml"), "--initial", str(EUROC / "initial.yaml")]
             fixed = [*known, "--fix", "intrinsics"]
-            report(work, [str(EUROC), *fixed], args.out / "report.png")
+            report(work, [str(EUROC), *fixed], args.out / "report.png", args.out / "report_phone.png")
     print("\n".join(str(path) for path in sorted(args.out.glob("*.png"))))
     return 0
 
@@ -61,14 +63,17 @@ def live_page(work: Path, out: Path, seconds: float) -> Path:
     address = next(m.group(1) for line in demo.stderr if (m := re.search(r"live page at (\S+)", line)))
 
     async def script(page: Any) -> None:
-        await page.open(address)
+        marks = "document.querySelectorAll('#corners .detected, #corners .predicted').length === 2"
+        await page.open(address, 390, 844, dark=True)  # while something is still wanted
+        await page.wait("document.querySelectorAll('#corners .wanted, #corners .cell').length > 1", seconds)
+        await page.wait(marks)
+        await page.screenshot(out / "phone.png")
+        await page.open(address, height=1180)
         await page.wait("document.getElementById('status').classList.contains('converged')", seconds + 15)
         await page.wait(f"page.latest.cam0.duration_s > {0.7 * seconds}", seconds + 15)
-        await page.wait("document.querySelectorAll('#corners .detected, #corners .predicted').length === 2")
+        await page.evaluate("document.querySelector('button[data-room=\"1\"]').click()")
+        await page.wait(marks)
         await page.screenshot(out / "page.png")
-        await page.open(address, 390, 844, dark=True)
-        await page.wait("document.querySelectorAll('#corners .detected, #corners .predicted').length === 2")
-        await page.screenshot(out / "phone.png")
 
     try:
         browser.drive(script, work / "profile")
@@ -92,16 +97,23 @@ def terminal(work: Path, log: Path, path: Path) -> None:
     browser.draw_svg(console.export_svg(title="vical watch"), work, path)
 
 
-def report(work: Path, arguments: list[str], path: Path) -> None:
-    """Make the report of a calibration and look at its first page."""
+def report(work: Path, arguments: list[str], path: Path, phone: Path | None = None) -> None:
+    """Make the report of a calibration and look at its first page, on a desk and on a phone in the dark."""
     html = work / "report.html"
     command = [*_VICAL, "calibrate", *arguments, "--report", str(html)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    if done.returncode not in (0, EXIT_NOT_CONVERGED):
+        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}")
 
     async def script(page: Any) -> None:
         await page.open(html.as_uri(), 1100, 1400)
-        await page.wait("document.readyState === 'complete' && document.images.length > 0")
+        await page.wait("document.readyState === 'complete' && document.querySelector('figure svg') !== null")
+        await asyncio.sleep(0.5)  # the 3-D view draws itself when it knows its size
         await page.screenshot(path)
+        if phone is not None:
+            await page.open(html.as_uri(), 390, 844, dark=True)
+            await page.wait("document.readyState === 'complete' && document.querySelector('.known') !== null")
+            await page.screenshot(phone)
 
     browser.drive(script, work / "profile")
 

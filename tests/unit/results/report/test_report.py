@@ -339,7 +339,8 @@ def test_a_full_result_fills_every_section(result, tmp_path):
     text = path.read_text()
     for needed in (
         "what limits the accuracy", "projection uncertainty", "poses of the board", "fit worst",
-        "3.0\N{NO-BREAK SPACE}s",        "are 1.10 times (RMS)", "T_imu_cam0 = [[", "T_cam0_imu = [[", '"board":', "biases0",
+        "3.0\N{NO-BREAK SPACE}s",
+        "are 1.10 times (RMS)", "T_imu_cam0 = [[", "T_cam0_imu = [[", "\"board\":", "biases0",
     ):  # fmt: skip
         assert needed in text, needed
     assert len(text) < 3_000_000
