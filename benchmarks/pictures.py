@@ -65,14 +65,15 @@ def live_page(work: Path, out: Path, seconds: float) -> Path:
     async def script(page: Any) -> None:
         marks = "document.querySelectorAll('#corners .detected, #corners .predicted').length === 2"
         await page.open(address, 390, 844, dark=True)  # while something is still wanted
-        await page.wait("document.querySelectorAll('#corners .wanted, #corners .cell').length > 1", seconds)
-        await page.wait(marks)
+        converged = "document.getElementById('status').classList.contains('converged')"
+        wanted = "document.querySelector('#corners .wanted') !== null"
+        await page.wait(f"{marks} && ({wanted} || {converged})", seconds + 15)
         await page.screenshot(out / "phone.png")
         await page.open(address, height=1180)
-        await page.wait("document.getElementById('status').classList.contains('converged')", seconds + 15)
+        await page.wait(converged, seconds + 15)
         await page.wait(f"page.latest.cam0.duration_s > {0.7 * seconds}", seconds + 15)
         await page.evaluate("document.querySelector('button[data-room=\"1\"]').click()")
-        await page.wait(marks)
+        await page.wait(marks, seconds)
         await page.screenshot(out / "page.png")
 
     try:

@@ -28,12 +28,12 @@ class CameraWatch:
 
     Args:
         target_m: Points of the board by id, m, shape (n, 3); None: not known, or target-free.
-        size: width, height of the images; (0, 0): as the messages have it.
+        size: width, height of the images where the messages do not have it; (0, 0): not known.
     """
 
     def __init__(self, target_m: FloatArray | None, size: tuple[int, int] = (0, 0)) -> None:
         self.target_m = target_m
-        self._size = size
+        self.size = size
         self._coverage: Coverage | None = None
         self._motion = Motion()
         self._tilts: set[str] = set()
@@ -62,9 +62,10 @@ class CameraWatch:
             return
         self._points.append(message)
         self._motion.add(message.stamp_ns * 1e-9, message.ids, message.uv_px)
-        size = self._size if self._size[0] else message.image_size
-        if self._coverage is None and size[0] and size[1]:
-            self._coverage = Coverage(size)
+        if all(message.image_size):
+            self.size = message.image_size
+        if all(self.size) and (self._coverage is None or self._coverage.size != self.size):
+            self._coverage = Coverage(self.size)
         if self._coverage is not None and len(message.uv_px):
             self._coverage.add(message.uv_px)
 

@@ -17,6 +17,8 @@ ACROSS = 16
 """Cells over the width of the image."""
 ENOUGH = 5
 """Corners in a cell that count as seen: as many as the estimator asks for at the edges (`image_coverage`)."""
+_NEW = 0.1  # weight of a new image in the misfit of a cell: predictions of the first seconds are forgotten
+_MOST_ROWS = 4 * ACROSS  # a message may state any size
 _TILT_RAD = np.deg2rad(30.0)
 """Tilt that is asked for: at 30 degrees the near edge of a board is clearly larger than the far one."""
 _SHARES = (0.55, 0.35)  # of the image's width that the board is to fill: near, and far
@@ -40,26 +42,34 @@ class Coverage:
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
-        self.down = max(1, round(ACROSS * size[1] / size[0]))
+        self.down = min(max(1, round(ACROSS * size[1] / size[0])), _MOST_ROWS)
         self.count = np.zeros((self.down, ACROSS), dtype=np.int64)
-        self._misses = np.zeros((self.down, ACROSS), dtype=np.int64)
+        self._images = np.zeros((self.down, ACROSS), dtype=np.int64)
         self._square = np.zeros((self.down, ACROSS))
 
     def cells(self, uv_px: FloatArray) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Return row and column of the cell of each pixel."""
         scale = np.array([ACROSS, self.down]) / np.array(self.size)
-        at = np.clip(np.nan_to_num(uv_px * scale), 0, (ACROSS - 1, self.down - 1)).astype(np.int64)
+        at = np.clip(uv_px * scale, 0, (ACROSS - 1, self.down - 1)).astype(np.int64)
         return at[:, 1], at[:, 0]
 
     def add(self, uv_px: FloatArray) -> None:
         """Take the corners of one image, shape (n, 2)."""
-        np.add.at(self.count, self.cells(uv_px), 1)
+        np.add.at(self.count, self.cells(uv_px[np.isfinite(uv_px).all(axis=1)]), 1)
 
     def add_misfit(self, uv_px: FloatArray, error_px: FloatArray) -> None:
         """Take how far predictions were from corners, shape (n, 2) both."""
-        where = self.cells(uv_px)
-        np.add.at(self._misses, where, 1)
-        np.add.at(self._square, where, 0.5 * np.sum(error_px**2, axis=1))
+        good = np.isfinite(uv_px).all(axis=1) & np.isfinite(error_px).all(axis=1)
+        uv_px, error_px = uv_px[good], error_px[good]
+        where, shape = self.cells(uv_px), self.count.shape
+        found, square = np.zeros(shape), np.zeros(shape)
+        np.add.at(found, where, 1.0)
+        np.add.at(square, where, 0.5 * np.sum(error_px**2, axis=1))
+        new = found > 0
+        self._images[new] += 1
+        weight = np.maximum(1.0 / np.maximum(self._images, 1), _NEW)
+        change = weight * (square / np.maximum(found, 1.0) - self._square)
+        self._square[new] += change[new]
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
@@ -68,8 +78,7 @@ class Coverage:
 
     def document(self) -> dict[str, Any]:
         """Return counts (0 to `ENOUGH`) and RMS misfit (px, None: not known), row by row."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            rms = np.sqrt(self._square / self._misses)
+        rms = np.where(self._images > 0, np.sqrt(self._square), np.nan)
         return {
             "columns": ACROSS,
             "rows": self.down,

@@ -35,6 +35,7 @@ class Downloads:
         if not messages:
             raise ExportError("there is no result yet")
         sizes = {name: camera.size for name, camera in self._config.cameras.items()}
+        sizes |= self._state.image_sizes
         rig = rig_from_estimate(merge_calibrations(messages), sizes, note="vical, from the live page")
         files = export(rig, format_name, force=force)
         if len(files) == 1:

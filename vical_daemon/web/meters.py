@@ -21,7 +21,9 @@ _DARK, _BRIGHT = 60, 235  # 8-bit levels of the brightest and of saturated pixel
 _SATURATED = 0.02  # share of pixels
 
 
-def known_of_needed(camera: CameraEstimate, targets: ConvergenceTargets) -> list[dict[str, Any]]:
+def known_of_needed(
+    camera: CameraEstimate, targets: ConvergenceTargets, *, enough: bool = False
+) -> list[dict[str, Any]]:
     """Return a meter for each axis of translation and rotation (camera frame) and for the time shift.
 
     A meter shows the information that the data have given over what is needed: the squared ratio of the
@@ -30,6 +32,8 @@ def known_of_needed(camera: CameraEstimate, targets: ConvergenceTargets) -> list
     Args:
         camera: Its estimate.
         targets: Sigmas that count as converged.
+        enough: The estimator calls it converged: every meter is full. (The sigma of the time shift then still
+            contains what the IMU's driver does not know of its stamps, which no motion can improve.)
 
     Returns:
         `name`, `kind` (translation, rotation or time), `share` (0 to 1) and `sigma` with `unit`. What was
@@ -48,7 +52,7 @@ def known_of_needed(camera: CameraEstimate, targets: ConvergenceTargets) -> list
         names = ("x", "y", "z") if len(variances) == 3 else ("shift",)
         for name, variance in zip(names, variances, strict=True):
             if variance > 0.0 and math.isfinite(variance):
-                share = min(limit**2 / float(variance), 1.0)
+                share = 1.0 if enough else min(limit**2 / float(variance), 1.0)
                 sigma = float(f"{scale * math.sqrt(variance):.3g}")
                 meters.append(
                     {"kind": kind, "name": name, "share": round(share, 3), "sigma": sigma, "unit": unit}

@@ -24,6 +24,7 @@ from vical_daemon.bus.messages import (
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance, Verb
 from vical_daemon.estimation.measurements import ConvergenceTargets
+from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.wording import (
     direction_warning,
     event_document,
@@ -145,6 +146,11 @@ class WebState:
         now_s = self._clock()
         return {name: (camera.latest, now_s - camera.arrived_s) for name, camera in self._cameras.items()}
 
+    @property
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """Size of the images of every camera that is followed, where it is known, px."""
+        return {name: watch.size for name, watch in self._watches.items() if all(watch.size)}
+
     def _process(self, sample: Sample, arrived_s: float) -> None:
         """Process one message.
 
@@ -233,7 +239,9 @@ class WebState:
         stored = self._stored.get(name)
         before = None if stored is None else stored.camera_estimate
         return {
-            "meters": known_of_needed(known, self._targets),
+            "meters": known_of_needed(
+                known, self._targets, enough=message.estimate.status is Status.CONVERGED
+            ),
             "rig": rig_document(place),
             "stored": None
             if stored is None or before is None

@@ -31,6 +31,13 @@ def test_cells_count_corners_and_their_misfit():
     assert document["share"] == pytest.approx((coverage.count >= ENOUGH).mean(), abs=1e-3)
 
 
+def test_the_misfit_of_the_first_seconds_is_forgotten():
+    coverage, uv = Coverage(SIZE), np.array([[100.0, 100.0], [110.0, 105.0]])
+    for k in range(80):
+        coverage.add_misfit(uv, np.full((2, 2), 30.0 if k < 5 else 0.3))
+    assert [v for v in coverage.document()["rms_px"] if v is not None] == [pytest.approx(0.3, abs=0.6)]
+
+
 def fill(coverage, x0, y0, x1, y1):
     x, y = np.meshgrid(np.arange(x0, x1, 8.0), np.arange(y0, y1, 8.0))
     coverage.add(np.column_stack([x.ravel(), y.ravel()]))
@@ -90,6 +97,7 @@ def test_meters_show_information_over_what_is_needed(web_feed):
         assert meters["translation", axis]["share"] == pytest.approx(expected, abs=1e-3)
     assert meters["rotation", "z"]["share"] == 1.0
     assert meters["time", "shift"]["share"] == 1.0 and meters["time", "shift"]["unit"] == "ms"
+    assert all(m["share"] == 1.0 for m in known_of_needed(camera, ConvergenceTargets(1e-9), enough=True))
     camera.T_imu_cam.covariance[:] = np.zeros((6, 6)).tolist()
     assert [m["kind"] for m in known_of_needed(camera, ConvergenceTargets())] == ["time"]  # the rest is fixed
 
@@ -117,3 +125,9 @@ def test_light_is_judged_by_the_bright_parts():
     assert light(good // 8)["advice"].startswith("dark image")
     over = np.where(rng.uniform(size=good.shape) < 0.2, 255, good).astype(np.uint8)
     assert "% of the image is saturated" in light(over)["advice"]
+
+
+def test_any_size_in_a_message_is_bounded():
+    coverage = Coverage((1, 2**31))
+    coverage.add(np.array([[0.5, 1e9], [np.nan, 3.0]]))
+    assert coverage.count.size <= 4 * ACROSS**2 and coverage.count.sum() == 1

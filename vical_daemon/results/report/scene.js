@@ -85,7 +85,7 @@ class Scene {
     const high = [0, 1, 2].map((i) => Math.max(...seen.map((v) => v[i])));
     this.centre = low.map((v, i) => 0.5 * (v + high[i]));
     const extent = Math.max(Math.hypot(...high.map((v, i) => v - low[i])), arm);
-    this.scale = (this.zoom * Math.min(box.width, box.height) * (room ? 0.8 : 0.55)) / extent;
+    this.scale = (this.zoom * Math.min(box.width, box.height) * (room ? 1.1 : 0.55)) / extent;
     this.middle = [box.width / 2, box.height / 2];
     this.view();
     if (room) this.drawRoom(board, path);
