@@ -12,19 +12,25 @@ from __future__ import annotations
 import argparse
 import asyncio
 import io
+import queue
 import re
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 from typing import Any
 
-from vical_mocks.harness import browser
+import numpy as np
+from vical_mocks.harness import browser, web_feed
 
+from vical_daemon.bus.interface import LocalBus
 from vical_daemon.cli import live_table
 from vical_daemon.cli.errors import EXIT_NOT_CONVERGED
 from vical_daemon.cli.watch import View
+from vical_daemon.estimation.guidance import Guidance, Verb
 from vical_daemon.logs.mcap import LogReader
+from vical_daemon.vision.target import Checkerboard
 
 ROOT = Path(__file__).resolve().parents[1]
 EUROC = ROOT.parent / "shared" / "data" / "euroc_imu_april"
@@ -43,6 +49,7 @@ def main(argv: list[str]) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
+        guidance(work, args.out / "guidance.png")
         log = live_page(work, args.out, args.seconds)
         terminal(work, log, args.out / "terminal.png")
         board = ["--target", str(log.with_name("target.yaml"))]
@@ -53,6 +60,34 @@ def main(argv: list[str]) -> int:
             report(work, [str(EUROC), *fixed], args.out / "report.png", args.out / "report_phone.png")
     print("\n".join(str(path) for path in sorted(args.out.glob("*.png"))))
     return 0
+
+
+def guidance(work: Path, path: Path) -> None:
+    """Look at the page on a phone while a board is wanted elsewhere, fed by the harness of the tests."""
+    bus, stop, rng = LocalBus(), threading.Event(), np.random.default_rng(0)
+    board = work / "board.yaml"
+    board.write_text(Checkerboard(8, 6, 0.05, 0.05).to_yaml())
+    served: queue.Queue[str] = queue.Queue()
+    thread = web_feed.serve_page(bus, stop, served.put, board)
+    address = served.get(timeout=60)
+    advice = Guidance(Verb.TURN, ("x", "y"))
+
+    async def script(page: Any) -> None:
+        await page.open(address, 390, 844)
+        for number in range(1, 400):
+            web_feed.publish_estimate(bus, web_feed.estimate(0.02 + 0.001 * number, rng, motion=advice))
+            web_feed.publish_status(bus)
+            web_feed.publish_image(bus, number)
+            await asyncio.sleep(0.05)
+            if number > 30 and await page.evaluate("document.querySelector('#corners .wanted') !== null"):
+                break
+        await page.screenshot(path)
+
+    try:
+        browser.drive(script, work / "profile")
+    finally:
+        stop.set()
+        thread.join()
 
 
 def live_page(work: Path, out: Path, seconds: float) -> Path:

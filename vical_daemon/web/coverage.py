@@ -78,7 +78,7 @@ class Coverage:
 
     def document(self) -> dict[str, Any]:
         """Return counts (0 to `ENOUGH`) and RMS misfit (px, None: not known), row by row."""
-        rms = np.where(self._images > 0, np.sqrt(self._square), np.nan)
+        rms = np.where(self._images * _NEW >= 1.0, np.sqrt(self._square), np.nan)  # fewer say little
         return {
             "columns": ACROSS,
             "rows": self.down,

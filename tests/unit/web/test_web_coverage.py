@@ -20,6 +20,9 @@ def test_cells_count_corners_and_their_misfit():
     error = np.where(uv[:, :1] < 320, 0.5, 2.0) * np.ones(2)
     coverage.add(uv)
     coverage.add_misfit(uv, error)
+    assert set(coverage.document()["rms_px"]) == {None}  # one image says little
+    for _ in range(9):
+        coverage.add_misfit(uv, error)
     coverage.add(np.array([[np.nan, 3.0], [1e9, -5.0]]))  # whatever comes, nothing breaks
     document = coverage.document()
     count = np.array(document["count"]).reshape(document["rows"], document["columns"])
