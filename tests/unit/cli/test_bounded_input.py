@@ -61,6 +61,7 @@ READERS = [
     ("run -c FILE", ".yaml"),
     ("watch --once -c FILE", ".yaml"),
     ("web -c FILE", ".yaml"),
+    ("command accept -c FILE", ".yaml"),
     ("target --from FILE -o OUT", ".yaml"),
     ("imu decode FILE", ".bin"),
     ("imu info FILE", ""),
