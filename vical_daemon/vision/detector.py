@@ -32,8 +32,6 @@ FLOW_TOLERANCE_PX = 3.0
 """From the common homography; beyond, the optical flow of a corner is wrong."""
 KEEP_SHARE = 0.5
 """Guided detection holds while it finds this share of the corners that should be in view."""
-THOROUGH_EVERY = 3
-"""Of pictures without a board, every third is searched at full size, which takes a tenth of a second."""
 MAX_GAP_NS = 400_000_000
 
 
@@ -101,7 +99,9 @@ class BoardDetector:
             fix = self._search(picture, gray)
         if fix is None or fix.found.sum() < MIN_POINTS:
             self._last = None
+            self._misses += 1
             return None
+        self._misses = 0
         self._remember(fix, reduced, t_ns)
         ids = np.flatnonzero(fix.found).astype(np.int64)
         return Detection(ids, fix.uv_px[ids], fix.sigma_px[ids])
@@ -110,12 +110,11 @@ class BoardDetector:
         self.stats.searches += 1
         uv = np.full((len(self._layout.xy_m), 2), np.nan)
         if isinstance(self.target, AprilGrid):
-            tags, corners = search_tags(picture, gray, self.target)
+            tags, corners = search_tags(picture, gray, self.target, self._misses)
             for tag, quad in zip(tags, corners, strict=True):
                 uv[4 * tag : 4 * tag + 4] = quad
         else:
-            found = search_checkerboard(gray, self.target, self._misses % THOROUGH_EVERY == 0)
-            self._misses = 0 if found is not None else self._misses + 1
+            found = search_checkerboard(gray, self.target, self._misses)
             if found is None:
                 return None
             last = None

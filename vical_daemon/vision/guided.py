@@ -47,7 +47,7 @@ class BoardFix:
         found: Shape (n,).
         model: Fitted to the corners found.
         predicted_px: What the model predicts, shape (n, 2); nan behind the camera.
-        places_px: Where each corner is, or should be by the model and what near ones miss it by, shape (n, 2).
+        places_px: Where each corner is, or should be by the model and what near ones miss it by, (n, 2).
         tried_px: Where each corner was looked for last, shape (n, 2); nan: nowhere.
         contrast_dn: Median corner contrast, grey levels.
     """
