@@ -78,10 +78,10 @@ def search_tags(
 
 
 def _passes(width_px: int, misses: int) -> list[Pass]:
-    reduced, scale = [], 0.5
-    while width_px * scale >= FIRST_WIDTH_PX:
-        reduced.insert(0, Pass(31, 1, scale))
-        scale /= 2
+    """The passes that a picture gets, reduced pictures first, the smallest before."""
+    reduced: list[Pass] = []
+    while width_px * 0.5 ** (len(reduced) + 1) >= FIRST_WIDTH_PX:
+        reduced.insert(0, Pass(31, 1, 0.5 ** (len(reduced) + 1)))
     if misses:
         return [*reduced, PASSES[misses % len(PASSES)]]
     return [*reduced, *PASSES]
@@ -99,7 +99,9 @@ def _find_quads(gray: Gray, attempt: Pass) -> FloatArray:
     black = cv2.erode(black, np.ones((3, 3), np.uint8), iterations=erosions)
     contours, hierarchy = cv2.findContours(black, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     least = MIN_EDGE_PX * max(scale, 1.0) - 2 * erosions
-    outer = np.flatnonzero(hierarchy[0][:, 3] < 0) if hierarchy is not None else []
+    if hierarchy is None:
+        return np.zeros((0, 4, 2))
+    outer = np.flatnonzero(hierarchy[0][:, 3] < 0)
     found = [quad for k in outer if (quad := _as_quad(contours[k], least)) is not None]
     if not found:
         return np.zeros((0, 4, 2))
