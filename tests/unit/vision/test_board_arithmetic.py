@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from vical_daemon.vision.aprilgrid import PASSES, _passes
 from vical_daemon.vision.grid_model import _project, _project_with_jacobian
 from vical_daemon.vision.layout import BoardLayout
 from vical_daemon.vision.saddle import SaddleImage, pixel_noise
@@ -64,3 +65,12 @@ def test_corners_with_windows_of_several_sizes_are_refined_together():
         alone = image.refine(places[k : k + 1] + 0.6, radius[k : k + 1])
         np.testing.assert_allclose(together.uv_px[k], alone.uv_px[0], atol=2e-3)
         assert together.sigma_px[k] == pytest.approx(alone.sigma_px[0], rel=0.02)
+
+
+def test_every_pass_has_its_turn_while_there_is_no_board():
+    for width in (320, 640, 1280):
+        first = _passes(width, 0)
+        assert first[-len(PASSES) :] == list(PASSES)
+        later = [_passes(width, misses) for misses in range(1, len(PASSES) + 1)]
+        assert {passes[-1] for passes in later} == set(PASSES)
+        assert all(passes[:-1] == first[: -len(PASSES)] for passes in later)
