@@ -1,4 +1,4 @@
-"""`vical calibrate INPUT`: the online filter over a recording."""
+"""`vical calibrate INPUT ...`: the online filter over recordings of one rig."""
 
 from __future__ import annotations
 
@@ -23,7 +23,11 @@ _EXAMPLES = """\
 examples:
   vical calibrate log.mcap --target target.yaml --initial lens.yaml --fix intrinsics
   vical calibrate euroc_folder --target april.yaml --json -o result.json --report result.html
+  vical calibrate monday.mcap tuesday.mcap --target target.yaml     one rig, several recordings
   vical export result.json --format kalibr -o camchain.yaml
+
+Several recordings have mounting, lens and time shift in common; biases, and where the board stands, are
+those of each. Their clocks need not have anything to do with each other.
 
 exit code: 0 converged; 3 there is a result, but it is converging or degenerate (--accept makes that 0);
 1 no result; 2 bad usage
@@ -35,7 +39,12 @@ _UNUSABLE = ("waiting", "initialising", "inconsistent")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     parser.epilog = _EXAMPLES
-    parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
+    parser.add_argument(
+        "inputs",
+        metavar="INPUT",
+        nargs="+",
+        help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder; several are one calibration of the same rig",
+    )
     parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format; without: target-free")
     parser.add_argument("--camera", metavar="NAME", help="only this camera")
     parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
@@ -86,11 +95,11 @@ def run(args: argparse.Namespace) -> int:
         from vical_daemon.vision.target import load_target
 
         load_target(Path(args.target))  # a wrong file is refused before the recording is read
-    recording = open_recording(args.input, cameras=[args.camera] if args.camera else ())
-    for warning in recording.warnings:
+    recordings = [open_recording(p, cameras=[args.camera] if args.camera else ()) for p in args.inputs]
+    for warning in (text for recording in recordings for text in recording.warnings):
         print(f"vical: warning: {warning}", file=sys.stderr)
     job = calibration_run.make_job(
-        recording,
+        recordings[0],
         initial,
         target=args.target,
         camera=args.camera,
@@ -100,6 +109,7 @@ def run(args: argparse.Namespace) -> int:
         skip_s=args.skip,
         seconds=args.seconds,
     )
+    calibration_run.add_recordings(job, recordings[1:], args.imu)
     bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
     outcome = calibration_run.run_job(job, bar.show, keep_frames=bool(args.report))
     bar.close()
@@ -120,6 +130,9 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
         from vical_daemon.cli.calibration_text import describe
 
         print(describe(result))
+    for use in outcome.inputs:
+        if use.imu is None:
+            print(f"vical: warning: {use.path} is not in the result: nothing starts from it", file=sys.stderr)
     if args.report and result["cameras"]:
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
@@ -140,7 +153,7 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
 def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any]) -> None:
     from vical_daemon.results import report
 
-    inputs = [Path(p) for p in (args.input, args.target, args.initial) if p]
+    inputs = [Path(p) for p in (*args.inputs, args.target, args.initial) if p]
     settings = {"fix": args.fix, "estimate": args.estimate}
     if args.skip or args.seconds is not None:
         settings["part"] = f"{outcome.estimate.duration_s:.1f} s, from {args.skip:g} s on"

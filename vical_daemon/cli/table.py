@@ -46,6 +46,7 @@ COMMANDS = (
     Command("check", START, "check the config and the devices"),
     Command("doctor", START, "check this computer for causes of bad stamps"),
     Command("target", START, "write a board to print, to scale, and its target file"),
+    Command("completion", START, "print a completion script for bash or zsh"),
     Command("run", SERVICE, "run the daemon, or single roles of it"),
     Command("watch", SERVICE, "show the calibration live in the terminal"),
     Command("web", SERVICE, "serve a page with the live calibration, on loopback"),

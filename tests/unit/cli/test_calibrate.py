@@ -376,3 +376,69 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
     out, err = capsys.readouterr()
     assert out == "" and "Traceback" not in err
     assert words in err.splitlines()[-1] and err.splitlines()[-1].startswith("vical: error: ")
+
+
+def _part(euroc: Path, folder: Path, begin_s: float, end_s: float, later_ns: int = 0) -> Path:
+    """A part of the recording as one by itself, with other stamps."""
+    (folder / "mav0/imu0").mkdir(parents=True)
+    (folder / "mav0/cam0").mkdir()
+    imu = (euroc / "mav0/imu0/data.csv").read_text().splitlines()
+    with gzip.open(euroc / "mav0/cam0/corners.csv.gz", "rt") as file:
+        corners = file.read().splitlines()
+    first_ns = int(imu[1].split(",")[0])
+    low, high = first_ns + round(begin_s * 1e9), first_ns + round(end_s * 1e9)
+    for rows, path in ((imu, "imu0/data.csv"), (corners, "cam0/corners.csv")):
+        kept = [rows[0]]
+        for stamp, rest in (row.split(",", 1) for row in rows[1:]):
+            if low <= int(stamp) < high:
+                kept.append(f"{int(stamp) + later_ns},{rest}")
+        (folder / "mav0" / path).write_text("\n".join(kept) + "\n")
+    return folder
+
+
+def test_several_recordings_are_one_calibration(euroc: Path, tmp_path: Path, capsys) -> None:
+    """The second has the stamps of another boot, long before those of the first."""
+    one = _part(euroc, tmp_path / "one", 0.0, 12.0)
+    other = _part(euroc, tmp_path / "other", 40.0, 52.0, later_ns=-(10**17))
+    files = ["--target", str(euroc / "target.yaml"), "--initial", str(euroc / "initial.yaml")]
+    report = tmp_path / "report.html"
+    words = [str(one), str(other), *files, "--fix", "intrinsics", "--json", "--accept", "converging"]
+    assert main(["calibrate", *words, "--report", str(report)]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [Path(part["path"]).name for part in result["inputs"]] == ["one", "other"]
+    assert all(part["used"] and part["frames"] > 200 for part in result["inputs"])
+    assert result["frames"] == sum(part["frames"] for part in result["inputs"])
+    assert result["duration_s"] == pytest.approx(24.0, abs=0.2)
+    begin_s = [part["begin_s"] for part in result["inputs"]]
+    assert begin_s[0] == 0.0 and result["trace"][-1]["t_s"] > begin_s[1] > 20.0
+    reference = np.array([-0.0172, -0.0690, 0.0042])  # of the whole recording
+    camera = result["cameras"]["cam0"]["T_imu_cam"]
+    sigma = np.sqrt(np.diag(camera["covariance"]))[:3]
+    assert (np.abs(np.array(camera["p_m"]) - reference) < 4.0 * sigma).all() and sigma.max() < 3e-3
+    html = report.read_text()
+    assert "Recordings" in html and str(other) in html
+    text = calibration_text.describe(result)
+    assert f"{other}: 12.0 s" in text
+
+
+def test_a_recording_that_cannot_start_is_tried_again_after_the_others(
+    euroc: Path, tmp_path: Path, capsys
+) -> None:
+    brief = _part(euroc, tmp_path / "brief", 20.0, 22.5)  # too short for a start of its own
+    longer = _part(euroc, tmp_path / "longer", 40.0, 52.0)
+    files = ["--target", str(euroc / "target.yaml"), "--initial", str(euroc / "initial.yaml")]
+    words = [str(brief), str(longer), *files, "--fix", "intrinsics", "--json", "--accept", "converging"]
+    assert main(["calibrate", *words]) == 0
+    first, second = json.loads(capsys.readouterr().out)["inputs"]
+    assert second["used"] and first["used"] and first["begin_s"] > second["begin_s"]
+    assert 20 < first["frames"] < 60
+
+
+def test_recordings_of_other_cameras_are_refused(euroc: Path, tmp_path: Path, capsys) -> None:
+    one = _part(euroc, tmp_path / "one", 0.0, 2.0)
+    two = _part(euroc, tmp_path / "two", 0.0, 2.0)
+    shutil.copytree(two / "mav0/cam0", two / "mav0/cam1")
+    (two / "mav0/cam0").rename(two / "mav0/cam2")
+    files = ["--target", str(euroc / "target.yaml"), "--initial", str(euroc / "initial.yaml")]
+    assert main(["calibrate", str(one), str(two), *files]) == 1
+    assert "has the cameras cam1, cam2, and" in capsys.readouterr().err
