@@ -11,12 +11,6 @@ import sys
 from collections.abc import Sequence
 
 import numpy as np
-from vical_mocks.points import SimulatedRun, simulate
-from vical_mocks.rig import BiasWalk, Rig, nominal_gravity, reference_rig
-from vical_mocks.rotations import exp_so3, log_so3
-from vical_mocks.tracks import simulate_tracks
-
-from benchmarks import euroc_halves
 from vical_mocks.harness.feed import (
     CAMERA,
     CalibratorSubject,
@@ -28,6 +22,12 @@ from vical_mocks.harness.feed import (
     nees,
     points_frame,
 )
+from vical_mocks.points import SimulatedRun, simulate
+from vical_mocks.rig import BiasWalk, Rig, nominal_gravity, reference_rig
+from vical_mocks.rotations import exp_so3, log_so3
+from vical_mocks.tracks import simulate_tracks
+
+from benchmarks import euroc_halves
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
 from vical_daemon.estimation.result import CameraEstimate
 from vical_daemon.vision.target import load_target

@@ -14,8 +14,8 @@ from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json, suggest
 
 if TYPE_CHECKING:
-    from vical_daemon.cli.calibration_run import Job, Outcome
     from vical_daemon.estimation.result import CalibrationEstimate
+    from vical_daemon.offline.calibrate import Job, Outcome
 
 FIX = ("intrinsics", "timeshift", "extrinsics")
 ESTIMATE = ("imu_intrinsics", "readout", "target_scale", "target_shape")
@@ -86,9 +86,9 @@ def run(args: argparse.Namespace) -> int:
     for path in (args.report, args.output):
         if path and not Path(path).absolute().parent.is_dir():
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
-    from vical_daemon.cli import calibration_run
     from vical_daemon.config.priors import Initial, read_initial
     from vical_daemon.logs import open_recording
+    from vical_daemon.offline import calibrate
 
     initial = read_initial(args.initial) if args.initial else Initial()
     if args.target:
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     recordings = [open_recording(p, cameras=[args.camera] if args.camera else ()) for p in args.inputs]
     for warning in (text for recording in recordings for text in recording.warnings):
         print(f"vical: warning: {warning}", file=sys.stderr)
-    job = calibration_run.make_job(
+    job = calibrate.make_job(
         recordings[0],
         initial,
         target=args.target,
@@ -109,16 +109,16 @@ def run(args: argparse.Namespace) -> int:
         skip_s=args.skip,
         seconds=args.seconds,
     )
-    calibration_run.add_recordings(job, recordings[1:], args.imu)
+    calibrate.add_recordings(job, recordings[1:], args.imu)
     bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
-    outcome = calibration_run.run_job(job, bar.show, keep_frames=bool(args.report))
+    outcome = calibrate.run_job(job, bar.show, keep_frames=bool(args.report))
     bar.close()
     return _deliver(args, job, outcome, accepted)
 
 
 def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tuple[str, ...]) -> int:
     """Print, write what was asked for, and say in one line if the result cannot be used as it is."""
-    from vical_daemon.cli.calibration_run import document
+    from vical_daemon.offline.calibrate import document
 
     result = document(job, outcome)
     text = json.dumps(_finite(result), allow_nan=False)
@@ -137,8 +137,8 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
     if status in _UNUSABLE or not result["cameras"]:
-        from vical_daemon.cli.calibration_run import suspects
-        from vical_daemon.cli.input_diagnosis import diagnose_input
+        from vical_daemon.offline.calibrate import suspects
+        from vical_daemon.offline.input_diagnosis import diagnose_input
 
         mistake = diagnose_input(job)
         if mistake:

@@ -232,8 +232,8 @@ class TargetFreeCalibrator:
         elif known is None:
             begun = self._begin(frames, None)
         else:
-            last = self._of_another(frames, known) if self._anew else known
-            begun = last if isinstance(last, str) else self._go_on(frames, last)
+            before = self._of_another(frames, known) if self._anew else known
+            begun = before if isinstance(before, str) else self._go_on(frames, before)
         if isinstance(begun, str):
             self.judge.waiting(begun, self.starter.motion_missing)
             return False

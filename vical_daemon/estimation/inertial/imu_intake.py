@@ -211,7 +211,7 @@ class ImuIntake:
             self._gap = None
 
     def next_recording(self) -> None:
-        """Another recording follows: its stamps are as they should be, and the gap before it is not reported."""
+        """Another recording follows: its stamps are regular again, and the gap before it is not reported."""
         self._believe_gap()
         self._steps, self._set_back_s = StampSteps(), 0.0
         self._spikes.restart()

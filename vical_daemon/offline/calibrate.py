@@ -15,7 +15,6 @@ from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.outgoing import publish
 from vical_daemon.calibrate.estimators import make_estimator
 from vical_daemon.calibrate.worker import EstimateRole
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.config.cross_checks import NEEDS_TARGET
 from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
 from vical_daemon.config.priors import Initial
@@ -25,6 +24,7 @@ from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.logs import Recording, Stream
 from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
+from vical_daemon.offline.errors import InputError, OptionError
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.model.frame_report import FrameReport
@@ -153,21 +153,19 @@ def make_job(
         seconds: See `Job`.
 
     Raises:
-        CliError: No such stream, or something needed is not known.
+        InputError: No such stream, or something needed is not known.
     """
     if skip_s >= recording.duration_s:
-        raise CliError(
-            f"--skip {skip_s:g}: {recording.path} is only {recording.duration_s:.1f} s long", EXIT_USAGE
-        )
+        raise OptionError(f"--skip {skip_s:g}: {recording.path} is only {recording.duration_s:.1f} s long")
     imu_stream = _choose("imu", recording.imus, imu)
     chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
     if not chosen:
-        raise CliError(
+        raise InputError(
             f"{recording.path} holds no camera, neither images nor points; `vical info` shows what is in it"
         )
     priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
     if target is None and any(p.distortion_model == PLUMB_BOB for p in priors.values()):
-        raise CliError(f"--initial: {NEEDS_TARGET}")
+        raise InputError(f"--initial: {NEEDS_TARGET}")
     config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
     config = replace(
         config,
@@ -190,18 +188,18 @@ def add_recordings(job: Job, recordings: Sequence[Recording], imu: str | None = 
         imu: Which; None: the only one.
 
     Raises:
-        CliError: A recording is not of the same cameras, or too short.
+        InputError: A recording is not of the same cameras, or too short.
     """
     for recording in recordings:
         if job.skip_s >= recording.duration_s:
             length = f"{recording.path} is only {recording.duration_s:.1f} s long"
-            raise CliError(f"--skip {job.skip_s:g}: {length}", EXIT_USAGE)
+            raise OptionError(f"--skip {job.skip_s:g}: {length}")
         cameras = _same_cameras(job, recording)
         for name, stream in cameras.items():
             size = job.priors[name].resolution
             if stream.resolution not in (None, size):
                 given, found = ("{} x {}".format(*r) for r in (size, stream.resolution))
-                raise CliError(f"{recording.path}: {name} has images of {found}, those before of {given}")
+                raise InputError(f"{recording.path}: {name} has images of {found}, those before of {given}")
         imu_stream = _choose("imu", recording.imus, imu)
         part = Job(recording, imu_stream, cameras, job.config, job.priors, job.skip_s, job.seconds)
         job.others.append(part)
@@ -215,7 +213,7 @@ def _same_cameras(job: Job, recording: Recording) -> dict[str, Stream]:
     cameras = {name: found[name] for name in job.cameras if name in found}
     if not cameras:
         there, here = ", ".join(found) or "none", ", ".join(job.cameras)
-        raise CliError(f"{recording.path} has the cameras {there}, and {job.recording.path} has {here}")
+        raise InputError(f"{recording.path} has the cameras {there}, and {job.recording.path} has {here}")
     return cameras
 
 
@@ -403,11 +401,9 @@ def _choose(what: str, streams: dict[str, Stream], name: str | None) -> Stream:
         if len(streams) == 1:
             return next(iter(streams.values()))
         known = ", ".join(streams) or "none"
-        raise CliError(
-            f"the recording has {len(streams)} {what}s ({known}); say which with --{what}", EXIT_USAGE
-        )
+        raise OptionError(f"the recording has {len(streams)} {what}s ({known}); say which with --{what}")
     if name not in streams:
-        raise CliError(
+        raise InputError(
             f"there is no {what} {name!r} in the recording (known: {', '.join(streams) or 'none'})"
         )
     return streams[name]
@@ -422,15 +418,14 @@ def _prior(name: str, stream: Stream, initial: Initial, fix: Sequence[str]) -> C
     prior = prior or CameraPrior(resolution=(0, 0))
     if prior.resolution == (0, 0):
         if stream.resolution is None:
-            raise CliError(
+            raise OptionError(
                 f"{name}: the image size is neither in the recording nor in --initial; "
-                f"give a file with `{name}: {{resolution: [width, height]}}`",
-                EXIT_USAGE,
+                f"give a file with `{name}: {{resolution: [width, height]}}`"
             )
         prior = replace(prior, resolution=stream.resolution)
     elif stream.resolution is not None and stream.resolution != prior.resolution:
         given_size, size = ("{} x {}".format(*r) for r in (prior.resolution, stream.resolution))
-        raise CliError(f"{name}: --initial is for images of {given_size}, the recording's are {size}")
+        raise InputError(f"{name}: --initial is for images of {given_size}, the recording's are {size}")
     given = {
         "intrinsics": prior.intrinsics,
         "extrinsics": prior.T_imu_cam,
@@ -438,7 +433,7 @@ def _prior(name: str, stream: Stream, initial: Initial, fix: Sequence[str]) -> C
     }
     for what in fix:
         if given[what] is None:
-            raise CliError(f"--fix {what}: --initial does not give it for {name}", EXIT_USAGE)
+            raise OptionError(f"--fix {what}: --initial does not give it for {name}")
     return prior
 
 
