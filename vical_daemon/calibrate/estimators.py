@@ -48,8 +48,8 @@ class Estimator(Protocol):
         """Whether there is a calibration that another recording of the same rig can go on with."""
         ...
 
-    def next_recording(self) -> None:
-        """What comes now is another recording of the same rig."""
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """What comes now is another recording of the same rig; see `Calibrator.next_recording`."""
         ...
 
     def estimate(self) -> CalibrationEstimate:

@@ -7,11 +7,12 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, suggest
+from vical_daemon.cli.options import add_json, suggest, warn
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.result import CalibrationEstimate
@@ -33,11 +34,12 @@ exit code: 0 converged; 3 there is a result, but it is converging or degenerate 
 1 no result; 2 bad usage
 """
 ACCEPT = ("converging", "degenerate")
+CLOCKS = ("common", "apart")
 _UNUSABLE = ("waiting", "initialising", "inconsistent")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of COMMANDS."""
+def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACCEPT) -> None:
+    """Add the options of COMMANDS; `accept`: words that --accept takes."""
     parser.epilog = _EXAMPLES
     parser.add_argument(
         "inputs",
@@ -72,14 +74,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--accept",
         metavar="STATUS",
         default="",
-        help=f"comma-separated, exit 0 instead of 3 for a result that is: {', '.join(ACCEPT)}",
+        help=f"comma-separated, exit 0 instead of 3 for a result that is: {', '.join(accept)}",
+    )
+    parser.add_argument(
+        "--clock",
+        choices=CLOCKS,
+        default=CLOCKS[0],
+        help="several recordings: one time shift for all (common, default), or one for each (apart)",
     )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate and print; 1 if there is no usable result, 3 if it is not converged."""
-    accepted = _words("--accept", args.accept, ACCEPT)
+    job, accepted = job_of(args)
+    from vical_daemon.offline.calibrate import document, run_job
+
+    bar = ProgressBar(hidden=args.quiet or not sys.stderr.isatty())
+    outcome = run_job(job, bar.show, keep_frames=bool(args.report))
+    bar.close()
+    result = document(job, outcome)
+    write(args, result)
+    for use in outcome.inputs:
+        if use.imu is None:
+            warn(f"{use.path} is not in the result: nothing starts from it")
+    return conclude(args, job, outcome, result, accepted)
+
+
+def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[Job, tuple[str, ...]]:
+    """Check the options and open the recordings; what is to be calibrated, and the words of --accept."""
+    accepted = _words("--accept", args.accept, accept)
     fix, estimate = _words("--fix", args.fix, FIX), _words("--estimate", args.estimate, ESTIMATE)
     if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
@@ -97,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
         load_target(Path(args.target))  # a wrong file is refused before the recording is read
     recordings = [open_recording(p, cameras=[args.camera] if args.camera else ()) for p in args.inputs]
     for warning in (text for recording in recordings for text in recording.warnings):
-        print(f"vical: warning: {warning}", file=sys.stderr)
+        warn(warning)
     job = calibrate.make_job(
         recordings[0],
         initial,
@@ -110,29 +134,32 @@ def run(args: argparse.Namespace) -> int:
         seconds=args.seconds,
     )
     calibrate.add_recordings(job, recordings[1:], args.imu)
-    bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
-    outcome = calibrate.run_job(job, bar.show, keep_frames=bool(args.report))
-    bar.close()
-    return _deliver(args, job, outcome, accepted)
+    job.common_clock = args.clock == CLOCKS[0]
+    return job, accepted
 
 
-def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tuple[str, ...]) -> int:
-    """Print, write what was asked for, and say in one line if the result cannot be used as it is."""
-    from vical_daemon.offline.calibrate import document
-
-    result = document(job, outcome)
+def write(
+    args: argparse.Namespace, result: dict[str, Any], more: Callable[[dict[str, Any]], str] | None = None
+) -> None:
+    """Print the result and write it where it was asked for; `more`: text that goes before, for people."""
     text = json.dumps(_finite(result), allow_nan=False)
     if args.output:
         Path(args.output).write_text(text + "\n", encoding="utf-8")
     if args.json:
         print(text)
-    elif result["cameras"]:
+        return
+    if more is not None:
+        print(more(result) + "\n")
+    if result["cameras"]:
         from vical_daemon.cli.calibration_text import describe
 
         print(describe(result))
-    for use in outcome.inputs:
-        if use.imu is None:
-            print(f"vical: warning: {use.path} is not in the result: nothing starts from it", file=sys.stderr)
+
+
+def conclude(
+    args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any], accepted: tuple[str, ...]
+) -> int:
+    """Write the report; say in one line if the result cannot be used as it is; return the exit code."""
     if args.report and result["cameras"]:
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
@@ -146,7 +173,7 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
         raise CliError(f"no calibration: {status}: {why or 'too little data'} ({suspects(job)})")
     if status == "converged":
         return 0
-    print(f"vical: warning: {status}: {why}", file=sys.stderr)
+    warn(f"{status}: {why}")
     return 0 if status in accepted else EXIT_NOT_CONVERGED
 
 
@@ -185,7 +212,7 @@ def _finite(value: Any) -> Any:
     return [_finite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-class _Bar:
+class ProgressBar:
     """One line on stderr that shows how far it is; only on a terminal and after the first second."""
 
     def __init__(self, *, hidden: bool) -> None:

@@ -59,6 +59,9 @@ COMMANDS = (
     Command("imu", DEVICES, "use an IMU directly: info, stream, decode, gyro bias, self test"),
     Command("camera", DEVICES, "use a camera directly: list, stream, snapshot, controls"),
     Command("calibrate", CALIBRATION, "calibrate from a recording: extrinsics and time shift"),
+    Command(
+        "merge", CALIBRATION, "merge recordings of one rig into one calibration, and name those that disagree"
+    ),
     Command("td-icp", CALIBRATION, "find the time shift between sensors from their rotations"),
     Command(
         "observability", CALIBRATION, "show which parameters a motion determines, and what motion is missing"

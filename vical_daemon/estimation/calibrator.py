@@ -454,11 +454,14 @@ class Calibrator:
         """Whether another recording can go on with this calibration: its start left no direction unknown."""
         return self.filter is not None and self.filter.unshown is None
 
-    def next_recording(self) -> None:
+    def next_recording(self, *, common_clock: bool = True) -> None:
         """What comes from now on is another recording of the same rig; call `finish` first.
 
         Mounting, lens, time shift and all else of cameras, imu and target are the same; motion, biases and
         where the board stands against gravity are new. Where the calibration cannot go on, nothing is kept.
+
+        Args:
+            common_clock: The time shift is the same, too; else it is found again.
         """
         if not self.can_go_on:
             self.filter = None
@@ -480,6 +483,8 @@ class Calibrator:
             self.watch.shift_reopened()
             self._lost = RecordingStart(self.target, {})
             self._seek_shift |= f.drifting  # who knows how far, in the time between
+            if not common_clock:
+                self._seek_shift |= {n for n, c in self.layout.cameras.items() if c.timeshift is not None}
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

@@ -447,7 +447,7 @@ class TargetFreeCalibrator:
         """Whether another recording can continue this calibration: no direction of it is unknown."""
         return self.latest is not None and self.starter.held is None
 
-    def next_recording(self) -> None:
+    def next_recording(self, *, common_clock: bool = True) -> None:
         """What comes from now on is another recording of the same rig; see `Calibrator.next_recording`."""
         if self.can_go_on:
             self._lost(Cause.NONE, keep=True)
@@ -464,7 +464,7 @@ class TargetFreeCalibrator:
         self._imu.next_recording()
         self._images, self._pending, self._set_by_s = ImageIntake(), [], 0.0
         self._newest_s = self._fitted_s = -np.inf
-        self._confirmed = self._seek_shift = False
+        self._confirmed, self._seek_shift = False, self._anew and not common_clock
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:

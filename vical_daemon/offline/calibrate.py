@@ -47,6 +47,7 @@ class Job:
         skip_s: Seconds of the recording that are left out at its beginning.
         seconds: How many are used then; None: all.
         others: Further recordings of the same rig, in the order in which they are used.
+        common_clock: The time shift is the same in all recordings.
     """
 
     recording: Recording
@@ -57,6 +58,7 @@ class Job:
     skip_s: float = 0.0
     seconds: float | None = None
     others: list[Job] = field(default_factory=list)
+    common_clock: bool = True
 
     @property
     def duration_s(self) -> float:
@@ -95,6 +97,7 @@ class InputUse:
         duration_s: Seconds of it that were read.
         frames: Images of it in the result.
         imu: Biases at its end, as in the result; None: it is not in the result.
+        timeshifts_s: By camera, at its end.
     """
 
     path: str
@@ -102,12 +105,14 @@ class InputUse:
     duration_s: float
     frames: int
     imu: dict[str, Any] | None
+    timeshifts_s: dict[str, float] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return it as `--json` prints it."""
         biases = {key: self.imu[key] for key in ("gyro_bias_rps", "accel_bias_mps2")} if self.imu else {}
         rest = {"begin_s": self.begin_s, "duration_s": self.duration_s, "frames": self.frames}
-        return {"path": self.path, "used": self.imu is not None, **rest, **biases}
+        shifts = {"timeshift_cam_imu_s": self.timeshifts_s} if self.imu else {}
+        return {"path": self.path, "used": self.imu is not None, **rest, **biases, **shifts}
 
 
 @dataclass(slots=True)
@@ -228,13 +233,16 @@ def _config(rig: str, imu: Stream, priors: dict[str, CameraPrior], noise: ImuNoi
     )
 
 
-def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outcome:
-    """Push the recording through the roles.
+def run_job(
+    job: Job, progress: Progress, *, keep_frames: bool = False, only: Sequence[int] | None = None
+) -> Outcome:
+    """Push the recordings through the roles.
 
     Args:
         job: What to calibrate.
         progress: Called now and then with the share done and the estimate.
         keep_frames: Collect the verdict on every frame.
+        only: Numbers of the recordings that are used (`Job.parts`), in this order; None: all.
     """
     frames: list[FrameReport] = []
     bus = LocalBus()
@@ -251,7 +259,8 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     for key in (job.imu.key, status_key, *(_points_key(job, name) for name in job.cameras)):
         bus.subscribe(key, role.take)
     _attach_detectors(bus, job)
-    total = sum(_expected(part) for part in job.parts)
+    parts = job.parts if only is None else [job.parts[k] for k in only]
+    total = sum(_expected(part) for part in parts)
     t_shown_s, done = time.monotonic(), 0
 
     def play(part: Job, later_ns: int) -> None:
@@ -271,20 +280,21 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
                     progress(min(done / total, 1.0), role.latest)
         publish(bus, role.finish())
 
-    inputs = _play_all(job, role, play)
+    inputs = _play_all(parts, role, play, common_clock=job.common_clock)
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
-    used = inputs if job.others else []
+    used = inputs if len(parts) > 1 else []
     return Outcome(replace(role.latest, events=events), traces, frames, used)
 
 
-def _play_all(job: Job, role: EstimateRole, play: Callable[[Job, int], None]) -> list[InputUse]:
+def _play_all(
+    parts: Sequence[Job], role: EstimateRole, play: Callable[[Job, int], None], *, common_clock: bool
+) -> list[InputUse]:
     """Play one recording after the other on one time axis.
 
     The calibration goes on from one to the next. Where there is none yet at the end of a recording that could
     go on, the next begins without it, and that recording is tried once more at the end.
     """
-    parts = job.parts
     order = list(range(len(parts)))
     uses: dict[int, InputUse] = {}
     free_ns, frames = parts[0].begin_ns, 0
@@ -303,10 +313,12 @@ def _play_all(job: Job, role: EstimateRole, play: Callable[[Job, int], None]) ->
         ends = turn + 1 == len(order) or (turn + 1 >= len(parts) and not goes_on)
         in_result = of_it > 0 and (goes_on or (ends and bool(role.latest.cameras)))
         imu = asdict(role.latest.imu) if in_result and role.latest.imu is not None else None
-        uses[number] = InputUse(str(part.recording.path), begin_s, part.duration_s, of_it if imu else 0, imu)
+        shifts = {name: c.timeshift_cam_imu_s for name, c in role.latest.cameras.items()}
+        counted = of_it if imu else 0
+        uses[number] = InputUse(str(part.recording.path), begin_s, part.duration_s, counted, imu, shifts)
         if ends:
             break
-        role.next_recording()
+        role.next_recording(common_clock=common_clock)
     return [uses[number] for number in range(len(parts))]
 
 
@@ -341,8 +353,9 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     """Return the result as `--json` prints it; `cpu_s` counts from the start of the process."""
     result = outcome.estimate.to_json()
     result["status"] = str(outcome.estimate.status)
-    result["duration_s"] = sum(part.duration_s for part in job.parts)
+    result["duration_s"] = job.duration_s
     if outcome.inputs:
+        result["duration_s"] = sum(use.duration_s for use in outcome.inputs)
         result["inputs"] = [use.to_json() for use in outcome.inputs]
     for name, camera in result["cameras"].items():
         camera["resolution"] = list(job.priors[name].resolution)
