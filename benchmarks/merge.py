@@ -1,8 +1,8 @@
-"""Ten short recordings of one rig merged, one of them bumped: is it named, and how near the bound is the result?
+"""Ten short recordings of one rig merged, one of them bumped: is it named, how near the bound is the rest?
 
-Each trial: recordings of 5 s with their own motion, biases and lean of the board. The bump turns the camera by
-0.5 deg and moves it by 5 mm in one of them. The result of the others is compared with the Cramér-Rao bound of
-those recordings together, and with that of one recording as long as all of them.
+Each trial: recordings of 5 s with their own motion, biases and lean of the board. The bump turns the camera
+by 0.5 deg and moves it by 5 mm in one of them. The result of the others is compared with the Cramér-Rao bound
+of those recordings together, and with that of one recording as long as all of them.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def trial(seed: int, count: int, seconds: float, *, bump: bool) -> str:
     begin_s = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         folders = [write_asl(Path(folder) / f"r{k}", run, _APART_S * k) for k, run in enumerate(runs)]
-        merged: MergeOutcome = merge(job_of(folders), lambda share, estimate: None)
+        merged: MergeOutcome = merge(job_of(folders), lambda *_: None)
     cpu_s = time.process_time() - begin_s
     camera = merged.outcome.estimate.cameras["cam0"]
     chi, sigma = compare(camera, rigs[0])
@@ -113,8 +113,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--no-bump", action="store_true", help="all recordings agree: false alarms")
     args = parser.parse_args(argv)
     print(
-        "| seed | compared | named | status | NEES/7 | sigmas over the bound of these recordings: arm / rotation / shift "
-        "| over the bound of one long recording | CPU s |"
+        "| seed | compared | named | status | NEES/7 | sigmas over the bound of these recordings: "
+        "arm / rotation / shift | over the bound of one long recording | CPU s |"
     )
     print("|---|---|---|---|---|---|---|---|", flush=True)
     for seed in range(args.first_seed, args.first_seed + args.trials):

@@ -7,12 +7,13 @@ out if the common calibration reports a change within it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.result import CameraEstimate, Status
-from vical_daemon.estimation.tools.agreement import Agreement, agreements, calibrations
+from vical_daemon.estimation.tools.agreement import Agreement, Difference, agreements, calibrations
 from vical_daemon.offline.calibrate import Job, Outcome, Progress, document, run_job
 
 AGREES, DISAGREES, CANNOT_TELL = "agrees", "disagrees", "cannot tell"
@@ -65,7 +66,7 @@ def merge(job: Job, progress: Progress, *, keep_frames: bool = False) -> MergeOu
         changed = [k for k in changed if found[k].agrees is None]
         if not changed or len(used) < 3:
             return MergeOutcome(found, used, outcome)
-        found[changed[0]] = Agreement(False, 0.0)
+        found[changed[0]] = Agreement(False, -math.inf)
         used.remove(changed[0])
 
 
@@ -100,7 +101,7 @@ def merge_document(job: Job, merged: MergeOutcome) -> dict[str, Any]:
         entry |= {
             "verdict": verdict,
             "probability": one.probability,
-            "differences": [asdict(difference) for difference in one.differences],
+            "differences": [_difference(difference) for difference in one.differences],
         }
         inputs.append(entry)
     result["inputs"] = inputs
@@ -110,6 +111,12 @@ def merge_document(job: Job, merged: MergeOutcome) -> dict[str, Any]:
         reason = "the recordings do not agree, and there are too few to tell which one is wrong"
         result |= {"status": str(Status.INCONSISTENT), "reason": reason, "cameras": {}, "trace": []}
     return result
+
+
+def _difference(difference: Difference) -> dict[str, Any]:
+    entry = asdict(difference)
+    del entry["log_probability"]
+    return entry | {"probability": difference.probability}
 
 
 def changed_since(job: Job, merged: MergeOutcome) -> bool:

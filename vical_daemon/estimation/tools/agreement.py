@@ -9,10 +9,10 @@ left out until all others agree (data snooping, Baarda 1968). Those left out are
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, gammaln
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
@@ -49,14 +49,19 @@ class Difference:
         what: `LEVER_ARM`, `ROTATION`, `TIME_SHIFT` or `LENS`.
         value: By how much it differs: m, rad, s, or px and coefficients.
         sigma: Of that, with what both leave open.
-        probability: Of a difference so large by chance.
+        log_probability: Of a difference so large by chance, natural logarithm.
     """
 
     camera: str
     what: str
     value: list[float]
     sigma: list[float]
-    probability: float
+    log_probability: float
+
+    @property
+    def probability(self) -> float:
+        """Of a difference so large by chance; 0 where a float cannot hold it."""
+        return float(np.exp(self.log_probability))
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +70,18 @@ class Agreement:
 
     Attributes:
         agrees: None: it cannot be compared, because it or all others are missing.
-        probability: Of its largest difference by chance.
+        log_probability: Of its largest difference by chance, times their number, natural logarithm.
         differences: All of them.
     """
 
     agrees: bool | None
-    probability: float = 1.0
+    log_probability: float = 0.0
     differences: list[Difference] = field(default_factory=list)
+
+    @property
+    def probability(self) -> float:
+        """Of its largest difference by chance; 0 where a float cannot hold it."""
+        return float(np.exp(self.log_probability))
 
 
 def calibrations(
@@ -127,19 +137,19 @@ def agreements(found: Sequence[Calibration | None], false_alarm: float = FALSE_A
         false_alarm: See `FALSE_ALARM`.
     """
     known = [k for k, calibration in enumerate(found) if calibration]
-    limit = false_alarm / max(len(known), 1)
+    limit = np.log(false_alarm / max(len(known), 1))
     kept = list(known)
     while len(kept) > 2:
         compared = {k: _compare(found, k, kept) for k in kept}
-        worst = min(kept, key=lambda k: compared[k].probability)
-        if compared[worst].probability >= limit:
+        worst = min(kept, key=lambda k: compared[k].log_probability)
+        if compared[worst].log_probability >= limit:
             break
         kept.remove(worst)
     result = [Agreement(None) for _ in found]
     for k in known:
         one = _compare(found, k, kept)
         if one.differences:
-            result[k] = Agreement(one.probability >= limit, one.probability, one.differences)
+            result[k] = replace(one, agrees=bool(one.log_probability >= limit))
     return result
 
 
@@ -157,7 +167,16 @@ def _compare(found: Sequence[Calibration | None], k: int, kept: Sequence[int]) -
         d, P = own.value - rest, own.covariance + P_rest
         square = float(d @ np.linalg.solve(P, d))
         sigma = np.sqrt(np.diag(P))
-        chance = float(chdtrc(len(d), square))
-        differences.append(Difference(*key, d.tolist(), sigma.tolist(), chance))
-    probability = min((d.probability for d in differences), default=1.0) * len(differences)
-    return Agreement(True, min(probability, 1.0), differences)
+        differences.append(Difference(*key, d.tolist(), sigma.tolist(), _log_chance(square, len(d))))
+    if not differences:
+        return Agreement(None)
+    smallest = min(d.log_probability for d in differences) + np.log(len(differences))
+    return Agreement(True, min(float(smallest), 0.0), differences)
+
+
+def _log_chance(square: float, dof: int) -> float:
+    """Logarithm of the probability that chi-square is larger; far out its asymptote, where floats end."""
+    chance = float(chdtrc(dof, square))
+    if chance > 1e-280:
+        return float(np.log(chance))
+    return float((0.5 * dof - 1.0) * np.log(0.5 * square) - 0.5 * square - gammaln(0.5 * dof))
