@@ -14,6 +14,11 @@ from vical_mocks.rig import BiasWalk, nominal_gravity, reference_rig
 from vical_mocks.rotations import exp_so3
 
 from vical_daemon.cli import main
+from vical_daemon.cli import merge as merge_command
+from vical_daemon.estimation.result import CalibrationEstimate, Status
+from vical_daemon.estimation.tools.agreement import Agreement
+from vical_daemon.offline import merge as merge_module
+from vical_daemon.offline.calibrate import Outcome
 
 SHIFT_S, LATE_S = 0.01, 0.05
 
@@ -47,29 +52,24 @@ def _merge(capsys, folders: dict[str, Path], *days: str, more: tuple[str, ...] =
     return code, json.loads(out) if out else {}, err
 
 
-def test_the_bumped_one_is_named_and_left_out(folders, capsys) -> None:
-    code, result, err = _merge(capsys, folders, "monday", "wednesday", "tuesday")
+def test_those_that_disagree_are_named_and_left_out(folders, capsys) -> None:
+    code, result, err = _merge(capsys, folders, "monday", "wednesday", "tuesday", "thursday")
     assert code == 3
-    assert [entry["verdict"] for entry in result["inputs"]] == ["agrees", "disagrees", "agrees"]
-    assert [entry["used"] for entry in result["inputs"]] == [True, False, True]
-    assert result["disagreeing"] == [str(folders["wednesday"])]
+    assert [entry["verdict"] for entry in result["inputs"]] == ["agrees", "disagrees", "agrees", "disagrees"]
+    assert [entry["used"] for entry in result["inputs"]] == [True, False, True, False]
+    assert result["disagreeing"] == [str(folders[day]) for day in ("wednesday", "thursday")]
     assert f"{folders['wednesday']} disagrees" in err and "has the rig changed" in err
-    turn = next(d for d in result["inputs"][1]["differences"] if d["what"] == "rotation")
-    assert np.linalg.norm(turn["value"]) == pytest.approx(0.03, abs=0.006)
-    assert turn["probability"] < 1e-6
+    wednesday, thursday = ({d["what"]: d for d in result["inputs"][k]["differences"]} for k in (1, 3))
+    assert np.linalg.norm(wednesday["rotation"]["value"]) == pytest.approx(0.03, abs=0.006)
+    assert wednesday["rotation"]["probability"] < 1e-6
+    assert thursday["time shift"]["value"] == pytest.approx([LATE_S], abs=2e-3)
+    assert thursday["rotation"]["probability"] > 1e-4 < thursday["lever arm"]["probability"]
     camera = result["cameras"]["cam0"]
-    truth = reference_rig(20).p_imu_cam
     sigma = np.sqrt(np.diag(camera["T_imu_cam"]["covariance"]))[:3]
-    assert (np.abs(np.array(camera["T_imu_cam"]["p_m"]) - truth) < 4.0 * sigma).all()
-    assert result["frames"] > 80
-
-
-def test_of_two_that_disagree_nothing_is_merged(folders, capsys, tmp_path) -> None:
-    code, result, err = _merge(capsys, folders, "monday", "wednesday", more=("-o", str(tmp_path / "r.json")))
-    assert code == 3
-    assert result["status"] == "inconsistent" and result["cameras"] == {}
-    assert json.loads((tmp_path / "r.json").read_text())["disagreeing"] == result["disagreeing"]
-    assert "too few to tell" in err
+    error = np.array(camera["T_imu_cam"]["p_m"]) - reference_rig(20).p_imu_cam
+    assert (np.abs(error) < 4.0 * sigma).all() and result["frames"] > 80
+    text = merge_command.describe_inputs(result)
+    assert "wednesday     6.0 s  disagrees    lever arm" in text
 
 
 def test_clocks_apart_are_found_in_each(folders, capsys) -> None:
@@ -81,11 +81,18 @@ def test_clocks_apart_are_found_in_each(folders, capsys) -> None:
     assert shifts == pytest.approx([SHIFT_S, SHIFT_S + LATE_S], abs=2e-3)
 
 
-def test_with_one_clock_another_time_shift_is_named(folders, capsys) -> None:
-    code, result, err = _merge(capsys, folders, "monday", "tuesday", "thursday")
+def test_of_two_that_disagree_nothing_is_merged(folders, capsys, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(merge_module, "run_job", lambda *_, **__: Outcome(_nothing(), {"cam0": []}))
+    monkeypatch.setattr(merge_module, "agreements", lambda found: [Agreement(False, -50.0)] * len(found))
+    code, result, err = _merge(capsys, folders, "monday", "wednesday", more=("-o", str(tmp_path / "r.json")))
     assert code == 3
-    assert result["disagreeing"] == [str(folders["thursday"])]
-    assert "merge with --clock apart" in err
+    assert result["status"] == "inconsistent" and result["cameras"] == {}
+    assert json.loads((tmp_path / "r.json").read_text())["disagreeing"] == result["disagreeing"]
+    assert "too few to tell" in err
+
+
+def _nothing() -> CalibrationEstimate:
+    return CalibrationEstimate(0, Status.CONVERGED, "", 1.0, "", 6.0, 60, 600, {}, None, [], 1.0, 0.0)
 
 
 def test_one_recording_is_not_enough(folders, capsys) -> None:
