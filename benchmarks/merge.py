@@ -54,10 +54,8 @@ def job_of(folders: list[Path]) -> Job:
 
 
 def bound_of(run: SimulatedRun) -> Bound:
-    """The bound at the end of a recording, lens known."""
-    options = BoundOptions(
-        gravity="free", intrinsics=False, distortion=False, corner_sigma_px=run.options.corner_sigma_px
-    )
+    """The bound at the end of a recording, lens and magnitude of gravity known, as the filter has them."""
+    options = BoundOptions(intrinsics=False, distortion=False, corner_sigma_px=run.options.corner_sigma_px)
     return bounds(run, options, [run.duration_s])[-1]
 
 
