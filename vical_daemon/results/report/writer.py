@@ -108,6 +108,7 @@ def write_report(
         for name in cameras:
             size = (image_sizes or {}).get(name)
             body += CameraPart(result, name, frames or (), size, target_m, images, gallery).sections()
+        body += _inputs_section(result)
         body += _imu_section(result, gallery)
         body += _clock_section(clocks, gallery)
         rows = values.event_rows(result.get("events") or [])
@@ -156,6 +157,22 @@ def trace_of(result: Mapping[str, Any], camera: str) -> list[dict[str, Any]]:
     if isinstance(trace, dict):
         trace = trace.get(camera) or []
     return [p for p in trace if p.get("camera", camera) == camera]
+
+
+def _inputs_section(result: Mapping[str, Any]) -> list[str]:
+    """Of several recordings, what each gave; the time axis of the figures runs on over all of them."""
+    if not result.get("inputs"):
+        return []
+    rows = []
+    for part in result["inputs"]:
+        biases = [part.get("gyro_bias_rps") or [], part.get("accel_bias_mps2") or []]
+        texts = [
+            "  ".join(f"{v:.{digits}f}" for v in bias) for bias, digits in zip(biases, (6, 4), strict=True)
+        ]
+        frames = str(part["frames"]) if part["used"] else "not in the result"
+        rows.append((part["path"], f"{part['begin_s']:.1f}", f"{part['duration_s']:.1f}", frames, *texts))
+    head = ("recording", "begins, s", "length, s", "frames", "gyro bias, rad/s", "accelerometer bias, m/s²")
+    return [page.section("Recordings", page.table(head, rows, 1))]
 
 
 def _clock_section(clocks: Sequence[ClockSeries], gallery: Gallery) -> list[str]:
