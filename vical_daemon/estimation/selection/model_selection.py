@@ -130,20 +130,25 @@ def log_bayes_factor(
         factor: What was learnt beyond the prior is worth so many times less than the covariance says.
         share: Not zero, but as near to it as that share of the prior's sigma, shape (n,); None: zero.
     """
-    information = np.linalg.inv(covariance)
-    learnt = (information - np.eye(len(values))) / factor
-    weighted = information @ values / factor
-    off = _log_evidence(learnt, weighted)
+    L = root(covariance)
+    standard = solve_lower(L, values)
+    # with C = L L' and M M' = I + (factor - 1) L'L: I + (C^-1 - I) / factor = L^-T M M' L^-1 / factor
+    M = root(np.eye(len(values)) + (factor - 1.0) * (L.T @ L))
+    fitted = solve_lower(M, standard)
+    size = np.log(M.diagonal() / L.diagonal()).sum() - 0.5 * len(values) * np.log(factor)
+    off = 0.5 * min(float(fitted @ fitted) / factor, 2.0 * _MOST) - float(size)
     if share is None or not share.any():
         return off
-    return off - _log_evidence(share[:, None] * learnt * share, share * weighted)
+    inverse = solve_lower(L, np.diag(share))  # with the share of each value on its right
+    learnt = (inverse.T @ inverse - np.diag(share**2)) / factor
+    return off - _log_evidence(learnt, inverse.T @ standard / factor)
 
 
 def _log_evidence(learnt: FloatArray, weighted: FloatArray) -> float:
     """Logarithm of how likely data are under a prior of unit variance, over that under exact zeros."""
-    total = np.eye(len(weighted)) + learnt
-    fits = float(weighted @ np.linalg.solve(total, weighted))
-    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(total)[1])
+    L = root(np.eye(len(weighted)) + learnt)
+    fitted = solve_lower(L, weighted)
+    return 0.5 * min(float(fitted @ fitted), 2.0 * _MOST) - float(np.log(L.diagonal()).sum())
 
 
 def factor(f: CalibrationFilter) -> float:
