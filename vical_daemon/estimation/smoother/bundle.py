@@ -289,7 +289,7 @@ class Bundle:
         tail = order.tail
         L22 = np.tril(root[tail:, tail:])
         try:
-            covariance = np.linalg.inv(L22 @ L22.T)
+            covariance = np.asarray(np.linalg.inv(L22 @ L22.T), dtype=np.float64)
         except np.linalg.LinAlgError:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
@@ -318,7 +318,7 @@ class Bundle:
 
 
 def _in_place(H: FloatArray) -> tuple[FloatArray, int]:
-    """Lower Cholesky factor of a symmetric matrix, in its place, rubbish above the diagonal; and LAPACK's info.
+    """Lower Cholesky factor of a symmetric matrix in its place, with rubbish above it; and LAPACK's info.
 
     Seen as its transpose it is in LAPACK's order: neither copying nor zeroing it saves a third of the time.
     """
