@@ -62,9 +62,10 @@ def run(frames: int) -> None:
     )
     for name, cost in _costs(duration_s):
         each = cost.images_ms
-        spent = f"{cost.start_s:.2f} | {np.median(each):.2f} | {np.mean(each):.2f}"
+        median = "-" if "target-free" in name else f"{np.median(each):.2f}"  # most images only wait there
+        spent = f"{cost.start_s:.2f} | {median} | {np.mean(each):.2f}"
         print(f"| {name} | {cost.points:.0f} | {spent} |", flush=True)
-    print(f"\nAn inertial reading is taken in in {_reading_us():.0f} us.")
+    print(f"\nIntake of an inertial reading: {_reading_us():.0f} us.")
 
 
 def _costs(duration_s: float) -> Iterable[tuple[str, Cost]]:
