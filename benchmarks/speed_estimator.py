@@ -1,8 +1,7 @@
-"""CPU time of the estimator: an image with a board and without one, an inertial reading, the start."""
+"""The estimator of `benchmarks speed`: images with and without a board, inertial readings, the start."""
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -44,14 +43,6 @@ class Cost(NamedTuple):
     points: float
     start_s: float
     images_ms: list[float]
-
-
-def main(argv: list[str]) -> int:
-    """Run and print Markdown tables."""
-    parser = argparse.ArgumentParser(prog="benchmarks speed_estimator", description=__doc__)
-    parser.add_argument("--frames", type=int, default=240, help="images after the start")
-    run(parser.parse_args(argv).frames)
-    return 0
 
 
 def run(frames: int) -> None:

@@ -43,6 +43,15 @@ class Estimator(Protocol):
         """End of the data."""
         ...
 
+    @property
+    def can_go_on(self) -> bool:
+        """Whether there is a calibration that another recording of the same rig can go on with."""
+        ...
+
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """What comes now is another recording of the same rig; see `Calibrator.next_recording`."""
+        ...
+
     def estimate(self) -> CalibrationEstimate:
         """Return the current estimate, with the events since the last call."""
         ...

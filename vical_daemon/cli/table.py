@@ -46,6 +46,7 @@ COMMANDS = (
     Command("check", START, "check the config and the devices"),
     Command("doctor", START, "check this computer for causes of bad stamps"),
     Command("target", START, "write a board to print, to scale, and its target file"),
+    Command("completion", START, "print a completion script for bash or zsh"),
     Command("run", SERVICE, "run the daemon, or single roles of it"),
     Command("watch", SERVICE, "show the calibration live in the terminal"),
     Command("web", SERVICE, "serve a page with the live calibration, on loopback"),
@@ -58,6 +59,9 @@ COMMANDS = (
     Command("imu", DEVICES, "use an IMU directly: info, stream, decode, gyro bias, self test"),
     Command("camera", DEVICES, "use a camera directly: list, stream, snapshot, controls"),
     Command("calibrate", CALIBRATION, "calibrate from a recording: extrinsics and time shift"),
+    Command(
+        "merge", CALIBRATION, "merge recordings of one rig into one calibration, and name those that disagree"
+    ),
     Command("td-icp", CALIBRATION, "find the time shift between sensors from their rotations"),
     Command(
         "observability", CALIBRATION, "show which parameters a motion determines, and what motion is missing"

@@ -81,6 +81,16 @@ class TargetFreeRig:
         """End of the data: everything that inertial data cover."""
         return _in_order(part.finish() for part in self.parts.values())
 
+    @property
+    def can_go_on(self) -> bool:
+        """Whether another recording can go on with what is known of any camera."""
+        return any(part.can_go_on for part in self.parts.values())
+
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """What comes from now on is another recording of the same rig."""
+        for part in self.parts.values():
+            part.next_recording(common_clock=common_clock)
+
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         return together({name: part.estimate() for name, part in self.parts.items()})

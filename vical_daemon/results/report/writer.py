@@ -98,6 +98,7 @@ def write_report(
             points = gather(frames or (), name)
             size = _image_size(name, camera, points, image_sizes or {})
             body += _camera_sections(name, camera, _trace(result, name), points, size, gallery)
+        body += _inputs_section(result)
         body.append(page.section("IMU and gravity", page.table(values.HEAD, values.imu_rows(dict(result)))))
         body += _clock_section(clocks, gallery)
         body.append(_provenance_section(provenance or collect()))
@@ -205,6 +206,22 @@ def _residual_figures(
 _COVERAGE_HINT = (
     "Large parts of the image never saw the board: move it into the corners to pin the lens down."
 )
+
+
+def _inputs_section(result: Mapping[str, Any]) -> list[str]:
+    """Of several recordings, what each gave; the time axis of the figures runs on over all of them."""
+    if not result.get("inputs"):
+        return []
+    rows = []
+    for part in result["inputs"]:
+        biases = [part.get("gyro_bias_rps") or [], part.get("accel_bias_mps2") or []]
+        texts = [
+            "  ".join(f"{v:.{digits}f}" for v in bias) for bias, digits in zip(biases, (6, 4), strict=True)
+        ]
+        frames = str(part["frames"]) if part["used"] else "not in the result"
+        rows.append((part["path"], f"{part['begin_s']:.1f}", f"{part['duration_s']:.1f}", frames, *texts))
+    head = ("recording", "begins, s", "length, s", "frames", "gyro bias, rad/s", "accelerometer bias, m/s²")
+    return [page.section("Recordings", page.table(head, rows, numeric_from=1))]
 
 
 def _clock_section(clocks: Sequence[ClockSeries], gallery: _Gallery) -> list[str]:
