@@ -13,6 +13,7 @@ from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
     ENTRY_SIGMA,
+    GRAVITY_SIGMA_RAD,
     GYRO_BIAS_SIGMA_RPS,
     KNOWN_OFF_SIGMA,
     KNOWN_SIZE_SIGMA,
@@ -96,7 +97,7 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection
         before_m = min(_before_board_m(state, name) for name in layout.cameras)
         lever_arm, position, angle = min(0.15, 0.35 * before_m), min(0.1, 0.25 * before_m), 0.1
     s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
-    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, 0.1
+    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA
     if layout.accel_lag is not None:

@@ -16,6 +16,8 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer, ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence, Strapdown, influence, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
+from vical_daemon.estimation.model.unscented import root as root_of
+from vical_daemon.estimation.model.unscented import solve_lower
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
 _ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be told as zero
@@ -73,7 +75,7 @@ def make_link(
     motion, errors, by_imu = _integrated(segment, imu[:6], imu[6:])
     covariance = errors.noise(noise)[_ORDER[:, None], _ORDER] + _ROUNDING
     try:
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        root = solve_lower(root_of(covariance), np.eye(9))
     except np.linalg.LinAlgError:
         return None
     return Link(

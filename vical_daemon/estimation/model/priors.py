@@ -10,6 +10,8 @@ GYRO_BIAS_SIGMA_RPS = 0.02
 """1.1 deg/s: four times the initial bias error of the datasheet (3DM-GX3-25: 0.25 deg/s)."""
 ACCEL_BIAS_SIGMA_MPS2 = 0.3
 """Fifteen times the initial bias error of the datasheet (3DM-GX3-25: 0.002 g)."""
+GRAVITY_SIGMA_RAD = 0.1
+"""Tilt of gravity in the world of a board that the closed form has found."""
 SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s; two poor crystals."""
 ENTRY_SIGMA = 2e-3
