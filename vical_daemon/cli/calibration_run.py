@@ -146,13 +146,20 @@ def _config(rig: str, imu: Stream, priors: dict[str, CameraPrior], noise: ImuNoi
     )
 
 
-def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outcome:
+def run_job(
+    job: Job,
+    progress: Progress,
+    *,
+    keep_frames: bool = False,
+    enough: Callable[[CalibrationEstimate], bool] | None = None,
+) -> Outcome:
     """Push the recording through the roles.
 
     Args:
         job: What to calibrate.
         progress: Called now and then with the share done and the estimate.
         keep_frames: Collect the verdict on every frame.
+        enough: Called with each estimate, once a second of data; True: the rest is not needed.
     """
     frames: list[FrameReport] = []
     bus = LocalBus()
@@ -164,9 +171,12 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     events: list[Event] = []
 
     def listen(estimate: CalibrationEstimate) -> CalibrationEstimate:
+        nonlocal done
         events.extend(estimate.events)
+        done = done or (enough is not None and enough(estimate))
         return estimate
 
+    done = False
     role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, inspect=listen, keep=keep)
     status_key = topics.STATUS.key(job.config.rig, "imu")
     for key in (job.imu.key, status_key, *(_points_key(job, name) for name in job.cameras)):
@@ -175,13 +185,15 @@ def run_job(job: Job, progress: Progress, *, keep_frames: bool = False) -> Outco
     count = job.imu.count + sum(stream.count for stream in job.cameras.values())
     total = count * job.duration_s / max(job.recording.duration_s, 1e-9)
     t_shown_s = time.monotonic()
-    for done, (key, payload) in enumerate(job.messages()):
+    for number, (key, payload) in enumerate(job.messages()):
+        if done:
+            break
         bus.publish(key, payload)
         if key != job.imu.key:
             publish(bus, role.step())
             if time.monotonic() - t_shown_s > 0.1:
                 t_shown_s = time.monotonic()
-                progress(min(done / total, 1.0), role.latest)
+                progress(min(number / total, 1.0), role.latest)
     publish(bus, role.finish())
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
@@ -193,6 +205,7 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     result = outcome.estimate.to_json()
     result["status"] = str(outcome.estimate.status)
     result["duration_s"] = job.duration_s
+    result["fixed"] = sorted(job.config.calibration.fix)
     for name, camera in result["cameras"].items():
         camera["resolution"] = list(job.priors[name].resolution)
     if result["imu"] is not None:

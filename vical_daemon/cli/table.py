@@ -59,6 +59,7 @@ COMMANDS = (
     Command("camera", DEVICES, "use a camera directly: list, stream, snapshot, controls"),
     Command("calibrate", CALIBRATION, "calibrate from a recording: extrinsics and time shift"),
     Command("td-icp", CALIBRATION, "find the time shift between sensors from their rotations"),
+    Command("verify", CALIBRATION, "check whether a calibration still holds for a recording"),
     Command(
         "observability", CALIBRATION, "show which parameters a motion determines, and what motion is missing"
     ),
@@ -67,6 +68,7 @@ COMMANDS = (
     Command("info", LOGS, "show topics, rates, gaps, drops, jitter and duration of a recording"),
     Command("replay", LOGS, "play a recording on the bus in real time"),
     Command("recover", LOGS, "repair an unfinished MCAP file"),
+    Command("compare", RESULTS, "compare calibrations: in joint sigmas, and in pixels over the image"),
     Command("export", RESULTS, "export a calibration to the format of other software"),
 )
 

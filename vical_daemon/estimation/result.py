@@ -57,6 +57,8 @@ class CameraEstimate:
         readout_sigma_s: Its standard deviation, s.
         resolution: width, height of the images, px; []: not known (it does not travel in the message).
         withheld: The same as `unobservable`, as data; [] in logs of older versions.
+        joint_covariance: Of [px py pz rx ry rz, time shift, fx fy cx cy, distortion] together, m, rad, s, px, rotation
+            error local (right); zero rows where not estimated; []: not known (it does not travel in the message).
     """
 
     T_imu_cam: PoseEstimate
@@ -74,6 +76,7 @@ class CameraEstimate:
     readout_sigma_s: float = 0.0
     resolution: list[int] = field(default_factory=list)
     withheld: list[WeakDirection] = field(default_factory=list)
+    joint_covariance: list[list[float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,1 @@
+"""Use cases on files, each callable from Python."""
