@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         skip_s=args.skip,
         seconds=args.seconds,
     )
-    bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
+    bar = ProgressBar(hidden=args.quiet or not sys.stderr.isatty())
     outcome = calibration_run.run_job(job, bar.show, keep_frames=bool(args.report))
     bar.close()
     return _deliver(args, job, outcome, accepted)
@@ -172,7 +172,7 @@ def finite(value: Any) -> Any:
     return [finite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-class _Bar:
+class ProgressBar:
     """One line on stderr that shows how far it is; only on a terminal and after the first second."""
 
     def __init__(self, *, hidden: bool) -> None:

@@ -60,9 +60,9 @@ def _rows(apart: Difference) -> list[str]:
         for k, label in labels:
             d, sigma = scale * apart.d[k], scale * apart.sigma[k]
             z = apart.d[k] / apart.sigma[k]
-            left_open = "  left open" if abs(z) < _OPEN_Z else ""
+            left_open = "  left open by both" if abs(z) < _OPEN_Z else ""
             name = f"{block} {label}".strip()
-            lines.append(f"  {name:<14}{d:>+12.{digits}f}{sigma:>11.{digits}f}{z:>8.1f} {unit:<4}{left_open}")
+            lines.append(f"  {name:<14}{d:>+12.{digits}f}{sigma:>11.{digits}f}{z:>8.1f} {unit:<4}{left_open}".rstrip())
     return lines
 
 
@@ -103,6 +103,8 @@ def _pixels(m: PixelMap, *, full: bool) -> list[str]:
     )
     if not full:
         return [head]
+    if not m.least_px.any():
+        return [head, *("  " + "".join(f"{x:8.2f}" for x in row) for row in m.apart_px)]
     lines = [head, f"  {'px, over the image':<{8 * m.apart_px.shape[1] + 2}}  after what both leave open"]
     for all_px, least_px in zip(m.apart_px, m.least_px, strict=True):
         lines.append("  " + "".join(f"{x:8.2f}" for x in all_px) + "  |" + "".join(f"{x:8.2f}" for x in least_px))

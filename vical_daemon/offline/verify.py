@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -80,22 +80,26 @@ class Verifier:
         return all(check.answer is not Answer.CANNOT_TELL for check in self.cameras.values())
 
     def _weigh(self, check: CameraCheck, found: KnownCamera) -> None:
-        if not check.lens_asked:
-            found = found.without_lens()
         try:
-            apart = difference(check.stored, found)
+            weighed = self._odds(check, found if check.lens_asked else found.without_lens())
+            if not check.lens_asked:
+                # `changed` must stand even if the lens is off; `holds` is said for the lens as given
+                taken = self._odds(check, found.given_lens())
+                weighed = replace(weighed, log_holds=taken.log_holds, visible=taken.visible)
         except NotComparable as error:
             check.why = str(error)
             return
-        n = len(apart.d)
-        focal_px = 1.0 if check.stored.lens is None else float(check.stored.lens[0])
-        counts = self.counts.of_errors(focal_px, n)
-        check.odds = weighed = odds(apart.d, apart.covariance, apart.covariance_a, counts)
-        check.why = ""
+        check.odds, check.why = weighed, ""
         if not weighed.undecided:
             check.answer = Answer.HOLDS
         elif weighed.log_changed > math.log(len(self.cameras) / FALSE_ALARM):
             check.answer = Answer.CHANGED
+
+    def _odds(self, check: CameraCheck, found: KnownCamera) -> Odds:
+        apart = difference(check.stored, found)
+        focal_px = 1.0 if check.stored.lens is None else float(check.stored.lens[0])
+        counts = self.counts.of_errors(focal_px, len(apart.d))
+        return odds(apart.d, apart.covariance, apart.covariance_a, counts)
 
     @property
     def answer(self) -> Answer:

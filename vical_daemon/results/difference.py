@@ -58,7 +58,7 @@ class Difference:
         P = self.b.covariance
         gain = np.linalg.pinv(P[LENS, LENS], rcond=1e-12, hermitian=True) @ P[LENS, :7]
         d = self.d[:7] - gain.T @ self.d[LENS]
-        own = self.a.without_lens().covariance
+        own = self.a.given_lens().covariance
         S = P[:7, :7] - P[:7, LENS] @ gain + own
         bare = replace(self.a, lens=None), replace(self.b, lens=None)
         return Difference(*bare, d, S, np.sqrt(np.diag(S)), own, self.model, 0.0, self.common_s)

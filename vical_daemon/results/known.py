@@ -69,9 +69,13 @@ class KnownCamera:
         """Standard deviations, shape (7 + n,)."""
         return np.sqrt(np.diag(self.covariance) / self.inflation)
 
-    def without_lens(self) -> KnownCamera:
-        """The same for a given lens: mounting and time shift are known as well as that lens makes them."""
+    def given_lens(self) -> KnownCamera:
+        """The same if its lens is taken to be right: mounting and time shift are known as well as that makes them."""
         return replace(self, lens=None, covariance=given(self.covariance, LENS), lens_held=True)
+
+    def without_lens(self) -> KnownCamera:
+        """Mounting and time shift alone, whatever the lens."""
+        return replace(self, lens=None, covariance=self.covariance[:7, :7])
 
 
 def known_cameras(rig: Rig, source: str) -> dict[str, KnownCamera]:
