@@ -70,7 +70,9 @@ def again(run: SimulatedRun, rig: Rig, seed: int, seconds: float, *, target_free
     return simulate_tracks(_SEED_OF_TODAY + seed, seconds, rig=rig, landmarks_m=run.points_m, **options)
 
 
-def estimate(run: SimulatedRun, prior: CameraPrior, *, target_free: bool, verifier: Verifier | None = None) -> Any:
+def estimate(
+    run: SimulatedRun, prior: CameraPrior, *, target_free: bool, verifier: Verifier | None = None
+) -> Any:
     """Calibrate; with a verifier until it knows, looking once a second."""
     options = CalibrationOptions(target_free=target_free, imu_noise=imu_noise(run))
     subject = CalibratorSubject(options, prior, None if target_free else run.points_m)
@@ -114,7 +116,12 @@ def trial(target_free: bool, stored_s: float, seconds: float, seed: int) -> runn
     verifier = Verifier({CAMERA: CameraCheck(known, lens_asked=True)})
     estimate(today, prior, target_free=target_free, verifier=verifier)
     document = verifier.document()
-    return {"way": way, "answer": document["verdict"], "document": document, "sigma": known.sigma[:7].tolist()}
+    return {
+        "way": way,
+        "answer": document["verdict"],
+        "document": document,
+        "sigma": known.sigma[:7].tolist(),
+    }
 
 
 def print_summary(results: list[runner.Result]) -> None:
@@ -149,7 +156,9 @@ def main(argv: list[str]) -> int:
     """Run the study."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks verify", description=__doc__)
     runner.add_arguments(parser, trials=40, seconds=5.0)
-    parser.add_argument("--stored", type=float, default=30.0, metavar="S", help="length of the first recording")
+    parser.add_argument(
+        "--stored", type=float, default=30.0, metavar="S", help="length of the first recording"
+    )
     parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
     args = parser.parse_args(argv)
     name = f"verify_{'free' if args.target_free else 'board'}_{args.stored:g}_{args.seconds:g}s"

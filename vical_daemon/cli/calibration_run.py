@@ -169,6 +169,7 @@ def run_job(
         estimator.stamps_known_to(stamp_sigma_s)
     keep = frames.extend if keep_frames else None
     events: list[Event] = []
+    done = False
 
     def listen(estimate: CalibrationEstimate) -> CalibrationEstimate:
         nonlocal done
@@ -176,7 +177,6 @@ def run_job(
         done = done or (enough is not None and enough(estimate))
         return estimate
 
-    done = False
     role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, inspect=listen, keep=keep)
     status_key = topics.STATUS.key(job.config.rig, "imu")
     for key in (job.imu.key, status_key, *(_points_key(job, name) for name in job.cameras)):

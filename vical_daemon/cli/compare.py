@@ -30,7 +30,9 @@ exit code: 0 same; 4 changed; 5 not comparable; 1 a source cannot be read; 2 bad
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the sources and what to show."""
     parser.epilog = _EPILOG
-    parser.add_argument("sources", metavar="SOURCE", nargs="+", help="calibrations: two, with --matrix any number")
+    parser.add_argument(
+        "sources", metavar="SOURCE", nargs="+", help="calibrations: two, with --matrix any number"
+    )
     parser.add_argument("--camera", metavar="NAME", help="only this camera")
     parser.add_argument("--map", action="store_true", help="show the whole map of pixel differences")
     parser.add_argument(
@@ -49,7 +51,9 @@ def run(args: argparse.Namespace) -> int:
     if args.distance and not all(0.0 < d < 1e6 for d in args.distance):
         raise CliError("--distance must be above 0 m", EXIT_USAGE)
     if len(args.sources) < 2 or (len(args.sources) > 2 and not args.matrix):
-        raise CliError(f"two calibrations are compared, {len(args.sources)} are named (more: --matrix)", EXIT_USAGE)
+        raise CliError(
+            f"two calibrations are compared, {len(args.sources)} are named (more: --matrix)", EXIT_USAGE
+        )
     if args.matrix:
         return _matrix(args)
     comparison = _compare(args, *args.sources)

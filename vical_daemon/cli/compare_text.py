@@ -11,7 +11,9 @@ from vical_daemon.results.compare import FALSE_ALARM
 from vical_daemon.results.difference import Difference
 from vical_daemon.results.pixel_map import PixelMap
 
-_OPEN_Z = 2.0  # below it a difference is within what both leave open; marked for the eye, no verdict hangs on it
+_OPEN_Z = (
+    2.0  # below it a difference is within what both leave open; marked for the eye, no verdict hangs on it
+)
 
 
 def describe(comparison: Comparison, *, with_map: bool) -> str:
@@ -43,7 +45,7 @@ def _camera(camera: CameraComparison, *, with_map: bool) -> list[str]:
     lines += _rows(apart)
     if apart.unlike_px > 0.0:
         lines.append(
-            f"  lenses of two models, compared as {apart.model}; {apart.unlike_px:.2f} px RMS cannot be compared"
+            f"  lenses of two models, compared as {apart.model}: leaves {apart.unlike_px:.2f} px RMS apart"
         )
     lines += _about_the_lens(camera)
     for m in camera.maps:
@@ -62,7 +64,9 @@ def _rows(apart: Difference) -> list[str]:
             z = apart.d[k] / apart.sigma[k]
             left_open = "  left open by both" if abs(z) < _OPEN_Z else ""
             name = f"{block} {label}".strip()
-            lines.append(f"  {name:<14}{d:>+12.{digits}f}{sigma:>11.{digits}f}{z:>8.1f} {unit:<4}{left_open}".rstrip())
+            lines.append(
+                f"  {name:<14}{d:>+12.{digits}f}{sigma:>11.{digits}f}{z:>8.1f} {unit:<4}{left_open}".rstrip()
+            )
     return lines
 
 
@@ -89,8 +93,9 @@ def _about_the_lens(camera: CameraComparison) -> list[str]:
     verdict = f"changed: {', '.join(left.blocks)}" if left.changed else "same"
     return [
         "",
-        f"  {held} held its lens at given values, {free} estimated it. With the lens of {held}, {free} would have a",
-        f"  mounting that differs by {mm:.2f} mm and {deg:.3f} deg: {verdict} (by chance {left.probability:.2g})",
+        f"  {held} held its lens at given values, {free} estimated it. With the lens of {held}, {free} has",
+        f"  a mounting that differs by {mm:.2f} mm and {deg:.3f} deg: {verdict} "
+        f"(by chance {left.probability:.2g})",
     ]
 
 
@@ -98,8 +103,8 @@ def _pixels(m: PixelMap, *, full: bool) -> list[str]:
     """The map of one distance: two figures, or all of them."""
     at = f"at {m.distance_m:g} m"
     head = (
-        f"  {at}: projections differ by {_rms(m.apart_px):.2f} px RMS, at most {np.nanmax(m.apart_px):.2f} px; "
-        f"after what both leave open: {_rms(m.least_px):.2f} px, at most {np.nanmax(m.least_px):.2f} px"
+        f"  {at}: projections differ by {_rms(m.apart_px):.2f} px RMS, {np.nanmax(m.apart_px):.2f} at most; "
+        f"after what both leave open: {_rms(m.least_px):.2f} and {np.nanmax(m.least_px):.2f} px"
     )
     if not full:
         return [head]
@@ -107,7 +112,9 @@ def _pixels(m: PixelMap, *, full: bool) -> list[str]:
         return [head, *("  " + "".join(f"{x:8.2f}" for x in row) for row in m.apart_px)]
     lines = [head, f"  {'px, over the image':<{8 * m.apart_px.shape[1] + 2}}  after what both leave open"]
     for all_px, least_px in zip(m.apart_px, m.least_px, strict=True):
-        lines.append("  " + "".join(f"{x:8.2f}" for x in all_px) + "  |" + "".join(f"{x:8.2f}" for x in least_px))
+        lines.append(
+            "  " + "".join(f"{x:8.2f}" for x in all_px) + "  |" + "".join(f"{x:8.2f}" for x in least_px)
+        )
     return lines
 
 
@@ -119,5 +126,7 @@ def _imu(d: FloatArray, sigma: FloatArray) -> list[str]:
     lines = ["imu biases (they walk: not part of the verdict)"]
     for k, (name, axis) in enumerate((n, axis) for n in ("gyro bias", "accel. bias") for axis in "xyz"):
         unit = "rad/s" if k < 3 else "m/s^2"
-        lines.append(f"  {name + ' ' + axis:<14}{d[k]:>+12.5f}{sigma[k]:>11.5f}{d[k] / sigma[k]:>8.1f} {unit}")
+        lines.append(
+            f"  {name + ' ' + axis:<14}{d[k]:>+12.5f}{sigma[k]:>11.5f}{d[k] / sigma[k]:>8.1f} {unit}"
+        )
     return lines

@@ -51,7 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--initial", metavar="FILE", help="the lens and the IMU's noise, where SOURCE does not give them"
     )
     parser.add_argument(
-        "--fix", choices=("intrinsics",), help="ask about mounting and time shift alone, for the lens as given"
+        "--fix",
+        choices=("intrinsics",),
+        help="ask about mounting and time shift alone, for the lens as given",
     )
     parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
     parser.add_argument("--seconds", type=float, metavar="S", help="use only S seconds (after --skip)")
@@ -60,7 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     counts.add_argument("--rotation-deg", type=float, default=0.2, metavar="DEG", help="default 0.2")
     counts.add_argument("--timeshift-ms", type=float, default=1.0, metavar="MS", help="default 1")
     counts.add_argument(
-        "--focal-percent", type=float, default=0.5, metavar="P", help="default 0.5; of the principal point, too"
+        "--focal-percent",
+        type=float,
+        default=0.5,
+        metavar="P",
+        help="default 0.5; of the principal point, too",
     )
     add_json(parser)
 
@@ -119,7 +125,9 @@ def _verifier(
     missing = [name for name in cameras if name not in known]
     if missing:
         there = ", ".join(known)
-        raise CliError(f"{against} has no camera {missing[0]!r} (it has {there}); choose with --camera", EXIT_USAGE)
+        raise CliError(
+            f"{against} has no camera {missing[0]!r} (it has {there}); choose with --camera", EXIT_USAGE
+        )
     checks = {
         name: CameraCheck(known[name].given_lens() if held else known[name], lens_asked=not held)
         for name in cameras
@@ -134,7 +142,8 @@ def _initial(args: argparse.Namespace, known: dict[str, KnownCamera], rig: Rig |
 
     given = read_initial(args.initial) if args.initial else Initial()
     cameras = {
-        name: replace(prior, T_imu_cam=None, timeshift_cam_imu_s=None) for name, prior in given.cameras.items()
+        name: replace(prior, T_imu_cam=None, timeshift_cam_imu_s=None)
+        for name, prior in given.cameras.items()
     }
     for name, camera in known.items():
         if camera.lens is None:

@@ -57,8 +57,9 @@ class CameraEstimate:
         readout_sigma_s: Its standard deviation, s.
         resolution: width, height of the images, px; []: not known (it does not travel in the message).
         withheld: The same as `unobservable`, as data; [] in logs of older versions.
-        joint_covariance: Of [px py pz rx ry rz, time shift, fx fy cx cy, distortion] together, m, rad, s, px, rotation
-            error local (right); zero rows where not estimated; []: not known (it does not travel in the message).
+        joint_covariance: Of [px py pz rx ry rz, time shift, fx fy cx cy, distortion] together, m, rad, s, px,
+            rotation error local (right); zero rows where not estimated; []: not known (it does not travel in
+            the message).
     """
 
     T_imu_cam: PoseEstimate

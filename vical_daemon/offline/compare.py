@@ -10,7 +10,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.offline.sources import SourceError, read_known
 from vical_daemon.results.compare import FALSE_ALARM, Verdict, judge
-from vical_daemon.results.difference import Difference, NotComparable, difference
+from vical_daemon.results.difference import Difference, NotComparableError, difference
 from vical_daemon.results.export import Rig
 from vical_daemon.results.known import KnownCamera, keys
 from vical_daemon.results.pixel_map import PixelMap, pixel_map
@@ -107,7 +107,9 @@ class Comparison:
         }
 
 
-def compare(a: str, b: str, *, camera: str | None = None, distances_m: tuple[float, ...] = DISTANCES_M) -> Comparison:
+def compare(
+    a: str, b: str, *, camera: str | None = None, distances_m: tuple[float, ...] = DISTANCES_M
+) -> Comparison:
     """Compare two sources.
 
     Args:
@@ -137,7 +139,12 @@ def _pairs(
     if not names and camera is None and len(a) == len(b) == 1:
         (x,), (y,) = a.values(), b.values()
         return [(x, y)], [f"{x.name} of the first is compared with {y.name} of the second"]
-    only = [f"{name} is only in {known[name].source}" for known, other in ((a, b), (b, a)) for name in known if name not in other]
+    only = [
+        f"{name} is only in {known[name].source}"
+        for known, other in ((a, b), (b, a))
+        for name in known
+        if name not in other
+    ]
     return [(a[name], b[name]) for name in names], only if camera is None else []
 
 
@@ -145,7 +152,7 @@ def _compare(a: KnownCamera, b: KnownCamera, distances_m: tuple[float, ...]) -> 
     names = (a.name, b.name)
     try:
         apart = difference(a, b)
-    except NotComparable as error:
+    except NotComparableError as error:
         return CameraComparison(names, str(error))
     verdict = judge(apart)
     maps = tuple(m for distance_m in distances_m if (m := pixel_map(apart, distance_m)) is not None)

@@ -26,6 +26,7 @@ def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
         ExportError: A file that is not of the expected form.
     """
     from vical_daemon.config.priors import read_initial
+    from vical_daemon.config.strict_yaml import ConfigError
     from vical_daemon.results.export import ExportError
     from vical_daemon.results.known import known_cameras, known_prior
 
@@ -33,10 +34,13 @@ def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
     try:
         rig = read_source(source)
         return known_cameras(rig, path.name), rig
-    except ExportError:
+    except ExportError as error:
         if path.suffix not in (".yaml", ".yml"):
             raise
-    priors = read_initial(path).cameras
+        try:
+            priors = read_initial(path).cameras
+        except ConfigError:
+            raise error from None
     found = {name: known_prior(name, prior, path.name) for name, prior in priors.items()}
     known = {name: camera for name, camera in found.items() if camera is not None}
     if not known:
@@ -65,7 +69,10 @@ def read_source(source: str) -> Rig:
     document = _read_json(path)
     note = f"vical, from {path.name}"
     if isinstance(document.get("estimate"), dict):  # a file of the store
-        devices = {"imu": document.get("imu_serial"), f"camera/{document.get('camera')}": document.get("camera_serial")}
+        devices = {
+            "imu": document.get("imu_serial"),
+            f"camera/{document.get('camera')}": document.get("camera_serial"),
+        }
         return rig_from_json(document["estimate"] | {"devices": devices}, note=note)
     return rig_from_json(document, note=note)
 
@@ -147,5 +154,3 @@ def _from_store() -> Rig:
     estimate = with_changes(stored[-1].estimate, cameras=cameras)
     devices = {"imu": stored[-1].imu_serial} | {f"camera/{e.camera}": e.camera_serial for e in stored}
     return replace(rig_from_estimate(estimate, note="vical, from the store"), devices=devices)
-
-

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.camera_rays import rays_over_image
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.results.change_odds import FALSE_ALARM, Counts, Odds, odds
-from vical_daemon.results.difference import NotComparable, difference
+from vical_daemon.results.difference import NotComparableError, difference
 from vical_daemon.results.export import rig_from_estimate
 from vical_daemon.results.known import BLOCKS, KnownCamera, known_cameras
 
@@ -86,7 +86,7 @@ class Verifier:
                 # `changed` must stand even if the lens is off; `holds` is said for the lens as given
                 taken = self._odds(check, found.given_lens())
                 weighed = replace(weighed, log_holds=taken.log_holds, visible=taken.visible)
-        except NotComparable as error:
+        except NotComparableError as error:
             check.why = str(error)
             return
         check.odds, check.why = weighed, ""
@@ -144,7 +144,9 @@ def _camera_document(name: str, check: CameraCheck, counts: Counts) -> dict[str,
         return out
     out["probability_changed"] = weighed.probability
     if check.answer is Answer.CHANGED:
-        out["changes"] = [{"camera": name} | _change(block, check.stored, weighed) for block in weighed.blocks]
+        out["changes"] = [
+            {"camera": name} | _change(block, check.stored, weighed) for block in weighed.blocks
+        ]
     smallest = _smallest(counts)
     for block in weighed.log_holds:
         unit = smallest[block]

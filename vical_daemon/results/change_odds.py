@@ -1,7 +1,7 @@
-"""Has a calibration changed? Odds of `as stored` against `this block has moved`, and against a change that counts.
+"""Has a calibration changed? Odds of `unchanged` against `moved`, and against the least change that counts.
 
-Both odds may be looked at after every image: a likelihood ratio exceeds 1/alpha at any time with a probability of
-alpha at most, if its denominator is true [Ville 1939]. [docs/math/verify.md, eq. (1) to (4)]
+Both odds may be looked at after every image: a likelihood ratio exceeds 1/alpha at any time with a
+probability of alpha at most, if its denominator is true [Ville 1939]. [docs/math/verify.md, eq. (1) to (4)]
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FALSE_ALARM = 1e-3
 MISSED = 1e-2
 """Bound of the probability to say `holds` of a calibration of which one block has changed by what counts."""
 PRIOR = 0.05
-"""Probability of a change before the recording: once in twenty recordings, for `probability_changed` alone."""
+"""Probability of a change before the recording, one recording in twenty; for `probability_changed` alone."""
 _WIDE = 3.0  # a change, where there is one, is of the order of this many times what counts
 _DIRECTIONS = 400  # on the sphere; the worst of them is within 6 deg of the worst of all
 _SURE = 1.645  # sigmas: what is called visible is shown by 95 % of recordings
@@ -46,7 +46,7 @@ class Counts:
     lens_share: float = 5e-3
 
     def of_errors(self, focal_px: float, size: int) -> FloatArray:
-        """Of each error in its unit, shape (size,); of a distortion coefficient what moves the border as much.
+        """Of each error in its unit, shape (size,); of a distortion what moves the border as much.
 
         (The border lies at 0.7 focal lengths of a lens of 70 deg: k1 there moves a point by k1 * 0.7^2.)
         """
@@ -112,7 +112,7 @@ def odds(d: FloatArray, S: FloatArray, stored: FloatArray, counts: FloatArray) -
     logs = np.array([log for log, _, _ in hypotheses])
     _, names, places = max(hypotheses, key=lambda h: h[0])
     moved, covariance = _moved(e, S, places)
-    stored_information = np.linalg.inv(C)
+    stored_information = np.asarray(np.linalg.inv(C))
     holds, visible, floor = {}, {}, {}
     for name, at in present.items():
         block = np.ix_(at, at)
@@ -135,7 +135,7 @@ def odds(d: FloatArray, S: FloatArray, stored: FloatArray, counts: FloatArray) -
 
 
 def _log_odds(e: FloatArray, S: FloatArray, places: Iterable[int]) -> float:
-    """log N(e; 0, S + W) - log N(e; 0, S), where some errors may have changed, N(0, W)."""
+    """Log N(e; 0, S + W) - log N(e; 0, S), where some errors may have changed, N(0, W)."""
     with_change = S + _wide(len(e), places)
     root, wider = np.linalg.cholesky(S), np.linalg.cholesky(with_change)
     logs = np.log(np.diag(root)).sum() - np.log(np.diag(wider)).sum()

@@ -1,4 +1,4 @@
-"""The verdict on two calibrations: same or changed, and which part. [docs/math/verify.md]"""
+"""The verdict on two calibrations: same or changed, and which part; docs/math/verify.md."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import chi2
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import IntArray
 from vical_daemon.results.difference import Difference
 from vical_daemon.results.known import BLOCKS
 
@@ -45,7 +45,7 @@ def judge(difference: Difference) -> Verdict:
 
 
 def _blocks(difference: Difference) -> tuple[str, ...]:
-    """The fewest blocks without which the rest agrees; of as many, those that leave the rest agreeing best."""
+    """The fewest blocks without which the rest agrees; of as many, those that leave the best agreement."""
     present = [name for name in BLOCKS if name != "lens" or difference.has_lens]
     index = np.arange(len(difference.d))
     for count in range(1, len(present)):
@@ -59,7 +59,7 @@ def _blocks(difference: Difference) -> tuple[str, ...]:
     return tuple(present)
 
 
-def _test(difference: Difference, kept: FloatArray) -> tuple[float, float]:
+def _test(difference: Difference, kept: IntArray) -> tuple[float, float]:
     """Sum of squares of some errors in joint sigmas, and the probability of a larger one."""
     d, S = difference.d[kept], difference.covariance[np.ix_(kept, kept)]
     scale = np.sqrt(np.diag(S))

@@ -1,4 +1,4 @@
-"""How two calibrations of one camera differ: errors with their joint covariance. [docs/math/verify.md]"""
+"""How two calibrations of one camera differ: errors with their joint covariance; docs/math/verify.md."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from vical_daemon.estimation.model.camera_rays import rays_over_image
 from vical_daemon.results.known import LENS, KnownCamera
 
 _LEAST_SHARE = 0.1
-"""Of the sum of variances, the least that a difference has whose data are common: estimates of the same data with
-other settings differ by rounding, order of images and linearisation, which the formula of efficient estimates
-leaves out (up to a third of a sigma)."""
+"""Of the sum of variances, the least that a difference has whose data are common: estimates of the same data
+with other settings differ by linearisation and by the images they refuse, which the formula of efficient
+estimates leaves out (up to a third of a sigma)."""
 
 
-class NotComparable(ValueError):
+class NotComparableError(ValueError):
     """Two calibrations are not of the same thing; the message says why."""
 
 
@@ -54,7 +54,7 @@ class Difference:
         return len(self.d) > 7
 
     def given_lens(self) -> Difference:
-        """Mounting and time shift of B if its lens were A's, minus A's: d_a - S_ab S_bb^-1 d_b, of B alone."""
+        """Mounting and time shift of B if its lens were A's, minus A's: d_a - P_ab P_bb^-1 d_b, P of B."""
         P = self.b.covariance
         gain = np.linalg.pinv(P[LENS, LENS], rcond=1e-12, hermitian=True) @ P[LENS, :7]
         d = self.d[:7] - gain.T @ self.d[LENS]
@@ -68,14 +68,14 @@ def difference(a: KnownCamera, b: KnownCamera) -> Difference:
     """Return B minus A.
 
     Raises:
-        NotComparable: Images of other sizes, or other devices.
+        NotComparableError: Images of other sizes, or other devices.
     """
     if a.resolution and b.resolution and a.resolution != b.resolution:
         sizes = ["{} x {}".format(*k.resolution) for k in (a, b) if k.resolution]
-        raise NotComparable(f"images of {sizes[0]} and of {sizes[1]} px: not the same lens or mode")
+        raise NotComparableError(f"images of {sizes[0]} and of {sizes[1]} px: not the same lens or mode")
     for what, x, y in zip(("imu", "camera"), a.serials, b.serials, strict=True):
         if x and y and x != y:
-            raise NotComparable(f"not the same {what}: serial numbers {x} and {y}")
+            raise NotComparableError(f"not the same {what}: serial numbers {x} and {y}")
     pose = np.concatenate(
         [
             b.p_imu_cam - a.p_imu_cam,
@@ -133,9 +133,9 @@ def _in_lens(covariance: FloatArray, T: FloatArray) -> FloatArray:
 def _joint(a: KnownCamera, b: KnownCamera, A: FloatArray, B: FloatArray) -> tuple[FloatArray, float]:
     """Covariance of B - A, and the seconds of data that are in both.
 
-    The estimate of more data is the efficient one, whose error is not correlated with its difference from any
-    other estimate [Hausman 1978]: for data that are all common, cov(B - A) = P_less - P_more; for a share s of the
-    shorter, P_a + P_b - 2 s P_more.
+    The estimate of more data is the efficient one, whose error is not correlated with its difference from
+    any other estimate [Hausman 1978]: for data that are all common, cov(B - A) = P_less - P_more; for a
+    share s of the shorter, P_a + P_b - 2 s P_more.
     """
     common_s = max(0.0, (min(a.end_ns, b.end_ns) - max(a.begin_ns, b.begin_ns)) * 1e-9)
     if not (common_s and a.begin_ns and b.begin_ns):

@@ -17,9 +17,9 @@ POSITION, ROTATION, SHIFT, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7
 BLOCKS = {"position": POSITION, "rotation": ROTATION, "time shift": SHIFT, "lens": LENS}
 """Blocks of a calibration's errors, in the order of `CameraEstimate.joint_covariance`."""
 
-# One sigma of a value without covariance. Kalibr's calibrations of the two halves of EuRoC's `imu_april` differ by
-# 1.5 mm (length of three axes) and 0.073 deg, so one sigma of an axis is 1.5 / sqrt(6) = 0.6 mm and 0.03 deg of a
-# half; two different recordings are less alike than two halves of one: 1 mm and 0.05 deg.
+# One sigma of a value without covariance. Kalibr's calibrations of the two halves of EuRoC's `imu_april`
+# differ by 1.5 mm (length of three axes) and 0.073 deg, so one sigma of an axis is 1.5 / sqrt(6) = 0.6 mm and
+# 0.03 deg of a half; two recordings are less alike than two halves of one: 1 mm and 0.05 deg.
 ASSUMED_POSITION_M = 1e-3
 ASSUMED_ROTATION_RAD = float(np.deg2rad(0.05))
 ASSUMED_SHIFT_S = 1e-4  # docs/benchmarks.md: OpenVINS, 0.02 to 0.05 ms; Kalibr's halves 0.017 ms; times two
@@ -70,7 +70,7 @@ class KnownCamera:
         return np.sqrt(np.diag(self.covariance) / self.inflation)
 
     def given_lens(self) -> KnownCamera:
-        """The same if its lens is taken to be right: mounting and time shift are known as well as that makes them."""
+        """The same if its lens is taken to be right: what else is known is known as well as that makes it."""
         return replace(self, lens=None, covariance=given(self.covariance, LENS), lens_held=True)
 
     def without_lens(self) -> KnownCamera:
@@ -114,9 +114,8 @@ def pinv(covariance: FloatArray) -> FloatArray:
     """Inverse of a covariance in mixed units; directions of no variance at all are left out."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(sigma > 0.0, sigma, 1.0)
-    return np.asarray(np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-12, hermitian=True)) / np.outer(
-        scale, scale
-    )
+    inverse = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    return np.asarray(inverse / np.outer(scale, scale))
 
 
 def keys(model: str, *, lens: bool) -> list[str]:
@@ -129,7 +128,8 @@ def keys(model: str, *, lens: bool) -> list[str]:
 def _known(camera: RigCamera, rig: Rig, source: str) -> KnownCamera:
     lens = np.array([*camera.intrinsics, *camera.distortion])
     size = 7 + len(lens)
-    covariance, inflation, notes = np.zeros((size, size)), 1.0, ()
+    covariance, inflation = np.zeros((size, size)), 1.0
+    notes: tuple[str, ...] = ()
     if camera.joint_covariance is not None:
         covariance = camera.joint_covariance.copy()
         if camera.timeshift_sigma_s:

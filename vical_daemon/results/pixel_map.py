@@ -1,7 +1,7 @@
 """What a difference of two calibrations means: how far apart they project a point, over the image.
 
-A point fixed to the imu is seen by both. Where it lies is chosen by the pixel of camera A and a distance. Two maps:
-of the difference as it is, and of the least difference that the sigmas allow. [docs/math/verify.md, eq. (5)]
+A point fixed to the imu is seen by both. Where it lies is chosen by the pixel of camera A and a distance. Two
+maps: of the difference as it is, and of the least that the sigmas allow. [docs/math/verify.md, eq. (6)]
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def _seen(camera: KnownCamera, p_imu: FloatArray) -> FloatArray:
 def _least(difference: Difference, p_imu: FloatArray) -> FloatArray:
     """Displacements (px) of the smallest change that both calibrations allow.
 
-    Of all changes x with (x - d)' S^-1 (x - d) <= q, the one with the smallest |J x|^2; q is the bound of the test,
-    so that the least difference is zero exactly where the verdict is `same`.
+    Of all changes x with (x - d)' S^-1 (x - d) <= q, the one with the smallest |J x|^2; q is the bound of the
+    test, so that the least difference is zero exactly where the verdict is `same`.
     """
     base = difference.a if difference.model == difference.a.model else difference.b
     S, d = difference.covariance, difference.d

@@ -51,14 +51,12 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     )
 
 
-def _joint_covariance(
-    f: CalibrationFilter, name: str, spread: float, lens_sigma: FloatArray
-) -> FloatArray:
+def _joint_covariance(f: CalibrationFilter, name: str, spread: float, lens_sigma: FloatArray) -> FloatArray:
     """Of [lever arm, rotation, time shift, lens], with the filter's correlations, zeros where not estimated.
 
     A lens that is free has the sigmas that are published: what those exceed the filter's is error of the lens
-    model, which is not correlated with the pose. A lens that is held has the filter's own: what the pose would
-    be for another lens follows from its correlation with the pose.
+    model, which is not correlated with the pose. A lens that is held has the filter's own: what the pose
+    would be for another lens follows from its correlation with the pose.
     """
     where, free = f.layout.cameras[name], f.layout.lens_free(name)
     places = (where.position, where.rotation, where.timeshift, where.intrinsics, where.distortion)

@@ -67,9 +67,9 @@ def read_camchain(path: Path) -> Rig:
         ExportError: Not such a file; the message says which key is missing or wrong.
     """
     try:
-        text = read_text(path, MAX_BYTES)
+        text = read_text(path, MAX_BYTES).removeprefix("%YAML:1.0")  # OpenCV's first line, in OpenVINS's file
         refuse_hostile(text, path.name)
-        document = yaml.safe_load(text.removeprefix("%YAML:1.0"))  # OpenCV's first line, in OpenVINS's file
+        document = yaml.safe_load(text)
     except OSError as error:
         raise ExportError(f"{path}: {error.strerror or error}") from None
     except (ConfigError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -100,7 +100,7 @@ def _read_camera(name: str, block: Any, T_before_imu: FloatArray | None, path: P
     if "T_cam_imu" in block:
         T_cam_imu = _matrix(block["T_cam_imu"], f"{name}.T_cam_imu", path)
     elif "T_imu_cam" in block:  # OpenVINS
-        T_cam_imu = np.linalg.inv(_matrix(block["T_imu_cam"], f"{name}.T_imu_cam", path))
+        T_cam_imu = np.asarray(np.linalg.inv(_matrix(block["T_imu_cam"], f"{name}.T_imu_cam", path)))
     elif "T_cn_cnm1" in block and T_before_imu is not None:
         T_cam_imu = _matrix(block["T_cn_cnm1"], f"{name}.T_cn_cnm1", path) @ T_before_imu
     else:
