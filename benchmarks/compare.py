@@ -55,9 +55,7 @@ def main(argv: list[str]) -> int:
     work = partial(trial, args.target_free, args.seconds)
     results = [r for r in runner.run_trials(name, work, runner.seeds_of(args), args, code) if r["z"]]
     z, p = runner.array(results, "z"), runner.array(results, "p")
-    print(
-        "| pairs | RMS of z: position | rotation | time shift | lens | chi-square / 15, median and mean | changed |"
-    )
+    print("| pairs | RMS of z: position | rotation | time shift | lens | chi2 / 15: median, mean | changed |")
     print("|---|---|---|---|---|---|---|")
     rms = [
         f"{np.sqrt(np.mean(z[:, at] ** 2)):.2f}"

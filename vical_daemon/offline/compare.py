@@ -12,8 +12,8 @@ from vical_daemon.offline.sources import SourceError, read_known
 from vical_daemon.results.compare import FALSE_ALARM, Verdict, judge
 from vical_daemon.results.difference import Difference, NotComparableError, difference
 from vical_daemon.results.export import Rig
-from vical_daemon.results.known import KnownCamera, keys
-from vical_daemon.results.pixel_map import PixelMap, pixel_map
+from vical_daemon.results.known import LENS, KnownCamera, keys
+from vical_daemon.results.pixel_map import PixelMap, lens_displacement_px, pixel_map
 
 SAME, CHANGED, NOT_COMPARABLE = "same", "changed", "not comparable"
 DISTANCES_M = (1.0, 10.0)
@@ -28,8 +28,8 @@ class CameraComparison:
         why: Why it cannot be compared; "": it can.
         difference: B minus A.
         verdict: Of all of it.
-        same_lens: Of mounting and time shift, if B had the lens of A; None where that is no question.
-        same_lens_difference: What is left then.
+        held: Which of them held its lens at given values while the other estimated it, "a" or "b"; "": none.
+        lens_px: How far apart the lenses project, RMS over the image, and its sigma; None: no lens in both.
         maps: Over the image, by distance; empty without lens or image size.
     """
 
@@ -37,8 +37,8 @@ class CameraComparison:
     why: str = ""
     difference: Difference | None = None
     verdict: Verdict | None = None
-    same_lens: Verdict | None = None
-    same_lens_difference: Difference | None = None
+    held: str = ""
+    lens_px: tuple[float, float] | None = None
     maps: tuple[PixelMap, ...] = ()
 
     @property
@@ -156,10 +156,12 @@ def _compare(a: KnownCamera, b: KnownCamera, distances_m: tuple[float, ...]) -> 
         return CameraComparison(names, str(error))
     verdict = judge(apart)
     maps = tuple(m for distance_m in distances_m if (m := pixel_map(apart, distance_m)) is not None)
-    left = None
-    if apart.has_lens and a.model == b.model and a.lens_held != b.lens_held:
-        left = apart.given_lens() if a.lens_held else difference(b, a).given_lens()
-    return CameraComparison(names, "", apart, verdict, None if left is None else judge(left), left, maps)
+    held = "" if a.lens_held == b.lens_held or not apart.has_lens else "a" if a.lens_held else "b"
+    lens_px = None
+    if apart.has_lens:
+        base = a if apart.model == a.model else b
+        lens_px = lens_displacement_px(base, apart.d[LENS], apart.covariance[LENS, LENS])
+    return CameraComparison(names, "", apart, verdict, held, lens_px, maps)
 
 
 def _imu(a: Rig | None, b: Rig | None) -> tuple[FloatArray, FloatArray] | None:
@@ -184,9 +186,9 @@ def _camera_document(camera: CameraComparison) -> dict[str, Any]:
     v = camera.verdict
     out |= {"chi_square": v.chi_square, "dof": v.dof, "probability": v.probability, "changed": list(v.blocks)}
     out |= {"common_s": camera.difference.common_s, "lens_models_unlike_px": camera.difference.unlike_px}
-    left = camera.same_lens
-    if left is not None:
-        out["same_lens"] = {"verdict": CHANGED if left.changed else SAME, "probability": left.probability}
+    out["lens_held_by"] = camera.held
+    if camera.lens_px is not None:
+        out |= dict(zip(("lens_px", "lens_px_sigma"), camera.lens_px, strict=True))
     out["maps"] = [
         {
             "distance_m": m.distance_m,

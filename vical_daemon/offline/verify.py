@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.camera_model import project_jacobians
-from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.camera_rays import rays_over_image
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.results.change_odds import FALSE_ALARM, Counts, Odds, odds
 from vical_daemon.results.difference import NotComparableError, difference
 from vical_daemon.results.export import rig_from_estimate
 from vical_daemon.results.known import BLOCKS, KnownCamera, known_cameras
+from vical_daemon.results.pixel_map import lens_displacement_px
 
 UNITS = {"position": "m", "rotation": "rad", "time shift": "s", "lens": "px"}
 
@@ -171,24 +169,10 @@ def _change(block: str, stored: KnownCamera, weighed: Odds) -> dict[str, Any]:
     at = BLOCKS[block]
     moved, P = weighed.moved[at], weighed.moved_covariance[at, at]
     if block == "lens":
-        size, sigma = _lens_px(stored, moved, P)
+        size, sigma = lens_displacement_px(stored, moved, P)
         return {"what": block, "value": size, "sigma": sigma, "unit": UNITS[block], "change": moved.tolist()}
     size = float(np.linalg.norm(moved))
     way = moved / max(size, 1e-300)
     value = float(moved[0]) if block == "time shift" else size
     change = {"what": block, "value": value, "sigma": float(np.sqrt(way @ P @ way)), "unit": UNITS[block]}
     return change if block == "time shift" else change | {"axis": way.tolist()}
-
-
-def _lens_px(stored: KnownCamera, moved: FloatArray, P: FloatArray) -> tuple[float, float]:
-    """How far the lens projects points from where it did, RMS over the image, and its sigma, px."""
-    lens = stored.lens
-    assert lens is not None
-    size = stored.resolution or (round(2.0 * lens[2]), round(2.0 * lens[3]))
-    rays = rays_over_image(lens[:4], lens[4:], stored.model, size)
-    J = project_jacobians(rays, lens[:4], lens[4:], stored.model)[2].reshape(2 * len(rays), -1)
-    J = J[:, : len(moved)] / np.sqrt(len(rays))
-    apart = J @ moved
-    rms = float(np.linalg.norm(apart))
-    slope = J.T @ apart / max(rms, 1e-300)
-    return rms, float(np.sqrt(slope @ P @ slope))

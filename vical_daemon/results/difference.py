@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, project, project_jacobians
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.camera_rays import rays_over_image
-from vical_daemon.results.known import LENS, KnownCamera
+from vical_daemon.results.known import KnownCamera
 
 _LEAST_SHARE = 0.1
 """Of the sum of variances, the least that a difference has whose data are common: estimates of the same data
@@ -52,16 +52,6 @@ class Difference:
     def has_lens(self) -> bool:
         """Whether the lenses are part of it."""
         return len(self.d) > 7
-
-    def given_lens(self) -> Difference:
-        """Mounting and time shift of B if its lens were A's, minus A's: d_a - P_ab P_bb^-1 d_b, P of B."""
-        P = self.b.covariance
-        gain = np.linalg.pinv(P[LENS, LENS], rcond=1e-12, hermitian=True) @ P[LENS, :7]
-        d = self.d[:7] - gain.T @ self.d[LENS]
-        own = self.a.given_lens().covariance
-        S = P[:7, :7] - P[:7, LENS] @ gain + own
-        bare = replace(self.a, lens=None), replace(self.b, lens=None)
-        return Difference(*bare, d, S, np.sqrt(np.diag(S)), own, self.model, 0.0, self.common_s)
 
 
 def difference(a: KnownCamera, b: KnownCamera) -> Difference:

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import project
+from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.camera_rays import rays_over_image, unproject
 from vical_daemon.results.compare import FALSE_ALARM
 from vical_daemon.results.difference import Difference
 from vical_daemon.results.known import KnownCamera
@@ -103,3 +103,23 @@ def _moved(camera: KnownCamera, p_imu: FloatArray, k: int, step: float) -> Float
         camera, p_imu_cam=camera.p_imu_cam + e[:3], R_imu_cam=camera.R_imu_cam @ so3.exp(e[3:6]), lens=lens
     )
     return np.asarray((_seen(moved, p_imu) - _seen(camera, p_imu)).ravel())
+
+
+def lens_displacement_px(camera: KnownCamera, moved: FloatArray, P: FloatArray) -> tuple[float, float]:
+    """How far a lens that has changed projects points from where it did, RMS over the image, and its sigma.
+
+    Args:
+        camera: With its lens.
+        moved: Errors of the lens, shape (n,).
+        P: Their covariance, shape (n, n).
+    """
+    lens = camera.lens
+    assert lens is not None
+    size = camera.resolution or (round(2.0 * lens[2]), round(2.0 * lens[3]))
+    rays = rays_over_image(lens[:4], lens[4:], camera.model, size)
+    J = project_jacobians(rays, lens[:4], lens[4:], camera.model)[2].reshape(2 * len(rays), -1)
+    J = J[:, : len(moved)] / np.sqrt(len(rays))
+    apart = J @ moved
+    rms = float(np.linalg.norm(apart))
+    slope = J.T @ apart / max(rms, 1e-300)
+    return rms, float(np.sqrt(slope @ P @ slope))

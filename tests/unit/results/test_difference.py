@@ -13,7 +13,7 @@ from vical_daemon.results.compare import FALSE_ALARM, judge
 from vical_daemon.results.difference import NotComparableError, difference
 from vical_daemon.results.export import Rig
 from vical_daemon.results.known import KnownCamera, known_cameras
-from vical_daemon.results.pixel_map import pixel_map
+from vical_daemon.results.pixel_map import lens_displacement_px, pixel_map
 
 LENS = np.array([458.0, 457.0, 367.0, 248.0, -0.28, 0.07, 2e-4, 2e-5])
 SIGMA = np.array([1e-3] * 3 + [5e-4] * 3 + [5e-5] + [0.5] * 4 + [3e-3, 5e-3, 1e-4, 1e-4])
@@ -105,17 +105,13 @@ def test_what_cannot_be_compared_is_refused(known):
         difference(replace(known, serials=("", "A")), replace(known, serials=("7", "B")))
 
 
-def test_held_lens_explains_the_difference_from_a_free_one(known, covariance):
-    """A held its lens 3 px off in cx: what B says for that lens is its pose moved along its correlations."""
+def test_lenses_alone_are_compared_in_pixels(known, covariance):
+    """cx 3 px off moves every point by 3 px; its sigma is that of cx, to first order."""
     off = np.zeros(8)
     off[2] = 3.0
-    gain = covariance[:7, 7:] @ np.linalg.inv(covariance[7:, 7:])
-    e = np.concatenate([gain @ off, off])
-    held = moved(known, e)
-    held = replace(held, lens_held=True)
-    left = difference(held, known).given_lens()
-    assert np.abs(left.d / left.sigma).max() < 1e-2  # but for the second order of the rotation
-    assert not judge(left).changed
+    px, sigma = lens_displacement_px(known, off, covariance[7:, 7:])
+    assert px == pytest.approx(3.0, rel=1e-6)
+    assert 0.1 * SIGMA[9] < sigma < 3.0 * SIGMA[9]
 
 
 def test_pixel_map_of_a_turn_is_its_angle_times_the_focal_length(known):
