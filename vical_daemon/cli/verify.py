@@ -76,8 +76,8 @@ def run(args: argparse.Namespace) -> int:
     counts = _counts(args)
     if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
-    from vical_daemon.cli import calibration_run
     from vical_daemon.logs import open_recording
+    from vical_daemon.offline.calibrate import make_job, run_job
     from vical_daemon.offline.sources import read_known
 
     known, rig = read_known(args.against)
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"vical: warning: {warning}", file=sys.stderr)
     initial = _initial(args, known, rig)
     held = args.fix == "intrinsics" or any(camera.lens is None for camera in known.values())
-    job = calibration_run.make_job(
+    job = make_job(
         recording,
         initial,
         target=args.target,
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     )
     verifier = _verifier(known, list(job.cameras), held, counts, args.against)
     bar = ProgressBar(hidden=args.quiet or not sys.stderr.isatty())
-    calibration_run.run_job(job, bar.show, enough=verifier.look)
+    run_job(job, bar.show, enough=verifier.look)
     bar.close()
     document = verifier.document()
     if args.json:

@@ -1,1 +1,1 @@
-"""Use cases on files, each callable from Python."""
+"""Use cases on files: each command that reads a recording, callable from Python, without printing."""

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.offline.sources import SourceError, read_known
+from vical_daemon.offline.errors import InputError
+from vical_daemon.offline.sources import read_known
 from vical_daemon.results.compare import FALSE_ALARM, Verdict, judge
 from vical_daemon.results.difference import Difference, NotComparableError, difference
 from vical_daemon.results.export import Rig
@@ -119,12 +120,12 @@ def compare(
         distances_m: Of the maps.
 
     Raises:
-        SourceError: One of them cannot be read, or holds no such camera.
+        InputError: One of them cannot be read, or holds no such camera.
     """
     known, rigs = zip(*(read_known(source) for source in (a, b)), strict=True)
     pairs, notes = _pairs(known[0], known[1], camera)
     if camera and not pairs:
-        raise SourceError(f"no camera {camera!r} in both {a} and {b}")
+        raise InputError(f"no camera {camera!r} in both {a} and {b}")
     cameras = [_compare(x, y, distances_m) for x, y in pairs]
     for x, y in pairs:
         notes += [note for note in (*x.notes, *y.notes) if note not in notes]

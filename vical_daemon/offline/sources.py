@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vical_daemon.offline.errors import InputError
+
 if TYPE_CHECKING:
     from vical_daemon.results.export import Rig
     from vical_daemon.results.known import KnownCamera
@@ -14,15 +16,11 @@ if TYPE_CHECKING:
 _RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recording: 18 hours
 
 
-class SourceError(ValueError):
-    """No calibration can be read there; the message is one line for the user."""
-
-
 def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
     """Read what a source claims about each camera; a Kalibr file may lack the lens (then there is no rig).
 
     Raises:
-        SourceError: Nothing there that holds a calibration.
+        InputError: Nothing there that holds a calibration.
         ExportError: A file that is not of the expected form.
     """
     from vical_daemon.config.priors import read_initial
@@ -44,7 +42,7 @@ def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
     found = {name: known_prior(name, prior, path.name) for name, prior in priors.items()}
     known = {name: camera for name, camera in found.items() if camera is not None}
     if not known:
-        raise SourceError(f"{source}: no camera with T_cam_imu in it")
+        raise InputError(f"{source}: no camera with T_cam_imu in it")
     return known, None
 
 
@@ -52,7 +50,7 @@ def read_source(source: str) -> Rig:
     """Read a rig from whatever the source is.
 
     Raises:
-        SourceError: Nothing there that holds a calibration.
+        InputError: Nothing there that holds a calibration.
     """
     from vical_daemon.results.export import rig_from_json
     from vical_daemon.results.export.kalibr import read_camchain
@@ -61,7 +59,7 @@ def read_source(source: str) -> Rig:
     if source == "store" and not path.exists():
         return _from_store()
     if not path.exists():
-        raise SourceError(f"{source}: no such file")
+        raise InputError(f"{source}: no such file")
     if path.suffix in (".yaml", ".yml"):
         return read_camchain(path)
     if path.is_dir() or path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
@@ -89,11 +87,11 @@ def _read_json(path: Path) -> dict[str, Any]:
         try:
             document = json.loads(lines[-1]) if lines else None
         except json.JSONDecodeError:
-            raise SourceError(f"{path}: not JSON: {error}") from None
+            raise InputError(f"{path}: not JSON: {error}") from None
     except (UnicodeDecodeError, RecursionError):
-        raise SourceError(f"{path}: not JSON; give the result of `vical calibrate -o`") from None
+        raise InputError(f"{path}: not JSON; give the result of `vical calibrate -o`") from None
     if not isinstance(document, dict):
-        raise SourceError(f"{path}: not a result of `vical calibrate --json`")
+        raise InputError(f"{path}: not a result of `vical calibrate --json`")
     return document
 
 
@@ -129,7 +127,7 @@ def _from_log(path: Path) -> Rig:
         for name, values in reader.metadata:
             devices |= values if name == "devices" else {}
     if not last:
-        raise SourceError(
+        raise InputError(
             f"{path}: no calibration in this log; run `vical calibrate {path} --target FILE -o result.json` "
             "and export result.json"
         )
@@ -149,7 +147,7 @@ def _from_store() -> Rig:
     folder = state_directory() / "calibration"
     stored = sorted(CalibrationStore(folder).all(), key=lambda entry: entry.saved_ns)
     if not stored:
-        raise SourceError(f"no calibration is stored in {folder}: nothing has converged on this machine yet")
+        raise InputError(f"no calibration is stored in {folder}: nothing has converged on this machine yet")
     cameras = {entry.camera: entry.known for entry in stored}
     estimate = with_changes(stored[-1].estimate, cameras=cameras)
     devices = {"imu": stored[-1].imu_serial} | {f"camera/{e.camera}": e.camera_serial for e in stored}

@@ -15,7 +15,7 @@ from vical_daemon.results.export.rig import Rig, RigCamera
 
 POSITION, ROTATION, SHIFT, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, None)
 BLOCKS = {"position": POSITION, "rotation": ROTATION, "time shift": SHIFT, "lens": LENS}
-"""Blocks of a calibration's errors, in the order of `CameraEstimate.joint_covariance`."""
+"""Blocks of a calibration's errors, in the order of `CameraEstimate.calibration_covariance`."""
 
 # One sigma of a value without covariance. Kalibr's calibrations of the two halves of EuRoC's `imu_april`
 # differ by 1.5 mm (length of three axes) and 0.073 deg, so one sigma of an axis is 1.5 / sqrt(6) = 0.6 mm and
@@ -130,8 +130,8 @@ def _known(camera: RigCamera, rig: Rig, source: str) -> KnownCamera:
     size = 7 + len(lens)
     covariance, inflation = np.zeros((size, size)), 1.0
     notes: tuple[str, ...] = ()
-    if camera.joint_covariance is not None:
-        covariance = camera.joint_covariance.copy()
+    if camera.calibration_covariance is not None:
+        covariance = camera.calibration_covariance.copy()
         if camera.timeshift_sigma_s:
             covariance[6, 6] = max(covariance[6, 6], camera.timeshift_sigma_s**2)
     elif camera.covariance is not None:

@@ -42,7 +42,7 @@ def estimate(e=None, *, times=1.0, seconds=4.0, status=Status.CONVERGING, covari
         0.3,
         resolution=[752, 480],
         unobservable=["the lever arm along x: turn about y"] if times > 5.0 else [],
-        joint_covariance=P.tolist(),
+        calibration_covariance=P.tolist(),
     )
     imu = ImuEstimate([0.0] * 3, [0.0] * 3)
     guidance = "turn faster about x" if times > 5.0 else ""

@@ -143,7 +143,7 @@ def test_values_without_sigmas_get_assumed_ones_and_a_note(pinhole_camera):
 
 
 def test_unknown_correlations_are_bounded(pinhole_camera, rng):
-    """Any covariance with the blocks that a result without `joint_covariance` gives lies below the bound."""
+    """Any covariance with the blocks that older results give lies below the bound."""
     size = 15
     mixed = rng.standard_normal((size, size))
     P = mixed @ mixed.T * np.outer(SIGMA, SIGMA)

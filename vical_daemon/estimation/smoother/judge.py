@@ -139,6 +139,10 @@ class FreeJudge:
             self._against_since_s = None
             self._agreement.clear()
 
+    def next_recording(self) -> None:
+        """Another recording begins: it has not contradicted anything yet."""
+        self._against_since_s = None
+
     def contradicted(self, against_s: float) -> None:
         """Images of the last `against_s` seconds contradict the calibration: not known yet why."""
         if self._against_since_s is None:

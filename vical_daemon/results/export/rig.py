@@ -35,7 +35,7 @@ class RigCamera:
         rate_hz: Frames a second; None: not known.
         unobservable: Directions that the motion did not reveal: do not use their values.
         lens_sigma: Standard deviations of fx fy cx cy and the distortion; (): not known.
-        joint_covariance: See `CameraEstimate`, shape (7 + n, 7 + n); None: not known.
+        calibration_covariance: See `CameraEstimate`, shape (7 + n, 7 + n); None: not known.
     """
 
     name: str
@@ -53,7 +53,7 @@ class RigCamera:
     rate_hz: float | None = None
     unobservable: tuple[str, ...] = ()
     lens_sigma: tuple[float, ...] = ()
-    joint_covariance: FloatArray | None = None
+    calibration_covariance: FloatArray | None = None
 
     @property
     def T_imu_cam(self) -> FloatArray:

@@ -91,7 +91,7 @@ def _camera(name: str, entry: Any) -> RigCamera:
         size = entry.get("resolution")
         sigma = entry.get("timeshift_sigma_s")
         lens_sigma = [*(entry.get("intrinsics_sigma") or ()), *(entry.get("distortion_sigma") or ())]
-        joint, n = entry.get("joint_covariance"), 11 + len(distortion)
+        joint, n = entry.get("calibration_covariance"), 11 + len(distortion)
         camera = RigCamera(
             name=name,
             R_imu_cam=so3.matrix_from_quat(q / np.linalg.norm(q)),
@@ -106,7 +106,7 @@ def _camera(name: str, entry: Any) -> RigCamera:
             readout_s=float(entry.get("readout_s") or 0.0),
             unobservable=tuple(entry.get("unobservable") or ()),
             lens_sigma=tuple(float(v) for v in lens_sigma) if len(lens_sigma) == n - 7 else (),
-            joint_covariance=None if not joint else np.array(joint, dtype=np.float64).reshape(n, n),
+            calibration_covariance=None if not joint else np.array(joint, dtype=np.float64).reshape(n, n),
         )
     except KeyError as error:
         raise ExportError(f"cameras.{name}: no key {error}") from error
