@@ -54,6 +54,7 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         stamp_jitter_s=float(f.shared[name].jitter_s) if name in f.shared else 0.0,
         joint_order=order,
         joint_covariance=joint.tolist(),
+        calibration_covariance=_calibration_covariance(f, name, spread, lens_sigma).tolist(),
     )
 
 
@@ -79,6 +80,37 @@ def _joint(f: CalibrationFilter, name: str, stated: FloatArray) -> tuple[list[st
     raw = f.covariance([int(row) for row in rows[use]])
     scale = stated[use] / np.sqrt(np.maximum(np.diag(raw), 1e-300))
     return [names[i] for i in use], raw * np.outer(scale, scale)
+
+
+def _calibration_covariance(
+    f: CalibrationFilter, name: str, spread: float, lens_sigma: FloatArray
+) -> FloatArray:
+    """Of [lever arm, rotation, time shift, lens], with the filter's correlations, zeros where not estimated.
+
+    A lens that is free has the sigmas that are published: what those exceed the filter's is error of the lens
+    model, which is not correlated with the pose. A lens that is held has the filter's own: what the pose
+    would be for another lens follows from its correlation with the pose.
+    """
+    where, free = f.layout.cameras[name], f.layout.lens_free(name)
+    places = (where.position, where.rotation, where.timeshift, where.intrinsics, where.distortion)
+    first = np.cumsum([0, 3, 3, 1, 4])
+    rows: list[int] = []
+    at: list[int] = []
+    for place, begin in zip(places, first, strict=True):
+        if place is not None:
+            found = [place] if isinstance(place, int) else list(range(place.start, place.stop))
+            rows += found
+            at += range(begin, begin + len(found))
+    out = np.zeros((7 + len(lens_sigma),) * 2)
+    if rows:
+        out[np.ix_(at, at)] = spread**2 * f.covariance(rows)
+    if free:
+        lens = slice(7, None)
+        out[lens, lens] += np.diag(np.maximum(lens_sigma**2 - np.diag(out)[lens], 0.0))
+    if f.unshown is not None:
+        out[:6, :6] += f.unshown.covariance()
+        out[6, 6] += f.unshown.timeshift_sigma_s**2
+    return out
 
 
 def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
