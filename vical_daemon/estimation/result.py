@@ -57,11 +57,10 @@ class CameraEstimate:
         readout_sigma_s: Its standard deviation, s.
         resolution: width, height of the images, px; []: not known (it does not travel in the message).
         withheld: The same as `unobservable`, as data; [] in logs of older versions.
+        calibration_covariance: Of [px py pz rx ry rz, time shift, fx fy cx cy, distortion] together, m, rad,
+            s, px, rotation error local (right); zero rows where not estimated; lens model errors
+            are not correlated with the pose, unlike above; []: not known (it does not travel in the message).
         stamp_jitter_s: Measured jitter of the image stamps, one standard deviation, s; 0: none found.
-        joint_order: Names of the rows of `joint_covariance`: px py pz rx ry rz timeshift, and where the lens
-            is in doubt fx fy cx cy and its coefficients.
-        joint_covariance: Of mounting, time shift and lens together, m, rad, s, px: the filter's correlations
-            with the sigmas above. [] without a target (neither of the two travels in the message).
     """
 
     T_imu_cam: PoseEstimate
@@ -80,8 +79,7 @@ class CameraEstimate:
     resolution: list[int] = field(default_factory=list)
     withheld: list[WeakDirection] = field(default_factory=list)
     stamp_jitter_s: float = 0.0
-    joint_order: list[str] = field(default_factory=list)
-    joint_covariance: list[list[float]] = field(default_factory=list)
+    calibration_covariance: list[list[float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
