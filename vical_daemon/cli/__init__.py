@@ -32,7 +32,8 @@ Start here:
 
 Every command takes --json (only machine-readable output on stdout) and --help.
 Exit code: 0 done, 1 a known failure (one line on stderr), 2 wrong usage or config,
-3 done, but the calibration is not `converged`.
+3 done, but the calibration is not `converged` or a recording of `merge` disagrees,
+4 `verify`, `compare`: changed, 5 `verify`: cannot tell, `compare`: not comparable.
 """
 
 

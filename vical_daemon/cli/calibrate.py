@@ -27,10 +27,10 @@ examples:
   vical calibrate monday.mcap tuesday.mcap --target target.yaml     one rig, several recordings
   vical export result.json --format kalibr -o camchain.yaml
 
-Several recordings have mounting, lens and time shift in common; biases, and where the board stands, are
-those of each. Their clocks need not have anything to do with each other.
+Mounting, lens and time shift are common to all recordings. Biases and the pose of the board are estimated
+for each. The clocks of the recordings need not be related.
 
-exit code: 0 converged; 3 there is a result, but it is converging or degenerate (--accept makes that 0);
+exit code: 0 converged; 3 the result is only converging or degenerate (--accept makes that 0);
 1 no result; 2 bad usage
 """
 ACCEPT = ("converging", "degenerate")
@@ -45,42 +45,54 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         "inputs",
         metavar="INPUT",
         nargs="+",
-        help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder; several are one calibration of the same rig",
+        help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder; several recordings of one rig make one calibration",
     )
-    parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format; without: target-free")
-    parser.add_argument("--camera", metavar="NAME", help="only this camera")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
+    parser.add_argument(
+        "--target",
+        metavar="FILE",
+        help="target file of the board, Kalibr's format (default: calibrate without a board)",
+    )
+    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
     parser.add_argument(
         "--initial",
         metavar="FILE",
-        help="what is known before: Kalibr's camchain and imu.yaml, every key optional",
+        help="prior values, in the format of Kalibr's camchain and imu.yaml; every key is optional",
     )
     parser.add_argument(
-        "--fix", metavar="WHAT", default="", help=f"comma-separated, held at --initial: {', '.join(FIX)}"
+        "--fix",
+        metavar="WHAT",
+        default="",
+        help=f"comma-separated, kept at the values of --initial: {', '.join(FIX)}",
     )
     parser.add_argument(
         "--estimate",
         metavar="WHAT",
         default="",
-        help=f"comma-separated, estimated without being suspected first: {', '.join(ESTIMATE)}",
+        help=f"comma-separated, estimated from the start instead of on evidence: {', '.join(ESTIMATE)}",
     )
-    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
-    parser.add_argument("--seconds", type=float, metavar="S", help="use only S seconds (after --skip)")
-    parser.add_argument("--report", metavar="F.html", help="write a report with figures")
     parser.add_argument(
-        "-o", "--output", metavar="F.json", help="also write the result there, for `vical export`"
+        "--skip", type=float, default=0.0, metavar="S", help="skip the first S seconds (default 0)"
+    )
+    parser.add_argument("--seconds", type=float, metavar="S", help="use at most S seconds (after --skip)")
+    parser.add_argument("--report", metavar="F.html", help="write a report, one HTML file")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="F.json",
+        help="write the result as JSON, for `vical export`, `verify` and `compare`",
     )
     parser.add_argument(
         "--accept",
         metavar="STATUS",
         default="",
-        help=f"comma-separated, exit 0 instead of 3 for a result that is: {', '.join(accept)}",
+        help=f"comma-separated, exit with 0 instead of 3 if the result is: {', '.join(accept)}",
     )
     parser.add_argument(
         "--clock",
         choices=CLOCKS,
         default=CLOCKS[0],
-        help="several recordings: one time shift for all (common, default), or one for each (apart)",
+        help="with several recordings: one time shift for all (common, the default) or one for each (apart)",
     )
     add_json(parser)
 

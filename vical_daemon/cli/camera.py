@@ -35,10 +35,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     leaf("list", "list cameras of every kind, with their names for the config", _list)
     stream = leaf("stream", "print one line per frame with its stamp, then a summary", _stream)
     _add_device(stream)
-    stream.add_argument("--frames", type=int, default=None, metavar="N", help="end after N frames")
+    stream.add_argument(
+        "--frames", type=int, default=None, metavar="N", help="end after N frames (default: at ^C)"
+    )
     stream.add_argument("--seconds", type=float, default=None, metavar="S", help="end after S seconds")
     stream.add_argument(
-        "--timeout", type=float, default=5.0, metavar="S", help="fail after S seconds without a frame"
+        "--timeout",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="fail after S seconds without a frame (default 5)",
     )
     snapshot = leaf("snapshot", "save one image to a file", _snapshot)
     _add_device(snapshot)
@@ -48,18 +54,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=_WARM_UP_FRAMES,
         metavar="N",
-        help="discard N frames first, for the automatic exposure",
+        help=f"discard N frames first, for the automatic exposure (default {_WARM_UP_FRAMES})",
     )
     _add_device(leaf("controls", "list the controls of a V4L2 camera, with ranges", _controls))
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("device", metavar="DEVICE", help="/dev/video0, iidc:GUID, aravis:ID, folder:PATH")
-    parser.add_argument("--size", metavar="WxH", default=None, help="pixels, e.g. 640x480")
-    parser.add_argument("--rate", type=float, default=None, metavar="HZ", help="frames per second")
-    parser.add_argument("--format", default=None, metavar="NAME", help="pixel format, e.g. GREY, YUYV, MJPG")
-    parser.add_argument("--encoding", choices=("mono8", "mono16", "bgr8"), default="mono8")
-    parser.add_argument("--exposure", type=float, default=None, metavar="S", help="exposure time, s")
+    parser.add_argument(
+        "--size", metavar="WxH", default=None, help="image size in px, e.g. 640x480 (default: the camera's)"
+    )
+    parser.add_argument(
+        "--rate", type=float, default=None, metavar="HZ", help="frames per second (default: the camera's)"
+    )
+    parser.add_argument(
+        "--format",
+        default=None,
+        metavar="NAME",
+        help="pixel format, e.g. GREY, YUYV, MJPG (default: the cheapest)",
+    )
+    parser.add_argument(
+        "--encoding",
+        choices=("mono8", "mono16", "bgr8"),
+        default="mono8",
+        help="encoding of the frames (default mono8)",
+    )
+    parser.add_argument(
+        "--exposure",
+        type=float,
+        default=None,
+        metavar="S",
+        help="exposure time, s (default: as the camera is set)",
+    )
     parser.add_argument(
         "--assume-exposure",
         type=float,
@@ -76,16 +102,26 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
         help="set another control; may be repeated",
     )
     parser.add_argument(
-        "--readout", type=float, default=0.0, metavar="S", help="readout time from first to last row, s"
+        "--readout",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="readout time from first to last row, s (default 0)",
     )
     parser.add_argument("--rolling", action="store_true", help="the camera has a rolling shutter")
     parser.add_argument(
         "--stamp",
         choices=("auto", "raw", "soe", "eof", "first-packet", "shutter-closed"),
         default="auto",
-        help="what the driver's stamp marks, if the driver's own claim is wrong",
+        help="what the driver's stamp marks, if the driver reports it wrongly (default auto)",
     )
-    parser.add_argument("--buffers", type=int, default=None, metavar="N", help="number of kernel buffers")
+    parser.add_argument(
+        "--buffers",
+        type=int,
+        default=None,
+        metavar="N",
+        help="number of kernel buffers (default: the driver's)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:

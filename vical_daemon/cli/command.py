@@ -31,7 +31,7 @@ _EPILOG = """\
   vical command reset             forget it and begin anew; the store stays as it is
   vical command record-start      begin a recording (record-stop ends it)
 
-exit code: 0 done; 1 nobody answers, or the result is not one to accept; 2 bad usage
+exit code: 0 done; 1 no answer, or the result was refused; 2 bad usage
 """
 
 
@@ -39,8 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the word, and which bus."""
     parser.add_argument("word", choices=WORDS, metavar="WORD", help=", ".join(WORDS))
     add_config(parser, required=False)
-    parser.add_argument("--connect", metavar="ENDPOINT", help="router to connect to, e.g. tcp/127.0.0.1:7447")
-    parser.add_argument("--rig", metavar="NAME", help="which rig, where the bus has several")
+    parser.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        help="router to connect to, e.g. tcp/127.0.0.1:7447 (default: the local bus)",
+    )
+    parser.add_argument("--rig", metavar="NAME", help="which rig, if the bus has several")
     parser.epilog = _EPILOG
     add_json(parser)
 

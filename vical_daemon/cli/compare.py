@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from vical_daemon.offline.compare import Comparison
 
 _EPILOG = """\
-sources: a result (.json), a log with calibrations in it (.mcap or folder), a file of the store, store,
-Kalibr's camchain (.yaml), OpenVINS's kalibr_imucam_chain.yaml
+sources: a result (.json), a log with calibrations in it (.mcap or folder), a file of the store,
+`store` (the latest), Kalibr's camchain (.yaml), OpenVINS's kalibr_imucam_chain.yaml
 
 examples:
   vical compare monday.json today.json
@@ -31,18 +31,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the sources and what to show."""
     parser.epilog = _EPILOG
     parser.add_argument(
-        "sources", metavar="SOURCE", nargs="+", help="calibrations: two, with --matrix any number"
+        "sources", metavar="SOURCE", nargs="+", help="two calibrations; with --matrix any number"
     )
-    parser.add_argument("--camera", metavar="NAME", help="only this camera")
+    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
     parser.add_argument("--map", action="store_true", help="show the whole map of pixel differences")
     parser.add_argument(
         "--distance",
         type=float,
         action="append",
         metavar="M",
-        help="distance of the points of the map, m, may be repeated (default: 1 and 10)",
+        help="distance of the points of the map, m (default: 1 and 10); may be repeated",
     )
-    parser.add_argument("--matrix", action="store_true", help="compare each with each")
+    parser.add_argument("--matrix", action="store_true", help="compare every pair")
     add_json(parser)
 
 

@@ -62,9 +62,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds",
         type=float,
         metavar="S",
-        help=f"seconds of data (default: until converged, at most {MOST:g})",
+        help=f"seconds of data (default: until converged, at most {MOST:g}); "
+        f"if it has not converged by then, up to {LONGEST:g} times as many",
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of motion and noise")
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="N", help="seed of motion and noise (default 1)"
+    )
     parser.add_argument(
         "--out", metavar="DIR", help="folder for config, target, recording and result (default: a new folder)"
     )

@@ -30,17 +30,25 @@ Further files of a format (imu.yaml, one file per camera) are written next to th
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add SOURCE, the format and what the source may lack."""
     parser.add_argument(
-        "source", metavar="SOURCE", help="result JSON, log (.mcap), Kalibr's camchain (.yaml), or: store"
+        "source",
+        metavar="SOURCE",
+        help="result (.json), log (.mcap), Kalibr's camchain (.yaml), or `store` (the latest)",
     )
     parser.add_argument("--format", required=True, choices=FORMATS, metavar="F", help=", ".join(FORMATS))
     parser.add_argument(
         "-o", "--output", metavar="F", help="file or folder (default: the main file on stdout)"
     )
-    parser.add_argument("--camera", metavar="NAME", help="only this camera")
-    parser.add_argument("--resolution", metavar="WxH", help="image size, if the source has none")
+    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
+    parser.add_argument(
+        "--resolution", metavar="WxH", help="image size in px, e.g. 752x480, if the source has none"
+    )
     parser.add_argument("--imu-noise", metavar="F.yaml", help="Kalibr's imu.yaml with the noise densities")
-    parser.add_argument("--imu-topic", metavar="T", default="/imu0", help="ROS topic of the IMU")
-    parser.add_argument("--image-topic", metavar="T", help="ROS topic of the images (one camera)")
+    parser.add_argument(
+        "--imu-topic", metavar="T", default="/imu0", help="ROS topic of the IMU in the files (default /imu0)"
+    )
+    parser.add_argument(
+        "--image-topic", metavar="T", help="ROS topic of the images in the files (one camera only)"
+    )
     parser.add_argument(
         "--imu-frame",
         metavar="NAME",

@@ -47,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "capture-gyro-bias", "let the device measure its gyro bias at rest (lost at power-off)", _capture_bias
     )
     _add_port(bias)
-    bias.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long, 1 to 30 s (10)")
+    bias.add_argument(
+        "--seconds", type=float, default=10.0, metavar="S", help="how long to measure, 1 to 30 s (default 10)"
+    )
     bias.add_argument(
         "--store-in-eeprom", action="store_true", help="keep the bias after power-off (the EEPROM wears out)"
     )
@@ -60,7 +62,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_protocol(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--protocol", choices=("auto", "single-byte", "mip"), default="auto")
+    parser.add_argument(
+        "--protocol",
+        choices=("auto", "single-byte", "mip"),
+        default="auto",
+        help="protocol of the device (default: find out)",
+    )
 
 
 def _add_port(parser: argparse.ArgumentParser) -> None:
@@ -70,13 +77,17 @@ def _add_port(parser: argparse.ArgumentParser) -> None:
         "--link",
         choices=_LINKS,
         default="auto",
-        help="kind of link; on a real UART the wire time is subtracted from stamps",
+        help="kind of link (default: find out); on a UART the wire time is subtracted from stamps",
     )
 
 
 def _add_stream(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="samples per second")
-    parser.add_argument("--samples", type=int, default=None, metavar="N", help="end after N samples")
+    parser.add_argument(
+        "--rate", type=float, default=100.0, metavar="HZ", help="samples per second (default 100)"
+    )
+    parser.add_argument(
+        "--samples", type=int, default=None, metavar="N", help="end after N samples (default: at ^C)"
+    )
     parser.add_argument("--seconds", type=float, default=None, metavar="S", help="end after S seconds")
     parser.add_argument(
         "--filter-width",

@@ -33,7 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="local gravity, m/s^2 (default 9.80665); an error becomes accelerometer scale",
     )  # fmt: skip
     parser.add_argument(
-        "--min-rest", type=float, default=1.0, metavar="S", help="ignore shorter rests (default 1)"
+        "--min-rest",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="ignore rests shorter than S seconds (default 1)",
     )
     parser.add_argument("-o", "--output", metavar="F.yaml", help="write matrices and biases to this file")
     parser.epilog = _EPILOG

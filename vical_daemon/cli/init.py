@@ -30,12 +30,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of COMMANDS."""
     parser.epilog = _EPILOG
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE", default="vical.yaml", help="the config (vical.yaml)"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE",
+        default="vical.yaml",
+        help="config to write (default vical.yaml)",
     )
     parser.add_argument(
         "--target",
         choices=("aprilgrid", "checkerboard"),
-        help=f"make a board as large as A4 takes: {_BOARD_FILE} and {_TARGET_FILE}, beside the config",
+        help=f"also make a board for an A4 sheet: {_BOARD_FILE} and {_TARGET_FILE}, next to the config",
     )
     parser.add_argument("--rig", metavar="NAME", help="name of the rig (default: this computer's)")
     parser.add_argument(
@@ -43,13 +48,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="PORT",
-        help="look for an IMU on this port too (a pseudo terminal is not found by itself); may be repeated",
+        help="also look for an IMU on this port (for pseudo terminals); may be repeated",
     )
     parser.add_argument(
-        "--emulated", action="store_true", help="an emulated IMU and a rendered camera instead of devices"
+        "--emulated", action="store_true", help="use an emulated IMU and a rendered camera instead of devices"
     )
-    parser.add_argument("--no-check", action="store_true", help="write the files and open no device again")
-    parser.add_argument("--force", action="store_true", help="overwrite files that are there")
+    parser.add_argument("--no-check", action="store_true", help="write the files only, without the check")
+    parser.add_argument("--force", action="store_true", help="overwrite existing files")
     add_json(parser)
 
 

@@ -26,7 +26,7 @@ def add_json(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             "--json",
             action="store_true",
-            help="print only machine-readable output on stdout, the rest on stderr",
+            help="print JSON only on stdout, everything else on stderr",
         )
 
 

@@ -25,13 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=1.0,
         metavar="X",
-        help="speed relative to real time; 0: as fast as possible",
+        help="speed relative to real time (default 1; 0: as fast as possible)",
     )
     parser.add_argument("--rig", help="publish under this rig's keys (default: as recorded)")
     parser.add_argument(
-        "--streams", nargs="+", metavar="NAME", help="play only these topics, IMUs or cameras"
+        "--streams", nargs="+", metavar="NAME", help="play only these topics, IMUs or cameras (default: all)"
     )
-    parser.add_argument("--all", action="store_true", help="also play images of cameras that have points")
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="also play images of cameras whose detected points are in the recording",
+    )
     parser.add_argument(
         "--connect",
         metavar="ENDPOINT",
@@ -42,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=2.0,
         metavar="S",
-        help="wait S seconds for subscribers, if this command hosts the bus",
+        help="wait S seconds for subscribers, if this command hosts the bus (default 2)",
     )
     add_config(parser, required=False)
     add_json(parser)

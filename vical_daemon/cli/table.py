@@ -43,8 +43,8 @@ START, SERVICE, DEVICES, CALIBRATION, LOGS, RESULTS = (
 COMMANDS = (
     Command("demo", START, "run the whole system without hardware, and compare the estimate with the truth"),
     Command("init", START, "write a commented config from what is plugged in, and check it"),
-    Command("check", START, "check the config and the devices"),
-    Command("doctor", START, "check this computer for causes of bad stamps"),
+    Command("check", START, "check a config and its devices"),
+    Command("doctor", START, "check this computer for causes of inaccurate time stamps"),
     Command("target", START, "write a board to print, to scale, and its target file"),
     Command("completion", START, "print a completion script for bash or zsh"),
     Command("run", SERVICE, "run the daemon, or single roles of it"),
@@ -61,7 +61,7 @@ COMMANDS = (
     ),
     Command("imu", DEVICES, "use an IMU directly: info, stream, decode, gyro bias, self test"),
     Command("camera", DEVICES, "use a camera directly: list, stream, snapshot, controls"),
-    Command("calibrate", CALIBRATION, "calibrate from a recording: extrinsics and time shift"),
+    Command("calibrate", CALIBRATION, "calibrate from recordings: mounting, time shift and lens"),
     Command(
         "merge", CALIBRATION, "merge recordings of one rig into one calibration, and name those that disagree"
     ),

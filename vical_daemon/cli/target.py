@@ -58,17 +58,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force", action="store_true", help="overwrite an existing target file with other contents"
     )
-    parser.add_argument("--paper", default="a4", help="a5 ... a0, letter, legal, tabloid or WxH in mm (a4)")
+    parser.add_argument(
+        "--paper", default="a4", help="a5 ... a0, letter, legal, tabloid or WxH in mm (default a4)"
+    )
     grid = parser.add_argument_group("aprilgrid")
-    grid.add_argument("--tag-cols", type=int, metavar="N", help="tags along x (6)")
-    grid.add_argument("--tag-rows", type=int, metavar="N", help="tags along y (6)")
-    grid.add_argument("--tag-size", metavar="LENGTH", help="edge of a tag, m or e.g. 30mm (as large as fits)")
-    grid.add_argument("--tag-spacing", type=float, metavar="X", help="gap between tags / tag size (0.3)")
+    grid.add_argument("--tag-cols", type=int, metavar="N", help="tags along x (default 6)")
+    grid.add_argument("--tag-rows", type=int, metavar="N", help="tags along y (default 6)")
+    grid.add_argument(
+        "--tag-size",
+        metavar="LENGTH",
+        help="edge of a tag, in m, or with a unit: 30mm (default: as large as fits)",
+    )
+    grid.add_argument(
+        "--tag-spacing", type=float, metavar="X", help="gap between tags over tag size (default 0.3)"
+    )
     squares = parser.add_argument_group("checkerboard")
-    squares.add_argument("--cols", type=int, metavar="N", help="inner corners along x (8)")
-    squares.add_argument("--rows", type=int, metavar="N", help="inner corners along y (7)")
+    squares.add_argument("--cols", type=int, metavar="N", help="inner corners along x (default 8)")
+    squares.add_argument("--rows", type=int, metavar="N", help="inner corners along y (default 7)")
     squares.add_argument(
-        "--square", metavar="LENGTH", help="edge of a square, m, or e.g. 30mm (as large as fits)"
+        "--square",
+        metavar="LENGTH",
+        help="edge of a square, in m, or with a unit: 30mm (default: as large as fits)",
     )
     add_json(parser)
 

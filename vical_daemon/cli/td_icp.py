@@ -19,19 +19,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a trajectory file"
     )
-    parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format (not needed for tracks)")
-    parser.add_argument("--initial", metavar="FILE", help="the lens and the imu's noise: Kalibr's files")
-    parser.add_argument("--camera", metavar="NAME", help="only this camera")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
+    parser.add_argument(
+        "--target",
+        metavar="FILE",
+        help="target file of the board, Kalibr's format (not needed for feature tracks)",
+    )
+    parser.add_argument("--initial", metavar="FILE", help="Kalibr's files with the lens and the IMU's noise")
+    parser.add_argument("--camera", metavar="NAME", help="which camera, if the recording has several")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
     parser.add_argument(
         "--sensors",
         metavar="A,B,C",
-        help="several sensors jointly: names of imus and cameras, topics with orientations (Odometry, "
+        help="register these sensors jointly: names of IMUs and cameras, topics with orientations (Odometry, "
         "PoseStamped, PoseWithCovarianceStamped, TransformStamped, QuaternionStamped, Imu), trajectory files "
         "(TUM, EuRoC). The imu's gyro is the reference, or without one the fastest stream",
     )
     parser.add_argument(
-        "--search", metavar="S", type=float, default=5.0, help="look for delays up to ± S seconds (5)"
+        "--search", metavar="S", type=float, default=5.0, help="search delays up to ± S seconds (default 5)"
     )
     parser.add_argument(
         "--watch",

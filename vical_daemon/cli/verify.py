@@ -28,7 +28,7 @@ examples:
   vical verify euroc/mav0 --against camchain-imucam.yaml --initial imu.yaml --target april.yaml
   vical verify euroc/mav0 --against mounting.yaml --initial lens.yaml --target april.yaml
 
-The last one asks about mounting and time shift alone, for the lens of --initial, because the file gives none.
+In the last example mounting.yaml has no lens: mounting and time shift are tested, with the lens of --initial.
 
 exit code: 0 holds; 4 no longer holds; 5 this recording cannot tell; 1 it cannot be read; 2 bad usage
 """
@@ -42,31 +42,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--against",
         metavar="SOURCE",
         required=True,
-        help="the calibration: result, log, store, Kalibr's or OpenVINS's camchain",
+        help="result, log, file of the store, `store` (the latest), Kalibr's or OpenVINS's camchain",
     )
-    parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format; without: target-free")
-    parser.add_argument("--camera", metavar="NAME", help="only this camera")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
     parser.add_argument(
-        "--initial", metavar="FILE", help="the lens and the IMU's noise, where SOURCE does not give them"
+        "--target",
+        metavar="FILE",
+        help="target file of the board, Kalibr's format (default: calibrate without a board)",
+    )
+    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
+    parser.add_argument(
+        "--initial",
+        metavar="FILE",
+        help="Kalibr's files with the lens and the IMU's noise, if SOURCE does not have them",
     )
     parser.add_argument(
         "--fix",
         choices=("intrinsics",),
-        help="ask about mounting and time shift alone, for the lens as given",
+        help="test mounting and time shift only, with the lens as given",
     )
-    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
-    parser.add_argument("--seconds", type=float, metavar="S", help="use only S seconds (after --skip)")
-    counts = parser.add_argument_group("what counts as a change")
-    counts.add_argument("--position-mm", type=float, default=2.0, metavar="MM", help="default 2")
-    counts.add_argument("--rotation-deg", type=float, default=0.2, metavar="DEG", help="default 0.2")
-    counts.add_argument("--timeshift-ms", type=float, default=1.0, metavar="MS", help="default 1")
+    parser.add_argument(
+        "--skip", type=float, default=0.0, metavar="S", help="skip the first S seconds (default 0)"
+    )
+    parser.add_argument("--seconds", type=float, metavar="S", help="use at most S seconds (after --skip)")
+    counts = parser.add_argument_group("the smallest changes that count")
+    counts.add_argument(
+        "--position-mm", type=float, default=2.0, metavar="MM", help="change of position, mm (default 2)"
+    )
+    counts.add_argument(
+        "--rotation-deg", type=float, default=0.2, metavar="DEG", help="change of rotation, deg (default 0.2)"
+    )
+    counts.add_argument(
+        "--timeshift-ms",
+        type=float,
+        default=1.0,
+        metavar="MS",
+        help="change of the time shift, ms (default 1)",
+    )
     counts.add_argument(
         "--focal-percent",
         type=float,
         default=0.5,
         metavar="P",
-        help="default 0.5; of the principal point, too",
+        help="change of focal length or principal point, %% of the focal length (default 0.5)",
     )
     add_json(parser)
 

@@ -30,9 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="router to connect to, e.g. tcp/127.0.0.1:7447 (default: the local bus)",
     )
     parser.add_argument("--rig", default="*", help="only this rig (default: all rigs on the bus)")
-    parser.add_argument("--once", action="store_true", help="print the last known state and end")
-    parser.add_argument("--until-converged", action="store_true", help="end when every camera has converged")
-    parser.add_argument("--timeout", type=float, metavar="S", help="give up after S seconds (exit 1)")
+    parser.add_argument("--once", action="store_true", help="print the last known state and exit")
+    parser.add_argument("--until-converged", action="store_true", help="exit when every camera has converged")
+    parser.add_argument(
+        "--timeout",
+        type=float,
+        metavar="S",
+        help="give up after S seconds, with exit code 1 (default: never)",
+    )
     add_json(parser)
 
 

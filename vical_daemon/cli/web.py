@@ -31,7 +31,11 @@ On a robot set `web: {enabled: true}` instead; then `vical run` serves the page.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add where to listen and which bus to ask."""
     add_config(parser, required=False)
-    parser.add_argument("--connect", metavar="ENDPOINT", help="router to connect to, e.g. tcp/127.0.0.1:7447")
+    parser.add_argument(
+        "--connect",
+        metavar="ENDPOINT",
+        help="router to connect to, e.g. tcp/127.0.0.1:7447 (default: the local bus)",
+    )
     parser.add_argument("--host", help="address to listen on (default: as in the config, 127.0.0.1)")
     parser.add_argument("--port", type=int, help="port (default: as in the config, 8080; 0: any free one)")
     parser.add_argument(
