@@ -1,4 +1,4 @@
-"""The first seconds: what was seen is kept, and a start is tried from it, ever less often."""
+"""The first seconds: what was seen is kept, and a start is tried from it, ever less often, not at rest."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.initial_filter import wide_filter
 from vical_daemon.estimation.init.readout_start import looks_rolling
 from vical_daemon.estimation.init.relinearisation import Frames, Step, rehearsed
+from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import Layout
 
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
-_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must cost little
+_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0
 _LOOK_S = 2.0  # a look takes 0.2 to 0.3 s of CPU
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
@@ -67,26 +68,41 @@ class Starting:
         """Forget what was seen and try often again."""
         self._next_s, self._every_s = -np.inf, _ATTEMPT_FIRST_S
         self._next_look_s = -np.inf
+        self._tried = False
+        self._rest = {name: RestDetector() for name in self._frames}
         self._caches.clear()
         for frames in self._frames.values():
             frames.clear()
 
     def take(self, items: Sequence[tuple[float, PointsFrame]]) -> None:
-        """Keep images (stamp in the camera's clock in s, points); of too many, the older half is dropped."""
+        """Keep images (stamp in the camera's clock in s, points).
+
+        Of too many, the older half is dropped; of a rest before any motion, all but the last image.
+        """
         for t_cam_s, frame in items:
-            frames = self._frames[frame.camera]
+            frames, rest = self._frames[frame.camera], self._rest[frame.camera]
             frames.append((t_cam_s, frame))
+            rest.take(t_cam_s, frame)
             if len(frames) > _MAX_FRAMES:
                 del frames[: len(frames) // 2]
+            if rest.rests_since(frames[0][0]):
+                for name, kept in self._frames.items():
+                    self._frames[name] = [x for x in kept if x[0] >= t_cam_s]
 
     @property
     def oldest_s(self) -> float:
         """Stamp of the oldest image kept, s; infinite when there is none."""
         return min((f[0][0] for f in self._frames.values() if f), default=np.inf)
 
+    @property
+    def _rests(self) -> bool:
+        """Whether some camera shows a rig at rest by now, and none that it moves."""
+        seen = [r for r in self._rest.values() if r.seen]
+        return bool(seen) and all(r.rests for r in seen)
+
     def due(self, newest_s: float) -> bool:
-        """Whether it is time for another attempt."""
-        if newest_s < self._next_s:
+        """Whether it is time for another attempt; a rig at rest adds nothing to the last one."""
+        if newest_s < self._next_s or (self._tried and self._rests):
             return False
         self._next_s = newest_s + self._every_s
         self._every_s = min(1.25 * self._every_s, _ATTEMPT_MOST_S)
@@ -102,7 +118,11 @@ class Starting:
         """
         spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
         if len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S:
+            self._every_s = _ATTEMPT_FIRST_S
+            if self._rests:
+                return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
             return _none("collecting the first seconds: move the rig, keep the target in view")
+        self._tried = True
         data = start.StartData(
             buffer, self._frames, priors, self._options, self._layout, self._target, self._caches
         )
