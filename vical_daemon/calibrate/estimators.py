@@ -26,6 +26,10 @@ class Estimator(Protocol):
         """Take the stamp uncertainty that the IMU's driver reports now, one sigma, s."""
         ...
 
+    def imu_counters(self) -> dict[str, int]:
+        """Return how many inertial readings were left out so far, by cause."""
+        ...
+
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image."""
         ...

@@ -203,6 +203,7 @@ class EstimateRole:
             "implausible": str(self._implausible),
             "stamps_refused": str(sum(gate.refused for gate in self._gates.values())),
             "stamp_jumps": str(sum(gate.jumps for gate in self._gates.values())),
+            **{name: str(count) for name, count in self.estimator.imu_counters().items()},
         }
         verdicts = {} if self._watch is None else self._watch.verdicts
         status = calibration_status(self.latest, counters)

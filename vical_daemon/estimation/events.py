@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
+from vical_daemon.estimation.measurements import COLUMNS, ROWS
+
 
 class EventKind(StrEnum):
     """What happened; see `REFERENCE` for meaning, unit of the value, and when it is announced."""
@@ -41,6 +43,7 @@ class EventKind(StrEnum):
     TARGET_SHAPE = "target_shape"
     FIXED_LENS = "fixed_lens"
     ROLLING_SHUTTER = "rolling_shutter"
+    ROLLING_COLUMNS = "rolling_shutter_columns"
     LENS_TERM_MISSING = "lens_term_missing"
     DEVICE_REPLACED = "device_replaced"
     ESTIMATOR_RESTARTED = "estimator_restarted"
@@ -106,6 +109,8 @@ class Event:
 
 SAID = frozenset({EventKind.OTHER, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED})
 """Kinds whose details (serial numbers, a line of code) are text only."""
+ROLLING = {ROWS: EventKind.ROLLING_SHUTTER, COLUMNS: EventKind.ROLLING_COLUMNS}
+"""What is announced of a rolling shutter, by what it reads one after the other."""
 _CHANGES = frozenset(
     {
         EventKind.BUMPED,
@@ -285,6 +290,11 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.ROLLING_SHUTTER: About(
         "A rolling shutter that the config does not mention; its readout is estimated. Value: readout, where "
         "already known.",
+        "s",
+        "Once per camera.",
+    ),
+    EventKind.ROLLING_COLUMNS: About(
+        "The same, read by columns: a phone held upright.",
         "s",
         "Once per camera.",
     ),

@@ -41,6 +41,7 @@ from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTIN
 from vical_daemon.estimation.smoother.handover import afresh, aged, next_window
 from vical_daemon.estimation.smoother.judge import FreeJudge
 from vical_daemon.estimation.smoother.reports import window_reports
+from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
 from vical_daemon.estimation.smoother.starter import Starter
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
@@ -123,6 +124,10 @@ class TargetFreeCalibrator:
             self.judge.saw_imu(reading.t_imu_ns, reading.gyro_rps)
         self.judge.imu_refused += self._imu.refused - refused
         self.judge.announce_all(self._imu.news())
+
+    def imu_counters(self) -> dict[str, int]:
+        """Inertial readings left out so far, by cause."""
+        return self._imu.counters()
 
     @property
     def _buffer(self) -> ImuBuffer | None:
@@ -255,15 +260,33 @@ class TargetFreeCalibrator:
 
     def _adjusted(self, window: Window, known: Carry | None, reopened: Collection[int] = ()) -> _Begun | None:
         """Adjust a first window with what is known but for some errors; None where it does not fit."""
-        assert self._buffer is not None
-        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened)
-        bundle = Bundle(window, carry, *self._noise)
-        fit = bundle.solve(self._buffer, _STEPS_START)
+        bundle, carry, fit = self._solved(window, known, reopened)
+        if known is None and self._axis_open and fit is not None and shows_columns(bundle, fit):
+            by_columns = self._solved(read_by_columns(window), known, reopened)
+            if by_columns[2] is not None and by_columns[2].sigma_px < fit.sigma_px:
+                bundle, carry, fit = by_columns
         if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
             return None
         if known is not None and not self.judge.agrees(fit, carry, complete=False):
             return None
+        if known is None and self._axis_open:
+            axis = bundle.window.camera.readout_axis
+            self.prior = self.starter.prior = replace(self.prior, readout_axis=axis)
         return _Begun(bundle, fit)
+
+    def _solved(
+        self, window: Window, known: Carry | None, reopened: Collection[int]
+    ) -> tuple[Bundle, Carry, Fit | None]:
+        """Adjust a window with what is known but for some errors."""
+        assert self._buffer is not None
+        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened)
+        bundle = Bundle(window, carry, *self._noise)
+        return bundle, carry, bundle.solve(self._buffer, _STEPS_START)
+
+    @property
+    def _axis_open(self) -> bool:
+        """Whether nothing was said, or found, of what a rolling shutter would read one after the other."""
+        return not (self.prior.readout_axis or self.prior.readout_s)
 
     def _go_on(self, frames: list[Stamped], known: Carry) -> _Begun | str:
         """Start a window after a pause; where it contradicts what was known, find what has changed."""

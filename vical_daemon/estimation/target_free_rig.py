@@ -60,6 +60,10 @@ class TargetFreeRig:
         for part in self.parts.values():
             part.add_imu(t_imu_ns, gyro_rps, specific_force_mps2)
 
+    def imu_counters(self) -> dict[str, int]:
+        """Inertial readings left out so far, by cause; the same for each camera."""
+        return next(iter(self.parts.values())).imu_counters()
+
     def add_points(self, frame: PointsFrame) -> None:
         """Take the tracks of one image; those of unknown cameras are only counted."""
         part = self.parts.get(frame.camera)

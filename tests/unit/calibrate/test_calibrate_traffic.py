@@ -45,6 +45,9 @@ class Recorded:
         self.waiting = 0
         self.hangs = self.fails = False
 
+    def imu_counters(self) -> dict[str, int]:
+        return {"imu_clipped": 3, "imu_spikes": 1}
+
     def stamps_known_to(self, sigma_s: float) -> None:
         self.sigma_s = sigma_s
 
@@ -126,7 +129,9 @@ class TestEstimate:
             role.step()
         role.finish()
         assert estimator.frames == estimator.imu_samples == 100
-        assert role.statuses()[0].values["stamps_refused"] == "8"
+        values = role.statuses()[0].values
+        assert values["stamps_refused"] == "8"
+        assert (values["imu_clipped"], values["imu_spikes"]) == ("3", "1")
 
     def test_progress_counts_what_is_used_or_refused(self, config: Config) -> None:
         estimator = Recorded()

@@ -50,6 +50,9 @@ class FakeEstimator:
         self.fed: list[tuple[str, int]] = []
         self.status = Status.CONVERGING
 
+    def imu_counters(self) -> dict[str, int]:
+        return {}
+
     def stamps_known_to(self, sigma_s: float) -> None:
         self.stamp_sigma_s = sigma_s
 

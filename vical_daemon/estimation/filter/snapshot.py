@@ -47,6 +47,7 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         float(camera.readout_s),
         float(sigma[where.readout]) if where.readout is not None else 0.0,
         [int(size) for size in camera.resolution],
+        camera.readout_axis,
     )
 
 

@@ -75,6 +75,15 @@ class ImuIntake:
         """Readings left out because neither their neighbours nor the other sensor support them."""
         return self._spikes.spikes
 
+    def counters(self) -> dict[str, int]:
+        """Readings left out so far, by cause, as the status names them."""
+        return {
+            "imu_refused": self.refused,
+            "imu_repeated": self.repeated,
+            "imu_clipped": self.clipped,
+            "imu_spikes": self.spikes,
+        }
+
     @property
     def shift_s(self) -> float:
         """Time shift by the stamps as they come now, minus the time shift by the even axis, s."""

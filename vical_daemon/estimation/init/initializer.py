@@ -36,7 +36,8 @@ class Attempt:
         frames: Those it begins with, in order of the imu's time.
         reason: Why there is none, or what the motion does not show.
         motion_missing: It is motion that is missing, not time.
-        rolling: Name of a camera that has a rolling shutter of which nothing was said.
+        rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
+            the other (`ROWS`, `COLUMNS`); None: there is none.
         size: See `Rehearsed`.
     """
 
@@ -44,7 +45,7 @@ class Attempt:
     frames: Frames
     reason: str
     motion_missing: bool = False
-    rolling: str = ""
+    rolling: tuple[str, str] | None = None
     size: float | None = None
 
 
@@ -127,7 +128,7 @@ class Starting:
             buffer, self._frames, priors, self._options, self._layout, self._target, self._caches
         )
         rolling = self._rolling(buffer.newest_s, priors)
-        if rolling:
+        if rolling is not None:
             return Attempt(None, [], "", rolling=rolling)
         result = start.attempt(data)
         if result.state is None and result.motion_missing and may_be_partial:
@@ -164,17 +165,18 @@ class Starting:
         self._options = replace(self._options, estimate=self._options.estimate | set(off))
         self._caches.clear()
 
-    def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> str:
-        """Name of a camera whose images a rolling shutter has bent, though nobody said so; or empty."""
+    def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> tuple[str, str] | None:
+        """A camera whose images a rolling shutter has bent, though nobody said so, and its axis; or None."""
         if newest_s < self._next_look_s:
-            return ""
+            return None
         self._next_look_s = newest_s + _LOOK_S
         for name, where in self._layout.cameras.items():
             if where.readout is None and priors[name].readout_s == 0.0:
                 lens = Lens.from_prior(priors[name])
-                if looks_rolling(self._frames[name], lens, self._target):
-                    return name
-        return ""
+                axis = looks_rolling(self._frames[name], lens, self._target)
+                if axis:
+                    return name, axis
+        return None
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:

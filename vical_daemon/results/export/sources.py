@@ -94,6 +94,7 @@ def _camera(name: str, entry: Any) -> RigCamera:
             covariance=None if not covariance else np.array(covariance, dtype=np.float64).reshape(6, 6),
             timeshift_sigma_s=None if sigma is None else float(sigma),
             readout_s=float(entry.get("readout_s") or 0.0),
+            readout_axis=str(entry.get("readout_axis") or ""),
             unobservable=tuple(entry.get("unobservable") or ()),
         )
     except KeyError as error:

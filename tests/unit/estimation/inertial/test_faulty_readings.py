@@ -109,6 +109,7 @@ def test_clipping_is_announced_once_with_its_share_and_is_never_interpolated() -
     assert [event.kind for event in events] == [EventKind.IMU_CLIPPED]
     assert events[0].value == pytest.approx(beyond[1000:].mean(), abs=0.1)
     assert intake.clipped == pytest.approx(beyond.sum(), rel=0.1)
+    assert intake.counters()["imu_clipped"] == intake.clipped
     where = np.flatnonzero(beyond[2000:])[0] + 2000
     assert intake.buffer is not None
     assert intake.buffer.gap_within(where / RATE_HZ - 0.02, where / RATE_HZ + 0.02)
@@ -118,6 +119,6 @@ def test_spikes_leave_no_event_and_no_gap() -> None:
     six = motion()
     six[700, 1] -= 12.0
     intake, kinds = take(six)
-    assert kinds == [] and intake.spikes == 1
+    assert kinds == [] and intake.counters()["imu_spikes"] == 1
     assert intake.buffer is not None and len(intake.buffer) == len(six) - 1
     assert not intake.buffer.gap_within(3.4, 3.6)
