@@ -131,6 +131,8 @@ class Starting:
         if rolling is not None:
             return Attempt(None, [], "", rolling=rolling)
         result = start.attempt(data)
+        if result.size is not None:
+            return Attempt(None, [], "", size=result.size)
         if result.state is None and result.motion_missing and may_be_partial:
             result = start.partial_attempt(data, result.reason)
         if result.state is None:
