@@ -11,13 +11,22 @@ A disturbance begins at 20 s; ten seconds follow it. Each recording is run witho
 from __future__ import annotations
 
 import argparse
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from typing import Any
 
 import numpy as np
-from vical_mocks.harness.feed import CalibratorSubject, Record, StartErrors, camera_prior, feed, imu_noise
+from vical_mocks.harness.feed import (
+    CalibratorSubject,
+    Record,
+    StartErrors,
+    camera_prior,
+    finish,
+    follow,
+    imu_noise,
+)
 from vical_mocks.points import SimulatedRun, simulate
 from vical_mocks.rig import Bump, reference_rig
 from vical_mocks.tracks import room_landmarks, simulate_tracks
@@ -27,6 +36,8 @@ from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
 
 AT_S, AFTER_S = 20.0, 10.0
+COMMON_S = AT_S - 0.5
+LOOK_S = 0.25
 GAPS_S = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 60.0)
 STEPS_S = (0.02, 0.5, 3600.0)
 Change = Callable[[SimulatedRun], SimulatedRun]
@@ -107,8 +118,15 @@ UNDISTURBED = "undisturbed"
 CASES[UNDISTURBED] = (lambda run: run, 0.0)
 
 
-def simulated(case: str, seed: int, seconds: float, *, target_free: bool) -> SimulatedRun:
-    """The undisturbed recording; a bump of 2 deg and 10 mm where the case asks for one."""
+@lru_cache(maxsize=4)
+def simulated(case: str, seed: int, *, target_free: bool) -> SimulatedRun:
+    """The undisturbed recording; a bump of 2 deg and 10 mm where the case asks for one.
+
+    As long as the longest case needs, whatever the case: noise depends on the length.
+    """
+    if not case.startswith("bump") and case != UNDISTURBED:
+        return simulated(UNDISTURBED, seed, target_free=target_free)
+    seconds = AT_S + max(GAPS_S) + AFTER_S
     bumps: tuple[Bump, ...] = ()
     if case.startswith("bump"):
         rng = np.random.default_rng([seed, 77])
@@ -139,20 +157,39 @@ def _undisturbed_m(seed: int, lens_known: bool, target_free: bool) -> Any:
 
 
 def recorded(case: str, seed: int, *, lens_known: bool, target_free: bool) -> Record:
-    """What is said about one recording with the disturbance of a case."""
+    """What is said about one recording with the disturbance of a case.
+
+    All cases of a seed are the same up to the disturbance: that part is followed once, and each case goes on
+    from a copy.
+    """
     change, lasts_s = CASES[case]
-    run = simulated(case, seed, AT_S + lasts_s + AFTER_S, target_free=target_free)
+    before, record = pickle.loads(_before(seed, lens_known, target_free))
+    subject = Stepped.__new__(Stepped)
+    subject.calibrator = before.calibrator
+    run = simulated(case, seed, target_free=target_free)
+    subject.sensor, subject.step_ns = case.split()[0], round(_added_s(case) * 1e9)
+    subject.at_ns = run.options.epoch_ns + round(AT_S * 1e9)
+    end_s = AT_S + lasts_s + AFTER_S
+    run = change(run)
+    follow(run, subject, record, LOOK_S, after_s=COMMON_S, until_s=end_s)
+    finish(run, subject, record, end_s)
+    return record
+
+
+@lru_cache(maxsize=64)
+def _before(seed: int, lens_known: bool, target_free: bool) -> bytes:
+    """The calibrator and what it had said, `COMMON_S` into the recording; pickled."""
+    run = simulated(UNDISTURBED, seed, target_free=target_free)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"}) if lens_known else frozenset(),
         target_free=target_free,
         imu_noise=imu_noise(run),
     )
     prior = camera_prior(run, seed, StartErrors(), exact_lens=lens_known)
-    points = None if target_free else run.points_m
-    subject = Stepped(options, prior, points)
-    subject.sensor, subject.step_ns = case.split()[0], round(_added_s(case) * 1e9)
-    subject.at_ns = run.options.epoch_ns + round(AT_S * 1e9)
-    return feed(change(run), subject, 0.25)
+    subject = CalibratorSubject(options, prior, None if target_free else run.points_m)
+    record = Record()
+    follow(run, subject, record, LOOK_S, until_s=COMMON_S)
+    return pickle.dumps((subject, record))
 
 
 def _added_s(case: str) -> float:

@@ -468,8 +468,7 @@ class Calibrator:
         if self.watch.doubtful or any(clock_drift.in_doubt(f, name) for name in self.priors):
             return clock_drift.CLOCKS_IN_DOUBT
         converged = self.judge.status == Status.CONVERGED
-        doubts = hypotheses.IN_DOUBT.items()
-        return next((why for name, why in doubts if hypotheses.in_doubt(f, name, converged=converged)), "")
+        return hypotheses.IN_DOUBT.get(hypotheses.in_doubt(f, converged=converged), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

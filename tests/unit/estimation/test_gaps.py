@@ -1,5 +1,6 @@
 """Gaps, frozen sensors and clocks that are set: the motion is found anew, the calibration is kept."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import Status
 
 BEGIN_S, END_S = 14.0, 22.0
+COMMON_S = BEGIN_S - 0.5
 
 
 @pytest.fixture(scope="module")
@@ -32,14 +34,25 @@ def stream(run):
     return sorted(items, key=lambda item: item[:2])
 
 
-def calibrate(run, change=lambda items: items):
-    """Feed what is left of a recording; the calibrator, its events, and sigmas and status as time goes by."""
+def calibrate(run, change=lambda items: items, so_far=None):
+    """Feed a recording, or what follows `COMMON_S`; the last estimate, all events, and all estimates."""
+    c, events, shots = pickle.loads(so_far) if so_far else (calibrator(run), [], [])
+    items = change(stream(run))
+    follow(c, events, shots, [x for x in items if x[0] >= COMMON_S] if so_far else items)
+    c.finish()
+    estimate = c.estimate()
+    return estimate, events + estimate.events, shots
+
+
+def calibrator(run):
     lens = run.rig.lens
     prior = {"cam0": CameraPrior((640, 480), tuple(lens.intrinsics), lens.model, tuple(lens.distortion))}
     options = CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise())
-    c = Calibrator(options, prior, run.points_m)
-    events, shots = [], []
-    for n, (t_s, kind, stamp_ns, content) in enumerate(change(stream(run))):
+    return Calibrator(options, prior, run.points_m)
+
+
+def follow(c, events, shots, items):
+    for n, (t_s, kind, stamp_ns, content) in enumerate(items):
         if kind:
             c.add_points(replace(content, t_cam_ns=stamp_ns))
             c.process()
@@ -49,14 +62,19 @@ def calibrate(run, change=lambda items: items):
             estimate = c.estimate()
             events += estimate.events
             shots.append((t_s, estimate))
-    c.finish()
-    estimate = c.estimate()
-    return estimate, events + estimate.events, shots
 
 
 @pytest.fixture(scope="module")
-def whole(run):
-    return calibrate(run)[0]
+def so_far(run):
+    """What all disturbed recordings have in common, followed once."""
+    c, events, shots = calibrator(run), [], []
+    follow(c, events, shots, [x for x in stream(run) if x[0] < COMMON_S])
+    return pickle.dumps((c, events, shots))
+
+
+@pytest.fixture(scope="module")
+def whole(run, so_far):
+    return calibrate(run, so_far=so_far)[0]
 
 
 def without(kinds, seconds):
@@ -112,8 +130,8 @@ def before(shots):
     ],
     ids=["imu 0.1 s", "imu 2 s", "camera 2 s", "both 1 s", "both 5 s"],
 )
-def test_a_gap_costs_the_motion_and_not_the_calibration(run, whole, kinds, seconds, said):
-    estimate, events, shots = calibrate(run, without(kinds, seconds))
+def test_a_gap_costs_the_motion_and_not_the_calibration(run, so_far, whole, kinds, seconds, said):
+    estimate, events, shots = calibrate(run, without(kinds, seconds), so_far)
     (gap,) = (e for e in events if e.kind is said)
     assert gap.value == pytest.approx(seconds, abs=0.05)
     assert not CHANGES & {e.kind for e in events}
@@ -131,8 +149,8 @@ def test_a_gap_costs_the_motion_and_not_the_calibration(run, whole, kinds, secon
     [(0, 1.0, EventKind.IMU_REPEATED), (1, 3.0, EventKind.IMAGE_REPEATED)],
     ids=["imu", "camera"],
 )
-def test_a_frozen_sensor_is_a_gap(run, whole, kind, seconds, said):
-    estimate, events, _ = calibrate(run, frozen(kind, seconds))
+def test_a_frozen_sensor_is_a_gap(run, so_far, whole, kind, seconds, said):
+    estimate, events, _ = calibrate(run, frozen(kind, seconds), so_far)
     assert [e.kind for e in events].count(said) == 1
     assert not CHANGES & {e.kind for e in events}
     assert estimate.status == Status.CONVERGED
@@ -141,8 +159,8 @@ def test_a_frozen_sensor_is_a_gap(run, whole, kind, seconds, said):
 
 @pytest.mark.parametrize("step_s", [0.02, -0.02, 0.5, -0.5, 3600.0, -3600.0])
 @pytest.mark.parametrize("kind", [0, 1], ids=["imu", "camera"])
-def test_a_clock_that_is_set_moves_the_time_shift_alone(run, whole, kind, step_s):
-    estimate, events, _ = calibrate(run, stepped(kind, step_s))
+def test_a_clock_that_is_set_moves_the_time_shift_alone(run, so_far, whole, kind, step_s):
+    estimate, events, _ = calibrate(run, stepped(kind, step_s), so_far)
     shift_s = run.rig.timeshift_cam_imu_s + (step_s if kind == 0 else -step_s)
     e = estimate.cameras["cam0"]
     assert not STARTS & {e.kind for e in events}
@@ -194,22 +212,9 @@ def test_two_cameras_go_on_together_after_a_gap(run):
     assert c.estimate().status == Status.CONVERGED
 
 
-def test_the_motion_found_anew_is_the_true_one(run):
-    c = Calibrator(
-        CalibrationOptions(fix=frozenset({"intrinsics"}), imu_noise=ImuNoise()),
-        {
-            "cam0": CameraPrior(
-                (640, 480), tuple(run.rig.lens.intrinsics), "radtan", tuple(run.rig.lens.distortion)
-            )
-        },
-        run.points_m,
-    )
-    for _, kind, stamp_ns, content in stream(run):
-        if kind:
-            c.add_points(content)
-            c.process()
-        else:
-            c.add_imu(stamp_ns, *content)
+def test_the_motion_found_anew_is_the_true_one(run, so_far):
+    c, events, shots = pickle.loads(so_far)
+    follow(c, events, shots, [x for x in stream(run) if x[0] >= COMMON_S])
     f, base_s = c.filter, (int(run.t_imu_ns[0]) - run.options.epoch_ns) * 1e-9
     restart = MotionRestart(run.points_m, {})
     frames = [x for x in run.frames if END_S - 1.5 < x.t_s < END_S - 0.5][:5]

@@ -227,14 +227,17 @@ def off(f: CalibrationFilter, name: str) -> float:
     return not_zero(weights(f), name)
 
 
-def in_doubt(f: CalibrationFilter, name: str, *, converged: bool = False) -> bool:
-    """Whether the data speak for a block that is not zero, though not yet surely: they soon will.
+def in_doubt(f: CalibrationFilter, *, converged: bool = False) -> str:
+    """Name of a block for which the data speak, though not yet surely: they soon will. Empty: none.
 
     Images that do not fit may never decide it; what is told covers both then. What has `converged` stays so
     until the block is more likely off than not: of many looks, one sees 5 % by chance.
     """
-    doubtful = name in blocks(f) and name not in f.off and misfit(f) == 1.0
-    return doubtful and off(f, name) > (0.5 if converged else OFF)
+    if misfit(f) != 1.0:
+        return ""
+    doubtful, shares = blocks(f).keys() - f.off, weights(f)
+    enough = 0.5 if converged else OFF
+    return next((n for n in IN_DOUBT if n in doubtful and not_zero(shares, n) > enough), "")
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
