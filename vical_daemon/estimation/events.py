@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
-from vical_daemon.estimation.measurements import COLUMNS, ROWS
-
 
 class EventKind(StrEnum):
     """What happened; see `REFERENCE` for meaning, unit of the value, and when it is announced."""
@@ -109,8 +107,8 @@ class Event:
 
 SAID = frozenset({EventKind.OTHER, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED})
 """Kinds whose details (serial numbers, a line of code) are text only."""
-ROLLING = {ROWS: EventKind.ROLLING_SHUTTER, COLUMNS: EventKind.ROLLING_COLUMNS}
-"""What is announced of a rolling shutter, by what it reads one after the other."""
+ROLLING = {"rows": EventKind.ROLLING_SHUTTER, "columns": EventKind.ROLLING_COLUMNS}
+"""What is announced of a rolling shutter, by what it reads one after the other (`CameraPrior.readout_axis`)."""
 _CHANGES = frozenset(
     {
         EventKind.BUMPED,
@@ -220,7 +218,7 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.STAMP_JITTER: About(
         "The stamps of the images jitter; allowed for. Value: standard deviation.",
         "s",
-        "Once per camera, from 0.3 ms.",
+        "Once per camera, from 0.3 ms; with a board, once neighbours are known to be late independently.",
     ),
     EventKind.STAMPS_STEPPED: About(
         "A camera's clock was set. Value: step against the IMU's stamps.",

@@ -434,7 +434,7 @@ class TargetFreeCalibrator:
             keep: The window as adjusted last was good.
             against_s: For how long images have contradicted the calibration, s; 0: they do not.
         """
-        window = self.window
+        window, unproven = self.window, against_s > 0.0 and not self.judge.proven
         self.window = None
         if window is not None and against_s and self.judge.against_s:
             self._confirmed = True
@@ -445,6 +445,8 @@ class TargetFreeCalibrator:
                 self.judge.closed()
             else:
                 self.latest = self.carry if self._closed else None
+        if unproven:  # one window stands against one: neither is known to be right
+            self.latest, self._closed, self._confirmed = None, 0, False
         self.carry = None
         self.starter.again()
         self.judge.lost(why, value, self.latest, against_s)

@@ -292,8 +292,7 @@ def _load(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.ND
     """Parse a table of numbers; stamps keep all digits: integers, or text where the first is a fraction."""
     begin = _first_data_row(text)
     if _fractional(text, begin):
-        fields = dtype.fields or {}
-        dtype = np.dtype([("t", "U40"), *((name, fields[name][0]) for name in (dtype.names or ())[1:])])
+        dtype = np.dtype([("t", "U40"), *((name, dtype[name]) for name in (dtype.names or ())[1:])])
     try:
         rows: npt.NDArray[Any] = np.loadtxt(
             io.BytesIO(text[begin:]),

@@ -31,11 +31,13 @@ def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: 
         StampError: One does not fit into 64 bits.
     """
     slowest, fastest, usual = _IMU_HZ if imu else _CAMERA_HZ
-    whole = isinstance(values, np.ndarray)
-    distinct = np.unique(values).tolist() if isinstance(values, np.ndarray) else sorted(set(values))
-    unit = unit_by_spacing(distinct, slowest, fastest, usual)
-    if unit == "ns" and whole:
-        return np.asarray(values), ""
+    if isinstance(values, np.ndarray):
+        distinct: list[int] = np.unique(values).tolist()
+        unit = unit_by_spacing(distinct, slowest, fastest, usual)
+        if unit == "ns":
+            return values, ""
+    else:
+        unit = unit_by_spacing(values, slowest, fastest, usual)
     named = unit_named(title.split(",")[0])
     if named is not None and named != "ns" and unit != "ns":
         unit = named
