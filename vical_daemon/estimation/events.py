@@ -108,7 +108,7 @@ class Event:
 SAID = frozenset({EventKind.OTHER, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED})
 """Kinds whose details (serial numbers, a line of code) are text only."""
 ROLLING = {"rows": EventKind.ROLLING_SHUTTER, "columns": EventKind.ROLLING_COLUMNS}
-"""What is announced of a rolling shutter, by what it reads one after the other (`CameraPrior.readout_axis`)."""
+"""What is announced of a rolling shutter, by `CameraPrior.readout_axis`."""
 _CHANGES = frozenset(
     {
         EventKind.BUMPED,
