@@ -1,4 +1,4 @@
-"""Detectors on rendered pictures: corner errors, reported sigmas, share found, time; feature tracks."""
+"""Detectors on rendered pictures: corner errors, reported sigmas, share found; feature tracks."""
 
 from __future__ import annotations
 
@@ -33,8 +33,6 @@ class Score:
     opencv: list[np.ndarray] = field(default_factory=list)
     opencv_found: int = 0
     opencv_seen: int = 0
-    guided_ms: list[float] = field(default_factory=list)
-    full_ms: list[float] = field(default_factory=list)
     blur_px: list[float] = field(default_factory=list)
 
 
@@ -53,9 +51,9 @@ def main(argv: list[str]) -> int:
 def _boards(frames: int) -> None:
     print(
         "\n| board | distance m | exposure ms | noise | blur px | corners found | error rms px | bias px | "
-        "gross | error²/sigma² | OpenCV found | OpenCV rms px | guided ms | full ms |"
+        "gross | error²/sigma² | OpenCV found | OpenCV rms px |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
     cases: list[tuple[Target, float]] = [(APRILGRID, 0.8), (APRILGRID, 1.6)]
     cases += [(CHECKERBOARD, 0.6)]
     for target, distance in cases:
@@ -68,21 +66,14 @@ def _boards(frames: int) -> None:
 
 
 def _run(camera: SimulatedCamera, target: Target, frames: int) -> Score:
-    score, guided, full = Score(), BoardDetector(target), BoardDetector(target, guided=False)
+    score, detector = Score(), BoardDetector(target)
     for k in range(frames):
         t_s = k * STEP_S
         image = camera.render(t_s)
         uv, seen = camera.project(target.points_m, t_s)
         score.blur_px.append(camera.corner_blur_px(t_s))
-        searches, begin = guided.stats.searches, time.thread_time()
-        found = guided.detect(image, round(t_s * 1e9))
-        spent = (time.thread_time() - begin) * 1e3
-        if guided.stats.searches == searches:
-            score.guided_ms.append(spent)
+        found = detector.detect(image, round(t_s * 1e9))
         if k % 3 == 0:
-            begin = time.thread_time()
-            full.detect(image)
-            score.full_ms.append((time.thread_time() - begin) * 1e3)
             count, theirs = _opencv(image, target, uv)
             score.opencv_found += count
             score.opencv_seen += int(seen.sum())
@@ -125,8 +116,7 @@ def _row(score: Score) -> str:
     opencv += f"{np.sqrt(np.mean(theirs[theirs < GROSS_PX] ** 2) / 2):.3f}" if len(theirs) else "–"
     return (
         f"{np.mean(score.blur_px):.1f} | {len(errors) / score.seen:.1%} | {rms:.4f} | {bias:.4f} | "
-        f"{int(np.sum(~fine))} | {ratio:.2f} | {opencv} | "
-        f"{np.median(score.guided_ms) if score.guided_ms else np.nan:.1f} | {np.median(score.full_ms):.1f}"
+        f"{int(np.sum(~fine))} | {ratio:.2f} | {opencv}"
     )
 
 

@@ -10,19 +10,27 @@ real recording lies beside the checkout, its report is taken as well.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import io
+import queue
 import re
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 from typing import Any
 
-from vical_mocks.harness import browser
+import numpy as np
+from vical_mocks.harness import browser, web_feed
 
+from vical_daemon.bus.interface import LocalBus
 from vical_daemon.cli import live_table
+from vical_daemon.cli.errors import EXIT_NOT_CONVERGED
 from vical_daemon.cli.watch import View
+from vical_daemon.estimation.guidance import Guidance, Verb
 from vical_daemon.logs.mcap import LogReader
+from vical_daemon.vision.target import Checkerboard
 
 ROOT = Path(__file__).resolve().parents[1]
 EUROC = ROOT.parent / "shared" / "data" / "euroc_imu_april"
@@ -41,6 +49,7 @@ def main(argv: list[str]) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
+        guidance(work, args.out / "guidance.png")
         log = live_page(work, args.out, args.seconds)
         terminal(work, log, args.out / "terminal.png")
         board = ["--target", str(log.with_name("target.yaml"))]
@@ -48,9 +57,37 @@ def main(argv: list[str]) -> int:
         if EUROC.is_dir():
             known = ["--target", str(EUROC / "target.yaml"), "--initial", str(EUROC / "initial.yaml")]
             fixed = [*known, "--fix", "intrinsics"]
-            report(work, [str(EUROC), *fixed], args.out / "report.png")
+            report(work, [str(EUROC), *fixed], args.out / "report.png", args.out / "report_phone.png")
     print("\n".join(str(path) for path in sorted(args.out.glob("*.png"))))
     return 0
+
+
+def guidance(work: Path, path: Path) -> None:
+    """Look at the page on a phone while a board is wanted elsewhere, fed by the harness of the tests."""
+    bus, stop, rng = LocalBus(), threading.Event(), np.random.default_rng(0)
+    board = work / "board.yaml"
+    board.write_text(Checkerboard(8, 6, 0.05, 0.05).to_yaml())
+    served: queue.Queue[str] = queue.Queue()
+    thread = web_feed.serve_page(bus, stop, served.put, board)
+    address = served.get(timeout=60)
+    advice = Guidance(Verb.TURN, ("x", "y"))
+
+    async def script(page: Any) -> None:
+        await page.open(address, 390, 844)
+        for number in range(1, 400):
+            web_feed.publish_estimate(bus, web_feed.estimate(0.02 + 0.001 * number, rng, motion=advice))
+            web_feed.publish_status(bus)
+            web_feed.publish_image(bus, number)
+            await asyncio.sleep(0.05)
+            if number > 30 and await page.evaluate("document.querySelector('#corners .wanted') !== null"):
+                break
+        await page.screenshot(path)
+
+    try:
+        browser.drive(script, work / "profile")
+    finally:
+        stop.set()
+        thread.join()
 
 
 def live_page(work: Path, out: Path, seconds: float) -> Path:
@@ -61,14 +98,18 @@ def live_page(work: Path, out: Path, seconds: float) -> Path:
     address = next(m.group(1) for line in demo.stderr if (m := re.search(r"live page at (\S+)", line)))
 
     async def script(page: Any) -> None:
-        await page.open(address)
-        await page.wait("document.getElementById('status').classList.contains('converged')", seconds + 15)
-        await page.wait(f"page.latest.cam0.duration_s > {0.7 * seconds}", seconds + 15)
-        await page.wait("document.querySelectorAll('#corners path').length === 2")
-        await page.screenshot(out / "page.png")
-        await page.open(address, 390, 844, dark=True)
-        await page.wait("document.querySelectorAll('#corners path').length === 2")
+        marks = "document.querySelectorAll('#corners .detected, #corners .predicted').length === 2"
+        await page.open(address, 390, 844, dark=True)  # while something is still wanted
+        converged = "document.getElementById('status').classList.contains('converged')"
+        wanted = "document.querySelector('#corners .wanted') !== null"
+        await page.wait(f"{marks} && ({wanted} || {converged})", seconds + 15)
         await page.screenshot(out / "phone.png")
+        await page.open(address, height=1180)
+        await page.wait(converged, seconds + 15)
+        await page.wait(f"page.latest.cam0.duration_s > {0.7 * seconds}", seconds + 15)
+        await page.evaluate("document.querySelector('button[data-room=\"1\"]').click()")
+        await page.wait(marks, seconds)
+        await page.screenshot(out / "page.png")
 
     try:
         browser.drive(script, work / "profile")
@@ -92,16 +133,23 @@ def terminal(work: Path, log: Path, path: Path) -> None:
     browser.draw_svg(console.export_svg(title="vical watch"), work, path)
 
 
-def report(work: Path, arguments: list[str], path: Path) -> None:
-    """Make the report of a calibration and look at its first page."""
+def report(work: Path, arguments: list[str], path: Path, phone: Path | None = None) -> None:
+    """Make the report of a calibration and look at its first page, on a desk and on a phone in the dark."""
     html = work / "report.html"
     command = [*_VICAL, "calibrate", *arguments, "--report", str(html)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    if done.returncode not in (0, EXIT_NOT_CONVERGED):
+        raise SystemExit(f"{' '.join(command)} ended with {done.returncode}")
 
     async def script(page: Any) -> None:
         await page.open(html.as_uri(), 1100, 1400)
-        await page.wait("document.readyState === 'complete' && document.images.length > 0")
+        await page.wait("document.readyState === 'complete' && document.querySelector('figure svg') !== null")
+        await asyncio.sleep(0.5)  # the 3-D view draws itself when it knows its size
         await page.screenshot(path)
+        if phone is not None:
+            await page.open(html.as_uri(), 390, 844, dark=True)
+            await page.wait("document.readyState === 'complete' && document.querySelector('.known') !== null")
+            await page.screenshot(phone)
 
     browser.drive(script, work / "profile")
 

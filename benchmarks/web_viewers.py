@@ -10,18 +10,21 @@ import argparse
 import asyncio
 import multiprocessing
 import resource
+import tempfile
 import threading
 import time
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import aiohttp
 import numpy as np
 from vical_mocks.harness import web_feed
 
 from vical_daemon.bus.interface import LocalBus
+from vical_daemon.vision.target import Checkerboard
 
 
-def serve(pipe: Connection, seconds: float) -> None:
+def serve(pipe: Connection, seconds: float, board: Path) -> None:
     """Child: role web over a LocalBus; sends its address, then CPU seconds of the page and of the bus."""
     recorded = LocalBus()
     messages: list[tuple[str, bytes]] = []
@@ -36,7 +39,7 @@ def serve(pipe: Connection, seconds: float) -> None:
             web_feed.publish_status(recorded)
         steps.append(list(messages))
     bus, stop = LocalBus(), threading.Event()
-    thread = web_feed.serve_page(bus, stop, pipe.send)
+    thread = web_feed.serve_page(bus, stop, pipe.send, board)
     pipe.recv()  # viewers are there
     begin, begin_bus = _cpu_s(), time.thread_time()
     for step in steps:
@@ -75,10 +78,10 @@ async def watch(address: str, events: int, pictures: int, done: threading.Event)
     return received
 
 
-def measure(events: int, pictures: int, seconds: float) -> tuple[float, float, float]:
+def measure(events: int, pictures: int, seconds: float, board: Path) -> tuple[float, float, float]:
     """Return CPU shares of page and bus, and kB/s received by the viewers."""
     ours, theirs = multiprocessing.get_context("spawn").Pipe()
-    child = multiprocessing.get_context("spawn").Process(target=serve, args=(theirs, seconds))
+    child = multiprocessing.get_context("spawn").Process(target=serve, args=(theirs, seconds, board))
     child.start()
     address = ours.recv()
     done, result = threading.Event(), []
@@ -104,7 +107,10 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     print("| viewers of values | of pictures | page, % of a core | data path, % | sent, kB/s |")
     print("|---:|---:|---:|---:|---:|")
-    for events, pictures in ((0, 0), (1, 0), (4, 0), (1, 1), (4, 4)):
-        page, bus, rate = measure(events, pictures, args.seconds)
-        print(f"| {events} | {pictures} | {100 * page:.2f} | {100 * bus:.2f} | {rate:.0f} |", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        board = Path(folder) / "board.yaml"
+        board.write_text(Checkerboard(8, 6, 0.05, 0.05).to_yaml())
+        for events, pictures in ((0, 0), (1, 0), (4, 0), (1, 1), (4, 4)):
+            page, bus, rate = measure(events, pictures, args.seconds, board)
+            print(f"| {events} | {pictures} | {100 * page:.2f} | {100 * bus:.2f} | {rate:.0f} |", flush=True)
     return 0

@@ -5,12 +5,18 @@ Rotations are made with scipy, not with ours.
 
 from __future__ import annotations
 
+import gzip
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.measurements import ImuNoise
 from vical_daemon.results.export import Rig, RigCamera
+
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "euroc_imu_april"
 
 
 @pytest.fixture
@@ -174,3 +180,36 @@ def _simulate(rng, positions=24, axes=None):
         + 8e-4 * np.sqrt(IMU_RATE_HZ) * rng.standard_normal(force.shape)
     )
     return gyro_m, force_m
+
+
+@pytest.fixture(scope="session")
+def euroc() -> Path:
+    if not SHARED.is_dir():
+        pytest.skip(f"shared data absent: {SHARED}")
+    return SHARED
+
+
+def _first_seconds(euroc: Path, folder: Path, seconds: int) -> Path:
+    """Copy the first seconds of the recording, with its target and initial values."""
+    for name in ("target.yaml", "initial.yaml"):
+        shutil.copyfile(euroc / name, folder / name)  # not its mode: the original may be read-only
+    lines = (euroc / "mav0/imu0/data.csv").read_text().splitlines()[: 200 * seconds]
+    end_ns = int(lines[-1].split(",")[0])
+    (folder / "mav0/imu0").mkdir(parents=True)
+    (folder / "mav0/imu0/data.csv").write_text("\n".join(lines) + "\n")
+    (folder / "mav0/cam0").mkdir()
+    with gzip.open(euroc / "mav0/cam0/corners.csv.gz", "rt") as file:
+        kept = [row for row in file if row[0] == "#" or int(row.split(",")[0]) < end_ns]
+    (folder / "mav0/cam0/corners.csv").write_text("".join(kept))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def short(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _first_seconds(euroc, tmp_path_factory.mktemp("short"), 9)
+
+
+@pytest.fixture(scope="session")
+def shortest(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Just long enough for a first solution."""
+    return _first_seconds(euroc, tmp_path_factory.mktemp("shortest"), 5)

@@ -40,6 +40,7 @@ class CameraEncoder:
         self._backwards = 0
         self._dropped = 0
         self._rules: Counter[str] = Counter()
+        self._exposure_ns: int | None = None
 
     def message(self, frame: Frame) -> bytes | None:
         """Return the message of one frame, stamped mid-exposure; None if its stamp does not increase."""
@@ -49,17 +50,21 @@ class CameraEncoder:
             return None
         self._t_last_ns = frame.t_exposure_mid_ns
         self._rules[frame.stamp_rule] += 1
+        self._exposure_ns = frame.exposure_ns
         stamp_ns = self._clock.unix_ns(frame.t_exposure_mid_ns)
         return encode_image(stamp_ns, self._name, frame.image, frame.encoding)
 
     def counters(self) -> dict[str, str]:
-        """Return counters that the driver does not keep: how often each stamp rule was used, and losses."""
+        """Return what the driver does not keep: stamp rules and how often, losses, the last exposure."""
         rules = ", ".join(f"{rule} ({count})" for rule, count in self._rules.items())
-        return {
+        counters = {
             "stamp_rule": rules,
             "frames_dropped": str(self._dropped),
             "stamps_backwards": str(self._backwards),
         }
+        if self._exposure_ns is not None:
+            counters["exposure_ms"] = f"{1e-6 * self._exposure_ns:.3f}"
+        return counters
 
 
 def open_camera(config: CameraConfig) -> FrameSource:

@@ -60,6 +60,7 @@ def ros2_topic(key: str, namespace: str = "") -> Ros2Topic | None:
         "tracks": f"/{name}/feature_tracks",
         "predicted": f"/{name}/predicted_points",
         "calibration": f"/calibration/{name}",
+        "stored": f"/calibration/{name}/stored",
         "pose": f"/calibration/{name}/pose",
         "tf_static": "/tf_static",
         "status": "/diagnostics",

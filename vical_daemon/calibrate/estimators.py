@@ -9,7 +9,7 @@ from vical_daemon.bus import topics
 from vical_daemon.config.model import Config, ConfigError
 from vical_daemon.config.priors import calibration_options, camera_prior
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
@@ -47,12 +47,25 @@ class Estimator(Protocol):
         """End of the data."""
         ...
 
+    @property
+    def can_go_on(self) -> bool:
+        """Whether there is a calibration that another recording of the same rig can go on with."""
+        ...
+
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """What comes now is another recording of the same rig; see `Calibrator.next_recording`."""
+        ...
+
     def estimate(self) -> CalibrationEstimate:
         """Return the current estimate, with the events since the last call."""
         ...
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return the history of one camera's calibration."""
+        ...
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return how well the IMU alone predicted images before they were used."""
         ...
 
 

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus, Sample
-from vical_daemon.bus.messages import MessageError, decode_diagnostics
+from vical_daemon.bus.messages import MessageError, decode_diagnostics, encode_calibration
+from vical_daemon.bus.outgoing import Message
 from vical_daemon.config.model import Config
 from vical_daemon.config.paths import state_directory
 from vical_daemon.config.priors import camera_prior
@@ -170,6 +171,75 @@ class CalibrationPersistence:
                 except StoreError as error:
                     _log.warning("%s", error)
 
+    def accept(self, estimate: CalibrationEstimate | None) -> bool:
+        """Store an estimate because a person said so, even if it has not converged; announce the outcome.
+
+        A result with withheld directions is refused: its numbers would be taken for known.
+
+        Returns:
+            Whether it was stored.
+        """
+        why = self._unacceptable(estimate)
+        if not why:
+            assert estimate is not None
+            try:
+                for name in estimate.cameras:
+                    self._store.save(*self._pair(name), name, estimate, self._clock.now_ns())
+            except StoreError as error:
+                why = str(error)
+        if why:
+            self.announce(Event(EventKind.OTHER, said=f"not accepted: {why}"))
+            return False
+        for name in self._config.calibration_cameras:
+            stored = self._load(name)
+            if stored is not None:
+                self._before[name] = stored
+        self._saved_s = time.monotonic()
+        self.announce(Event(EventKind.OTHER, said="accepted: stored as the calibration of these devices"))
+        return True
+
+    def _unacceptable(self, estimate: CalibrationEstimate | None) -> str:
+        if estimate is None or not estimate.cameras:
+            return "there is no result yet"
+        if estimate.status is Status.INCONSISTENT:
+            return f"the data contradict each other: {estimate.reason}"
+        withheld = [line for camera in estimate.cameras.values() for line in camera.unobservable]
+        if withheld:
+            return f"the motion did not show {'; '.join(withheld)}"
+        if self._serials.in_doubt or not all(all(self._pair(name)) for name in estimate.cameras):
+            return "the serial numbers of the devices are not known"
+        return ""
+
+    def discard(self) -> dict[str, CameraPrior]:
+        """Put back what was stored when this calibration began (nothing, if nothing was).
+
+        Returns:
+            The prior of each camera for a new start.
+        """
+        try:
+            for name in self._config.calibration_cameras:
+                imu, camera = self._pair(name)
+                before = self._before.get(name)
+                if before is not None:
+                    self._store.save(imu, camera, name, before.estimate, before.saved_ns)
+                elif imu and camera and not self._serials.in_doubt:
+                    self._store.remove(imu, camera)
+            said = "discarded: calibrating anew, with what was stored before"
+        except StoreError as error:
+            said = f"discarded, but the store was not put back: {error}"
+        self.announce(Event(EventKind.OTHER, said=said))
+        self._compared.clear()
+        self._status, self._saved_s = None, -float("inf")
+        return self.priors(wait_s=0.0)
+
+    def stored_messages(self) -> list[Message]:
+        """Return the calibrations with which the current ones are to be compared, one message a camera."""
+        rig = self._config.rig
+        return [
+            (topics.STORED.key(rig, name), encode_calibration(_of_camera(stored, name), name))
+            for name, stored in self._before.items()
+        ]
+
     def close(self, estimate: CalibrationEstimate | None) -> None:
         """Save a last time and stop listening."""
         self.save(estimate)
@@ -202,6 +272,11 @@ class CalibrationPersistence:
     def _load(self, camera: str) -> StoredCalibration | None:
         imu_serial, camera_serial = self._pair(camera)
         return self._store.load(imu_serial, camera_serial) if imu_serial and camera_serial else None
+
+
+def _of_camera(stored: StoredCalibration, name: str) -> CalibrationEstimate:
+    """Return a stored estimate under the name that its camera has now."""
+    return replace(stored.estimate, cameras={name: stored.known}, events=[])
 
 
 def differences(camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float) -> list[Event]:

@@ -56,11 +56,19 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     estimator = _resumed(checkpoint, persistence) or _new_estimator(config, priors, persistence)
     role = EstimateRole(config, estimator, inspect=persistence.watch, watch=make_watch(config))
     supervisor = _Supervisor(config, role, persistence, checkpoint)
+    publish(bus, persistence.stored_messages())
     commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
     status = StatusSender(config.rig, "estimate", bus, clock)
     while not stop.is_set():
         queue.wait(PUBLISH_S / 2)
-        if _reset_wanted(commands):
+        words = _commands(commands)
+        if "accept" in words and persistence.accept(role.latest):
+            publish(bus, persistence.stored_messages())
+        if "discard" in words:
+            checkpoint.forget()
+            priors = persistence.discard()
+            role.reset(make_estimator(config, priors), make_watch(config))
+        if "reset" in words:
             _log.info("calibration reset by command")
             checkpoint.forget()
             role.reset(make_estimator(config, priors), make_watch(config))
@@ -68,6 +76,7 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
             checkpoint.forget()
             priors = persistence.begin_again()
             role.reset(_new_estimator(config, priors, persistence), make_watch(config))
+            publish(bus, persistence.stored_messages())
         while True:  # in batches, so that a backlog does not delay publications
             publish(bus, supervisor.work(queue.take(256), time.monotonic()))
             status.tick(lambda: supervisor.statuses(queue.dropped, time.monotonic()))
@@ -180,10 +189,10 @@ def _new_estimator(
     return make_estimator(config, priors)
 
 
-def _reset_wanted(commands: Subscription) -> bool:
-    """Return whether a ``reset`` command has arrived; ignores other commands."""
-    wanted = False
+def _commands(commands: Subscription) -> set[str]:
+    """Return the commands that have arrived: ``accept``, ``discard`` and ``reset`` mean something here."""
+    words = set()
     while (sample := commands.recv(0.0)) is not None:
         with suppress(MessageError):  # not a command
-            wanted |= decode_string(sample.payload).strip() == "reset"
-    return wanted
+            words.add(decode_string(sample.payload).strip())
+    return words

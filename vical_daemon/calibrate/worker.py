@@ -147,6 +147,11 @@ class EstimateRole:
         self._next_s = self._next_companion_s = -float("inf")
         return self._publications(0.0)
 
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """After `finish`: what comes now is another recording of the same rig; see `Calibrator`."""
+        self._gates.clear()
+        self.estimator.next_recording(common_clock=common_clock)
+
     def reset(self, estimator: Estimator, watch: DelayWatch | None = None) -> None:
         """Start again with a new estimator (and watch)."""
         self._order.pop_all()

@@ -94,18 +94,13 @@ def help_text(commands: dict[str, table.Command]) -> str:
 
 
 def _dispatch(words: list[str]) -> int:
-    completing = "_ARGCOMPLETE" in os.environ
-    selected = _selected(os.environ.get("COMP_LINE", "").split()[1:] if completing else words)
+    selected = _selected(words)
     parser, commands = build_parser(selected)
-    if selected is not None and selected not in commands and not completing:
+    if selected is not None and selected not in commands:
         raise errors.CliError(
             f"{selected!r} is not a command{options.suggest(selected, list(commands))} (see `vical --help`)",
             errors.EXIT_USAGE,
         )
-    if completing:
-        import argcomplete
-
-        argcomplete.autocomplete(parser)
     args = parser.parse_args(words)
     if args.version:
         from importlib.metadata import version

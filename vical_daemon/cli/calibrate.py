@@ -1,4 +1,4 @@
-"""`vical calibrate INPUT`: the online filter over a recording."""
+"""`vical calibrate INPUT ...`: the online filter over recordings of one rig."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import json
 import math
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, suggest
+from vical_daemon.cli.options import add_json, suggest, warn
 
 if TYPE_CHECKING:
-    from vical_daemon.cli.calibration_run import Job, Outcome
     from vical_daemon.estimation.result import CalibrationEstimate
+    from vical_daemon.offline.calibrate import Job, Outcome
 
 FIX = ("intrinsics", "timeshift", "extrinsics")
 ESTIMATE = ("imu_intrinsics", "readout", "target_scale", "target_shape")
@@ -23,19 +24,29 @@ _EXAMPLES = """\
 examples:
   vical calibrate log.mcap --target target.yaml --initial lens.yaml --fix intrinsics
   vical calibrate euroc_folder --target april.yaml --json -o result.json --report result.html
+  vical calibrate monday.mcap tuesday.mcap --target target.yaml     one rig, several recordings
   vical export result.json --format kalibr -o camchain.yaml
+
+Several recordings have mounting, lens and time shift in common; biases, and where the board stands, are
+those of each. Their clocks need not have anything to do with each other.
 
 exit code: 0 converged; 3 there is a result, but it is converging or degenerate (--accept makes that 0);
 1 no result; 2 bad usage
 """
 ACCEPT = ("converging", "degenerate")
+CLOCKS = ("common", "apart")
 _UNUSABLE = ("waiting", "initialising", "inconsistent")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of COMMANDS."""
+def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACCEPT) -> None:
+    """Add the options of COMMANDS; `accept`: words that --accept takes."""
     parser.epilog = _EXAMPLES
-    parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
+    parser.add_argument(
+        "inputs",
+        metavar="INPUT",
+        nargs="+",
+        help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder; several are one calibration of the same rig",
+    )
     parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format; without: target-free")
     parser.add_argument("--camera", metavar="NAME", help="only this camera")
     parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
@@ -63,34 +74,56 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--accept",
         metavar="STATUS",
         default="",
-        help=f"comma-separated, exit 0 instead of 3 for a result that is: {', '.join(ACCEPT)}",
+        help=f"comma-separated, exit 0 instead of 3 for a result that is: {', '.join(accept)}",
+    )
+    parser.add_argument(
+        "--clock",
+        choices=CLOCKS,
+        default=CLOCKS[0],
+        help="several recordings: one time shift for all (common, default), or one for each (apart)",
     )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate and print; 1 if there is no usable result, 3 if it is not converged."""
-    accepted = _words("--accept", args.accept, ACCEPT)
+    job, accepted = job_of(args)
+    from vical_daemon.offline.calibrate import document, run_job
+
+    bar = ProgressBar(hidden=args.quiet or not sys.stderr.isatty())
+    outcome = run_job(job, bar.show, keep_frames=bool(args.report))
+    bar.close()
+    result = document(job, outcome)
+    write(args, result)
+    for use in outcome.inputs:
+        if use.imu is None:
+            warn(f"{use.path} is not in the result: nothing starts from it")
+    return conclude(args, job, outcome, result, accepted)
+
+
+def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[Job, tuple[str, ...]]:
+    """Check the options and open the recordings; what is to be calibrated, and the words of --accept."""
+    accepted = _words("--accept", args.accept, accept)
     fix, estimate = _words("--fix", args.fix, FIX), _words("--estimate", args.estimate, ESTIMATE)
     if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
     for path in (args.report, args.output):
         if path and not Path(path).absolute().parent.is_dir():
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
-    from vical_daemon.cli import calibration_run
     from vical_daemon.config.priors import Initial, read_initial
     from vical_daemon.logs import open_recording
+    from vical_daemon.offline import calibrate
 
     initial = read_initial(args.initial) if args.initial else Initial()
     if args.target:
         from vical_daemon.vision.target import load_target
 
         load_target(Path(args.target))  # a wrong file is refused before the recording is read
-    recording = open_recording(args.input, cameras=[args.camera] if args.camera else ())
-    for warning in recording.warnings:
-        print(f"vical: warning: {warning}", file=sys.stderr)
-    job = calibration_run.make_job(
-        recording,
+    recordings = [open_recording(p, cameras=[args.camera] if args.camera else ()) for p in args.inputs]
+    for warning in (text for recording in recordings for text in recording.warnings):
+        warn(warning)
+    job = calibrate.make_job(
+        recordings[0],
         initial,
         target=args.target,
         camera=args.camera,
@@ -100,32 +133,39 @@ def run(args: argparse.Namespace) -> int:
         skip_s=args.skip,
         seconds=args.seconds,
     )
-    bar = _Bar(hidden=args.quiet or not sys.stderr.isatty())
-    outcome = calibration_run.run_job(job, bar.show, keep_frames=bool(args.report))
-    bar.close()
-    return _deliver(args, job, outcome, accepted)
+    calibrate.add_recordings(job, recordings[1:], args.imu)
+    job.common_clock = args.clock == CLOCKS[0]
+    return job, accepted
 
 
-def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tuple[str, ...]) -> int:
-    """Print, write what was asked for, and say in one line if the result cannot be used as it is."""
-    from vical_daemon.cli.calibration_run import document
-
-    result = document(job, outcome)
+def write(
+    args: argparse.Namespace, result: dict[str, Any], more: Callable[[dict[str, Any]], str] | None = None
+) -> None:
+    """Print the result and write it where it was asked for; `more`: text that goes before, for people."""
     text = json.dumps(_finite(result), allow_nan=False)
     if args.output:
         Path(args.output).write_text(text + "\n", encoding="utf-8")
     if args.json:
         print(text)
-    elif result["cameras"]:
+        return
+    if more is not None:
+        print(more(result) + "\n")
+    if result["cameras"]:
         from vical_daemon.cli.calibration_text import describe
 
         print(describe(result))
+
+
+def conclude(
+    args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any], accepted: tuple[str, ...]
+) -> int:
+    """Write the report; say in one line if the result cannot be used as it is; return the exit code."""
     if args.report and result["cameras"]:
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
     if status in _UNUSABLE or not result["cameras"]:
-        from vical_daemon.cli.calibration_run import suspects
-        from vical_daemon.cli.input_diagnosis import diagnose_input
+        from vical_daemon.offline.calibrate import suspects
+        from vical_daemon.offline.input_diagnosis import diagnose_input
 
         mistake = diagnose_input(job)
         if mistake:
@@ -133,14 +173,16 @@ def _deliver(args: argparse.Namespace, job: Job, outcome: Outcome, accepted: tup
         raise CliError(f"no calibration: {status}: {why or 'too little data'} ({suspects(job)})")
     if status == "converged":
         return 0
-    print(f"vical: warning: {status}: {why}", file=sys.stderr)
+    warn(f"{status}: {why}")
     return 0 if status in accepted else EXIT_NOT_CONVERGED
 
 
 def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[str, Any]) -> None:
+    from vical_daemon.offline.calibrate import images_at
     from vical_daemon.results import report
+    from vical_daemon.vision.target import load_target
 
-    inputs = [Path(p) for p in (args.input, args.target, args.initial) if p]
+    inputs = [Path(p) for p in (*args.inputs, args.target, args.initial) if p]
     settings = {"fix": args.fix, "estimate": args.estimate}
     if args.skip or args.seconds is not None:
         settings["part"] = f"{outcome.estimate.duration_s:.1f} s, from {args.skip:g} s on"
@@ -149,6 +191,8 @@ def _report(args: argparse.Namespace, job: Job, outcome: Outcome, result: dict[s
         result | {"trace": outcome.traces},
         outcome.frames,
         image_sizes={name: prior.resolution for name, prior in job.priors.items()},
+        target_m=load_target(Path(args.target)).points_m if args.target else None,
+        images=lambda camera, stamps_ns: images_at(job, camera, stamps_ns),
         provenance=report.collect(" ".join(sys.argv), inputs, settings),
     )
     print(f"report: {args.report}", file=sys.stderr)
@@ -172,7 +216,7 @@ def _finite(value: Any) -> Any:
     return [_finite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-class _Bar:
+class ProgressBar:
     """One line on stderr that shows how far it is; only on a terminal and after the first second."""
 
     def __init__(self, *, hidden: bool) -> None:

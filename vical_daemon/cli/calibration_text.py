@@ -24,6 +24,13 @@ def describe(result: dict[str, Any]) -> str:
             for axis, row in zip("xyz", imu.get(key) or [], strict=False):
                 lines.append(_row(f"{label} {axis}", row, None, "", 5))
         lines.append(_row("gravity in the world", result["gravity_world_mps2"], None, "m/s^2", 4))
+    if result.get("inputs") and "disagreeing" not in result:  # `vical merge` has its own lines
+        lines += ["", "recordings"]
+        for part in result["inputs"]:
+            used = f"{part['frames']} frames" if part["used"] else "not in the result"
+            lines.append(
+                f"  {part['path']}: {part['duration_s']:.1f} s from {part['begin_s']:.1f} s on, {used}"
+            )
     if result.get("events"):
         lines += ["", *(f"  {event['text']}" for event in result["events"])]
     if result.get("guidance"):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json
+from vical_daemon.cli.options import add_json, warn
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.guidance import WeakDirection
@@ -44,11 +44,20 @@ def run(args: argparse.Namespace) -> int:
             raise CliError(f"--estimate: {word!r} is not known (known: {', '.join(BLOCKS)})", EXIT_USAGE)
     if not Path(args.input).exists():
         raise CliError(f"{args.input} does not exist; check the path")
-    from vical_daemon.cli.observability_motion import motion_of
+    from vical_daemon.config.priors import Initial, read_initial
     from vical_daemon.estimation.tools.observability import gramian
     from vical_daemon.estimation.tools.observability_model import ModelBlocks, model_rank
+    from vical_daemon.offline.observability_motion import motion_of
 
-    motion, setup, frames = motion_of(args, frozenset(blocks))
+    motion, setup, frames = motion_of(
+        args.input,
+        frozenset(blocks),
+        target=args.target,
+        initial=read_initial(args.initial) if args.initial else Initial(),
+        camera=args.camera,
+        imu=args.imu,
+        warn=warn,
+    )
     result = gramian(motion, setup, frames)
     model = model_rank(
         ModelBlocks(

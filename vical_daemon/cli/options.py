@@ -94,3 +94,8 @@ def _nearest_choice(message: str) -> str:
     word = message.split("invalid choice: ")[1].split(" (choose")[0].strip("'\"")
     choices = message.split("choose from ")[1].rstrip(")")
     return suggest(word, [c.strip(" '\"") for c in choices.split(",")])
+
+
+def warn(line: str) -> None:
+    """Print what is unusual, in one line on stderr."""
+    print(f"vical: warning: {line}", file=sys.stderr)

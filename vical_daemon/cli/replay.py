@@ -15,9 +15,6 @@ from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
     from vical_daemon.bus.interface import Bus
-    from vical_daemon.logs import Recording
-
-_PROGRESS_S = 1.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,11 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Publish with the time between stamps that there was; without a router, host the bus meanwhile."""
     from vical_daemon.logs import open_recording
+    from vical_daemon.offline.replay import replay
 
     if args.speed < 0 or args.wait < 0:
         raise CliError("--speed and --wait must not be negative", EXIT_USAGE)
     recording = open_recording(args.log, topics=args.streams, check=False, as_recorded=True)
     bus = _open_bus(args)
+    shows = sys.stderr.isatty() and not args.quiet
+
+    def show(data_s: float) -> None:
+        print(f"\r{data_s:7.1f} of {recording.duration_s:.1f} s", end="", file=sys.stderr, flush=True)
+
     try:
         result = replay(
             recording,
@@ -67,10 +70,12 @@ def run(args: argparse.Namespace) -> int:
             speed=args.speed,
             rig=args.rig,
             everything=args.all,
-            progress=sys.stderr.isatty() and not args.quiet,
+            progress=show if shows else None,
         )
     finally:
         bus.close()
+    if shows:
+        print(file=sys.stderr)
     if args.json:
         print(json.dumps(result))
     else:
@@ -102,53 +107,3 @@ def _open_bus(args: argparse.Namespace) -> Bus:
     bus = open_bus(mode="router", socket=path, tcp_port=port)
     time.sleep(args.wait)  # or those who wait for a router miss the beginning
     return bus
-
-
-def replay(
-    recording: Recording,
-    bus: Bus,
-    stop: threading.Event,
-    *,
-    speed: float = 1.0,
-    rig: str | None = None,
-    everything: bool = False,
-    progress: bool = False,
-) -> dict[str, float]:
-    """Publish a recording; stamps stay as recorded.
-
-    Args:
-        recording: What to publish.
-        bus: Where to.
-        stop: Ends it early.
-        speed: Times real time; 0: as fast as it goes.
-        rig: Name of the rig in the keys; None: as recorded.
-        everything: Every stream, not only the best one of each camera.
-        progress: Show it on stderr.
-
-    Returns:
-        ``bus/messages``, ``duration_s`` and ``late_ms``, by how much the latest message came late.
-    """
-    from vical_daemon.bus.topics import check_name
-    from vical_daemon.logs.recorded_logs import stamp_of
-
-    prefix = f"vical/{check_name(rig)}/" if rig else ""
-    begin_s, count, late_s, shown_s = time.monotonic(), 0, 0.0, 0.0
-    first_ns = recording.begin_ns
-    for key, payload in recording.messages(recording.streams if everything else None):
-        data_s = ((stamp_of(payload) or first_ns) - first_ns) * 1e-9
-        wait_s = begin_s + data_s / speed - time.monotonic() if speed else 0.0
-        if wait_s > 0:
-            stop.wait(wait_s)
-        elif speed:
-            late_s = max(late_s, -wait_s)
-        if stop.is_set():
-            break
-        bus.publish(prefix + key.split("/", 2)[2] if prefix else key, payload)
-        count += 1
-        now_s = time.monotonic()
-        if progress and now_s - shown_s >= _PROGRESS_S:
-            shown_s = now_s
-            print(f"\r{data_s:7.1f} of {recording.duration_s:.1f} s", end="", file=sys.stderr, flush=True)
-    if progress:
-        print(file=sys.stderr)
-    return {"messages": count, "duration_s": time.monotonic() - begin_s, "late_ms": late_s * 1e3}

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "as a service: vical install-service; on a laptop: vical run -c vical.yaml, then vical watch"
     )
-    roles = parser.add_argument(
+    parser.add_argument(
         "roles",
         metavar="ROLE",
         nargs="*",
@@ -41,15 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(roles); default: all processes that the config asks for, as children",
     )
     parser.add_argument("--parent", type=int, default=0, help=argparse.SUPPRESS)  # of the children of `run`
-    roles.completer = _known_roles  # type: ignore[attr-defined]  # for argcomplete
     add_config(parser)
     add_json(parser)
-
-
-def _known_roles(**_: object) -> list[str]:
-    from vical_daemon.cli.process_sets import PROCESSES
-
-    return list(dict.fromkeys([*PROCESSES, *(role for roles in PROCESSES.values() for role in roles)]))
 
 
 def run(args: argparse.Namespace) -> int:

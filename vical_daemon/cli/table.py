@@ -46,7 +46,11 @@ COMMANDS = (
     Command("check", START, "check the config and the devices"),
     Command("doctor", START, "check this computer for causes of bad stamps"),
     Command("target", START, "write a board to print, to scale, and its target file"),
+    Command("completion", START, "print a completion script for bash or zsh"),
     Command("run", SERVICE, "run the daemon, or single roles of it"),
+    Command(
+        "command", SERVICE, "accept or discard the live calibration, begin anew, start or stop recording"
+    ),
     Command("watch", SERVICE, "show the calibration live in the terminal"),
     Command("web", SERVICE, "serve a page with the live calibration, on loopback"),
     Command("install-service", SERVICE, "install or remove systemd units, udev rules and the user"),
@@ -58,6 +62,9 @@ COMMANDS = (
     Command("imu", DEVICES, "use an IMU directly: info, stream, decode, gyro bias, self test"),
     Command("camera", DEVICES, "use a camera directly: list, stream, snapshot, controls"),
     Command("calibrate", CALIBRATION, "calibrate from a recording: extrinsics and time shift"),
+    Command(
+        "merge", CALIBRATION, "merge recordings of one rig into one calibration, and name those that disagree"
+    ),
     Command("td-icp", CALIBRATION, "find the time shift between sensors from their rotations"),
     Command(
         "observability", CALIBRATION, "show which parameters a motion determines, and what motion is missing"

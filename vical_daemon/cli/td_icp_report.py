@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vical_daemon.cli.td_icp_sources import LensUsed
     from vical_daemon.estimation.temporal.td_icp import TdIcpResult
     from vical_daemon.estimation.temporal.td_icp_joint import JointResult
     from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport
+    from vical_daemon.offline.td_icp.sources import LensUsed
 
 
 def report_json(report: DelayReport) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.init.initializer import LATE_S, Starting
 from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.init.recording_start import RecordingStart
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -33,7 +34,7 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import HeldLens
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, Layout, make_layout
 from vical_daemon.estimation.plausible import stamp_sigma_problem, usable_points
-from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.selection import model_selection as hypotheses
 from vical_daemon.estimation.selection.model_acceptance import BeyondDoubt
@@ -148,7 +149,7 @@ class Calibrator:
         """Take the points of one image; those of unknown cameras or off the board are only counted."""
         ok = usable_points(frame) & (frame.ids < len(self.target))
         nonsense = len(ok) > 0 and not ok.any()  # its stamp is worth no more than its points
-        if frame.camera not in self.priors or self._buffer is None or nonsense:
+        if frame.camera not in self.priors or self._buffer is None or self._imu.between or nonsense:
             self.judge.frames_ignored += 1
             return
         if not ok.all():
@@ -441,15 +442,54 @@ class Calibrator:
         """After the clock of a camera was set: find its time shift from the images collected."""
         assert self._buffer is not None
         self._seek_shift.discard(camera)
+        if isinstance(lost, RecordingStart):  # the gyro's bias is that of another recording
+            f.state.gyro_bias = lost.gyro_bias(f.state, self._buffer)
         own = [x for x in lost.frames if x[1].camera == camera]
         fit = self._past.shift_of(own, f, self._buffer, self.target)
         if fit is None:
             return lost
         self._set_shift(f, camera, fit)
-        self._lost = again = MotionRestart(self.target, self._used_ns)
+        self._lost = again = type(lost)(self.target, self._used_ns)
         for t_cam_s, frame in lost.frames:
             again.take(frame, t_cam_s, f.state, self._buffer)
         return again
+
+    @property
+    def can_go_on(self) -> bool:
+        """Whether another recording can go on with this calibration: its start left no direction unknown."""
+        return self.filter is not None and self.filter.unshown is None
+
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """What comes from now on is another recording of the same rig; call `finish` first.
+
+        Mounting, lens, time shift and all else of cameras, imu and target are the same; motion, biases and
+        where the board stands against gravity are new. Where the calibration cannot go on, nothing is kept.
+
+        Args:
+            common_clock: The time shift is the same, too; else it is found again.
+        """
+        if not self.can_go_on:
+            self.filter = None
+        f = self.filter
+        for name, where in self.layout.cameras.items():
+            if f is not None:
+                f.state.cameras[name].timeshift_s += self._offset_s(name)
+            if f is not None and where.timeshift is not None:  # drivers find the clock once more
+                f.reopen(where.timeshift, abs(self._imu.stepped_s))
+        self._imu.next_recording()
+        self._images, self._offsets_s = ImageIntake(), {}
+        self._pending = FrameQueue(list(self.priors))
+        self._past, self._unproven = RecentPast(), None
+        self._used_ns.clear()
+        self._seek_shift.clear()
+        self._starting.anew()
+        self._held_back, self._lost = HeldBack(), None
+        if f is not None:
+            self.watch.shift_reopened()
+            self._lost = RecordingStart(self.target, {})
+            self._seek_shift |= f.drifting  # who knows how far, in the time between
+            if not common_clock:
+                self._seek_shift |= {n for n, c in self.layout.cameras.items() if c.timeshift is not None}
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
@@ -473,3 +513,7 @@ class Calibrator:
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
         return trace_by_present_stamps(self.judge.trace(camera), self._offset_s(camera))
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return how well the IMU alone predicted images before they were used, oldest first."""
+        return list(self.judge.held_out)

@@ -59,6 +59,11 @@ class CameraEstimate:
         readout_axis: What a rolling shutter reads one after the other, `rows` or `columns`; empty: rows, or
             not known (it does not travel in the message, but the announcement that found it does).
         withheld: The same as `unobservable`, as data; [] in logs of older versions.
+        stamp_jitter_s: Measured jitter of the image stamps, one standard deviation, s; 0: none found.
+        joint_order: Names of the rows of `joint_covariance`: px py pz rx ry rz timeshift, and where the lens
+            is in doubt fx fy cx cy and its coefficients.
+        joint_covariance: Of mounting, time shift and lens together, m, rad, s, px: the filter's correlations
+            with the sigmas above. [] without a target (neither of the two travels in the message).
     """
 
     T_imu_cam: PoseEstimate
@@ -77,6 +82,9 @@ class CameraEstimate:
     resolution: list[int] = field(default_factory=list)
     readout_axis: str = ""
     withheld: list[WeakDirection] = field(default_factory=list)
+    stamp_jitter_s: float = 0.0
+    joint_order: list[str] = field(default_factory=list)
+    joint_covariance: list[list[float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +101,10 @@ class ImuEstimate:
 
 @dataclass(frozen=True, slots=True)
 class TracePoint:
-    """One entry a second of how a camera's calibration developed (`t_s` since the first sample)."""
+    """One entry a second of how a camera's calibration developed (`t_s` since the first sample).
+
+    Biases and their sigmas are those of `ImuEstimate`; [] where they were not kept.
+    """
 
     t_s: float
     p_m: list[float]
@@ -104,6 +115,24 @@ class TracePoint:
     timeshift_sigma_s: float
     nis_per_dof: float = 0.0
     status: str = ""
+    gyro_bias_rps: list[float] = field(default_factory=list)
+    gyro_bias_sigma_rps: list[float] = field(default_factory=list)
+    accel_bias_mps2: list[float] = field(default_factory=list)
+    accel_bias_sigma_mps2: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutCheck:
+    """One image that the IMU alone predicted, some tenths of a second ahead, before it was used.
+
+    Attributes:
+        t_s: Time since the first sample, s.
+        ratio: Mean squared error of the prediction over its predicted variance; 1 on average if the stated
+            noise of IMU and corners is right.
+    """
+
+    t_s: float
+    ratio: float
 
 
 @dataclass(frozen=True, slots=True)

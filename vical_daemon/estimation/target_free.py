@@ -27,7 +27,7 @@ from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.plausible import stamp_sigma_problem
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.carry import (
     DRIFT,
@@ -38,7 +38,7 @@ from vical_daemon.estimation.smoother.carry import (
     calibration_difference,
 )
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.handover import afresh, aged, next_window
+from vical_daemon.estimation.smoother.handover import afresh, aged, next_window, of_another_recording
 from vical_daemon.estimation.smoother.judge import FreeJudge
 from vical_daemon.estimation.smoother.reports import window_reports
 from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
@@ -109,6 +109,8 @@ class TargetFreeCalibrator:
         self._newest_s = -np.inf  # stamp of the last image, used or not
         self._thinning = Thinning(MAX_RATE_HZ)
         self._reports: list[FrameReport] = []
+        self._stepped_s = 0.0  # by how much the imu's stamps were moved in the recording before
+        self._anew = False  # another recording begins: its biases are not known
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
@@ -137,7 +139,7 @@ class TargetFreeCalibrator:
         """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
         count, frame = len(frame.ids), cleaned(frame)
         nonsense = count > 0 and not len(frame.ids)  # its stamp is worth no more than its tracks
-        if frame.camera != self.camera or self._buffer is None or nonsense:
+        if frame.camera != self.camera or self._buffer is None or self._imu.between or nonsense:
             self.judge.frames_ignored += 1
             return
         stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
@@ -225,7 +227,8 @@ class TargetFreeCalibrator:
         end = self._buffer.newest_s - _LATE_S
         known = self.latest
         self._buffer.cut(self._imu.gap_end_s)  # a start needs motion in one piece
-        frames = self.starter.stretch(self._buffer, self._pending, end, known, last=flush)
+        hint = None if self._anew else known
+        frames = self.starter.stretch(self._buffer, self._pending, end, hint, last=flush)
         if frames is None:
             return False
         begun: _Begun | str
@@ -234,7 +237,8 @@ class TargetFreeCalibrator:
         elif known is None:
             begun = self._begin(frames, None)
         else:
-            begun = self._go_on(frames, known)
+            before = self._of_another(frames, known) if self._anew else known
+            begun = before if isinstance(before, str) else self._go_on(frames, before)
         if isinstance(begun, str):
             self.judge.waiting(begun, self.starter.motion_missing)
             return False
@@ -243,6 +247,7 @@ class TargetFreeCalibrator:
         self._pending = [x for x in self._pending if x[0] > last]
         self.window, self.carry, self.latest = window, begun.bundle.carry, fit.carry
         self._noise = (fit.sigma_px, fit.spread, fit.jitter_s)
+        self._anew = False
         self.judge.held = self.starter.held
         self.judge.started(window.frames[0][0])
         self.judge.saw_fit(fit, last + window.shift_s)
@@ -257,6 +262,17 @@ class TargetFreeCalibrator:
         if isinstance(window, str):
             return window
         return self._adjusted(window, known) or _DOES_NOT_FIT
+
+    def _of_another(self, frames: list[Stamped], known: Carry) -> Carry | str:
+        """What was known, with the biases by the first images of another recording; or why there are none."""
+        assert self._buffer is not None
+        window = self.starter.window(self._buffer, frames, None)
+        if isinstance(window, str):
+            return window
+        if self.starter.held is not None:
+            self.starter.held = None
+            return "the rig turns about one axis only so far: turn it about a second one"
+        return of_another_recording(known, window, self._stepped_s)
 
     def _adjusted(self, window: Window, known: Carry | None, reopened: Collection[int] = ()) -> _Begun | None:
         """Adjust a first window with what is known but for some errors; None where it does not fit."""
@@ -451,6 +467,30 @@ class TargetFreeCalibrator:
         self.starter.again()
         self.judge.lost(why, value, self.latest, against_s)
 
+    @property
+    def can_go_on(self) -> bool:
+        """Whether another recording can continue this calibration: no direction of it is unknown."""
+        return self.latest is not None and self.starter.held is None
+
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """What comes from now on is another recording of the same rig; see `Calibrator.next_recording`."""
+        if self.can_go_on:
+            self._lost(Cause.NONE, keep=True)
+        if not self.can_go_on:
+            self.window = self.carry = self.latest = None
+            self._closed = 0
+        if self.latest is not None:
+            camera = self.latest.camera
+            self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + self._offset_s)
+        self._anew = self.latest is not None
+        self.starter.again()
+        self.judge.next_recording()
+        self._stepped_s = abs(self._imu.stepped_s)
+        self._imu.next_recording()
+        self._images, self._pending, self._set_by_s = ImageIntake(), [], 0.0
+        self._newest_s = self._fitted_s = -np.inf
+        self._confirmed, self._seek_shift = False, self._anew and not common_clock
+
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
@@ -465,6 +505,10 @@ class TargetFreeCalibrator:
     def _offset_s(self) -> float:
         """Time shift by the stamps as they come now, minus that of the windows, s."""
         return self._imu.shift_s + self._images.offset_s(self.camera)
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return nothing: there is no such check without a target."""
+        return []
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration developed."""

@@ -16,7 +16,7 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.result import CalibrationEstimate, ImuEstimate, Status, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, ImuEstimate, Status, TracePoint
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 # What the rig as a whole is: the first of these that any camera is.
@@ -85,9 +85,23 @@ class TargetFreeRig:
         """End of the data: everything that inertial data cover."""
         return _in_order(part.finish() for part in self.parts.values())
 
+    @property
+    def can_go_on(self) -> bool:
+        """Whether another recording can go on with what is known of any camera."""
+        return any(part.can_go_on for part in self.parts.values())
+
+    def next_recording(self, *, common_clock: bool = True) -> None:
+        """What comes from now on is another recording of the same rig."""
+        for part in self.parts.values():
+            part.next_recording(common_clock=common_clock)
+
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now; takes the events since the last call along."""
         return together({name: part.estimate() for name, part in self.parts.items()})
+
+    def held_out(self) -> list[HeldOutCheck]:
+        """Return nothing: there is no such check without a target."""
+        return []
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration of one camera developed."""

@@ -254,6 +254,11 @@ def stamp_of(payload: bytes) -> int | None:
     return stamp_ns
 
 
+def with_stamp(payload: bytes, stamp_ns: int) -> bytes:
+    """Return a message for which `stamp_of` gives a stamp, with another one."""
+    return payload[:4] + _STAMP.pack(*divmod(stamp_ns, 1_000_000_000)) + payload[12:]
+
+
 def _has_imu_size(payload: bytes) -> bool:
     """Whether these bytes are as long as a sensor_msgs/Imu with this frame id is."""
     if len(payload) < 16 + _IMU_NUMBERS:

@@ -128,6 +128,18 @@ class CalibrationStore:
             return None
         return stored
 
+    def remove(self, imu_serial: str, camera_serial: str) -> None:
+        """Forget the stored calibration of a pair, if there is one.
+
+        Raises:
+            StoreError: The disk refuses.
+        """
+        path = self.path(imu_serial, camera_serial)
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise StoreError(f"{path} cannot be removed: {error.strerror or error}") from None
+
     def all(self) -> list[StoredCalibration]:
         """Return all valid stored calibrations, newest first."""
         found = [

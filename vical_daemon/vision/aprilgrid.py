@@ -7,8 +7,11 @@ cut off) is found afterwards from the board as a whole, see `guided`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from vical_daemon.vision.detection import FloatArray, Gray, IntArray
 from vical_daemon.vision.saddle import SaddleImage
@@ -17,56 +20,107 @@ from vical_daemon.vision.target import AprilGrid
 
 MIN_EDGE_PX = 9.0
 MAX_CANDIDATES = 400
-PASSES: tuple[tuple[int, int, int], ...] = ((31, 1, 1), (31, 2, 1), (91, 2, 1), (31, 2, 2), (15, 1, 1))
-"""(threshold window px, erosions, enlargement): tried in turn until enough of the board is known."""
+FIRST_WIDTH_PX = 320
+"""The first pass works on the picture halved until it is about this wide: most boards show there."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One way to make the black squares stand apart.
+
+    Attributes:
+        window_px: Of the local threshold, in the scaled picture.
+        erosions: Of the black mask by a pixel, in the scaled picture.
+        scale: Size of the scaled picture over that of the picture.
+    """
+
+    window_px: int
+    erosions: int
+    scale: float = 1.0
+
+
+PASSES = (Pass(31, 1), Pass(31, 2), Pass(91, 2), Pass(31, 2, 2.0), Pass(15, 1))
+"""Tried in turn until enough of the board is known, after passes over reduced pictures."""
 ENOUGH_TAGS = 6
 
 
-def search_tags(image: SaddleImage, gray: Gray, target: AprilGrid) -> tuple[IntArray, FloatArray]:
+def search_tags(
+    image: SaddleImage, gray: Gray, target: AprilGrid, misses: int = 0
+) -> tuple[IntArray, FloatArray]:
     """Find tags of `target`.
+
+    Args:
+        image: The picture, prepared.
+        gray: The picture.
+        target: The board.
+        misses: Pictures before this one in which no board was found. The first gets every pass; each that
+            follows gets the passes over reduced pictures and one of the others in turn.
 
     Returns:
         Tag ids, shape (n,), each at most once, and the corners 0..3 of each, px, shape (n, 4, 2).
     """
     tags = target.tag_cols * target.tag_rows
     found: dict[int, FloatArray] = {}
-    for window, erosions, enlargement in PASSES:
-        quads = _find_quads(gray, window, erosions, enlargement)
+    for attempt in _passes(gray.shape[1], misses):
+        ids, ordered = decode(image.smooth, _find_quads(gray, attempt), tags)
+        known = np.flatnonzero(ids >= 0)
+        known = known[np.bincount(ids[known], minlength=tags)[ids[known]] == 1]
+        ids, quads = ids[known], ordered[known]
         edge = np.linalg.norm(quads - np.roll(quads, -1, axis=1), axis=2).min(axis=1, initial=np.inf)
-        corners = image.refine(quads.reshape(-1, 2), np.repeat(edge * 0.18, 4), max_shift_px=3.0)
-        ids, ordered = decode(image.smooth, corners.uv_px.reshape(-1, 4, 2), tags)
-        doubled = {int(i) for i in ids if np.sum(ids == i) > 1}
-        for tag, quad in zip(ids, ordered, strict=True):
-            if tag >= 0 and int(tag) not in doubled:
-                found.setdefault(int(tag), quad)
+        shift_px = 2.0 + 1.0 / attempt.scale
+        corners = image.refine(quads.reshape(-1, 2), np.repeat(edge * 0.18, 4), shift_px)
+        for tag, quad in zip(ids, corners.uv_px.reshape(-1, 4, 2), strict=True):
+            found.setdefault(int(tag), quad)
         if len(found) >= min(ENOUGH_TAGS, tags):
             break
     order = sorted(found)
     return np.array(order, np.int64), np.array([found[i] for i in order]).reshape(-1, 4, 2)
 
 
-def _find_quads(gray: Gray, window: int, erosions: int, enlargement: int) -> FloatArray:
+def _passes(width_px: int, misses: int) -> list[Pass]:
+    """The passes that a picture gets, reduced pictures first, the smallest before."""
+    reduced: list[Pass] = []
+    while width_px * 0.5 ** (len(reduced) + 1) >= FIRST_WIDTH_PX:
+        reduced.insert(0, Pass(31, 1, 0.5 ** (len(reduced) + 1)))
+    if misses:
+        return [*reduced, PASSES[misses % len(PASSES)]]
+    return [*reduced, *PASSES]
+
+
+def _find_quads(gray: Gray, attempt: Pass) -> FloatArray:
     """Convex black quadrilaterals, counter-clockwise for the viewer, shape (n, 4, 2), px of `gray`."""
-    if enlargement > 1:
-        gray = np.asarray(cv2.resize(gray, None, fx=enlargement, fy=enlargement), np.uint8)
-    black = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, 6)
+    scale, erosions = attempt.scale, attempt.erosions
+    if scale != 1:
+        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        gray = np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=method), np.uint8)
+    black = cv2.adaptiveThreshold(
+        gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, attempt.window_px, 6
+    )
     black = cv2.erode(black, np.ones((3, 3), np.uint8), iterations=erosions)
     contours, hierarchy = cv2.findContours(black, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    quads = []
-    least = MIN_EDGE_PX * enlargement - 2 * erosions
-    for contour, links in zip(contours, hierarchy[0] if hierarchy is not None else [], strict=True):
-        if links[3] < 0 and len(contour) >= 4:
-            quad = _as_quad(contour, least)
-            if quad is not None:
-                quads.append(quad)
-    if not quads:
+    least = MIN_EDGE_PX * max(scale, 1.0) - 2 * erosions
+    if hierarchy is None:
         return np.zeros((0, 4, 2))
-    quads.sort(key=lambda q: -float(cv2.contourArea(q.astype(np.float32))))
-    grown = _grow(np.array(quads[:MAX_CANDIDATES]), erosions + 0.5)
-    return (grown + 0.5) / enlargement - 0.5
+    outer = np.flatnonzero(hierarchy[0][:, 3] < 0)
+    found = [quad for k in outer if (quad := _as_quad(contours[k], least)) is not None]
+    if not found:
+        return np.zeros((0, 4, 2))
+    quads = np.array(found, np.float64).reshape(-1, 4, 2)
+    edge = np.roll(quads, -1, axis=1) - quads
+    turning = edge[:, 0, 0] * edge[:, 1, 1] - edge[:, 0, 1] * edge[:, 1, 0]
+    quads = np.where((turning < 0)[:, None, None], quads, quads[:, ::-1])
+    length2 = np.sum(edge * edge, axis=2)
+    large = length2.min(axis=1) >= (0.6 * least) ** 2
+    if np.count_nonzero(large) > MAX_CANDIDATES:
+        size = np.sort(length2.sum(axis=1)[large])[-MAX_CANDIDATES]
+        large &= length2.sum(axis=1) >= size
+    return (_grow(quads[large], erosions + 0.5) + 0.5) / scale - 0.5
 
 
-def _as_quad(contour: IntArray, least_edge_px: float) -> FloatArray | None:
+def _as_quad(contour: npt.NDArray[np.int32], least_edge_px: float) -> npt.NDArray[np.int32] | None:
+    """The four corners of a contour that looks like a square in perspective, shape (4, 1, 2)."""
+    if len(contour) < 4:
+        return None
     _, _, width, height = cv2.boundingRect(contour)
     if min(width, height) < least_edge_px or max(width, height) > 20 * min(width, height):
         return None
@@ -75,16 +129,9 @@ def _as_quad(contour: IntArray, least_edge_px: float) -> FloatArray | None:
     if cv2.contourArea(contour) < 0.7 * area:
         return None
     quad = cv2.approxPolyDP(hull, 0.06 * cv2.arcLength(hull, True), True)
-    if len(quad) != 4:
+    if len(quad) != 4 or abs(cv2.contourArea(quad) - area) > 0.2 * area:
         return None
-    corners = quad.reshape(4, 2).astype(np.float64)
-    if np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).min() < 0.6 * least_edge_px:
-        return None
-    if abs(cv2.contourArea(quad) - area) > 0.2 * area:
-        return None
-    edge = np.roll(corners, -1, axis=0) - corners
-    turning = edge[0, 0] * edge[1, 1] - edge[0, 1] * edge[1, 0]
-    return np.ascontiguousarray(corners if turning < 0 else corners[::-1])
+    return np.asarray(quad, np.int32)
 
 
 def _grow(quads: FloatArray, distance_px: float) -> FloatArray:

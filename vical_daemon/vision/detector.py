@@ -13,10 +13,8 @@ from vical_daemon.vision.detection import AnyImage, Detection, FloatArray, Gray,
 from vical_daemon.vision.grid_model import GridModel
 from vical_daemon.vision.guided import (
     BoardFix,
-    BoolArray,
     check_identity,
     complete_board,
-    predict_with_residuals,
     refine_missing,
     refine_predicted,
 )
@@ -26,12 +24,14 @@ from vical_daemon.vision.target import AprilGrid, Target
 
 MIN_POINTS = 4
 FLOW_POINTS = 24
-FLOW_WINDOW = (17, 17)
-FLOW_LEVELS = 3
+FLOW_WIDTH_PX = 320
+"""Optical flow works on pictures reduced to at least this width: the refinement needs only a pixel or two."""
+FLOW_WINDOW = (11, 11)
+FLOW_LEVELS = 2
+FLOW_TOLERANCE_PX = 3.0
+"""From the common homography; beyond, the optical flow of a corner is wrong."""
 KEEP_SHARE = 0.5
 """Guided detection holds while it finds this share of the corners that should be in view."""
-THOROUGH_EVERY = 3
-"""Of pictures without a board, every third is searched at full size, which takes a tenth of a second."""
 MAX_GAP_NS = 400_000_000
 
 
@@ -53,7 +53,7 @@ class _LastFrame:
     """The last frame with a board."""
 
     fix: BoardFix
-    gray: Gray
+    reduced: Gray
     t_ns: int | None
     velocity_px: FloatArray
     """Motion of each corner per second (per frame without stamps), nan where unknown."""
@@ -91,15 +91,18 @@ class BoardDetector:
         """
         gray = as_gray(image)
         picture = SaddleImage(gray)
-        fix = self._follow(picture, gray, t_ns) if self._guided else None
+        reduced = _reduced(gray) if self._guided else gray
+        fix = self._follow(picture, reduced, t_ns) if self._guided else None
         if fix is not None:
             self.stats.guided += 1
         else:
             fix = self._search(picture, gray)
         if fix is None or fix.found.sum() < MIN_POINTS:
             self._last = None
+            self._misses += 1
             return None
-        self._remember(fix, gray, t_ns)
+        self._misses = 0
+        self._remember(fix, reduced, t_ns)
         ids = np.flatnonzero(fix.found).astype(np.int64)
         return Detection(ids, fix.uv_px[ids], fix.sigma_px[ids])
 
@@ -107,12 +110,11 @@ class BoardDetector:
         self.stats.searches += 1
         uv = np.full((len(self._layout.xy_m), 2), np.nan)
         if isinstance(self.target, AprilGrid):
-            tags, corners = search_tags(picture, gray, self.target)
+            tags, corners = search_tags(picture, gray, self.target, self._misses)
             for tag, quad in zip(tags, corners, strict=True):
                 uv[4 * tag : 4 * tag + 4] = quad
         else:
-            found = search_checkerboard(gray, self.target, self._misses % THOROUGH_EVERY == 0)
-            self._misses = 0 if found is not None else self._misses + 1
+            found = search_checkerboard(gray, self.target, self._misses)
             if found is None:
                 return None
             last = None
@@ -121,10 +123,10 @@ class BoardDetector:
             uv = put_in_order(picture, self._layout, found, last)
         return complete_board(picture, self._layout, uv, np.isfinite(uv).all(axis=1), self._lens)
 
-    def _follow(self, picture: SaddleImage, gray: Gray, t_ns: int | None) -> BoardFix | None:
+    def _follow(self, picture: SaddleImage, reduced: Gray, t_ns: int | None) -> BoardFix | None:
         """Guided detection; None when there is nothing to follow or the board is lost."""
-        start = self._flow(gray, t_ns)
-        if start is None:
+        start = self._flow(reduced, t_ns)
+        if start is None or start[0].shape != picture.shape:
             return None
         model, predicted = start
         fix = refine_predicted(picture, self._layout, model, predicted, search_px=5.0)
@@ -134,23 +136,26 @@ class BoardDetector:
             return None
         return fix
 
-    def _flow(self, gray: Gray, t_ns: int | None) -> tuple[GridModel, FloatArray] | None:
+    def _flow(self, reduced: Gray, t_ns: int | None) -> tuple[GridModel, FloatArray] | None:
         """Start from the last frame, moved by the optical flow of a few well spread corners."""
         last = self._last
-        if last is None or last.gray.shape != gray.shape:
+        if last is None or last.reduced.shape != reduced.shape:
             return None
         step = _elapsed(last.t_ns, t_ns)
         if step is None:
             return None
-        moved = np.nan_to_num(last.velocity_px * step)
         found = np.flatnonzero(last.fix.found)
         chosen = found[np.linspace(0, len(found) - 1, min(len(found), FLOW_POINTS)).round().astype(int)]
-        before = last.fix.uv_px[chosen].astype(np.float32)
+        before = last.fix.uv_px[chosen]
+        guess = before + np.nan_to_num(last.velocity_px[chosen] * step)
+        scale = round(
+            last.fix.model.shape[1] / reduced.shape[1]
+        )  # cv2.pyrDown keeps every other pixel's centre
         after, status, _ = cv2.calcOpticalFlowPyrLK(
-            last.gray,
-            gray,
-            before[:, None, :],
-            np.ascontiguousarray((before + moved[chosen])[:, None, :], np.float32),
+            last.reduced,
+            reduced,
+            np.ascontiguousarray((before / scale)[:, None], np.float32),
+            np.ascontiguousarray((guess / scale)[:, None], np.float32),
             winSize=FLOW_WINDOW,
             maxLevel=FLOW_LEVELS,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.05),
@@ -159,22 +164,21 @@ class BoardDetector:
         good = status.ravel() > 0
         if good.sum() < 4:
             return None
-        where = after.reshape(-1, 2)[good].astype(np.float64)
-        model = last.fix.model.refit(self._layout.xy_m[chosen[good]], where)
-        shift = predict_with_residuals(last.fix, self._layout) - last.fix.model.predict(self._layout.xy_m)
-        return model, model.predict(self._layout.xy_m) + shift
+        where = after[good, 0].astype(np.float64) * scale
+        H, _ = cv2.findHomography(before[good], where, cv2.USAC_FAST, FLOW_TOLERANCE_PX)
+        if H is None:
+            return None
+        return last.fix.model, cv2.perspectiveTransform(last.fix.places_px[:, None], H)[:, 0]
 
     def _holds(self, fix: BoardFix, shape: tuple[int, int]) -> bool:
         """Whether guided detection still finds most of what should be in view."""
-        uv = fix.model.predict(self._layout.xy_m)
+        u, v = fix.predicted_px.T
         margin = 12.0
-        with np.errstate(invalid="ignore"):
-            inside = (uv > margin) & (uv < np.array([shape[1], shape[0]]) - 1 - margin)
-        expected: BoolArray = np.asarray(inside.all(axis=1))
+        inside = (u > margin) & (u < shape[1] - 1 - margin) & (v > margin) & (v < shape[0] - 1 - margin)
         found = int(fix.found.sum())
-        return found >= 8 and found >= KEEP_SHARE * int(expected.sum())
+        return found >= 8 and found >= KEEP_SHARE * int(inside.sum())
 
-    def _remember(self, fix: BoardFix, gray: Gray, t_ns: int | None) -> None:
+    def _remember(self, fix: BoardFix, reduced: Gray, t_ns: int | None) -> None:
         velocity = np.full(fix.uv_px.shape, np.nan)
         if self._last is not None:
             step = _elapsed(self._last.t_ns, t_ns)
@@ -182,10 +186,17 @@ class BoardDetector:
                 both = fix.found & self._last.fix.found
                 velocity[both] = (fix.uv_px - self._last.fix.uv_px)[both] / step
                 if both.any():
-                    velocity[~both] = np.median(velocity[both], axis=0)
+                    velocity[~both] = velocity[both].mean(axis=0)
         if fix.found.sum() >= 24:
             self._lens += 0.2 * (float(fix.model.parameters[8]) - self._lens)
-        self._last = _LastFrame(fix, gray, t_ns, velocity)
+        self._last = _LastFrame(fix, reduced, t_ns, velocity)
+
+
+def _reduced(gray: Gray) -> Gray:
+    """The picture, halved until the next half would be narrower than `FLOW_WIDTH_PX`."""
+    while gray.shape[1] >= 2 * FLOW_WIDTH_PX:
+        gray = np.asarray(cv2.pyrDown(gray), np.uint8)
+    return gray
 
 
 def _elapsed(before_ns: int | None, now_ns: int | None) -> float | None:

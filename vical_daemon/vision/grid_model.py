@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.vision.detection import FloatArray, IntArray
+from vical_daemon.vision.detection import FloatArray, IntArray, median
 
 BoolArray = npt.NDArray[np.bool_]
 
-CONVERGED = 2e-5
-"""Change of the (dimensionless) parameters that moves no corner by more than about 0.01 px."""
+CONVERGED = 2e-3
+"""Change of the (dimensionless) parameters that moves corners by about a pixel: what the next step would
+change is of second order in it."""
 MAX_LENS = 1.5
 LENS_PRIOR = 0.5
 """One-sigma of the lens coefficient around its start: keeps few points from inventing a lens."""
@@ -43,26 +44,24 @@ class GridModel:
 
     def predict(self, xy_m: FloatArray) -> FloatArray:
         """Pixels of board points, shape (n, 2); nan where a point lies behind the camera."""
-        x = (xy_m[:, :2] - self.centre_m) / self.scale_m
-        return np.asarray(_project(self.parameters, x, self.shape))
-
-    def axes_px(self, xy_m: FloatArray) -> FloatArray:
-        """Pixels per metre along the board's x and y at each point, shape (n, 2, 2): [:, 0] is d(uv)/dx."""
-        h = 1e-3 * self.scale_m
-        dx = (self.predict(xy_m[:, :2] + [h, 0]) - self.predict(xy_m[:, :2] - [h, 0])) / (2 * h)
-        dy = (self.predict(xy_m[:, :2] + [0, h]) - self.predict(xy_m[:, :2] - [0, h])) / (2 * h)
-        return np.stack([dx, dy], axis=1)
+        return np.asarray(_project(self.parameters, self._scaled(xy_m), self.shape))
 
     def refit(self, xy_m: FloatArray, uv_px: FloatArray, iterations: int = 6) -> GridModel:
         """Return the model fitted to new points, starting here; robust against a few wrong ones."""
-        x = (xy_m[:, :2] - self.centre_m) / self.scale_m
+        x, uv = self._scaled(xy_m), np.ascontiguousarray(uv_px.T)
         parameters = self.parameters
         for _ in range(iterations):
             before = parameters
-            parameters = _gauss_newton_step(parameters, x, uv_px, self.shape, self.parameters[8])
+            parameters = _gauss_newton_step(parameters, x, uv, self.shape, self.parameters[8])
             if np.max(np.abs(parameters - before)) < CONVERGED:
                 break
         return GridModel(parameters, self.centre_m, self.scale_m, self.shape)
+
+    def _scaled(self, xy_m: FloatArray) -> FloatArray:
+        """Scaled board coordinates x, y, 1, shape (3, n)."""
+        scaled = np.ones((3, len(xy_m)))
+        scaled[:2] = (xy_m[:, :2] - self.centre_m).T / self.scale_m
+        return scaled
 
 
 def fit_grid(
@@ -116,16 +115,16 @@ def outliers(
     Returns:
         True for valid points that are wrong, shape (n,).
     """
-    residual = np.where(valid[:, None], residual_px, np.inf)
+    residual = np.where(valid, residual_px.T, np.inf)
     if valid.sum() < 5:
-        return np.asarray(valid & ~(np.linalg.norm(residual, axis=1) < 3 * floor_px))
-    around = np.sort(residual[neighbours], axis=1)
+        return np.asarray(valid & ~(np.hypot(*residual) < 3 * floor_px))
+    around = np.sort(residual[:, neighbours], axis=2)
     count = valid[neighbours].sum(axis=1)
     middle = np.maximum(count - 1, 0) // 2
-    median = np.take_along_axis(around, middle[:, None, None], axis=1)[:, 0]
-    median = np.where((count >= 2)[:, None], median, 0.0)
-    odd = np.linalg.norm(np.where(valid[:, None], residual - median, 0.0), axis=1)
-    limit = max(floor_px, 6 * float(np.median(odd[valid])))
+    usual = around[:, np.arange(len(valid)), middle]
+    usual = np.where(count >= 2, usual, 0.0)
+    odd = np.hypot(*np.where(valid, residual - usual, 0.0))
+    limit = max(floor_px, 6 * median(odd[valid]))
     return np.asarray(valid & ~(odd < limit))
 
 
@@ -134,19 +133,21 @@ def _frame(shape: tuple[int, int]) -> tuple[float, FloatArray]:
     return max(height, width) / 2, np.array([(width - 1) / 2, (height - 1) / 2])
 
 
-def _undistorted(parameters: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Homography of scaled board points: u, v in half widths, and the divisor (nan behind the camera)."""
-    h = parameters
-    depth = h[6] * x[:, 0] + h[7] * x[:, 1] + 1.0
-    depth = np.where(depth > 1e-6, depth, np.nan)
-    u = (h[0] * x[:, 0] + h[1] * x[:, 1] + h[2]) / depth
-    v = (h[3] * x[:, 0] + h[4] * x[:, 1] + h[5]) / depth
-    return u, v, depth
+def _undistorted(parameters: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Homography of scaled board points (3, n): u, v in half widths, shape (2, n), and the divisor, (n,).
+
+    Both are nan behind the camera.
+    """
+    H = np.ones(9)
+    H[:8] = parameters[:8]
+    uvw = H.reshape(3, 3) @ x
+    depth = np.where(uvw[2] > 1e-6, uvw[2], np.nan)
+    return uvw[:2] / depth, depth
 
 
-def _root(lens: float, u: FloatArray, v: FloatArray) -> FloatArray:
+def _root(lens: float, r2: FloatArray) -> FloatArray:
     """Root of lens r_u r_d^2 - r_d + r_u = 0, chosen such that r_d tends to r_u as lens tends to 0."""
-    return np.asarray(np.sqrt(np.maximum(1 - 4 * lens * (u * u + v * v), 1e-6)))
+    return np.asarray(np.sqrt(np.maximum(1 - 4 * lens * r2, 1e-6)))
 
 
 # Trial parameters may be wild; points that then overflow are not finite, and no corner is looked for there.
@@ -155,54 +156,60 @@ _wild_guesses = np.errstate(over="ignore", invalid="ignore")
 
 @_wild_guesses
 def _project(parameters: FloatArray, x: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Pixels of scaled board points (n, 2), shape (n, 2)."""
+    """Pixels of scaled board points (3, n), shape (n, 2)."""
     half, middle = _frame(shape)
-    u, v, _ = _undistorted(parameters, x)
-    stretch = 2 * half / (1 + _root(parameters[8], u, v))
-    return np.stack([u * stretch + middle[0], v * stretch + middle[1]], axis=-1)
+    q, _ = _undistorted(parameters, x)
+    stretch = 2 * half / (1 + _root(parameters[8], q[0] * q[0] + q[1] * q[1]))
+    return np.ascontiguousarray((q * stretch).T) + middle
 
 
 @_wild_guesses
-def _jacobian(parameters: FloatArray, x: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Derivative of `_project` by the nine parameters, shape (n, 2, 9)."""
-    half, _ = _frame(shape)
-    u, v, depth = _undistorted(parameters, x)
+def _project_with_jacobian(
+    parameters: FloatArray, x: FloatArray, shape: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels of scaled board points, shape (2, n), and their derivative by the parameters, (9, 2, n)."""
+    half, middle = _frame(shape)
+    q, depth = _undistorted(parameters, x)
     lens = parameters[8]
-    root = _root(lens, u, v)
+    r2 = q[0] * q[0] + q[1] * q[1]
+    root = _root(lens, r2)
     stretch = 2 / (1 + root)
     per_lens = 4 / (root * (1 + root) ** 2)  # derivative of the stretch by lens r^2
-    r2 = u * u + v * v
-    a, b, d = stretch + 2 * lens * per_lens * u * u, 2 * lens * per_lens * u * v, stretch
-    d = d + 2 * lens * per_lens * v * v
-    X, Y, one = x[:, 0] / depth, x[:, 1] / depth, 1 / depth
-    J = np.empty((len(x), 2, 9))
-    for row, (by_u, by_v) in enumerate(((a, b), (b, d))):
-        J[:, row, 0], J[:, row, 1], J[:, row, 2] = by_u * X, by_u * Y, by_u * one
-        J[:, row, 3], J[:, row, 4], J[:, row, 5] = by_v * X, by_v * Y, by_v * one
-        along = -(by_u * u + by_v * v)
-        J[:, row, 6], J[:, row, 7] = along * X, along * Y
-    J[:, 0, 8], J[:, 1, 8] = u * r2 * per_lens, v * r2 * per_lens
-    return np.asarray(J * half)
+    board = x * (half / depth)
+    by_q = (2 * lens * per_lens * q)[:, None] * q  # derivative of the pixel by u and v, shape (2, 2, n)
+    by_q[0, 0] += stretch
+    by_q[1, 1] += stretch
+    J = np.empty((9, 2, x.shape[1]))
+    np.multiply(by_q[0], board[:, None], out=J[0:3])
+    np.multiply(by_q[1], board[:, None], out=J[3:6])
+    along = -(by_q[0] * q[0] + by_q[1] * q[1])
+    np.multiply(along, board[:2, None], out=J[6:8])
+    np.multiply(q, half * r2 * per_lens, out=J[8])
+    return q * (half * stretch) + middle[:, None], J
 
 
 def _gauss_newton_step(
     parameters: FloatArray, x: FloatArray, uv: FloatArray, shape: tuple[int, int], lens0: float
 ) -> FloatArray:
-    """One step of Huber-weighted least squares; the homography alone with fewer than eight points."""
-    residual = uv - _project(parameters, x, shape)
-    seen = np.isfinite(residual[:, 0])
-    count = int(seen.sum())
+    """One step of Huber-weighted least squares; the homography alone with fewer than eight points.
+
+    `x` is the scaled board points, shape (3, n), and `uv` their pixels, shape (2, n).
+    """
+    projected, J = _project_with_jacobian(parameters, x, shape)
+    residual = uv - projected
+    size = np.hypot(residual[0], residual[1])
+    seen = np.isfinite(size)
+    count = int(np.count_nonzero(seen))
     if count < 4:
         return parameters
-    J = _jacobian(parameters, x, shape)
     if count < len(seen):
-        residual, J = residual[seen], J[seen]
-    J = J.reshape(-1, 9)
-    size = np.linalg.norm(residual, axis=1)
-    knee = 1.5 * float(np.partition(size, count // 2)[count // 2]) + 0.3
-    weighted = J * np.repeat(np.minimum(1.0, knee / np.maximum(size, 1e-9)), 2)[:, None]
-    normal = weighted.T @ J
-    right = weighted.T @ residual.ravel()
+        residual, J, size = residual[:, seen], J[:, :, seen], size[seen]
+    knee = 1.5 * median(size) + 0.3
+    weight = np.minimum(1.0, knee / np.maximum(size, 1e-9))
+    J = J.reshape(9, -1)
+    weighted = (J.reshape(9, 2, -1) * weight).reshape(9, -1)
+    normal = weighted @ J.T
+    right = weighted @ residual.ravel()
     prior = 1.0 / LENS_PRIOR**2 if count >= 8 else 1e12
     normal[8, 8] += prior
     right[8] += prior * (lens0 - parameters[8])

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.vision.detection import FloatArray
+from vical_daemon.vision.detection import FloatArray, median
 from vical_daemon.vision.grid_model import GridModel, fit_grid, outliers
 from vical_daemon.vision.layout import BoardLayout
 from vical_daemon.vision.saddle import SaddleImage
-from vical_daemon.vision.tag_code import BITS, agreement, bit_centres, sample
+from vical_daemon.vision.tag_code import agreement, bit_places, sample
 from vical_daemon.vision.target import AprilGrid
 
 BoolArray = npt.NDArray[np.bool_]
@@ -28,6 +28,10 @@ MAX_SIGMA_PX = 2.0
 GROW_ROUNDS = 3
 MIN_AGREEMENT = 0.3
 MIN_BOARD_AGREEMENT = 0.35
+RETRY_PX = 0.5
+"""A corner that was not found is looked for again where its prediction moved by more than this."""
+MANY_NEW = 0.1
+"""Share of new corners above which the model is fitted again."""
 MIN_RIM_CORNERS = 3
 MAX_RIM_SHARE = 0.2
 """Of the places just beyond a checkerboard: this many that look like its corners, and it is shifted."""
@@ -42,12 +46,20 @@ class BoardFix:
         sigma_px: One-sigma per axis, shape (n,).
         found: Shape (n,).
         model: Fitted to the corners found.
+        predicted_px: What the model predicts, shape (n, 2); nan behind the camera.
+        places_px: Where each corner is, or should be by the model and what near ones miss it by, (n, 2).
+        tried_px: Where each corner was looked for last, shape (n, 2); nan: nowhere.
+        contrast_dn: Median corner contrast, grey levels.
     """
 
     uv_px: FloatArray
     sigma_px: FloatArray
     found: BoolArray
     model: GridModel
+    predicted_px: FloatArray
+    places_px: FloatArray
+    tried_px: FloatArray
+    contrast_dn: float
 
 
 def complete_board(
@@ -70,8 +82,7 @@ def complete_board(
     model = fit_grid(layout.xy_m[known], uv_px[known], image.shape, lens)
     if model is None:
         return None
-    keep = known.copy()
-    keep &= ~outliers(uv_px - model.predict(layout.xy_m), known, layout.neighbours, floor_px=2.5)
+    keep = known & ~outliers(uv_px - model.predict(layout.xy_m), known, layout.neighbours, floor_px=2.5)
     if keep.sum() < 4:
         return None
     return grow_board(image, layout, model.refit(layout.xy_m[keep], uv_px[keep]), uv_px, keep)
@@ -81,8 +92,8 @@ def grow_board(
     image: SaddleImage, layout: BoardLayout, model: GridModel, uv_px: FloatArray, known: BoolArray
 ) -> BoardFix | None:
     """Refine `known` corners and find the others around them, nearest first by rounds."""
-    start = BoardFix(uv_px, np.full(len(uv_px), np.inf), known, model)
-    fix = refine_predicted(image, layout, model, predict_with_residuals(start, layout), search_px=3.0)
+    start = predict_with_residuals(layout, model, model.predict(layout.xy_m), uv_px, known)
+    fix = refine_predicted(image, layout, model, start, search_px=3.0)
     if fix is None:
         return None
     for _ in range(GROW_ROUNDS):
@@ -93,91 +104,111 @@ def grow_board(
     return check_identity(image, layout, fix)
 
 
-def predict_with_residuals(fix: BoardFix, layout: BoardLayout) -> FloatArray:
+def predict_with_residuals(
+    layout: BoardLayout, model: GridModel, predicted_px: FloatArray, uv_px: FloatArray, found: BoolArray
+) -> FloatArray:
     """Predict all corners: found ones where they are, others by the model plus what near ones miss it by."""
-    predicted = fix.model.predict(layout.xy_m)
-    residual = (fix.uv_px - predicted)[fix.found]
-    missing = ~fix.found
-    if missing.any():
-        apart = np.linalg.norm(layout.xy_m[missing, None] - layout.xy_m[None, fix.found], axis=2)
-        weight = 1.0 / (apart + 1e-3 * fix.model.scale_m) ** 4
-        predicted[missing] += (weight @ residual) / weight.sum(axis=1, keepdims=True)
-    predicted[fix.found] = fix.uv_px[fix.found]
-    return predicted
+    best = np.where(found[:, None], uv_px, predicted_px)
+    missing = ~found
+    if missing.any() and found.any():
+        residual = (uv_px - predicted_px)[found]
+        dx, dy = (layout.xy_m[missing, None] - layout.xy_m[None, found]).transpose(2, 0, 1)
+        apart2 = dx * dx + dy * dy + (1e-3 * model.scale_m) ** 2
+        weight = 1.0 / (apart2 * apart2)
+        best[missing] += (weight @ residual) / weight.sum(axis=1, keepdims=True)
+    return best
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Corners looked for at some places, before they are compared with each other; as in `BoardFix`."""
+
+    uv_px: FloatArray
+    sigma_px: FloatArray
+    found: BoolArray
+    contrast_dn: float
 
 
 def refine_predicted(
-    image: SaddleImage,
-    layout: BoardLayout,
-    model: GridModel,
-    predicted_px: FloatArray,
-    search_px: float,
+    image: SaddleImage, layout: BoardLayout, model: GridModel, predicted_px: FloatArray, search_px: float
 ) -> BoardFix | None:
     """Refine corners at predicted places and keep those that pass every check.
 
     Args:
         image: The picture.
         layout: The board.
-        model: Roughly where the board is: gives local axes and so window sizes.
-        predicted_px: A place for each corner, shape (n, 2); nan where there is none.
+        model: Roughly where the board is.
+        predicted_px: A place for each corner, shape (n, 2); nan where there is none. Its differences along
+            the board give the sizes of the windows.
         search_px: Largest distance between prediction and corner.
 
     Returns:
         None where fewer than four corners pass.
     """
-    axes = model.axes_px(layout.xy_m)
+    look = _look(image, layout, predicted_px, np.ones(len(predicted_px), bool), search_px)
+    if look is None or look.found.sum() < 4:
+        return None
+    model = model.refit(layout.xy_m[look.found], look.uv_px[look.found])
+    return _consistent(layout, look, model, predicted_px)
+
+
+def _look(
+    image: SaddleImage, layout: BoardLayout, places_px: FloatArray, wanted: BoolArray, search_px: float
+) -> _Look | None:
+    """Refine the wanted corners; None where fewer than four are in reach or pass."""
+    if np.count_nonzero(wanted) < 4:
+        return None
+    axes = layout.steps.axes_px(places_px)
     radius = layout.radius_px(axes)
-    usable = np.isfinite(predicted_px).all(axis=1) & (radius >= MIN_RADIUS_PX)
-    index = np.flatnonzero(usable)
+    index = np.flatnonzero(wanted & np.isfinite(places_px[:, 0]) & (radius >= MIN_RADIUS_PX))
     if len(index) < 4:
         return None
-    reach = np.minimum(search_px, 0.5 * radius[index] + 1.5)
-    saddles = image.refine(predicted_px[index], radius[index], reach)
-    contrast = corner_contrast(image, layout, saddles.uv_px, axes[index], index)
+    axes, radius = axes[index], radius[index]
+    reach = np.minimum(search_px, 0.5 * radius + 1.5)
+    saddles = image.refine(places_px[index], radius, reach)
+    contrast = corner_contrast(image, layout, saddles.uv_px, axes, index)
     ok = saddles.ok & (saddles.sigma_px < MAX_SIGMA_PX) & (contrast > MIN_CONTRAST_DN)
-    if ok.sum() < 4:
+    if np.count_nonzero(ok) < 4:
         return None
-    ok &= contrast > MIN_CONTRAST * float(np.median(contrast[ok]))
-    uv, sigma = np.full((len(usable), 2), np.nan), np.full(len(usable), np.inf)
+    usual = median(contrast[ok])
+    uv, sigma = np.full(places_px.shape, np.nan), np.full(len(places_px), np.inf)
     uv[index], sigma[index] = saddles.uv_px, saddles.sigma_px
-    found = np.zeros(len(usable), bool)
-    found[index] = ok
-    return consistent(layout, BoardFix(uv, sigma, found, model))
+    found = np.zeros(len(places_px), bool)
+    found[index] = ok & (contrast > MIN_CONTRAST * usual)
+    return _Look(uv, sigma, found, usual)
 
 
-def consistent(layout: BoardLayout, fix: BoardFix) -> BoardFix | None:
-    """Fit the model to the corners found and drop those that stand out; None below four."""
-    model, found = fix.model, fix.found.copy()
+def _consistent(layout: BoardLayout, look: _Look, model: GridModel, tried_px: FloatArray) -> BoardFix | None:
+    """Drop the corners that stand out from the model and their neighbours; None below four."""
+    predicted, found = model.predict(layout.xy_m), look.found
     for _ in range(2):
-        if found.sum() < 4:
-            return None
-        model = model.refit(layout.xy_m[found], fix.uv_px[found])
-        wrong = outliers(fix.uv_px - model.predict(layout.xy_m), found, layout.neighbours)
-        found &= ~wrong
+        wrong = outliers(look.uv_px - predicted, found, layout.neighbours)
         if not wrong.any():
             break
+        found = found & ~wrong
     if found.sum() < 4:
         return None
-    return BoardFix(fix.uv_px, np.where(found, fix.sigma_px, np.inf), found, model)
+    places = predict_with_residuals(layout, model, predicted, look.uv_px, found)
+    sigma = np.where(found, look.sigma_px, np.inf)
+    return BoardFix(look.uv_px, sigma, found, model, predicted, places, tried_px, look.contrast_dn)
 
 
 def refine_missing(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> BoardFix:
-    """Look once more for the corners that are not found yet, from where their neighbours put them."""
-    predicted = predict_with_residuals(fix, layout)
-    predicted[fix.found] = np.nan
+    """Look for the corners that are not found yet, where their neighbours put them unless looked there."""
     height, width = image.shape
-    with np.errstate(invalid="ignore"):
-        predicted[~((predicted > 0) & (predicted < [width, height])).all(axis=1)] = np.nan
-    more = refine_predicted(image, layout, fix.model, predicted, search_px=3.0)
+    u, v = fix.places_px.T
+    wanted = ~fix.found & (u > 0) & (u < width) & (v > 0) & (v < height)
+    wanted &= ~(np.abs(fix.places_px - fix.tried_px).max(axis=1) < RETRY_PX)
+    more = _look(image, layout, fix.places_px, wanted, search_px=3.0)
     if more is None:
         return fix
-    merged = BoardFix(
-        np.where(fix.found[:, None], fix.uv_px, more.uv_px),
-        np.minimum(fix.sigma_px, more.sigma_px),
-        fix.found | more.found,
-        fix.model,
-    )
-    return consistent(layout, merged) or fix
+    found = fix.found | more.found
+    uv = np.where(fix.found[:, None], fix.uv_px, more.uv_px)
+    both = _Look(uv, np.minimum(fix.sigma_px, more.sigma_px), found, fix.contrast_dn)
+    model = fix.model
+    if more.found.sum() > MANY_NEW * fix.found.sum():
+        model = model.refit(layout.xy_m[found], uv[found])
+    return _consistent(layout, both, model, fix.places_px) or fix
 
 
 def corner_contrast(
@@ -216,22 +247,25 @@ def check_identity(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> Bo
 def is_shifted(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> bool:
     """Tell whether a checkerboard goes on beyond its outermost corners, where it must have ended."""
     rim = layout.rim
-    if rim is None:
+    if rim is None or rim.rim_index is None:
         return False
-    uv = fix.model.predict(rim.xy_m)
-    axes = fix.model.axes_px(rim.xy_m)
-    radius = rim.radius_px(axes)
+    places = fix.model.predict(rim.xy_m)
+    axes = rim.steps.take(rim.rim_index).axes_px(places)
+    uv, radius = places[rim.rim_index], rim.radius_px(axes)
     height, width = image.shape
-    with np.errstate(invalid="ignore"):
-        inside = ((uv > radius[:, None]) & (uv < np.array([width, height]) - 1 - radius[:, None])).all(axis=1)
-    index = np.flatnonzero(inside & (radius >= MIN_RADIUS_PX))
-    if len(index) < MIN_RIM_CORNERS:
+    u, v = uv.T
+    inside = (u > radius) & (u < width - 1 - radius) & (v > radius) & (v < height - 1 - radius)
+    chosen = np.flatnonzero(inside & (radius >= MIN_RADIUS_PX))
+    if len(chosen) < MIN_RIM_CORNERS:
         return False
-    found = np.flatnonzero(fix.found)
-    own = corner_contrast(image, layout, fix.uv_px[found], fix.model.axes_px(layout.xy_m[found]), found)
-    saddles = image.refine(uv[index], radius[index], np.minimum(5.0, 0.5 * radius[index] + 1.5))
-    contrast = corner_contrast(image, rim, saddles.uv_px, axes[index], index)
-    goes_on = saddles.ok & (contrast > 0.5 * float(np.median(own)))
+    index = rim.rim_index[chosen]
+    # A corner would lie within a pixel or two of its place, and show most of its contrast there.
+    near = corner_contrast(image, rim, uv[chosen], axes[chosen], index)
+    if np.count_nonzero(near > 0.4 * fix.contrast_dn) < MIN_RIM_CORNERS:
+        return False
+    saddles = image.refine(uv[chosen], radius[chosen], np.minimum(5.0, 0.5 * radius[chosen] + 1.5))
+    contrast = corner_contrast(image, rim, saddles.uv_px, axes[chosen], index)
+    goes_on = saddles.ok & (contrast > 0.5 * fix.contrast_dn)
     return bool(goes_on.sum() >= MIN_RIM_CORNERS and goes_on.mean() > MAX_RIM_SHARE)
 
 
@@ -241,28 +275,20 @@ def check_codes(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> Board
     Returns:
         The fix without the corners of hidden tags; None if the board as a whole is not where it seems.
     """
-    target = layout.target
-    assert isinstance(target, AprilGrid)
-    origin = layout.xy_m[::4]
-    spots = origin[:, None, :] + bit_centres()[None] * target.tag_size_m
-    uv = fix.model.predict(spots.reshape(-1, 2)).reshape(len(origin), BITS * BITS, 2)
-    uv += _tag_residual(fix, layout)[:, None, :]
+    quads, found = fix.places_px.reshape(-1, 4, 2), fix.found.reshape(-1, 4)
     height, width = image.shape
-    inside = ((uv > 0) & (uv < [width - 1, height - 1])).all(axis=(1, 2))
-    seen = np.flatnonzero(inside & fix.found.reshape(-1, 4).any(axis=1))
+    u, v = quads[..., 0], quads[..., 1]
+    inside = ((u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)).all(axis=1)
+    seen = np.flatnonzero(inside & found.any(axis=1))
     if not len(seen):
         return None
-    match = agreement(sample(image.smooth, uv[seen]), seen)
+    match = agreement(sample(image.smooth, bit_places(quads[seen])), seen)
     if match.mean() < MIN_BOARD_AGREEMENT:
         return None
-    hidden = np.zeros(len(origin), bool)
-    hidden[seen] = match < MIN_AGREEMENT
-    found = fix.found & ~np.repeat(hidden, 4)
-    return BoardFix(fix.uv_px, np.where(found, fix.sigma_px, np.inf), found, fix.model)
-
-
-def _tag_residual(fix: BoardFix, layout: BoardLayout) -> FloatArray:
-    """Mean distance of each tag's found corners from the model, px, shape (tags, 2)."""
-    residual = np.where(fix.found[:, None], fix.uv_px - fix.model.predict(layout.xy_m), 0.0)
-    count = np.maximum(fix.found.reshape(-1, 4).sum(axis=1), 1)
-    return np.asarray(residual.reshape(-1, 4, 2).sum(axis=1) / count[:, None])
+    hidden = match < MIN_AGREEMENT
+    if not hidden.any():
+        return fix
+    found = found.copy()
+    found[seen[hidden]] = False
+    left = _Look(fix.uv_px, fix.sigma_px, found.ravel(), fix.contrast_dn)
+    return _consistent(layout, left, fix.model, fix.tried_px)

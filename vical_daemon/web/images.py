@@ -22,6 +22,7 @@ from vical_daemon.bus.messages import (
     decode_image,
     decode_points,
 )
+from vical_daemon.web.meters import light
 
 WIDTH_LIMIT = 800  # px; wider images are thinned for display
 QUALITY = 70
@@ -150,16 +151,18 @@ def picture_event(sight: Sight) -> bytes | None:
         pixels, points, predicted = _contents(sight)
     except MessageError:
         return None
-    jpeg = b""
+    jpeg, brightness = b"", None
     if sight.image is not None:
         from vical_daemon.vision.image_codec import encode_image
 
-        jpeg = encode_image(thinned(pixels)[0], "jpeg", quality=QUALITY)
+        small, _ = thinned(pixels)
+        jpeg, brightness = encode_image(small, "jpeg", quality=QUALITY), light(small)
     document = {
         "stamp_s": round(sight.stamp_ns * 1e-9, 3),
         "size": [pixels.shape[1], pixels.shape[0]],
         "detected": _rows(points),
         "predicted": _rows(predicted),
+        "light": brightness,
         "jpeg": base64.b64encode(jpeg).decode(),
     }
     return b"event: picture\ndata: " + msgspec.json.encode(document) + b"\n\n"
@@ -188,7 +191,7 @@ def _contents(sight: Sight) -> tuple[npt.NDArray[Any], PointsMessage | None, Poi
         MessageError: One of its messages is malformed.
     """
     read = [None if s is None else decode_points(s.payload) for s in (sight.points, sight.predicted)]
-    pixels = np.zeros(_size(read[0]), np.uint8) if sight.image is None else _pixels(sight.image)
+    pixels = np.zeros(_size(read[0]), np.uint8) if sight.image is None else pixels_of(sight.image)
     return pixels, read[0], read[1]
 
 
@@ -229,7 +232,12 @@ def _stamp_ns(sample: Sample) -> int:
     return int(seconds) * 10**9 + int(nanoseconds)
 
 
-def _pixels(sample: Sample) -> npt.NDArray[Any]:
+def pixels_of(sample: Sample) -> npt.NDArray[Any]:
+    """Return the pixels of an image message, plain or compressed: grey (h, w) or BGR (h, w, 3).
+
+    Raises:
+        MessageError: It is malformed.
+    """
     parsed = topics.parse_key(sample.key)
     if parsed is not None and parsed.topic is topics.COMPRESSED:
         from vical_daemon.vision.image_codec import decode_image as decode_file

@@ -18,8 +18,12 @@ from vical_daemon.bus.interface import Bus, Subscription
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_string
 from vical_daemon.config.model import Config
 from vical_daemon.config.paths import state_directory
+from vical_daemon.config.priors import calibration_options
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.service.health import StatusSender
 from vical_daemon.service.wall_clock import WallClock, service_clock
+from vical_daemon.web.camera_watch import CameraWatch
+from vical_daemon.web.downloads import Downloads
 from vical_daemon.web.images import CameraView
 from vical_daemon.web.server import PageServer
 from vical_daemon.web.state import WebState
@@ -44,6 +48,10 @@ class _Feeds:
         self.views = {name: CameraView(name) for name in config.cameras}
         self._always = [
             bus.subscribe(topics.CALIBRATION.key(config.rig, name), state.take) for name in config.cameras
+        ]
+        seen = (topics.POINTS, topics.TRACKS, topics.PREDICTED, topics.STORED)
+        self._always += [
+            bus.subscribe(t.key(config.rig, n), state.take) for n in config.cameras for t in seen
         ]
         self._always.append(bus.subscribe(f"{topics.ROOT}/{config.rig}/status/*", state.take))
         self._watched: dict[str, list[Subscription]] = {}
@@ -88,7 +96,9 @@ def run(
         WebError: The address cannot be used.
     """
     clock = clock or service_clock()
-    state = WebState(config.rig)
+    points_m = _target_points(config)
+    watches = {name: CameraWatch(points_m, camera.size) for name, camera in config.cameras.items()}
+    state = WebState(config.rig, watches=watches, targets=calibration_options(config).targets)
     feeds = _Feeds(config, bus, state)
     try:
         asyncio.run(_serve(config, bus, stop, clock, state, feeds, ready))
@@ -110,7 +120,14 @@ async def _serve(
 
     settings = config.web
     server = PageServer(
-        state, feeds.views, feeds.watch, command, read_token(), settings.picture_rate_hz, settings.hosts
+        state,
+        feeds.views,
+        feeds.watch,
+        command,
+        read_token(),
+        settings.picture_rate_hz,
+        settings.hosts,
+        Downloads(config, state),
     )
     host, port = settings.host, settings.port
     try:
@@ -141,6 +158,19 @@ async def _serve(
         if viewer is not None:
             viewer.close()
         await server.close()
+
+
+def _target_points(config: Config) -> FloatArray | None:
+    """Return the points of the board; None without a target, or where its file is not on this computer."""
+    if config.target_path is None or config.calibration.mode == "target_free":
+        return None
+    from vical_daemon.vision.target import TargetError, load_target
+
+    try:
+        return load_target(config.target_path).points_m
+    except TargetError as error:
+        _log.warning("the page does not know the board: %s", error)
+        return None
 
 
 def _foxglove(config: Config, bus: Bus) -> FoxgloveServer | None:

@@ -14,7 +14,10 @@ import msgspec
 from aiohttp import web
 
 from vical_daemon.bus.log_limit import LogLimit
+from vical_daemon.results.export import ExportError
+from vical_daemon.results.report.scene import SCRIPT as SCENE_SCRIPT
 from vical_daemon.web.connections import BODY_S, Gate, Malformed, http_logger
+from vical_daemon.web.downloads import Downloads
 from vical_daemon.web.hosts import AllowedHosts
 from vical_daemon.web.images import CameraView, Sight, drawn_jpeg, picture_event
 from vical_daemon.web.metrics import metrics
@@ -29,13 +32,18 @@ COMMANDS = {  # name on the page: role and command
     "record_start": ("record", "start"),
     "record_stop": ("record", "stop"),
     "reset": ("estimate", "reset"),
+    "accept": ("estimate", "accept"),
+    "discard": ("estimate", "discard"),
 }
-_FILES = {
+_FILES: dict[str, str | Path] = {
     "": "index.html",
     "style.css": "style.css",
     "app.js": "app.js",
     "chart.js": "chart.js",
     "camera.js": "camera.js",
+    "meters.js": "meters.js",
+    "decide.js": "decide.js",
+    "scene.js": SCENE_SCRIPT,  # the report draws with it, too
 }
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
@@ -61,6 +69,7 @@ class PageServer:
         token: Token that a client must send with a command; "": no client may command.
         picture_rate_hz: Highest picture rate.
         hosts: Further host names of the page, besides this computer's own.
+        downloads: Makes exports and finds the log; None: there are none.
     """
 
     def __init__(
@@ -72,7 +81,9 @@ class PageServer:
         token: str = "",
         picture_rate_hz: float = PICTURE_RATE_HZ,
         hosts: Sequence[str] = (),
+        downloads: Downloads | None = None,
     ) -> None:
+        self._downloads = downloads
         self.state, self.views = state, views
         self._watch, self._command, self._token = watch, command, token
         self._number = 0
@@ -101,6 +112,8 @@ class PageServer:
         app.router.add_get("/camera/{name}.mjpg", self._mjpeg)
         app.router.add_get("/api/state", self._state)
         app.router.add_post("/api/command", self._post_command)
+        app.router.add_get("/api/export/{format:[a-z0-9]+}", self._export)
+        app.router.add_get("/api/log", self._log_file)
         app.router.add_get("/metrics", self._metrics)
         app.router.add_get("/{file:[a-z.]*}", self._static)
         return app
@@ -285,13 +298,34 @@ class PageServer:
         if before != after:
             self._watch(name, after)
 
-    async def _post_command(self, request: web.Request) -> web.Response:
+    def _check_token(self, request: web.Request, what: str) -> None:
         if not self._token or self._command is None:
             raise web.HTTPForbidden(text="this page is read-only: no token is set on the robot")
         given = request.headers.get("Authorization", "").removeprefix("Bearer ")
         if not hmac.compare_digest(given.encode(errors="replace"), self._token.encode()):
-            self._note_refusal(f"a command from {request.remote} without the right token")
+            self._note_refusal(f"{what} from {request.remote} without the right token")
             raise web.HTTPUnauthorized(text="wrong token")
+
+    async def _export(self, request: web.Request) -> web.Response:
+        self._check_token(request, "an export")
+        if self._downloads is None:
+            raise web.HTTPNotFound
+        try:
+            name, data = self._downloads.export(request.match_info["format"], force="force" in request.query)
+        except ExportError as error:
+            raise web.HTTPConflict(text=str(error)) from None
+        return web.Response(body=data, headers=_attached(name))
+
+    async def _log_file(self, request: web.Request) -> web.StreamResponse:
+        self._check_token(request, "a download")
+        path = None if self._downloads is None else self._downloads.newest_log()
+        if path is None:
+            raise web.HTTPNotFound(text="there is no log on this computer; is recording on?")
+        return web.FileResponse(path, headers=_attached(path.name))
+
+    async def _post_command(self, request: web.Request) -> web.Response:
+        self._check_token(request, "a command")
+        assert self._command is not None
         try:
             async with asyncio.timeout(BODY_S):
                 document = json.loads(await request.read())
@@ -331,6 +365,13 @@ class _Broadcast:
         async with self._made:
             await self._made.wait_for(lambda: self._number != seen)
             return self._number, self._picture
+
+
+def _attached(name: str) -> dict[str, str]:
+    return {
+        "Content-Disposition": f'attachment; filename="{name}"',
+        "Content-Type": "application/octet-stream",
+    }
 
 
 def _part(jpeg: bytes) -> bytes:

@@ -6,7 +6,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,6 +23,8 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance, Verb
+from vical_daemon.estimation.measurements import ConvergenceTargets
+from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.wording import (
     direction_warning,
     event_document,
@@ -30,7 +33,11 @@ from vical_daemon.estimation.wording import (
     motion_caption,
     silence,
 )
+from vical_daemon.results.differences import differences
+from vical_daemon.results.report.scene import rig as rig_document
 from vical_daemon.service.liveness import FRESH_S
+from vical_daemon.web.camera_watch import CameraWatch
+from vical_daemon.web.meters import known_of_needed
 
 HISTORY = 1500
 """Rows kept of each camera: 1.6 MB, five minutes of estimates at 5 Hz."""
@@ -79,10 +86,21 @@ class WebState:
     Args:
         rig: Name of the rig.
         clock: Monotonic seconds.
+        watches: What is followed of each camera besides its estimate.
+        targets: Sigmas that count as converged.
     """
 
-    def __init__(self, rig: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        rig: str,
+        clock: Callable[[], float] = time.monotonic,
+        watches: Mapping[str, CameraWatch] | None = None,
+        targets: ConvergenceTargets | None = None,
+    ) -> None:
         self.rig = rig
+        self._watches = dict(watches or {})
+        self._targets = targets or ConvergenceTargets()
+        self._stored: dict[str, CalibrationMessage] = {}
         self._clock = clock
         self._lock = threading.Lock()
         self._arrived: deque[tuple[float, Sample]] = deque(maxlen=4096)
@@ -128,6 +146,11 @@ class WebState:
         now_s = self._clock()
         return {name: (camera.latest, now_s - camera.arrived_s) for name, camera in self._cameras.items()}
 
+    @property
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """Size of the images of every camera that is followed, where it is known, px."""
+        return {name: watch.size for name, watch in self._watches.items() if all(watch.size)}
+
     def _process(self, sample: Sample, arrived_s: float) -> None:
         """Process one message.
 
@@ -143,6 +166,13 @@ class WebState:
                 raise MessageError(f"{sample.key} speaks of {message.camera[:80]}")
             _admit(parsed.name, self._cameras)
             self._calibration(message, arrived_s)
+        elif parsed.topic in (topics.POINTS, topics.TRACKS, topics.PREDICTED):
+            watch = self._watches.get(parsed.name)
+            if watch is not None:
+                watch.take(sample, parsed.topic)
+        elif parsed.topic is topics.STORED:
+            _admit(parsed.name, self._stored)
+            self._stored[parsed.name] = admit_calibration(sample.payload)
         elif parsed.topic is topics.STATUS:
             _admit(parsed.name, self._statuses)
             self._statuses[parsed.name] = arrived_s, decode_diagnostics(sample.payload).statuses
@@ -152,6 +182,8 @@ class WebState:
         if message.estimate.duration_s < camera.latest.estimate.duration_s:
             camera.rows, camera.fresh, camera.restarted = [], [], True
             camera.events.clear()
+            if message.camera in self._watches:
+                self._watches[message.camera].begin_again()
         camera.latest, camera.arrived_s = message, arrived_s
         camera.events.extend(message.estimate.events)
         row = history_row(message)
@@ -170,6 +202,7 @@ class WebState:
             whole = full or camera.restarted
             entry = summary(camera.latest, now_s - camera.arrived_s, fault is not None)
             entry["events"] = [event_document(event) for event in camera.events]
+            entry |= self._result(name, camera.latest)
             entry["rows" if whole else "fresh"] = camera.rows if whole else camera.fresh
             cameras[name] = entry
         devices = [
@@ -190,10 +223,53 @@ class WebState:
             "cameras": cameras,
             "devices": devices,
             "fault": fault,
+            "sights": self._sights(full=full),
         }
         if full:
             document["columns"] = COLUMNS
         return document
+
+    def _result(self, name: str, message: CalibrationMessage) -> dict[str, Any]:
+        """Return meters, rig and comparison with the stored calibration of one camera."""
+        known = message.camera_estimate
+        if known is None:
+            return {"meters": [], "rig": None, "stored": None}
+        pose = known.T_imu_cam
+        place = {"p_m": pose.p_m, "q_wxyz": pose.q_wxyz, "covariance": pose.covariance}
+        stored = self._stored.get(name)
+        before = None if stored is None else stored.camera_estimate
+        return {
+            "meters": known_of_needed(
+                known, self._targets, enough=message.estimate.status is Status.CONVERGED
+            ),
+            "rig": rig_document(place),
+            "stored": None
+            if stored is None or before is None
+            else {
+                "t_ns": str(stored.estimate.t_ns),
+                "rows": [
+                    [d.name, finite(d.value), finite(d.sigma), finite(d.sigmas), d.unit]
+                    for d in differences(before, known)
+                ],
+            },
+        }
+
+    def _sights(self, *, full: bool) -> dict[str, Any]:
+        """Return what the page shows of the images of each camera."""
+        exposures = {
+            status.name.removeprefix("camera/"): status.values["exposure_ms"]
+            for _, statuses in self._statuses.values()
+            for status in statuses
+            if "exposure_ms" in status.values
+        }
+        sights = {}
+        for name, watch in self._watches.items():
+            with suppress(KeyError, ValueError):
+                watch.exposure_s = 1e-3 * float(exposures[name])
+            camera = self._cameras.get(name)
+            known = None if camera is None else camera.latest.camera_estimate
+            sights[name] = watch.document(known, full=full)
+        return sights
 
     def _fault(self) -> dict[str, str] | None:
         """Return the first component that reports an error; until it is fixed, the page gives no advice."""

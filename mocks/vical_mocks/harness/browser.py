@@ -41,7 +41,10 @@ class Page:
 
     def _note(self, message: dict[str, Any]) -> None:
         if message.get("method") == "Runtime.exceptionThrown":
-            self.errors.append(message["params"]["exceptionDetails"].get("text", "exception"))
+            details = message["params"]["exceptionDetails"]
+            self.errors.append(
+                details.get("exception", {}).get("description") or details.get("text", "exception")
+            )
         if message.get("method") == "Log.entryAdded" and message["params"]["entry"]["level"] == "error":
             self.errors.append(message["params"]["entry"]["text"])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,7 @@ from vical_daemon.bus.messages import (
     encode_image,
     encode_points,
 )
-from vical_daemon.config.model import CameraConfig, Config, ImuConfig, WebConfig
+from vical_daemon.config.model import CameraConfig, Config, ImuConfig, RecordConfig, WebConfig
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance
 from vical_daemon.estimation.result import (
@@ -37,10 +38,21 @@ T0_NS = 1_700_000_000_000_000_000
 NOTHING = Guidance()
 
 
-def serve_page(bus: Bus, stop: threading.Event, ready: Callable[[str], None]) -> threading.Thread:
-    """Start the role web for this rig on a free port; `ready` gets the address, `stop` ends the thread."""
+def serve_page(
+    bus: Bus,
+    stop: threading.Event,
+    ready: Callable[[str], None],
+    target: Path | None = None,
+    logs: Path | None = None,
+) -> threading.Thread:
+    """Start the role web for this rig on a free port; `ready` gets the address, `stop` ends the thread.
+
+    `target` is the file of the board, `logs` the folder of the recordings.
+    """
     config = Config(
         rig=RIG,
+        target=None if target is None else str(target),
+        record=RecordConfig(directory=None if logs is None else str(logs)),
         imus={"imu0": ImuConfig(port="none")},
         cameras={CAMERA: CameraConfig(uri="none")},
         web=WebConfig(enabled=True, port=0),
@@ -97,6 +109,8 @@ def publish_status(bus: Bus, level: Level = Level.OK, message: str = "500.0 Hz, 
     imu = DiagnosticStatus(level, "imu/imu0", message, "6223.12345", values)
     clock = DiagnosticStatus(Level.OK, "clock", "", "", {"offset_ns": "1"})
     bus.publish(topics.STATUS.key(RIG, "imu"), encode_diagnostics(T0_NS, "imu", [imu, clock]))
+    camera = DiagnosticStatus(Level.OK, "camera/cam0", "20.0 Hz, 0 lost", "C1", {"exposure_ms": "12.000"})
+    bus.publish(topics.STATUS.key(RIG, "camera"), encode_diagnostics(T0_NS, "camera", [camera, clock]))
     values = {"images": "600", "with_points": "590", "dropped": "3", "detection_ms": "11.2"}
     found = DiagnosticStatus(Level.OK, "detect/cam0", "98% of 600 images show points", "", values)
     bus.publish(topics.STATUS.key(RIG, "detect"), encode_diagnostics(T0_NS, "detect", [found, clock]))

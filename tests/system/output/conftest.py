@@ -10,6 +10,7 @@ import pytest
 from vical_mocks.harness import browser, web_feed
 
 from vical_daemon.bus.interface import LocalBus
+from vical_daemon.vision.target import Checkerboard
 
 
 @pytest.fixture(scope="session", name="web_feed")
@@ -25,19 +26,22 @@ def browser_module():
 
 
 class Served:
-    """A running page: its bus, address, and everything sent as commands."""
+    """A running page: its bus, address, folder of logs, and everything sent as commands."""
 
-    def __init__(self, bus, address):
-        self.bus, self.address, self.commands = bus, address, []
+    def __init__(self, bus, address, logs):
+        self.bus, self.address, self.logs, self.commands = bus, address, logs, []
 
 
 @pytest.fixture
-def served(monkeypatch):
+def served(monkeypatch, tmp_path):
     monkeypatch.setenv("VICAL_WEB_TOKEN", "open sesame")
+    board = tmp_path / "board.yaml"
+    board.write_text(Checkerboard(8, 6, 0.05, 0.05).to_yaml())
     bus, stop, ready, addresses = LocalBus(), threading.Event(), threading.Event(), []
-    thread = web_feed.serve_page(bus, stop, lambda address: (addresses.append(address), ready.set()))
+    known = {"target": board, "logs": tmp_path}
+    thread = web_feed.serve_page(bus, stop, lambda address: (addresses.append(address), ready.set()), **known)
     assert ready.wait(60)
-    page = Served(bus, addresses[0])
+    page = Served(bus, addresses[0], tmp_path)
     bus.subscribe("vical/*/command/*", lambda sample: page.commands.append(sample))
     yield page
     stop.set()

@@ -50,8 +50,12 @@ def report(tmp_path):
 def test_report_in_a_browser_and_on_paper(report, browser, keep, tmp_path):
     async def script(page):
         await page.open(report.as_uri(), 1100, 1400)
-        await page.wait("document.readyState === 'complete' && document.images.length > 3")
-        broken = await page.evaluate("[...document.images].filter((i) => !i.naturalWidth).length")
+        await page.wait(
+            "document.readyState === 'complete' && document.querySelectorAll('figure svg').length > 12"
+        )
+        broken = await page.evaluate(
+            "[...document.querySelectorAll('figure svg')].filter((i) => i.clientWidth < 100).length"
+        )
         outside = await page.evaluate(
             "performance.getEntriesByType('resource').filter((e) => !e.name.startsWith('data:')).length"
         )

@@ -12,8 +12,9 @@ import aiohttp
 import numpy as np
 import pytest
 
+from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
-from vical_daemon.bus.messages import Level, decode_string
+from vical_daemon.bus.messages import Level, decode_string, encode_calibration
 from vical_daemon.config.model import Config, WebConfig
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import Guidance, Lack, Verb
@@ -41,6 +42,9 @@ def test_files_and_headers(served):
         ("style.css", "text/css"),
         ("app.js", "javascript"),
         ("camera.js", "javascript"),
+        ("meters.js", "javascript"),
+        ("decide.js", "javascript"),
+        ("scene.js", "javascript"),
     ):
         status, headers, text = request("GET", served.address + name)
         assert status == 200
@@ -141,6 +145,21 @@ def test_commands_need_the_token(served, token, body, status):
     assert sent == ([("vical/rig0/command/estimate", "reset")] if status == 200 else [])
 
 
+def test_exports_and_the_log_need_the_token(fed):
+    (fed.logs / "run.mcap").write_text("a log")
+    right = {"Authorization": "Bearer open sesame"}
+    for path in ("api/export/ros", "api/log"):
+        assert request("GET", fed.address + path)[0] == 401
+        assert request("GET", fed.address + path, headers={"Authorization": "Bearer no"})[0] == 401
+    status, headers, text = request("GET", fed.address + "api/export/ros", headers=right)
+    assert (status, headers["Content-Disposition"]) == (200, 'attachment; filename="cam0.yaml"')
+    assert "image_width: 640" in text
+    status, headers, text = request("GET", fed.address + "api/log", headers=right)
+    assert (status, headers["Content-Disposition"]) == (200, 'attachment; filename="run.mcap"')
+    assert text == "a log"
+    assert request("GET", fed.address + "api/export/nonsense", headers=right)[0] == 409
+
+
 def test_without_a_token_nobody_commands(served, monkeypatch, tmp_path):
     monkeypatch.delenv("VICAL_WEB_TOKEN")
     monkeypatch.setenv("VICAL_STATE_DIR", str(tmp_path))
@@ -171,7 +190,9 @@ def test_in_a_browser(fed, browser, tmp_path):
         await page.open(fed.address)
         await page.wait("document.getElementById('link').textContent === 'live'")
         await page.wait("document.getElementById('picture').width === 640")
-        marks = await page.wait("document.querySelectorAll('#corners path').length === 2")
+        marks = await page.wait(
+            "document.querySelectorAll('#corners .detected, #corners .predicted').length === 2"
+        )
         misfit = await page.evaluate("document.getElementById('misfit').textContent")
         status = await page.wait("document.getElementById('status').classList.contains('converged')")
         lever = await page.evaluate("document.getElementById('lever').textContent")
@@ -281,6 +302,8 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
         for number in range(1, 50):  # points alone, as from a log without images
             web_feed.publish_points(bus, number)
             await asyncio.sleep(0.02)
+        web_feed.publish_estimate(bus, sent)  # however long the browser took to start, this is fresh
+        await page.wait("!page.latest.cam0.stale")
         await page.wait("document.querySelector('#corners path.detected') !== null")
         texts = {
             name: await page.evaluate(f"document.getElementById('{name}').textContent")
@@ -323,3 +346,59 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
     else:
         assert (texts["headline"], texts["motiontext"]) == ("Converged.", "nothing is missing")
         assert texts["guidance"] == "" and texts["edges"] == 0
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (820, 1180), (1400, 1000)])
+def test_what_the_operator_needs_is_seen_without_scrolling(
+    served, web_feed, browser, tmp_path, width, height, dark
+):
+    keep, bus, rng = shots() or tmp_path, served.bus, np.random.default_rng(0)
+    stored = encode_calibration(web_feed.estimate(60.0, np.random.default_rng(5)), "cam0")
+    bus.publish(topics.STORED.key(web_feed.RIG, "cam0"), stored)
+    for k in range(1, 40):
+        web_feed.publish_estimate(bus, web_feed.estimate(0.2 * k, rng))
+    web_feed.publish_status(bus)
+    for number in range(1, 30):
+        web_feed.publish_image(bus, number)
+
+    async def script(page):
+        await page.open(served.address, width, height, dark=dark)
+        await page.wait("document.querySelectorAll('.meter').length === 7")
+        for number in range(30, 60):
+            web_feed.publish_estimate(bus, web_feed.estimate(0.2 * (number + 10), rng))
+            web_feed.publish_image(bus, number)
+            await asyncio.sleep(0.05)
+        await page.wait("document.querySelector('#corners path.wanted') !== null")
+        await page.wait("document.querySelectorAll('#corners path.cell').length > 0")
+        await page.wait("document.getElementById('imageadvice').textContent !== ''")
+        low = await page.evaluate(
+            "Math.max(...['status', 'headline', 'corners', 'wanted', 'imageadvice', 'meters']"
+            ".map((id) => document.getElementById(id).getBoundingClientRect().bottom))"
+        )
+        texts = await page.evaluate(
+            "Object.fromEntries(['wanted', 'imageadvice', 'imagefacts', 'storedsays', 'storedrows']"
+            ".map((id) => [id, document.getElementById(id).textContent]))"
+        )
+        wide = await page.evaluate("document.documentElement.scrollWidth")
+        await page.screenshot(keep / f"operator_{width}_{'dark' if dark else 'light'}.png")
+        await page.evaluate("document.querySelector('button[data-room=\"1\"]').click()")
+        drawn = await page.evaluate(
+            "(() => { const c = document.getElementById('scene'), d = c.getContext('2d')"
+            ".getImageData(0, 0, c.width, c.height).data; return d.some((v) => v); })()"
+        )
+        before = await page.evaluate("JSON.stringify(scene.turn)")
+        await page.evaluate(
+            "for (const [kind, x] of [['pointerdown', 40], ['pointermove', 90], ['pointerup', 90]])"
+            " scene.canvas.dispatchEvent(new PointerEvent(kind, { pointerId: 1, clientX: x, clientY: 50 }))"
+        )
+        turned = await page.evaluate("JSON.stringify(scene.turn)") != before
+        return low, texts, wide, drawn, turned, page.errors
+
+    low, texts, wide, drawn, turned, errors = browser.drive(script, tmp_path / "profile")
+    assert errors == [] and wide <= width and low <= height
+    assert texts["wanted"].startswith("bring the board into the outline")
+    assert "in an exposure of 12 ms: shorten it to" in texts["imageadvice"]
+    assert "images/s" in texts["imagefacts"] and "of the image covered" in texts["imagefacts"]
+    assert "joint sigmas" in texts["storedsays"] and "lever arm x" in texts["storedrows"]
+    assert drawn and turned

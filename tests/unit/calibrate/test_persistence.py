@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
-from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
+from vical_daemon.bus.messages import DiagnosticStatus, Level, decode_calibration, encode_diagnostics
 from vical_daemon.calibrate.persistence import CalibrationPersistence, differences
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.events import Cause, Event, EventKind
@@ -199,3 +199,59 @@ def test_the_journal_gets_an_event_as_fields_and_its_name_from_its_kind(
     assert [name for name, _ in written] == ["bumped", "calibration", "calibration"]
     assert written[2][1]["kind"] == "stamp_jitter"
     assert (written[2][1]["camera"], written[2][1]["value"]) == ("cam0", 1e-3)
+
+
+def _said(persistence: CalibrationPersistence, estimate: CalibrationEstimate) -> list[str]:
+    return [event_text(event) for event in persistence.watch(estimate).events]
+
+
+def test_accept_stores_what_has_not_converged_and_makes_it_the_one_to_compare_with(config: Config) -> None:
+    _remember(config, _camera())
+    persistence = _later(config)
+    persistence.priors()
+    moved = _estimate(_camera(p_m=(0.09, 0.02, -0.03)), Status.CONVERGING)
+    assert persistence.accept(moved)
+    assert _said(persistence, moved)[0].startswith("accepted")
+    [(key, payload)] = persistence.stored_messages()
+    assert key == topics.STORED.key("rig0", "cam0")
+    assert decode_calibration(payload).estimate.cameras["cam0"].T_imu_cam.p_m[0] == 0.09
+    assert _later(config).priors()["cam0"].T_imu_cam[1][0] == 0.09
+
+
+@pytest.mark.parametrize(
+    ("estimate", "why"),
+    [
+        (None, "no result yet"),
+        (replace(_estimate(_camera()), cameras={}), "no result yet"),
+        (
+            replace(_estimate(_camera(), Status.INCONSISTENT), reason="stamps"),
+            "contradict each other: stamps",
+        ),
+        (_estimate(replace(_camera(), unobservable=["lever arm along z"])), "did not show lever arm along z"),
+    ],
+)
+def test_what_cannot_be_used_is_not_accepted(config: Config, estimate: CalibrationEstimate, why: str) -> None:
+    persistence = _later(config)
+    persistence.priors()
+    assert not persistence.accept(estimate)
+    said = _said(persistence, _estimate(_camera(), Status.WAITING))[0]
+    assert said.startswith("not accepted") and why in said
+    assert persistence.stored_messages() == []
+
+
+def test_discard_puts_back_what_was_stored_before(config: Config) -> None:
+    _remember(config, _camera())
+    persistence = _later(config)
+    persistence.priors()
+    persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03))))  # converged: stored by itself
+    assert _later(config).priors()["cam0"].T_imu_cam[1][0] == 0.09
+    assert persistence.discard()["cam0"].T_imu_cam[1][0] == 0.08
+    assert _later(config).priors()["cam0"].T_imu_cam[1][0] == 0.08
+
+
+def test_discard_forgets_where_nothing_was_stored_before(config: Config) -> None:
+    persistence = _later(config)
+    persistence.priors()
+    persistence.watch(_estimate(_camera()))
+    assert persistence.discard()["cam0"].T_imu_cam is None
+    assert _later(config).priors()["cam0"].T_imu_cam is None

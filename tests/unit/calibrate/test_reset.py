@@ -17,6 +17,8 @@ from vical_daemon.bus.messages import (
     encode_string,
 )
 from vical_daemon.calibrate import role as estimate
+from vical_daemon.cli import command
+from vical_daemon.cli.errors import CliError
 from vical_daemon.config.model import CameraConfig, Config, ImuConfig, StoreConfig
 from vical_daemon.estimation.wording import event_text
 from vical_daemon.service.wall_clock import private_clock
@@ -75,14 +77,14 @@ def running(tmp_path):
 
 
 def test_reset_forgets_everything(running):
-    command = topics.COMMAND.key("rig0", "estimate")
+    key = topics.COMMAND.key("rig0", "estimate")
     running.until(lambda: running.counts and running.counts[-1] > 100)
-    running.bus.publish(command, encode_string("dance"))
-    running.bus.publish(command, b"")
+    running.bus.publish(key, encode_string("dance"))
+    running.bus.publish(key, b"")
     before = running.counts[-1]
     running.until(lambda: running.counts[-1] > before)
     assert min(running.counts[-2:]) >= before  # neither an unknown word nor an empty message resets
-    running.bus.publish(command, encode_string("reset"))
+    running.bus.publish(key, encode_string("reset"))
     running.until(lambda: running.counts[-1] < before)
     assert running.counts[-1] < before
 
@@ -104,3 +106,23 @@ def test_another_device_begins_anew_and_is_told(running):
     running.until(lambda: running.events)
     text = "imu/imu0 is another device now (serial I2, not I1): the calibration begins anew"
     assert running.events == [text]
+
+
+@pytest.mark.parametrize(
+    ("word", "answer"), [("accept", "not accepted: there is no"), ("discard", "discarded")]
+)
+def test_a_command_is_answered_on_the_bus_and_in_the_terminal(running, word, answer):
+    running.until(lambda: running.counts and running.counts[-1] > 100)
+    sent = []
+    asking = threading.Thread(target=lambda: sent.append(command.send(running.bus, "rig0", word, 60.0)))
+    asking.start()
+    running.until(lambda: sent)
+    asking.join()
+    assert sent[0].startswith(answer)
+    assert running.events == sent
+
+
+def test_a_command_without_anybody_who_listens_says_so():
+    with pytest.raises(CliError, match="no answer from rig0"):
+        command.send(LocalBus(), "rig0", "accept", 0.05)
+    assert command.send(LocalBus(), "rig0", "record-start") == "sent: record-start to rig0"

@@ -61,6 +61,8 @@ READERS = [
     ("run -c FILE", ".yaml"),
     ("watch --once -c FILE", ".yaml"),
     ("web -c FILE", ".yaml"),
+    ("command accept -c FILE", ".yaml"),
+    ("merge SOUND FILE --target OUT", ".mcap"),
     ("target --from FILE -o OUT", ".yaml"),
     ("imu decode FILE", ".bin"),
     ("imu info FILE", ""),
@@ -69,7 +71,7 @@ READERS = [
     ("camera snapshot FILE -o OUT", ""),
 ]
 # `devices`, `init`: --port is opened as `imu info` opens its own; the others read no file that a user names.
-NO_FILES = {"demo", "devices", "doctor", "init", "install-service"}
+NO_FILES = {"completion", "demo", "devices", "doctor", "init", "install-service"}
 
 
 def test_every_command_is_looked_at() -> None:

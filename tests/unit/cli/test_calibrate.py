@@ -12,50 +12,15 @@ import numpy as np
 import pytest
 
 from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_diagnostics
-from vical_daemon.calibrate.estimators import Estimator
-from vical_daemon.cli import calibration_run, calibration_text, main
+from vical_daemon.cli import calibration_text, main
 from vical_daemon.config.priors import read_initial
-from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import Status
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.offline import calibrate
 
-SHARED = Path(__file__).parents[4] / "shared" / "data" / "euroc_imu_april"
 G = 9.80665
-
-
-@pytest.fixture(scope="session")
-def euroc() -> Path:
-    if not SHARED.is_dir():
-        pytest.skip(f"shared data absent: {SHARED}")
-    return SHARED
-
-
-def _first_seconds(euroc: Path, folder: Path, seconds: int) -> Path:
-    """Copy the first seconds of the recording, with its target and initial values."""
-    for name in ("target.yaml", "initial.yaml"):
-        shutil.copyfile(euroc / name, folder / name)  # not its mode: the original may be read-only
-    lines = (euroc / "mav0/imu0/data.csv").read_text().splitlines()[: 200 * seconds]
-    end_ns = int(lines[-1].split(",")[0])
-    (folder / "mav0/imu0").mkdir(parents=True)
-    (folder / "mav0/imu0/data.csv").write_text("\n".join(lines) + "\n")
-    (folder / "mav0/cam0").mkdir()
-    with gzip.open(euroc / "mav0/cam0/corners.csv.gz", "rt") as file:
-        kept = [row for row in file if row[0] == "#" or int(row.split(",")[0]) < end_ns]
-    (folder / "mav0/cam0/corners.csv").write_text("".join(kept))
-    return folder
-
-
-@pytest.fixture(scope="session")
-def short(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _first_seconds(euroc, tmp_path_factory.mktemp("short"), 9)
-
-
-@pytest.fixture(scope="session")
-def shortest(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Just long enough for a first solution."""
-    return _first_seconds(euroc, tmp_path_factory.mktemp("shortest"), 5)
 
 
 @pytest.fixture
@@ -122,14 +87,14 @@ def test_what_the_driver_said_of_its_stamps_counts_as_it_does_live(shortest: Pat
 
 
 @pytest.fixture(scope="session")
-def outcome(shortest: Path) -> calibration_run.Outcome:
-    job = calibration_run.make_job(
+def outcome(shortest: Path) -> calibrate.Outcome:
+    job = calibrate.make_job(
         open_recording(shortest),
         read_initial(shortest / "initial.yaml"),
         target=str(shortest / "target.yaml"),
         fix=("intrinsics",),
     )
-    return calibration_run.run_job(job, lambda share, estimate: None)
+    return calibrate.run_job(job, lambda share, estimate: None)
 
 
 @pytest.mark.parametrize(
@@ -148,108 +113,11 @@ def test_the_exit_code_tells_whether_it_converged(
     shortest: Path, outcome, monkeypatch: pytest.MonkeyPatch, capsys, status: str, accept: str, code: int
 ) -> None:
     changed = replace(outcome, estimate=replace(outcome.estimate, status=Status(status), guidance="nod"))
-    monkeypatch.setattr(calibration_run, "run_job", lambda *_, **__: changed)
+    monkeypatch.setattr(calibrate, "run_job", lambda *_, **__: changed)
     assert main(_arguments(shortest, "--json", "--accept", accept)) == code
     out, err = capsys.readouterr()
     assert json.loads(out)["status"] == status  # written in any case
     assert (f"{status}: " in err) == (status != "converged")
-
-
-def test_all_that_was_announced_on_the_way_is_told_at_the_end(
-    shortest: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Announcer:
-        def __init__(self, inner: Estimator) -> None:
-            self._inner, self.calls = inner, 0
-
-        def estimate(self):
-            self.calls += 1
-            return replace(
-                self._inner.estimate(), events=[Event(EventKind.OTHER, said=f"event {self.calls}")]
-            )
-
-        def __getattr__(self, name: str):
-            return getattr(self._inner, name)
-
-    make = calibration_run.make_estimator
-    monkeypatch.setattr(calibration_run, "make_estimator", lambda *a: Announcer(make(*a)))
-    job = calibration_run.make_job(
-        open_recording(shortest),
-        read_initial(shortest / "initial.yaml"),
-        target=str(shortest / "target.yaml"),
-    )
-    outcome = calibration_run.run_job(job, lambda share, estimate: None)
-    told = outcome.estimate.events
-    assert len(told) > 2
-    assert [event.said for event in told] == [f"event {k + 1}" for k in range(len(told))]
-    text = calibration_text.describe(calibration_run.document(job, outcome))
-    assert all(event.said in text for event in told)
-
-
-def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
-    short: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every sample and every frame reaches the estimator, by stamp, bit for bit."""
-    fed: list[tuple] = []
-
-    class Listener:
-        def __init__(self, inner: Estimator) -> None:
-            self._inner = inner
-
-        def add_imu(self, t_imu_ns, gyro_rps, specific_force_mps2) -> None:
-            fed.append((t_imu_ns, *gyro_rps, *specific_force_mps2))
-
-        def add_points(self, frame) -> None:
-            fed.append((frame.t_cam_ns, frame.ids.tobytes(), frame.uv_px.tobytes()))
-
-        waiting = 0
-
-        def process(self) -> list:
-            return []
-
-        finish = process
-
-        def __getattr__(self, name: str):
-            return getattr(self._inner, name)
-
-    make = calibration_run.make_estimator
-    monkeypatch.setattr(calibration_run, "make_estimator", lambda *a: Listener(make(*a)))
-    recording = open_recording(short)
-    job = calibration_run.make_job(
-        recording, read_initial(short / "initial.yaml"), target=str(short / "target.yaml")
-    )
-    calibration_run.run_job(job, lambda share, estimate: None)
-    samples = recording.imu_arrays("imu0")
-    expected = [
-        (int(t), *map(float, g), *map(float, a))
-        for t, g, a in zip(samples.t_ns, samples.gyro_rps, samples.specific_force_mps2, strict=True)
-    ]
-    assert [entry for entry in fed if len(entry) == 7] == expected
-    frames = [(f.t_cam_ns, f.ids.tobytes(), f.uv_px.tobytes()) for f in recording.points_frames("cam0")]
-    assert [entry for entry in fed if len(entry) == 3] == frames
-    assert [entry[0] for entry in fed] == sorted(entry[0] for entry in fed)
-
-
-def test_only_the_part_that_was_asked_for_is_used(short: Path) -> None:
-    recording = open_recording(short)
-    job = calibration_run.make_job(
-        recording,
-        read_initial(short / "initial.yaml"),
-        target=str(short / "target.yaml"),
-        skip_s=2.5,
-        seconds=3.0,
-    )
-    begin_ns = recording.begin_ns + 2_500_000_000
-    everything = [(key, payload) for key, payload in recording.messages()]
-    expected = [
-        item for item in everything if begin_ns <= (stamp_of(item[1]) or 0) <= begin_ns + 3_000_000_000
-    ]
-    assert 500 < len(expected) < len(everything) / 2
-    assert list(job.messages()) == expected
-    assert job.duration_s == 3.0
-    job.seconds = None
-    assert job.duration_s == pytest.approx(recording.duration_s - 2.5)
-    assert list(job.messages())[-1] == everything[-1]
 
 
 def _scale_csv(path: Path, columns: slice, factor: float) -> None:
@@ -376,3 +244,69 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
     out, err = capsys.readouterr()
     assert out == "" and "Traceback" not in err
     assert words in err.splitlines()[-1] and err.splitlines()[-1].startswith("vical: error: ")
+
+
+def _part(euroc: Path, folder: Path, begin_s: float, end_s: float, later_ns: int = 0) -> Path:
+    """A part of the recording as one by itself, with other stamps."""
+    (folder / "mav0/imu0").mkdir(parents=True)
+    (folder / "mav0/cam0").mkdir()
+    imu = (euroc / "mav0/imu0/data.csv").read_text().splitlines()
+    with gzip.open(euroc / "mav0/cam0/corners.csv.gz", "rt") as file:
+        corners = file.read().splitlines()
+    first_ns = int(imu[1].split(",")[0])
+    low, high = first_ns + round(begin_s * 1e9), first_ns + round(end_s * 1e9)
+    for rows, path in ((imu, "imu0/data.csv"), (corners, "cam0/corners.csv")):
+        kept = [rows[0]]
+        for stamp, rest in (row.split(",", 1) for row in rows[1:]):
+            if low <= int(stamp) < high:
+                kept.append(f"{int(stamp) + later_ns},{rest}")
+        (folder / "mav0" / path).write_text("\n".join(kept) + "\n")
+    return folder
+
+
+def test_several_recordings_are_one_calibration(euroc: Path, tmp_path: Path, capsys) -> None:
+    """The second has the stamps of another boot, long before those of the first."""
+    one = _part(euroc, tmp_path / "one", 0.0, 12.0)
+    other = _part(euroc, tmp_path / "other", 40.0, 52.0, later_ns=-(10**17))
+    files = ["--target", str(euroc / "target.yaml"), "--initial", str(euroc / "initial.yaml")]
+    report = tmp_path / "report.html"
+    words = [str(one), str(other), *files, "--fix", "intrinsics", "--json", "--accept", "converging"]
+    assert main(["calibrate", *words, "--report", str(report)]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [Path(part["path"]).name for part in result["inputs"]] == ["one", "other"]
+    assert all(part["used"] and part["frames"] > 200 for part in result["inputs"])
+    assert result["frames"] == sum(part["frames"] for part in result["inputs"])
+    assert result["duration_s"] == pytest.approx(24.0, abs=0.2)
+    begin_s = [part["begin_s"] for part in result["inputs"]]
+    assert begin_s[0] == 0.0 and result["trace"][-1]["t_s"] > begin_s[1] > 20.0
+    reference = np.array([-0.0172, -0.0690, 0.0042])  # of the whole recording
+    camera = result["cameras"]["cam0"]["T_imu_cam"]
+    sigma = np.sqrt(np.diag(camera["covariance"]))[:3]
+    assert (np.abs(np.array(camera["p_m"]) - reference) < 4.0 * sigma).all() and sigma.max() < 3e-3
+    html = report.read_text()
+    assert "Recordings" in html and str(other) in html
+    text = calibration_text.describe(result)
+    assert f"{other}: 12.0 s" in text
+
+
+def test_a_recording_that_cannot_start_is_tried_again_after_the_others(
+    euroc: Path, tmp_path: Path, capsys
+) -> None:
+    brief = _part(euroc, tmp_path / "brief", 20.0, 22.5)  # too short for a start of its own
+    longer = _part(euroc, tmp_path / "longer", 40.0, 52.0)
+    files = ["--target", str(euroc / "target.yaml"), "--initial", str(euroc / "initial.yaml")]
+    words = [str(brief), str(longer), *files, "--fix", "intrinsics", "--json", "--accept", "converging"]
+    assert main(["calibrate", *words]) == 0
+    first, second = json.loads(capsys.readouterr().out)["inputs"]
+    assert second["used"] and first["used"] and first["begin_s"] > second["begin_s"]
+    assert 20 < first["frames"] < 60
+
+
+def test_recordings_of_other_cameras_are_refused(euroc: Path, tmp_path: Path, capsys) -> None:
+    one = _part(euroc, tmp_path / "one", 0.0, 2.0)
+    two = _part(euroc, tmp_path / "two", 0.0, 2.0)
+    shutil.copytree(two / "mav0/cam0", two / "mav0/cam1")
+    (two / "mav0/cam0").rename(two / "mav0/cam2")
+    files = ["--target", str(euroc / "target.yaml"), "--initial", str(euroc / "initial.yaml")]
+    assert main(["calibrate", str(one), str(two), *files]) == 1
+    assert "has the cameras cam1, cam2, and" in capsys.readouterr().err

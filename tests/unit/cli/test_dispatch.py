@@ -167,29 +167,6 @@ def test_a_bug_is_not_described_as_known() -> None:
     assert describe_known(OSError("no file named")) is None
 
 
-@pytest.mark.parametrize(
-    ("line", "offered"),
-    [
-        ("vical ca", {"camera", "calibrate"}),
-        ("vical export store --format k", {"kalibr"}),
-        ("vical run re", {"record"}),
-        ("vical imu stream --protocol m", {"mip"}),
-    ],
-)
-def test_shell_completion(line: str, offered: set[str], tmp_path: Path) -> None:
-    answer = tmp_path / "answer"
-    completion = {
-        "_ARGCOMPLETE": "1",
-        "_ARGCOMPLETE_IFS": "\n",
-        "_ARGCOMPLETE_STDOUT_FILENAME": str(answer),
-        "COMP_LINE": line,
-        "COMP_POINT": str(len(line)),
-    }
-    vical = Path(sys.executable).with_name("vical")
-    subprocess.run([str(vical)], env=os.environ | completion, timeout=60, check=True)
-    assert {word.strip() for word in answer.read_text().split("\n")} == offered
-
-
 def test_table_names_are_unique_and_each_module_keeps_the_convention() -> None:
     names = [c.name for c in table.COMMANDS]
     assert len(names) == len(set(names))

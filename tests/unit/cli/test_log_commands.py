@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import threading
 
 import pytest
 
-from vical_daemon.bus import topics
-from vical_daemon.bus.interface import LocalBus
 from vical_daemon.cli import main
-from vical_daemon.cli.replay import replay
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.mcap import LogFolder, LogReader, LogWriter
 from vical_daemon.logs.recorded_logs import stamp_of
@@ -124,19 +120,3 @@ def test_info_of_several_logs_names_the_broken_one(log, asl_folder, tmp_path, ca
     logs = json.loads(capsys.readouterr().out)["logs"]
     assert [bool(entry.get("topics")) for entry in logs] == [True, False, True]
     assert str(broken) in logs[1]["problem"]
-
-
-def test_replay_publishes_in_time_and_order(asl_folder):
-    recording = open_recording(asl_folder)
-    bus, got = LocalBus(), []
-    bus.subscribe("**", got.append)
-    result = replay(recording, bus, threading.Event(), speed=0)
-    assert [(s.key, s.payload) for s in got] == list(recording.messages())
-    assert result["messages"] == 2600
-    got.clear()
-    result = replay(recording, bus, threading.Event(), speed=40, rig="robot7")
-    assert 0.29 < result["duration_s"] < 5
-    assert got[0].key == topics.IMU.key("robot7", "imu0")
-    stop = threading.Event()
-    stop.set()
-    assert replay(recording, bus, stop)["messages"] == 0

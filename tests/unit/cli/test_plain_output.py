@@ -21,7 +21,7 @@ def vical(*words, cwd=None, **environment):
         env={k: v for k, v in {**kept, **environment}.items() if v is not None},
         cwd=cwd,
         capture_output=True,
-        timeout=90,
+        timeout=300,
         check=False,
     )
     return done.returncode, done.stdout, done.stderr

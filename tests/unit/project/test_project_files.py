@@ -124,3 +124,18 @@ def test_ci_raises_deprecations_and_sets_the_usual_limits():
     assert "ulimit -l 8192" in script
     assert "ulimit -S -n 1024" in script
     assert run("bash", "-n", ".ci/run").returncode == 0
+
+
+def test_the_image_is_made_of_what_a_wheel_is_made_of():
+    """What `pip install .` reads goes into the build of the Containerfile, and nothing that is not there."""
+    let_in = {
+        line[1:] for line in (ROOT / ".containerignore").read_text().splitlines() if line.startswith("!")
+    }
+    assert all((ROOT / name).exists() for name in let_in)
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    needed = [*wheel["packages"], *wheel["force-include"], PROJECT["readme"], "pyproject.toml"]
+    assert {path.split("/")[0] for path in needed} <= let_in
+    recipe = (ROOT / "Containerfile").read_text()
+    copied = re.findall(r"^COPY (?!--from)(\S+) ", recipe, re.M)
+    assert copied and all(name == "." or name in let_in for name in copied)
+    assert "-c /src/constraints.txt" in recipe and "constraints.txt" in let_in

@@ -1,7 +1,10 @@
 """What the page keeps, says and draws, without a server."""
 
 import base64
+import io
 import json
+import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -9,12 +12,17 @@ import pytest
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.messages import Level, decode_calibration, encode_calibration, encode_diagnostics
+from vical_daemon.config.model import CameraConfig, Config, RecordConfig
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.wording import guidance_text
+from vical_daemon.results.export import ExportError
 from vical_daemon.service.liveness import FRESH_S
 from vical_daemon.vision.image_codec import decode_image
+from vical_daemon.vision.target import Checkerboard
+from vical_daemon.web.camera_watch import CameraWatch
+from vical_daemon.web.downloads import Downloads
 from vical_daemon.web.images import CameraView, colour, draw, drawn_jpeg, picture_event, thinned
 from vical_daemon.web.metrics import metrics
 from vical_daemon.web.state import COLUMNS, EVENTS, HISTORY, SOURCES, WebState, history_row
@@ -367,3 +375,81 @@ def test_broken_images_are_passed_over(web_feed):
     view.take(Sample(topics.IMAGE.key(web_feed.RIG, "other"), b"", 0))
     sight = view.next()
     assert sight is None or (picture_event(sight) is None and drawn_jpeg(sight) is None)
+
+
+def test_the_stored_calibration_stands_beside_the_present_one(bus, state, web_feed):
+    stored, now = (web_feed.estimate(t, np.random.default_rng(seed)) for t, seed in ((60.0, 1), (10.0, 2)))
+    web_feed.publish_estimate(bus, now)
+    assert state.tick()["cameras"]["cam0"]["stored"] is None
+    bus.publish(topics.STORED.key(web_feed.RIG, "cam0"), encode_calibration(stored, "cam0"))
+    shown = state.tick()["cameras"]["cam0"]
+    assert len(shown["stored"]["rows"]) == 7 and shown["stored"]["t_ns"] == str(stored.t_ns)
+    name, value, sigma, sigmas, unit = shown["stored"]["rows"][0]
+    moved = now.cameras["cam0"].T_imu_cam.p_m[0] - stored.cameras["cam0"].T_imu_cam.p_m[0]
+    assert (name, unit) == ("lever arm x", "mm")
+    assert (value, sigmas) == (
+        pytest.approx(1e3 * moved, rel=1e-5),
+        pytest.approx(abs(value) / sigma, rel=1e-5),
+    )
+    assert {m["kind"] for m in shown["meters"]} == {"translation", "rotation", "time"}
+    assert len(shown["rig"]["R"]) == 3
+
+
+def test_the_images_of_a_camera_give_coverage_pose_and_a_wanted_place(bus, web_feed):
+    board = Checkerboard(8, 6, 0.05, 0.05)
+    state = WebState(web_feed.RIG, watches={"cam0": CameraWatch(board.points_m)})
+    bus.subscribe("vical/**", state.take)
+    rng = np.random.default_rng(0)
+    web_feed.publish_estimate(bus, web_feed.estimate(10.0, rng))
+    web_feed.publish_status(bus)
+    for number in range(20):
+        web_feed.publish_image(bus, number)
+    sight = state.tick()["sights"]["cam0"]
+    coverage = sight["coverage"]
+    assert 0.1 < coverage["share"] < 0.6 and len(coverage["count"]) == coverage["rows"] * coverage["columns"]
+    assert any(v is not None and 0.2 < v < 1.0 for v in coverage["rms_px"])
+    assert sight["rate_hz"] == 20.0 and sight["board_share"] == 1.0
+    assert sight["blur"]["px"] > 0 and sight["wanted"]["text"].startswith("bring the board")
+    # 45 px squares of 50 mm at 520 px: the camera is 0.58 m in front of the board
+    assert np.linalg.norm(np.array(sight["pose"]["p"])) == pytest.approx(0.61, abs=0.05)
+    web_feed.publish_image(bus, 21)
+    state.tick()
+    assert len(state.full()["sights"]["cam0"]["path"]) == 2
+    web_feed.publish_estimate(bus, web_feed.estimate(1.0, rng))  # begun anew: all is wanted again
+    assert state.tick()["sights"]["cam0"]["coverage"] is None
+
+
+def test_no_place_is_wanted_where_the_lens_is_held(bus, web_feed):
+    state = WebState(web_feed.RIG, watches={"cam0": CameraWatch(Checkerboard(8, 6, 0.05, 0.05).points_m)})
+    bus.subscribe("vical/**", state.take)
+    held = web_feed.estimate(10.0, np.random.default_rng(0))
+    held.cameras["cam0"].intrinsics_sigma[:] = [0.0] * 4
+    web_feed.publish_estimate(bus, held)
+    web_feed.publish_image(bus, 1)
+    assert state.tick()["sights"]["cam0"]["wanted"] is None
+
+
+def test_downloads_hold_the_present_result_and_the_newest_log(bus, state, web_feed, tmp_path):
+    config = Config(
+        rig=web_feed.RIG,
+        cameras={"cam0": CameraConfig(uri="none", size=(640, 480))},
+        record=RecordConfig(directory=str(tmp_path)),
+    )
+    downloads = Downloads(config, state)
+    with pytest.raises(ExportError, match="no result yet"):
+        downloads.export("kalibr")
+    assert downloads.newest_log() is None
+    web_feed.publish_estimate(bus, web_feed.estimate(10.0, np.random.default_rng(0)))
+    state.tick()
+    name, data = downloads.export("kalibr")
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert (name, archive.namelist()) == ("kalibr.zip", ["camchain-imucam.yaml", "imu.yaml"])
+        assert "resolution: [640, 480]" in archive.read("camchain-imucam.yaml").decode()
+    name, data = downloads.export("json")
+    assert name == "calibration.json" and json.loads(data)["cameras"]["cam0"]
+    with pytest.raises(ExportError, match="none of"):
+        downloads.export("nonsense")
+    for age, part in ((100, "old.mcap"), (1, "new.mcap.part")):
+        (tmp_path / part).write_bytes(b"x")
+        os.utime(tmp_path / part, (1e9 - age, 1e9 - age))
+    assert downloads.newest_log().name == "new.mcap.part"

@@ -45,6 +45,7 @@ from vical_daemon.estimation.model.state import (
     Layout,
     MotionStart,
     State,
+    tilt_basis,
 )
 from vical_daemon.estimation.noise.consistency import Consistency, normalised
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
@@ -310,13 +311,23 @@ class CalibrationFilter:
         """Take the motion from elsewhere and keep the calibration, which ages until then.
 
         Args:
-            motion: Where the rig is, independent of all that the filter knows.
+            motion: Where the rig is, independent of all that the filter knows; of another recording also its
+                biases and gravity.
         """
         state, dt = self.state, motion.elapsed_s
-        A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, 9))], axis=1)
+        sigmas = motion.sigmas
+        if motion.biases is not None:
+            b = motion.biases
+            state.gyro_bias, state.accel_bias = b.gyro_bias, b.accel_bias
+            state.gravity, state.tilt = b.gravity, tilt_basis(b.gravity)
+            sigmas = np.concatenate(
+                [sigmas, np.repeat([b.gyro_bias_sigma, b.accel_bias_sigma, b.gravity_sigma], (3, 3, 2))]
+            )
+        new = len(sigmas)  # motion, or all up to gravity
+        A = np.concatenate([self.S, self._random_walk(dt), np.zeros((self.layout.size, new))], axis=1)
         self._drift_shifts(A, dt)
-        A[MOTION] = 0.0
-        A[MOTION, -9:] = np.diag(motion.sigmas)
+        A[:new] = 0.0
+        A[:new, -new:] = np.diag(sigmas)
         self.S = unscented.lower_root(A)
         state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
         state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu

@@ -6,6 +6,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
 from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
@@ -28,14 +29,17 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     sigma = spread * f.sigmas()
     lens_sigma = _lens_sigmas(f, name, spread)
     q = so3.quat_from_matrix(camera.R_imu_cam)
+    pose = spread**2 * pose_covariance(f, where)
+    shift_sigma = _timeshift_sigma(f, sigma, where)
+    order, joint = _joint(f, name, np.concatenate([np.sqrt(np.diag(pose)), [shift_sigma], lens_sigma]))
     return CameraEstimate(
         PoseEstimate(
             camera.p_imu_cam.tolist(),
             q.tolist(),
-            (spread**2 * pose_covariance(f, where)).tolist(),
+            pose.tolist(),
         ),
         float(camera.timeshift_s),
-        _timeshift_sigma(f, sigma, where),
+        shift_sigma,
         lens[:4].tolist(),
         lens_sigma[:4].tolist(),
         camera.distortion_model,
@@ -48,7 +52,34 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         float(sigma[where.readout]) if where.readout is not None else 0.0,
         [int(size) for size in camera.resolution],
         camera.readout_axis,
+        stamp_jitter_s=float(f.shared[name].jitter_s),
+        joint_order=order,
+        joint_covariance=joint.tolist(),
     )
+
+
+def _joint(f: CalibrationFilter, name: str, stated: FloatArray) -> tuple[list[str], FloatArray]:
+    """Names and covariance of mounting, time shift and lens: the filter's correlations, the stated sigmas.
+
+    Args:
+        f: The filter.
+        name: Of the camera.
+        stated: Sigmas of pose, time shift and lens, shape (7 + n,); what has none is left out.
+    """
+    where, model = f.layout.cameras[name], f.state.cameras[name].distortion_model
+    names = [*["px", "py", "pz", "rx", "ry", "rz", "timeshift", "fx", "fy", "cx", "cy"], *COEFFICIENTS[model]]
+    slices = (where.position, where.rotation, where.timeshift, where.intrinsics, where.distortion)
+    sizes = (3, 3, 1, 4, len(COEFFICIENTS[model]))
+    rows = np.concatenate(
+        [
+            np.full(n, -1) if s is None else np.arange(s.start, s.stop) if isinstance(s, slice) else [s]
+            for s, n in zip(slices, sizes, strict=True)
+        ]
+    ).astype(int)
+    use = np.flatnonzero((rows >= 0) & (stated > 0.0))
+    raw = f.covariance([int(row) for row in rows[use]])
+    scale = stated[use] / np.sqrt(np.maximum(np.diag(raw), 1e-300))
+    return [names[i] for i in use], raw * np.outer(scale, scale)
 
 
 def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:

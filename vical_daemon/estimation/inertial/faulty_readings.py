@@ -105,6 +105,11 @@ class SpikeFilter(Generic[T]):
         self._first: list[FloatArray] = []
         self._count = 0
 
+    def restart(self) -> None:
+        """Another recording follows: its first readings do not go on from the last ones."""
+        self.held, self._count = None, 0
+        self._last, self._before = np.full(6, np.nan), np.full(6, np.nan)
+
     def sift(self, six: FloatArray, item: T) -> list[T]:
         """Take a reading (rad/s, m/s^2, shape (6,)) and return the items of those that are good, in order."""
         if self.held is not None:

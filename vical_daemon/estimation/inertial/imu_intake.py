@@ -19,6 +19,7 @@ _MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
 _CLIPPED_S = 5.0  # after the first clipped reading, their share is announced
 _UNSEEN_S = 0.5
 """After a jump of the stamps an image is waited for so long, s: a slow camera takes two a second."""
+_APART_S = 10.0  # between two recordings on the common time axis: longer than any gap that is bridged
 _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
@@ -42,10 +43,11 @@ class ImuIntake:
 
     Attributes:
         buffer: The readings, s since the first stamp; None before the first one.
-        base_ns: First stamp, ns.
+        base_ns: First stamp, ns; stamps of images are counted from it, too.
         refused: Readings left out: out of order, no possible values, or with a wrong stamp.
         repeated: Readings left out because they repeat the one before, bit by bit.
         clipped: Readings left out because a channel is at its range.
+        between: Another recording was announced, and no reading of it has been added yet.
         gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
     """
 
@@ -56,6 +58,7 @@ class ImuIntake:
         self.repeated = 0
         self.clipped = 0
         self.gap_end_s = -np.inf
+        self.between = False
         self._steps = StampSteps()
         self._set_back_s = 0.0  # by how much the clock has been set back in all
         self._newest_s = -np.inf  # stamp as it came, plus what the clock has been set back
@@ -88,6 +91,11 @@ class ImuIntake:
     def shift_s(self) -> float:
         """Time shift by the stamps as they come now, minus the time shift by the even axis, s."""
         return self._steps.total_s - self._set_back_s
+
+    @property
+    def stepped_s(self) -> float:
+        """By how much all steps of even stamps have moved them, s."""
+        return self._steps.total_s
 
     def take(
         self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]
@@ -130,6 +138,9 @@ class ImuIntake:
             self._clipping = self._clipping or (t_s, self._taken, self.clipped)
             return []
         self._announce_clipping(t_s)
+        if self.between and t_s < self._newest_s + _APART_S:  # its stamps overlap, or seem to go on
+            self.base_ns -= round((self._newest_s + _APART_S - t_s) * 1e9)
+            t_s = self._newest_s + _APART_S
         added = self._in_order(buffer, t_s, reading)
         if added:
             self._repeats = self._clips = 0
@@ -175,11 +186,12 @@ class ImuIntake:
             self._set_back_s += back_s
             self._news.append(Event(EventKind.IMU_CLOCK_SET_BACK, value=back_s))
             held_s, t_s = held_s + back_s, t_s + back_s
-        else:
+        elif not self.between:
             self._believe_gap()
             kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
             if not self._clips:
                 self._gap = Event(kind, value=held_s - self._newest_s)
+        self.between = False
         self._add(buffer, held_s, held)
         self.gap_end_s = buffer.newest_s
         self._add(buffer, t_s, reading)
@@ -206,6 +218,14 @@ class ImuIntake:
         if self._gap is not None:
             self._news.append(self._gap)
             self._gap = None
+
+    def next_recording(self) -> None:
+        """Another recording follows: its stamps are regular again, and the gap before it is not reported."""
+        self._believe_gap()
+        self._steps, self._set_back_s = StampSteps(), 0.0
+        self._spikes.restart()
+        self._newest_s = -np.inf if self.buffer is None else self.buffer.newest_s
+        self._held, self._repeats, self._clips, self.between = None, 0, 0, True
 
     def news(self) -> list[Event]:
         """What happened to the stream since the last call; a gap after an image, or half a second."""

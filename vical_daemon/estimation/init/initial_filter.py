@@ -36,6 +36,9 @@ from vical_daemon.estimation.selection.model_selection import (
     TARGET,
 )
 
+GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA, GRAVITY_SIGMA = 0.02, 0.3, 0.1
+"""Sigmas of a start: rad/s, m/s^2, rad."""
+
 
 def wide_filter(
     state: State,
@@ -96,7 +99,7 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection
         before_m = min(_before_board_m(state, name) for name in layout.cameras)
         lever_arm, position, angle = min(0.15, 0.35 * before_m), min(0.1, 0.25 * before_m), 0.1
     s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
-    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = 0.02, 0.3, 0.1
+    s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA, GRAVITY_SIGMA
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA
     if layout.accel_lag is not None:

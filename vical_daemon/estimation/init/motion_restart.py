@@ -7,6 +7,7 @@ form of `initialise.linear_start` with everything but p_0 and v_0 known.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,22 @@ WIDE_SHARE = 0.03
 """Likewise of position, of the distance to the target."""
 _WIDE_MPS = 0.3  # of velocity: ten times what the images give
 _CALIBRATION = 5.0  # sigmas of the calibration the pose is made with: the data count again by 4 % at most
+
+
+class Poses(NamedTuple):
+    """Poses of the imu in the target's frame.
+
+    Attributes:
+        t_s: Instants, imu clock, s, shape (n,).
+        R: Attitudes, shape (n, 3, 3).
+        p: Positions, m, shape (n, 3).
+        first: What the first was taken from.
+    """
+
+    t_s: FloatArray
+    R: FloatArray
+    p: FloatArray
+    first: SeenPose
 
 
 class MotionRestart:
@@ -70,6 +87,13 @@ class MotionRestart:
         self.frames.append((t_cam_s, frame))
         self._seen.append(seen)
 
+    def drop_before(self, t_cam_s: float) -> None:
+        """Leave images out that were stamped before `t_cam_s`, and those after them up to one with a pose."""
+        keep = [k for k, (t, _) in enumerate(self.frames) if t >= t_cam_s and self._seen[k] is not None]
+        first = keep[0] if keep else len(self.frames)
+        if self.frames and self.frames[0][0] < t_cam_s:
+            self.frames, self._seen = self.frames[first:], self._seen[first:]
+
     def motion(
         self, state: State, layout: Layout, sigmas: FloatArray, buffer: ImuBuffer
     ) -> MotionStart | None:
@@ -81,25 +105,32 @@ class MotionRestart:
             sigmas: Of all errors, shape (n,).
             buffer: Inertial readings.
         """
-        seen = [s for s in self._seen if s is not None]
-        if len(seen) < _LEAST_IMAGES or seen[-1].t_cam_s - seen[0].t_cam_s < _LEAST_S:
+        poses = self._poses(state)
+        if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
             return None
-        cameras = [_camera(state, s.frame) for s in seen]
-        t_s = np.array([s.t_cam_s + c.timeshift_s for s, c in zip(seen, cameras, strict=True)])
-        R = np.array([s.R_target_cam @ c.R_imu_cam.T for s, c in zip(seen, cameras, strict=True)])
-        p = np.array([s.p_target_cam for s in seen]) - np.einsum(
-            "nij,nj->ni", R, np.array([c.p_imu_cam for c in cameras])
-        )
+        t_s, R = poses.t_s, poses.R
         integrals = integrate_twice(buffer, t_s, R, state.gyro_bias)
         if integrals is None:
             return None
         D, B = integrals
         T = t_s - t_s[0]
-        y = p - D + B @ state.accel_bias - 0.5 * (T * T)[:, None] * state.gravity
+        y = poses.p - D + B @ state.accel_bias - 0.5 * (T * T)[:, None] * state.gravity
         start, velocity = np.linalg.lstsq(np.stack([np.ones_like(T), T], axis=1), y, rcond=None)[0]
-        wide = self._sigmas(seen[0], layout, sigmas, float(T[-1]))
-        elapsed_s = self._elapsed_s(seen[0].frame, float(t_s[0]) - state.t_s)
+        wide = self._sigmas(poses.first, layout, sigmas, float(T[-1]))
+        elapsed_s = self._elapsed_s(poses.first.frame, float(t_s[0]) - state.t_s)
         return MotionStart(float(t_s[0]), R[0], start, velocity, wide, elapsed_s)
+
+    def _poses(self, state: State) -> Poses | None:
+        """Poses of the imu by the images collected and the calibration as it is known."""
+        seen = [s for s in self._seen if s is not None]
+        if not seen:
+            return None
+        cameras = [_camera(state, s.frame) for s in seen]
+        t_s = np.array([s.t_cam_s + c.timeshift_s for s, c in zip(seen, cameras, strict=True)])
+        R = np.array([s.R_target_cam @ c.R_imu_cam.T for s, c in zip(seen, cameras, strict=True)])
+        arms = np.array([c.p_imu_cam for c in cameras])
+        p = np.array([s.p_target_cam for s in seen]) - np.einsum("nij,nj->ni", R, arms)
+        return Poses(t_s, R, p, seen[0])
 
     def _elapsed_s(self, frame: PointsFrame, by_imu_s: float) -> float:
         """Time since the motion was lost: the less of what both clocks say, for either may have been set."""

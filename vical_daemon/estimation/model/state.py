@@ -212,6 +212,26 @@ class State:
             self.tilt = tilt_basis(self.gravity)
 
 
+class BiasStart(NamedTuple):
+    """Biases and gravity at the beginning of a recording, known independently of the calibration.
+
+    Attributes:
+        gyro_bias: rad/s, shape (3,).
+        accel_bias: m/s^2, shape (3,).
+        gravity: Acceleration of free fall in the world, m/s^2.
+        gyro_bias_sigma: rad/s.
+        accel_bias_sigma: m/s^2.
+        gravity_sigma: Of its direction, rad.
+    """
+
+    gyro_bias: FloatArray
+    accel_bias: FloatArray
+    gravity: FloatArray
+    gyro_bias_sigma: float
+    accel_bias_sigma: float
+    gravity_sigma: float
+
+
 class MotionStart(NamedTuple):
     """Motion at one instant, known independently of the calibration.
 
@@ -222,6 +242,7 @@ class MotionStart(NamedTuple):
         v_world_imu: Velocity, m/s.
         sigmas: Of attitude (rad), position (m), velocity (m/s), shape (9,).
         elapsed_s: Since the state's instant; stamps may have stepped.
+        biases: At the beginning of another recording; None: biases and gravity are those of before.
     """
 
     t_s: float
@@ -230,6 +251,7 @@ class MotionStart(NamedTuple):
     v_world_imu: FloatArray
     sigmas: FloatArray
     elapsed_s: float
+    biases: BiasStart | None = None
 
 
 def rotation_from_grp(p: FloatArray) -> FloatArray:

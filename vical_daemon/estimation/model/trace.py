@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.result import CameraEstimate, Status, TracePoint
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, Status, TracePoint
 
 _EVERY_S = 1.0
 _MOST = 7200
@@ -20,7 +20,14 @@ class Trace:
         """Whether a second has passed since the last entry."""
         return not self.points or t_s - self.points[-1].t_s >= _EVERY_S
 
-    def add(self, t_s: float, e: CameraEstimate, nis_per_dof: float, status: Status) -> None:
+    def add(
+        self,
+        t_s: float,
+        e: CameraEstimate,
+        nis_per_dof: float,
+        status: Status,
+        imu: ImuEstimate | None = None,
+    ) -> None:
         """Put an estimate down.
 
         Args:
@@ -28,6 +35,7 @@ class Trace:
             e: What was known then.
             nis_per_dof: Consistency then.
             status: And where the calibration stood.
+            imu: Biases then; None: not kept.
         """
         sigma = np.sqrt(np.diag(np.array(e.T_imu_cam.covariance)))
         pose = e.T_imu_cam
@@ -42,7 +50,14 @@ class Trace:
                 e.timeshift_sigma_s,
                 nis_per_dof,
                 str(status),
+                *_biases(imu),
             )
         )
         if len(self.points) > _MOST:
             del self.points[1 : _MOST // 2 : 2]
+
+
+def _biases(imu: ImuEstimate | None) -> tuple[list[float], ...]:
+    if imu is None:
+        return ()
+    return imu.gyro_bias_rps, imu.gyro_bias_sigma_rps, imu.accel_bias_mps2, imu.accel_bias_sigma_mps2

@@ -23,6 +23,7 @@ LAG = slice(32, 33)
 INERTIAL = slice(IMU.start, LAG.stop)
 FULL = LAG.stop
 _HELD_M = 1e-4
+BIASES = slice(5, 11)  # of a carry
 CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
 
 

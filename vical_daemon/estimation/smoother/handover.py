@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from vical_daemon.estimation.init.initial_filter import ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.selection.clock_drift import SKEW_WALK
 from vical_daemon.estimation.smoother.carry import (
     ARM,
+    BIASES,
     CALIBRATION,
     DRIFT,
     SHIFT,
@@ -62,6 +64,25 @@ def afresh(
     if ARM.start in reopened:
         camera = replace(camera, R_imu_cam=found.R_imu_cam, p_imu_cam=found.p_imu_cam)
     return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=camera)
+
+
+def of_another_recording(known: Carry, window: Window, stepped_s: float) -> Carry:
+    """What was known, for the first window of another recording: its biases are those that its start finds.
+
+    Args:
+        known: At the end of the recording before.
+        window: As a start from nothing makes it.
+        stepped_s: By how much the imu's stamps were moved there, s: they may begin as far off here.
+
+    The time between the recordings is not known, and taken as none.
+    """
+    P = known.covariance()
+    P[BIASES], P[:, BIASES] = 0.0, 0.0
+    P[BIASES, BIASES] = np.diag(np.repeat([GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA], 3) ** 2)
+    if known.active[SHIFT]:
+        place = CALIBRATION + int(known.active[:SHIFT].sum())
+        P[place, place] += stepped_s**2
+    return replace(known, bias=window.bias[0].copy(), root=root_of(P), t_cam_s=window.frames[0][0])
 
 
 def aged(carry: Carry, noise: ImuNoise, active: BoolArray, span_s: float, *, drifting: bool) -> Carry:

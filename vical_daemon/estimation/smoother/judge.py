@@ -144,6 +144,10 @@ class FreeJudge:
             self._agreement.clear()
             self._growing = 0.0, 0
 
+    def next_recording(self) -> None:
+        """Another recording begins: it has not contradicted anything yet."""
+        self._against_since_s = None
+
     def contradicted(self, against_s: float) -> None:
         """Images of the last `against_s` seconds contradict the calibration: not known yet why."""
         if self._against_since_s is None:

@@ -19,7 +19,13 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
-from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status, TracePoint
+from vical_daemon.estimation.result import (
+    CalibrationEstimate,
+    CameraEstimate,
+    HeldOutCheck,
+    Status,
+    TracePoint,
+)
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.selection import model_selection as hypotheses
 from vical_daemon.estimation.status.excitation import (
@@ -40,6 +46,7 @@ _LOST = 3.0  # a direction this far above its target after the patience is calle
 _NIS_BAD = 4.0
 _HELD_BACK_BAD = 9.0
 _RECENT = 60
+_KEPT_CHECKS = 2400  # one every 1.5 s: an hour
 
 
 class Judge:
@@ -77,6 +84,7 @@ class Judge:
         self._nis: deque[tuple[float, int]] = deque(maxlen=300)
         self._recent_used: deque[bool] = deque(maxlen=_RECENT)
         self._held_back: deque[float] = deque(maxlen=40)
+        self.held_out: deque[HeldOutCheck] = deque(maxlen=_KEPT_CHECKS)
         self._square: dict[str, deque[tuple[float, int]]] = {}
         self._trace: dict[str, Trace] = {}
         self._size: deque[float] = deque(maxlen=400)
@@ -150,6 +158,7 @@ class Judge:
             scale: `Consistency.scale` of the camera.
         """
         self._held_back.append(ratio)
+        self.held_out.append(HeldOutCheck(self._now_s, ratio))
         error = imu_noise_error(self._held_back, scale)
         if error is not None:
             self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
@@ -181,7 +190,9 @@ class Judge:
     def _maybe_trace(self, camera: str, f: CalibrationFilter) -> None:
         trace = self._trace.setdefault(camera, Trace())
         if trace.due(f.state.t_s):
-            trace.add(f.state.t_s, self._camera(camera, self.weighed(f)), self.nis_per_dof(), self.status)
+            known = self.weighed(f)
+            imu = imu_estimate(known, matrices=False)
+            trace.add(f.state.t_s, self._camera(camera, known), self.nis_per_dof(), self.status, imu)
 
     # ------------------------------------------------------------------ what is said
     def nis_per_dof(self) -> float:

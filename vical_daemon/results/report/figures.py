@@ -20,36 +20,39 @@ from vical_daemon.results.report.residuals import CameraResiduals, CellMap, per_
 X, Y, Z = "#d55e00", "#009e73", "#0072b2"
 AXES, INK, SOFT = (X, Y, Z), "#1d2433", "#8a93a6"
 WIDTH = 9.6  # inches
+Drawing = list[Figure]
+"""Figures of one panel each that belong together."""
 
 
-def _panels(
+def panels(
     height: float,
     rows: int = 1,
     columns: int = 1,
     ratios: Sequence[float] | None = None,
     width: float = WIDTH,
     right: float = 0.12,
-) -> tuple[Figure, npt.NDArray[Any]]:
-    """Return a figure and its axes, shape (rows, columns), with margins given in inches.
+) -> tuple[Drawing, npt.NDArray[Any]]:
+    """Return figures of one panel each, and their axes, shape (rows, columns), with margins in inches.
 
-    matplotlib's own layout engine would double the time of every figure.
+    One figure for each panel, so that the page can put them side by side on a desk and one below the other
+    on a phone. matplotlib's own layout engine would double the time of every figure.
     """
-    figure = Figure(figsize=(width, height))
-    left, top, bottom, gap = 0.68, 0.30, 0.45, 0.65
-    panel_width = (width - left - right - gap * (columns - 1)) / columns
-    panel_height = (height - top - bottom - gap * (rows - 1)) / rows
-    axes = figure.subplots(
-        rows, columns, squeeze=False, width_ratios=ratios,
-        gridspec_kw={
-            "left": left / width, "right": 1 - right / width, "top": 1 - top / height,
-            "bottom": bottom / height, "wspace": gap / panel_width, "hspace": gap / panel_height,
-        },
-    )  # fmt: skip
-    return figure, np.asarray(axes)
+    left, top, bottom = 0.68, 0.30, 0.45
+    shares = np.array(ratios if ratios is not None else [1.0] * columns)
+    figures, axes = [], np.empty((rows, columns), dtype=object)
+    for row in range(rows):
+        for column, share in enumerate(shares / shares.sum()):
+            w, h = width * share, height / rows
+            figure = Figure(figsize=(w, h))
+            box = (left / w, bottom / h, 1 - (left + right) / w, 1 - (top + bottom) / h)
+            axes[row, column] = figure.add_axes(box)
+            figures.append(figure)
+    return figures, axes
 
 
-def _style(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
-    axes.set_title(title, loc="left", fontsize=10, color=INK, fontweight="bold")
+def style(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
+    """Give a panel its title, labels and colours."""
+    axes.set_title(title, loc="left", pad=5, fontsize=10, color=INK, fontweight="bold")
     axes.set_xlabel(x, fontsize=9, color=INK)
     axes.set_ylabel(y, fontsize=9, color=INK)
     axes.tick_params(labelsize=8, colors=INK)
@@ -60,7 +63,8 @@ def _style(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
         axes.spines[side].set_color("#c3cad6")
 
 
-def _band(axes: Axes, t: FloatArray, value: FloatArray, sigma: FloatArray, colour: str, label: str) -> None:
+def band(axes: Axes, t: FloatArray, value: FloatArray, sigma: FloatArray, colour: str, label: str) -> None:
+    """Draw a curve with its band of one sigma."""
     axes.fill_between(t, value - sigma, value + sigma, color=colour, alpha=0.18, linewidth=0)
     axes.plot(t, value, color=colour, linewidth=1.4, label=label)
 
@@ -78,7 +82,7 @@ def _limit(axes: Axes, t: FloatArray, values: FloatArray, sigmas: FloatArray, sh
         axes.set_ylim(low[finite].min() - margin, high[finite].max() + margin)
 
 
-def convergence(trace: Sequence[dict[str, Any]]) -> Figure:
+def convergence(trace: Sequence[dict[str, Any]]) -> Drawing:
     """Draw lever arm, rotation and time shift over the recording with bands of one sigma.
 
     Left: all of it. Right: its second half. Lever arm and rotation are shown relative to their final
@@ -93,39 +97,39 @@ def convergence(trace: Sequence[dict[str, Any]]) -> Figure:
     r_sigma = np.degrees(np.array([p["r_sigma_rad"] for p in trace]))
     shift = 1e3 * np.array([p["timeshift_s"] for p in trace])
     shift_sigma = 1e3 * np.array([p["timeshift_sigma_s"] for p in trace])
-    figure, panels = _panels(7.8, 3, 2, (1.15, 1.0))
+    figure, grid = panels(6.9, 3, 2)
     for column in (0, 1):
         for i, axis in enumerate("xyz"):
-            _band(panels[0, column], t, p_mm[:, i] - p_mm[-1, i], p_sigma[:, i], AXES[i], axis)
-            _band(panels[1, column], t, rotation[:, i], r_sigma[:, i], AXES[i], axis)
-        _band(panels[2, column], t, shift, shift_sigma, INK, "time shift")
-    _style(panels[0, 0], "Lever arm, from its final value", y="mm")
-    _style(panels[1, 0], "Rotation, from its final value", y="deg")
-    _style(panels[2, 0], "Time shift", "time, s", "ms")
+            band(grid[0, column], t, p_mm[:, i] - p_mm[-1, i], p_sigma[:, i], AXES[i], axis)
+            band(grid[1, column], t, rotation[:, i], r_sigma[:, i], AXES[i], axis)
+        band(grid[2, column], t, shift, shift_sigma, INK, "time shift")
+    style(grid[0, 0], "Lever arm, from its final value", y="mm")
+    style(grid[1, 0], "Rotation, from its final value", y="deg")
+    style(grid[2, 0], "Time shift", "time, s", "ms")
     for row, title in enumerate(("second half", "second half", "second half")):
-        _style(panels[row, 1], title, "time, s" if row == 2 else "")
+        style(grid[row, 1], title, "time, s" if row == 2 else "")
     for column, share in ((0, 0.06), (1, 0.5)):
-        _limit(panels[0, column], t, p_mm - p_mm[-1], p_sigma, share)
-        _limit(panels[1, column], t, rotation, r_sigma, share)
-        _limit(panels[2, column], t, shift[:, None], shift_sigma[:, None], share)
-        for panel in panels[:, column]:
+        _limit(grid[0, column], t, p_mm - p_mm[-1], p_sigma, share)
+        _limit(grid[1, column], t, rotation, r_sigma, share)
+        _limit(grid[2, column], t, shift[:, None], shift_sigma[:, None], share)
+        for panel in grid[:, column]:
             panel.set_xlim(t[0] if column == 0 else 0.5 * (t[0] + t[-1]), t[-1])
-    for panel in panels[:2, 0]:
-        panel.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")
+    for panel in grid[:2, 0]:
+        panel.legend(fontsize=8, frameon=False, labelcolor=INK, ncols=3, loc="upper right")
     return figure
 
 
-def sigmas(trace: Sequence[dict[str, Any]]) -> Figure:
+def sigmas(trace: Sequence[dict[str, Any]]) -> Drawing:
     """Draw the standard deviations alone, logarithmic: how fast the answer is getting sharper."""
     t = np.array([p["t_s"] for p in trace])
-    figure, grid = _panels(2.7, 1, 3)
-    panels = grid[0]
+    figure, grid = panels(2.7, 1, 3)
+    row = grid[0]
     groups = (
         (1e3 * np.array([p["p_sigma_m"] for p in trace]), "Sigma of the lever arm", "mm"),
         (np.degrees(np.array([p["r_sigma_rad"] for p in trace])), "Sigma of the rotation", "deg"),
         (1e6 * np.array([[p["timeshift_sigma_s"]] for p in trace]), "Sigma of the time shift", "us"),
     )
-    for panel, (values, title, unit) in zip(panels, groups, strict=True):
+    for panel, (values, title, unit) in zip(row, groups, strict=True):
         for i in range(values.shape[1]):
             shown = np.where(values[:, i] > 0, values[:, i], np.nan)
             panel.plot(t, shown, color=AXES[i] if values.shape[1] == 3 else INK, linewidth=1.3)
@@ -134,13 +138,13 @@ def sigmas(trace: Sequence[dict[str, Any]]) -> Figure:
             panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             panel.yaxis.set_major_formatter("{x:g}")
             panel.yaxis.set_minor_formatter(NullFormatter())
-        _style(panel, title, "time, s", unit)
+        style(panel, title, "time, s", unit)
     return figure
 
 
-def consistency(points: CameraResiduals | None, trace: Sequence[dict[str, Any]]) -> Figure:
+def consistency(points: CameraResiduals | None, trace: Sequence[dict[str, Any]]) -> Drawing:
     """Draw NIS per degree of freedom over time with its 95 % band, and its histogram against chi^2."""
-    figure, ((left, right),) = _panels(2.9, 1, 2, (1.6, 1.0))
+    figure, ((left, right),) = panels(2.9, 1, 2, (1.6, 1.0))
     used = points is not None and bool(np.any(points.frame_dof > 0))
     if points is not None and used:
         use = points.frame_dof > 0
@@ -154,39 +158,39 @@ def consistency(points: CameraResiduals | None, trace: Sequence[dict[str, Any]])
         probability = chi2.cdf(nis, dof)
         right.hist(probability, bins=20, range=(0, 1), color=Z, alpha=0.75)
         right.axhline(len(probability) / 20, color=INK, linewidth=1, linestyle="--")
-        _style(right, "Rank of NIS in its chi-square: flat is right", "probability", "frames")
+        style(right, "Rank of NIS: flat is right", "probability", "frames")
     else:
         t = np.array([p["t_s"] for p in trace])
         left.plot(t, [p.get("nis_per_dof", np.nan) for p in trace], color=Z)
         right.set_axis_off()
     left.axhline(1.0, color=INK, linewidth=0.8)
-    _style(left, "NIS per degree of freedom (band: 95 %)", "time, s")
+    style(left, "NIS per degree of freedom (band: 95 %)", "time, s")
     return figure
 
 
-def residual_map(cell_map: CellMap, size: tuple[int, int]) -> Figure:
+def residual_map(cell_map: CellMap, size: tuple[int, int]) -> Drawing:
     """Draw mean residual arrows, RMS and number of points per cell over the image."""
     height = 0.8 + (WIDTH / 3.0) * size[1] / size[0] * 0.72
-    figure, (panels,) = _panels(max(2.0, height), 1, 3, right=0.35)
+    figure, (row,) = panels(max(2.0, height), 1, 3, right=0.35)
     x = 0.5 * (cell_map.x_edges[:-1] + cell_map.x_edges[1:])
     y = 0.5 * (cell_map.y_edges[:-1] + cell_map.y_edges[1:])
     length = np.linalg.norm(cell_map.mean_px, axis=-1)
     reach = float(np.nanpercentile(length, 95)) if np.isfinite(length).any() else 1.0
     cell = cell_map.x_edges[1] - cell_map.x_edges[0]
-    panels[0].quiver(
+    row[0].quiver(
         x, y, cell_map.mean_px[..., 0], cell_map.mean_px[..., 1], angles="xy", scale_units="xy",
         scale=max(reach, 1e-6) / (1.2 * cell), color=X, width=0.005,
     )  # fmt: skip
-    _style(panels[0], f"Mean residual (one cell = {reach / 1.2:.2g} px)")
+    style(row[0], f"Mean residual; cell: {reach / 1.2:.2g} px")
     extent = (0, size[0], size[1], 0)
-    rms = panels[1].imshow(cell_map.rms_px, extent=extent, cmap="magma_r", vmin=0, aspect="equal")
-    figure.colorbar(rms, ax=panels[1]).ax.tick_params(labelsize=8)
-    _style(panels[1], "RMS residual, px")
+    rms = row[1].imshow(cell_map.rms_px, extent=extent, cmap="magma_r", vmin=0, aspect="equal")
+    row[1].figure.colorbar(rms, ax=row[1]).ax.tick_params(labelsize=8, colors=INK)
+    style(row[1], "RMS residual, px")
     count = np.where(cell_map.count > 0, cell_map.count, np.nan)
-    seen = panels[2].imshow(count, extent=extent, cmap="viridis", aspect="equal")
-    figure.colorbar(seen, ax=panels[2]).ax.tick_params(labelsize=8)
-    _style(panels[2], "Points per cell")
-    for panel in panels:
+    seen = row[2].imshow(count, extent=extent, cmap="viridis", aspect="equal")
+    row[2].figure.colorbar(seen, ax=row[2]).ax.tick_params(labelsize=8, colors=INK)
+    style(row[2], "Points per cell")
+    for panel in row:
         panel.set_xlim(0, size[0])
         panel.set_ylim(size[1], 0)
         panel.set_aspect("equal")
@@ -194,9 +198,9 @@ def residual_map(cell_map: CellMap, size: tuple[int, int]) -> Figure:
     return figure
 
 
-def residual_scatter(points: CameraResiduals, sigma_px: float) -> Figure:
+def residual_scatter(points: CameraResiduals, sigma_px: float) -> Drawing:
     """Draw all residuals with their circles, their histogram, and the RMS of each board point."""
-    figure, ((left, middle, right),) = _panels(3.1, 1, 3)
+    figure, ((left, middle, right),) = panels(3.1, 1, 3)
     kept, refused = points.residual_px[points.accepted], points.residual_px[~points.accepted]
     thin = slice(None, None, max(1, len(kept) // 20000))
     left.plot(kept[thin, 0], kept[thin, 1], ".", color=Z, markersize=1.2, alpha=0.35, rasterized=True)
@@ -208,52 +212,52 @@ def residual_scatter(points: CameraResiduals, sigma_px: float) -> Figure:
     left.set_xlim(-reach, reach)
     left.set_ylim(-reach, reach)
     left.set_aspect("equal")
-    _style(left, "Residuals; circles: 1, 2, 3 sigma", "u, px", "v, px")
+    style(left, "Residuals; circles: 1, 2, 3 sigma", "u, px", "v, px")
     edges = np.linspace(-reach, reach, 60)
     for i, (colour, label) in enumerate(((X, "u"), (Y, "v"))):
         middle.hist(kept[:, i], bins=edges, histtype="step", color=colour, label=label, density=True)
     normal = np.exp(-0.5 * (edges / sigma_px) ** 2) / (sigma_px * np.sqrt(2 * np.pi))
     middle.plot(edges, normal, color=INK, linewidth=0.9, linestyle="--", label="stated")
-    middle.legend(fontsize=8, frameon=False)
-    _style(middle, "Distribution", "px")
+    middle.legend(fontsize=8, frameon=False, labelcolor=INK)
+    style(middle, "Distribution", "px")
     ids, rms, refused_share = per_point_rms(points)
     right.scatter(ids, rms, s=7, c=[X if share > 0.2 else Z for share in refused_share])
     right.set_ylim(bottom=0)
-    _style(right, "RMS by board point", "point id", "px")
+    style(right, "RMS by board point", "point id", "px")
     return figure
 
 
-def frame_rms(points: CameraResiduals) -> Figure:
+def frame_rms(points: CameraResiduals) -> Drawing:
     """Draw the RMS residual of each frame and the share of its points that was refused."""
-    figure, ((axes,),) = _panels(2.2)
+    figure, ((axes,),) = panels(2.2, width=4.8)
     axes.plot(points.frame_t_s, points.frame_rms_px, ".", color=Z, markersize=2.5, rasterized=True)
     axes.set_ylim(0, float(np.nanpercentile(points.frame_rms_px, 99.5)) * 1.3 + 1e-9)
-    _style(axes, "RMS residual by frame", "time, s", "px")
+    style(axes, "RMS residual by frame", "time, s", "px")
     return figure
 
 
-def correlation(covariance: FloatArray) -> Figure:
+def correlation(covariance: FloatArray) -> Drawing:
     """Draw the correlation of the six numbers of `T_imu_cam`."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    figure, ((axes,),) = _panels(2.9, width=3.4, right=0.4)
+    figure, ((axes,),) = panels(2.9, width=3.4, right=0.4)
     shown = axes.imshow(covariance / np.outer(sigma, sigma), vmin=-1, vmax=1, cmap="RdBu")
     labels = ["px", "py", "pz", "rx", "ry", "rz"]
     axes.set_xticks(range(6), labels)
     axes.set_yticks(range(6), labels)
-    figure.colorbar(shown, ax=axes, shrink=0.9).ax.tick_params(labelsize=8)
-    _style(axes, "Correlation")
+    axes.figure.colorbar(shown, ax=axes, shrink=0.9).ax.tick_params(labelsize=8, colors=INK)
+    style(axes, "Correlation")
     axes.grid(visible=False)
     return figure
 
 
-def clock(t_s: FloatArray, residual_us: FloatArray, name: str) -> Figure:
+def clock(t_s: FloatArray, residual_us: FloatArray, name: str) -> Drawing:
     """Draw how late each sample arrived against the fitted device clock."""
-    figure, ((left, right),) = _panels(2.4, 1, 2, (2.0, 1.0))
+    figure, ((left, right),) = panels(2.4, 1, 2, (2.0, 1.0))
     thin = slice(None, None, max(1, len(t_s) // 20000))
     left.plot(t_s[thin], residual_us[thin], ".", color=Z, markersize=1.5, alpha=0.5, rasterized=True)
     top = float(np.percentile(residual_us, 99.5)) * 1.2 + 1e-9
     left.set_ylim(min(0.0, float(np.percentile(residual_us, 0.5)) * 1.2), top)
-    _style(left, f"{name}: arrival behind the fitted clock", "time, s", "us")
+    style(left, f"{name}: arrival behind the fitted clock", "time, s", "us")
     right.hist(residual_us, bins=60, range=left.get_ylim(), color=Z, alpha=0.75)
-    _style(right, "Distribution", "us")
+    style(right, "Distribution", "us")
     return figure

@@ -1,63 +1,59 @@
-"""Layout of the report: HTML and CSS without any outside resource, readable on a phone, printable to PDF."""
+"""Layout of the report: HTML without any outside resource, readable on a phone, in the dark and on paper."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
+from typing import Any
 
-CSS = """
-:root{--ink:#1d2433;--soft:#5b6578;--line:#dfe4ec;--paper:#fff;--tint:#f5f7fa}
-*{box-sizing:border-box}
-body{margin:0;background:var(--tint);color:var(--ink);font:15px/1.5 system-ui,"Segoe UI",Roboto,sans-serif}
-main{max-width:1040px;margin:0 auto;padding:24px 16px 48px}
-header{display:flex;flex-wrap:wrap;align-items:baseline;gap:12px;margin-bottom:8px}
-h1{font-size:26px;margin:0}h2{font-size:19px;margin:32px 0 8px}h3{font-size:15px;margin:16px 0 6px}
-section,.card{background:var(--paper);border:1px solid var(--line);border-radius:10px}
-section,.card{padding:14px 18px;margin:12px 0}
-.pill{padding:3px 12px;border-radius:99px;font-weight:600;color:#fff;background:#7a8394}
-.converged{background:#0b8457}.converging,.initialising,.waiting{background:#2468b2}
-.degenerate{background:#b35c00}.inconsistent{background:#b3261e}
-.note{color:var(--soft);margin:2px 0 0}
-table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
-th,td{text-align:left;padding:5px 10px 5px 0;border-bottom:1px solid var(--line);vertical-align:top}
-th{font-weight:600;color:var(--soft);font-size:13px}
-td.n,th.n{text-align:right}
-td:last-child:not(.n){overflow-wrap:anywhere}
-.pair td,th{white-space:nowrap}
-.warn{border-left:4px solid #b35c00;background:#fff7ec}
-.bad{border-left:4px solid #b3261e;background:#fdf0ef}
-ul{margin:4px 0;padding-left:20px}
-figure{margin:10px 0}figure img{width:100%;height:auto;display:block}
-figcaption{color:var(--soft);font-size:13px}
-code,pre{font:13px/1.45 ui-monospace,Menlo,Consolas,monospace}
-pre{white-space:pre-wrap;overflow-wrap:anywhere;background:var(--tint);padding:10px;border-radius:8px}
-.scroll{overflow-x:auto}
-.pair{display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start}.pair>*{flex:1 1 320px}
-.pair figure{flex:0 1 300px}.pair>.scroll{flex:3 1 460px}
-@media print{body{background:#fff;font-size:12px}main{max-width:none;padding:0}
-section,.card{break-inside:avoid;border:none;padding:4px 0}h2{break-after:avoid}}
-@page{margin:14mm}
-"""
+from vical_daemon.results.report.scene import SCRIPT as SCENE_SCRIPT
+from vical_daemon.results.report.verdict import Verdict
+
+_HERE = Path(__file__).parent
+# Colours of the figures that follow the page's, which may be dark.
+_THEME = {
+    "#1d2433": "var(--ink)",
+    "#8a93a6": "var(--soft)",
+    "#e3e7ee": "var(--line)",
+    "#c3cad6": "var(--edge)",
+    "#d55e00": "var(--x)",
+    "#009e73": "var(--y)",
+    "#0072b2": "var(--z)",
+}
+_CLUTTER = re.compile(r"<\?xml.*?\?>|<!DOCTYPE.*?>|<metadata>.*?</metadata>|<style.*?</style>", re.DOTALL)
+_SIZE = re.compile(r'<svg([^>]*?) width="([\d.]+)pt" height="[\d.]+pt"')
+_SHOWN_WIDTH = 1.44  # pixels of the page for each point of a figure, on a desk
 
 
 def document(title: str, body: Iterable[str]) -> str:
     """Wrap the parts of a page into a complete HTML document."""
+    style = (_HERE / "style.css").read_text(encoding="utf-8")
+    scripts = [path.read_text(encoding="utf-8") for path in (SCENE_SCRIPT, _HERE / "report.js")]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{CSS}</style></head>\n<body><main>\n"
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title>\n<style>\n{style}</style></head>\n<body><main>\n"
         + "\n".join(body)
-        + "\n</main></body></html>\n"
+        + "\n</main>\n"
+        + "".join(f"<script>\n{script}</script>\n" for script in scripts)
+        + "</body></html>\n"
     )
 
 
-def header(title: str, status: str, reason: str, facts: Sequence[str]) -> str:
-    """Return the head of the page: title, status as a coloured word, why, and a line of facts."""
-    known = status if status.isalpha() else "unknown"
-    reason_line = f'<p class="note">{escape(reason)}</p>' if reason else ""
+def head(title: str, status: str, said: Verdict, facts: Sequence[str]) -> str:
+    """Return the head of the page: the verdict, what to do, and a line of facts."""
+    kind = status if status.isalpha() else "unknown"
+    known = "".join(f'<p class="known">{escape(line)}</p>' for line in said.known)
+    advice = "".join(f"<li>{escape(line)}</li>" for line in said.advice)
     return (
-        f'<header><h1>{escape(title)}</h1><span class="pill {known}">{escape(status)}</span></header>'
-        f'{reason_line}<p class="note">{escape(" · ".join(facts))}</p>'
+        f'<header><h1>{escape(title)}</h1><span class="pill {kind}">{escape(status)}</span></header>'
+        f'<div class="card verdict {kind}"><p class="word">{escape(said.word)}</p>{known}'
+        + (f"<ul>{advice}</ul>" if advice else "")
+        + f'<p class="note">{escape(" · ".join(facts))}</p></div>'
     )
 
 
@@ -65,12 +61,16 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric_from: int 
     """Return a table; columns from `numeric_from` on are aligned right. Cells are escaped."""
 
     def cell(tag: str, i: int, text: str) -> str:
-        kind = ' class="n"' if i >= numeric_from else ""
+        kind = ' class="n"' if i >= numeric_from else ' class="w"' if tag == "td" and i else ""
         return f"<{tag}{kind}>{escape(text)}</{tag}>"
 
     top = "".join(cell("th", i, text) for i, text in enumerate(head))
     lines = "".join("<tr>" + "".join(cell("td", i, text) for i, text in enumerate(r)) + "</tr>" for r in rows)
-    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table></div>'
+    kind = "" if numeric_from < len(head) else " lines"
+    return (
+        f'<div class="scroll"><table class="table{kind}"><thead><tr>{top}</tr></thead>'
+        f"<tbody>{lines}</tbody></table></div>"
+    )
 
 
 def section(title: str, *parts: str) -> str:
@@ -78,18 +78,40 @@ def section(title: str, *parts: str) -> str:
     return f"<h2>{escape(title)}</h2><section>{''.join(parts)}</section>"
 
 
-def warnings(lines: Sequence[str], *, bad: bool = False) -> str:
-    """Return a box of warnings; nothing for none."""
-    if not lines:
-        return ""
-    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    return f'<div class="card {"bad" if bad else "warn"}"><ul>{items}</ul></div>'
+def warning(text: str) -> str:
+    """Return a box with a warning."""
+    return f'<div class="card warn">{escape(text)}</div>'
 
 
-def figure(source: str, alt: str, caption: str = "") -> str:
-    """Return an image with its caption; `source` is a data URI."""
+def note(text: str) -> str:
+    """Return a line of small text."""
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def figure(name: str, drawings: Sequence[str], alt: str, caption: str = "") -> str:
+    """Return SVG files side by side, or one below the other where the page is narrow.
+
+    Their colours become those of the page, and their ids unique in it.
+    """
+    panels = "".join(_inline(svg, f"{name}-{i}") for i, svg in enumerate(drawings))
     text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f'<figure><img src="{source}" alt="{escape(alt)}">{text}</figure>'
+    return f'<figure aria-label="{escape(alt)}"><div class="panels">{panels}</div>{text}</figure>'
+
+
+def _inline(svg: str, prefix: str) -> str:
+    svg = _CLUTTER.sub("", svg)
+    for colour, variable in _THEME.items():
+        svg = svg.replace(colour, variable)
+    prefix = re.sub(r"\W", "", prefix)
+    svg = re.sub(r'\bid="', f'id="{prefix}', svg)
+    svg = re.sub(r'(href="#|url\(#)', rf"\g<1>{prefix}", svg)
+
+    def sized(match: re.Match[str]) -> str:
+        width = float(match.group(2)) * _SHOWN_WIDTH
+        flow = f"flex:{width:.0f} 1 {0.55 * width:.0f}px;max-width:{width:.0f}px"
+        return f'<svg{match.group(1)} role="img" style="{flow}"'
+
+    return _SIZE.sub(sized, svg, count=1).strip()
 
 
 def preformatted(text: str) -> str:
@@ -97,6 +119,35 @@ def preformatted(text: str) -> str:
     return f"<pre>{escape(text)}</pre>"
 
 
+def copyable(text: str) -> str:
+    """Return text as it is, in a box with a button that copies it."""
+    return f'<div class="matrix"><pre>{escape(text)}</pre><button class="copy">copy</button></div>'
+
+
+def scene(document: dict[str, Any]) -> str:
+    """Return a 3-D view with its buttons."""
+    data = json.dumps(document, separators=(",", ":")).replace("<", "\\u003c")
+    rooms = ""
+    if "board" in document:
+        rooms = '<button data-room="0" class="on">rig</button><button data-room="1">board and path</button>'
+    gains = "".join(
+        f'<button data-gain="{gain}"{" class=on" if gain == 1 else ""}>sigma × {gain}</button>'
+        for gain in (1, 10, 100)
+    )
+    return (
+        f'<div class="scene"><script type="application/json">{data}</script>'
+        '<canvas role="img" aria-label="3-D view of imu, camera and board"></canvas>'
+        f"<p>{rooms}{gains}</p>"
+        '<p class="note">Drag to turn, wheel or two fingers to come nearer. Red: where the camera may be; '
+        "at its axes: where their tips may be.</p></div>"
+    )
+
+
 def side_by_side(*parts: str) -> str:
     """Return parts next to each other where the page is wide enough."""
     return f'<div class="pair">{"".join(parts)}</div>'
+
+
+def grid(parts: Iterable[str]) -> str:
+    """Return figures in as many columns as the page has room for."""
+    return f'<div class="shots">{"".join(parts)}</div>'

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
 
+from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, RADTAN
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.results.euler import euler_deg, euler_sigma_deg
 
 Row = tuple[str, str, str, str]
@@ -115,12 +118,77 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
         lines.append(
             f"{100 * rejected:.1f} % of the measurements were refused: blur, wrong ids or a wrong board?"
         )
-    lines += [_text(event) for event in result.get("events") or []]
+    lines += advice_of(result.get("events") or [])
     if result.get("guidance"):
         lines.append(f"What would help: {result['guidance']}")
     return lines
 
 
-def _text(event: dict[str, Any] | str) -> str:
-    """Text of an event; results of version 0.1.0 have only text."""
-    return event if isinstance(event, str) else str(event["text"])
+def advice_of(events: Sequence[dict[str, Any] | str]) -> list[str]:
+    """Texts of the events that ask for something to be done, the last of each kind and camera."""
+    last = {
+        (event["kind"], event.get("camera")): str(event["text"])
+        for event in events
+        if isinstance(event, dict) and event["kind"] in _ACTIONABLE
+    }
+    return list(last.values())
+
+
+_ACTIONABLE = {
+    EventKind.FIXED_LENS,
+    EventKind.LENS_TERM_MISSING,
+    EventKind.STAMP_JITTER,
+    EventKind.IMU_NOISE,
+    EventKind.IMU_CLIPPED,
+    EventKind.ACCEL_LAG,
+    EventKind.TARGET_SIZE,
+    EventKind.TARGET_SHAPE,
+    EventKind.ROLLING_SHUTTER,
+    EventKind.CLOCK_DRIFT,
+    EventKind.CLOCK_WANDER,
+    EventKind.BUMPED,
+}
+
+
+def event_rows(events: Sequence[dict[str, Any] | str]) -> list[tuple[str, str]]:
+    """Rows of what was announced: time and text; results of version 0.1.0 have only text."""
+    rows = []
+    for event in events:
+        when = event.get("t_s") if isinstance(event, dict) else None
+        text = event if isinstance(event, str) else str(event["text"])
+        rows.append(("" if when is None else f"{float(when):.1f}\N{NO-BREAK SPACE}s", text))
+    return rows
+
+
+def held_out_text(checks: Sequence[dict[str, float]], noise: dict[str, float] | None) -> str:
+    """Say how well the IMU alone predicted images, and what that means for its stated noise, as HTML."""
+    ratio = [float(check["ratio"]) for check in checks]
+    rms, median = math.sqrt(sum(ratio) / len(ratio)), math.sqrt(float(np.median(ratio)))
+    text = (
+        f"{len(ratio)} times the IMU alone predicted an image 0.3 s ahead that was not used yet. The "
+        f"errors are {rms:.2f} times (RMS) and {median:.2f} times (median) those that the stated noise of "
+        "IMU and corners predicts."
+    )
+    if noise:
+        text += (
+            f" Stated noise: gyro {noise['gyro_density']:.3g} rad/s/√Hz, accelerometer "
+            f"{noise['accel_density']:.3g} m/s²/√Hz; walks {noise['gyro_walk']:.3g} and "
+            f"{noise['accel_walk']:.3g}."
+        )
+    return f"<p>{escape(text)}</p>"
+
+
+def matrix_text(R: FloatArray, p: FloatArray, name: str) -> str:
+    """Write a pose as a 4x4 matrix with its name, as numpy and most other software reads it.
+
+    >>> print(matrix_text(np.eye(3), np.array([0.1, 0, 0]), "T_a_b"))
+    T_a_b = [[ 1.00000000,  0.00000000,  0.00000000,  0.10000000],
+             [ 0.00000000,  1.00000000,  0.00000000,  0.00000000],
+             [ 0.00000000,  0.00000000,  1.00000000,  0.00000000],
+             [ 0.00000000,  0.00000000,  0.00000000,  1.00000000]]
+    """
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, p
+    lines = ["[" + ", ".join(f"{v + 0.0:11.8f}" for v in row) + "]" for row in T]
+    head = f"{name} = ["
+    return head + (",\n" + " " * len(head)).join(lines) + "]"

@@ -2,7 +2,7 @@
 // Listens to /events and draws. Everything from the robot goes in as text, never as HTML.
 
 const $ = (id) => document.getElementById(id);
-const page = { columns: [], rows: {}, latest: {}, devices: [], views: [], fault: null, control: false, camera: null, span: 0, heard: 0 };
+const page = { columns: [], rows: {}, latest: {}, devices: [], sights: {}, paths: {}, views: [], fault: null, control: false, camera: null, span: 0, heard: 0 };
 const SILENT_MS = 5000; // the robot speaks 2.5 times a second
 const AXES = ["x", "y", "z"];
 const COLOURS = ["--x", "--y", "--z"];
@@ -127,6 +127,8 @@ function round(value, digits) {
 function drawWords() {
   const latest = page.latest[page.camera];
   const status = latest ? latest.status : "waiting"; // "stale" when the estimates have stopped
+  if (page.status && status === "converged" && page.status !== status) meters.cue(1320);
+  page.status = status;
   const fault = page.fault; // what does not work comes before any advice
   $("status").className = `pill ${fault ? "fault" : status}`;
   document.querySelector("main").classList.toggle("stale", status === "stale");
@@ -196,6 +198,32 @@ function drawTabs() {
   }) : []));
 }
 
+const PATH = 60; // poses kept: 24 s
+const scene = new Scene($("scene"));
+sceneButtons(scene, document.querySelector(".space"));
+
+function keepSights(sights, full) { // a full message has the path, later ones the newest pose
+  page.sights = sights;
+  for (const [name, sight] of Object.entries(sights)) {
+    if (full) page.paths[name] = sight.path;
+    else if (sight.pose) page.paths[name] = (page.paths[name] || []).concat([sight.pose]).slice(-PATH);
+  }
+}
+
+function drawSight() {
+  const sight = page.sights[page.camera], latest = page.latest[page.camera];
+  // No advice with a fault or old values, and none that contradicts "nothing is missing".
+  const quiet = page.fault || !latest || latest.stale || (latest.status === "converged" && !latest.guidance);
+  camera.coverage = sight ? sight.coverage : null;
+  camera.setWanted(sight && sight.wanted && !quiet ? sight.wanted : null);
+  meters.sight(sight, camera.last && camera.last.light);
+  meters.draw(latest && latest.meters ? latest.meters : []);
+  drawStored(latest ? latest.stored : null);
+  const path = page.paths[page.camera] || [], board = sight && sight.board;
+  if (latest && latest.rig) scene.set({ rig: latest.rig, board: board || undefined, path: board && path.length ? path : undefined });
+  for (const button of document.querySelectorAll("button[data-room='1']")) button.disabled = !(board && path.length);
+}
+
 function choose(name) {
   page.camera = name;
   for (const tab of $("tabs").children) tab.setAttribute("aria-selected", String(tab.textContent === name));
@@ -207,6 +235,7 @@ function draw() {
   drawWords();
   drawDevices();
   drawCharts();
+  drawSight();
 }
 
 // The robot itself is silent: nobody else can say here that what is shown is old.
@@ -241,6 +270,7 @@ function take(message, full) {
   }
   page.devices = message.devices;
   page.fault = message.fault;
+  keepSights(message.sights || {}, full);
   draw();
 }
 
@@ -263,24 +293,6 @@ for (const button of document.querySelectorAll(".range button")) {
   };
 }
 
-$("token").value = sessionStorage.getItem("token") || "";
-$("form").onsubmit = async (event) => {
-  event.preventDefault();
-  const command = event.submitter ? event.submitter.value : "";
-  if (command === "reset" && !window.confirm("Forget the calibration so far and begin anew?")) return;
-  sessionStorage.setItem("token", $("token").value);
-  try {
-    const answer = await fetch("api/command", {
-      method: "POST",
-      headers: { "Content-Type": "application/json", Authorization: `Bearer ${$("token").value}` },
-      body: JSON.stringify({ command }),
-    });
-    setText("answer", answer.ok ? `sent: ${command.replace("_", " ")}` : await answer.text());
-  } catch (error) {
-    setText("answer", "the robot does not answer");
-  }
-};
-
-window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawCharts);
+window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { drawCharts(); scene.draw(); });
 setInterval(watchSilence, 1000);
-listen();
+document.addEventListener("DOMContentLoaded", listen); // when meters.js and decide.js have been read, too

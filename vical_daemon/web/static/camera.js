@@ -9,8 +9,10 @@ class CameraScreen {
     this.last = null;
     this.number = 0;
     this.shownAt = 0;
+    this.coverage = null; // {columns, rows, count, rms_px}, of the whole image
+    this.wanted = null; // {outline, text}: where the board is to be brought
     setInterval(() => this.watchAge(), 1000);
-    for (const id of ["show-detected", "show-predicted"]) this.byId(id).onchange = () => this.draw();
+    for (const id of ["show-detected", "show-predicted", "show-coverage"]) this.byId(id).onchange = () => this.draw();
   }
 
   look(name) { // the browser connects again by itself when the robot was away
@@ -65,17 +67,49 @@ class CameraScreen {
     const c = 3.6 * unit;
     const cross = ([, u, v]) => `M${u - c},${v - c}l${2 * c},${2 * c}M${u - c},${v + c}l${2 * c},${-2 * c}`;
     svg.replaceChildren(
+      ...this.cells(width, height), ...this.outline(),
       ...this.path("detected", detected, ring), ...this.path("predicted", predicted, cross),
     );
     this.byId("misfit").textContent = this.misfit(detected, predicted) + (this.last.jpeg ? "" : "; no images arrive");
   }
 
-  path(kind, points, mark) {
-    if (!points.length || !this.byId(`show-${kind}`).checked) return [];
+  setWanted(wanted) {
+    if (this.wanted && wanted && this.wanted.text !== wanted.text) meters.cue(660); // one place done
+    this.wanted = wanted;
+    setText("wanted", wanted ? wanted.text : "");
+  }
+
+  // Green where corners have been and fit, orange where they fit worse, dark where there were none.
+  cells(width, height) {
+    const c = this.coverage;
+    if (!c || !this.byId("show-coverage").checked) return [];
+    const w = width / c.columns, h = height / c.rows, most = Math.max(...c.count, 1);
+    const known = c.rms_px.filter((v) => v !== null).sort((a, b) => a - b);
+    const usual = known.length ? known[known.length >> 1] : 0;
+    const paths = { none: "", some: "", seen: "", poor: "" };
+    c.count.forEach((count, i) => {
+      const poor = usual && c.rms_px[i] !== null && c.rms_px[i] > 2 * usual;
+      const kind = !count ? "none" : count < most ? "some" : poor ? "poor" : "seen";
+      paths[kind] += `M${(i % c.columns) * w - 0.5},${Math.floor(i / c.columns) * h - 0.5}h${w}v${h}h${-w}z`;
+    });
+    return Object.entries(paths).filter(([, d]) => d).map(([kind, d]) => this.shape(`cell ${kind}`, d));
+  }
+
+  outline() {
+    if (!this.wanted) return [];
+    return [this.shape("wanted", `M${this.wanted.outline.map((p) => p.join()).join("L")}z`)];
+  }
+
+  shape(kind, d) {
     const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
     path.setAttribute("class", kind);
-    path.setAttribute("d", points.map(mark).join(""));
-    return [path];
+    path.setAttribute("d", d);
+    return path;
+  }
+
+  path(kind, points, mark) {
+    if (!points.length || !this.byId(`show-${kind}`).checked) return [];
+    return [this.shape(kind, points.map(mark).join(""))];
   }
 
   misfit(detected, predicted) {

@@ -1,8 +1,7 @@
-"""Where `vical td-icp` gets orientations from: cameras of a recording, pose topics, trajectory files."""
+"""Orientations and lenses of the cameras of a recording."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.lens_refinement import LensFit, refine_lens
 from vical_daemon.estimation.init.target_poses import Lens
@@ -19,6 +17,7 @@ from vical_daemon.estimation.temporal.camera_orientations import Orientations, t
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 from vical_daemon.logs import Recording, Stream
+from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -48,7 +47,12 @@ def seconds(t_ns: IntArray, base_ns: int) -> FloatArray:
 
 
 def camera_stream(
-    recording: Recording, stream: Stream, prior: CameraPrior | None, target: str | None, base_ns: int
+    recording: Recording,
+    stream: Stream,
+    prior: CameraPrior | None,
+    target: str | None,
+    base_ns: int,
+    warn: Warn = ignore,
 ) -> tuple[OrientationStream, LensUsed]:
     """Orientations of one camera of a recording, and the lens they were taken with.
 
@@ -58,25 +62,24 @@ def camera_stream(
         prior: What is known about its lens; None: nothing.
         target: Target file, needed unless the stream holds tracks.
         base_ns: Subtracted from stamps.
+        warn: Takes what is unusual.
 
     Raises:
-        CliError: Something needed is not there.
+        InputError: Something needed is not there.
     """
     lens = lens_of(stream, prior)
     if stream.kind == "tracks":
         if prior is None or prior.intrinsics is None:
-            raise CliError(
-                f"{stream.name}: tracks need the lens: give --initial with its intrinsics", EXIT_USAGE
-            )
+            raise OptionError(f"{stream.name}: tracks need the lens: give --initial with its intrinsics")
         chains = track_orientations(
             recording.points_frames(stream.name), lens.intrinsics, lens.distortion, lens.model
         )
         if not chains:
-            raise CliError(f"{stream.name}: too few features carry over from frame to frame")
+            raise InputError(f"{stream.name}: too few features carry over from frame to frame")
         found = max(chains, key=lambda chain: len(chain.t_cam_ns))
         return _stream(stream.name, found, base_ns), LensUsed(lens, GIVEN)
     guess = prior is None or prior.intrinsics is None
-    found, fit = board_poses(recording, stream, lens, guess, target)
+    found, fit = board_poses(recording, stream, lens, guess, target, warn)
     used = replace(lens, intrinsics=fit.intrinsics, distortion=fit.distortion)
     start = "a guess from the image size" if guess else GIVEN
     origin = f"estimated from {fit.views} views of the board, starting from {start}" if fit.views else start
@@ -89,16 +92,21 @@ def track_frames(
     """Tracks with their stamps in seconds, and the lens.
 
     Raises:
-        CliError: The lens is not known.
+        InputError: The lens is not known.
     """
     if prior is None or prior.intrinsics is None:
-        raise CliError(f"{stream.name}: tracks need the lens: give --initial with its intrinsics", EXIT_USAGE)
+        raise OptionError(f"{stream.name}: tracks need the lens: give --initial with its intrinsics")
     frames = [((f.t_cam_ns - base_ns) * 1e-9, f) for f in recording.points_frames(stream.name)]
     return frames, LensUsed(lens_of(stream, prior), GIVEN)
 
 
 def board_poses(
-    recording: Recording, stream: Stream, lens: Lens, guess: bool, target: str | None
+    recording: Recording,
+    stream: Stream,
+    lens: Lens,
+    guess: bool,
+    target: str | None,
+    warn: Warn = ignore,
 ) -> tuple[Orientations, LensFit]:
     """Find the board in a camera's frames, improve the lens by them, and return the camera's poses.
 
@@ -108,20 +116,21 @@ def board_poses(
         lens: Start.
         guess: The lens is only guessed from the image size.
         target: Target file.
+        warn: Takes what is unusual.
 
     Raises:
-        CliError: No target, or it does not fit the data.
+        InputError: No target, or it does not fit the data.
     """
     if target is None:
-        raise CliError(f"{stream.name}: give the board with --target", EXIT_USAGE)
+        raise OptionError(f"{stream.name}: give the board with --target")
     from vical_daemon.vision.target import load_target
 
     points_m = load_target(Path(target)).points_m
-    frames = _frames(recording, stream, target)
+    frames = _frames(recording, stream, target, warn)
     if not any(len(f.ids) for f in frames):
-        raise CliError(f"{stream.name}: the target was found in no image; is it the right target file?")
+        raise InputError(f"{stream.name}: the target was found in no image; is it the right target file?")
     if max(int(f.ids.max()) for f in frames if len(f.ids)) >= len(points_m):
-        raise CliError(
+        raise InputError(
             f"{stream.name}: point ids go beyond the target's {len(points_m)} points; wrong target file?"
         )
     if guess:
@@ -134,19 +143,18 @@ def lens_of(stream: Stream, prior: CameraPrior | None) -> Lens:
     """Return what is known about a camera's lens, or a guess from the image size.
 
     Raises:
-        CliError: Not even the image size is known.
+        InputError: Not even the image size is known.
     """
     if prior is None:
         if stream.resolution is None:
-            raise CliError(
+            raise OptionError(
                 f"{stream.name}: the image size is not in the recording; give --initial with "
-                f"`{stream.name}: {{resolution: [width, height]}}`",
-                EXIT_USAGE,
+                f"`{stream.name}: {{resolution: [width, height]}}`"
             )
         prior = CameraPrior(resolution=stream.resolution)
     elif prior.resolution == (0, 0) and prior.intrinsics is None:
         if stream.resolution is None:
-            raise CliError(f"{stream.name}: --initial gives neither resolution nor intrinsics", EXIT_USAGE)
+            raise OptionError(f"{stream.name}: --initial gives neither resolution nor intrinsics")
         prior = CameraPrior(resolution=stream.resolution, distortion_model=prior.distortion_model)
     return Lens.from_prior(prior)
 
@@ -155,7 +163,7 @@ def _stream(name: str, found: Orientations, base_ns: int) -> OrientationStream:
     return OrientationStream(name, seconds(found.t_cam_ns, base_ns), found.R_world_cam, found.covariance)
 
 
-def _frames(recording: Recording, stream: Stream, target: str) -> list[PointsFrame]:
+def _frames(recording: Recording, stream: Stream, target: str, warn: Warn) -> list[PointsFrame]:
     if stream.kind == "points":
         return [f for f in recording.points_frames(stream.name) if len(f.ids)]
     from vical_daemon.vision.detector import BoardDetector
@@ -173,7 +181,7 @@ def _frames(recording: Recording, stream: Stream, target: str) -> list[PointsFra
         if found is not None and len(found.ids):
             frames.append(PointsFrame(stream.name, stamp_ns, found.ids, found.uv_px, found.sigma_px))
     if unreadable:
-        print(f"vical: warning: {stream.name}: {unreadable} unreadable images left out", file=sys.stderr)
+        warn(f"{stream.name}: {unreadable} unreadable images left out")
     return frames
 
 

@@ -1,17 +1,11 @@
-"""`vical td-icp --sensors`: what each name means, and all of them registered together."""
+"""Any number of sensors: what each name means, and all of them registered together."""
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.td_icp import choose_gyro, is_trajectory, open_input, options_of, prior_of
-from vical_daemon.cli.td_icp_orientations import pose_topic, trajectory_file
-from vical_daemon.cli.td_icp_sources import LensUsed, camera_stream, seconds
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
@@ -22,34 +16,31 @@ from vical_daemon.estimation.temporal.td_icp_joint import (
     joint_with_gyro,
 )
 from vical_daemon.logs import Recording, RecordingError
-
-if TYPE_CHECKING:
-    from vical_daemon.config.priors import Initial
+from vical_daemon.offline.errors import InputError, OptionError
+from vical_daemon.offline.td_icp.recorded_orientations import pose_topic, trajectory_file
+from vical_daemon.offline.td_icp.request import TdIcpRequest, choose_gyro, is_trajectory, prior_of
+from vical_daemon.offline.td_icp.sources import LensUsed, camera_stream, seconds
 
 _INTEGRATED_HZ = 30.0  # of a gyro's attitude: what lies between adds nothing to a hand's motion
 _INTEGRATED_SIGMA_RAD = 3e-3  # only a start: the fit measures it
 
 
-def register(
-    args: argparse.Namespace, initial: Initial, names: list[str]
-) -> tuple[JointResult, dict[str, LensUsed]]:
+def register_sensors(request: TdIcpRequest, names: list[str]) -> tuple[JointResult, dict[str, LensUsed]]:
     """Collect the sensors' orientations and register them; also the lens of each camera.
 
     Args:
-        args: Of the command.
-        initial: What is known of lenses and the imu's noise.
+        request: What to register.
         names: Of the sensors.
 
     Raises:
-        CliError: A name means nothing, or its data cannot be used.
+        InputError: A name means nothing, or its data cannot be used.
     """
-    path = Path(args.input)
-    options = options_of(args, initial)
+    path, options = request.path, request.options
     if is_trajectory(path):
-        first, base = trajectory_file(path, None)
-        others = [trajectory_file(Path(name), base)[0] for name in names if _file(name)]
+        first, base = trajectory_file(path, None, request.warn)
+        others = [trajectory_file(Path(name), base, request.warn)[0] for name in names if _file(name)]
         return joint_of_orientations([first, *others], options), {}
-    recording = _recording(args.input, names)
+    recording = _recording(request, names)
     imus = {} if recording is None else recording.imus
     gyros = [name for name in names if name in imus]
     base_ns = None if recording is None else recording.begin_ns
@@ -58,11 +49,13 @@ def register(
         if recording is not None and name in gyros[1:] and base_ns is not None:
             streams.append(_integrated(recording, name, base_ns))
         elif recording is not None and name in recording.cameras and base_ns is not None:
-            camera, prior = recording.cameras[name], prior_of(initial, name)
-            stream, lenses[name] = camera_stream(recording, camera, prior, args.target, base_ns)
+            camera, prior = recording.cameras[name], prior_of(request.initial, name)
+            stream, lenses[name] = camera_stream(
+                recording, camera, prior, request.target, base_ns, request.warn
+            )
             streams.append(stream)
         elif name not in gyros:
-            stream, base_ns = _other_stream(args, recording, name, base_ns)
+            stream, base_ns = _other_stream(request, recording, name, base_ns)
             streams.append(stream)
     if gyros and recording is not None and base_ns is not None:
         imu, t_ns, gyro = choose_gyro(recording, gyros[0])
@@ -75,17 +68,17 @@ def _integrated(recording: Recording, name: str, base_ns: int) -> OrientationStr
     _, t_ns, gyro = choose_gyro(recording, name)
     cleaned = clean_gyro(seconds(t_ns, base_ns), gyro)
     if isinstance(cleaned, str):
-        raise CliError(f"{name}: {cleaned}")
+        raise InputError(f"{name}: {cleaned}")
     curve = GyroCurve.integrate(*cleaned, np.zeros(3))
     step = max(1, round(1.0 / (_INTEGRATED_HZ * float(np.median(np.diff(curve.t_s))))))
     R = so3.matrix_from_quat(curve.q_ref_imu[::step])
     return OrientationStream(name, curve.t_s[::step], R, _INTEGRATED_SIGMA_RAD)
 
 
-def _recording(path: str, names: list[str]) -> Recording | None:
+def _recording(request: TdIcpRequest, names: list[str]) -> Recording | None:
     """Open the recording; None where it holds neither imu nor camera and none of the names is one."""
     try:
-        return open_input(path)
+        return request.open()
     except RecordingError:
         if all(name.startswith("/") or Path(name).is_file() for name in names):
             return None
@@ -93,20 +86,20 @@ def _recording(path: str, names: list[str]) -> Recording | None:
 
 
 def _other_stream(
-    args: argparse.Namespace, recording: Recording | None, name: str, base_ns: int | None
+    request: TdIcpRequest, recording: Recording | None, name: str, base_ns: int | None
 ) -> tuple[OrientationStream, int]:
     """A sensor that is no camera: its orientations, and what was subtracted from its stamps."""
     if name.startswith("/") and not Path(name).is_file():
-        return pose_topic(Path(args.input), name, base_ns)
+        return pose_topic(request.path, name, base_ns)
     if Path(name).is_file():
-        return trajectory_file(Path(name), base_ns)
+        return trajectory_file(Path(name), base_ns, request.warn)
     known = "" if recording is None else ", ".join([*recording.imus, *recording.cameras])
-    raise CliError(
-        f"--sensors: {name!r} is no sensor of the recording ({known}), no /topic and no file", EXIT_USAGE
-    )
+    raise OptionError(f"--sensors: {name!r} is no sensor of the recording ({known}), no /topic and no file")
 
 
 def _file(name: str) -> bool:
     if not Path(name).is_file():
-        raise CliError(f"--sensors: {name} does not exist; with a trajectory as INPUT all sensors are files")
+        raise InputError(
+            f"--sensors: {name} does not exist; with a trajectory as INPUT all sensors are files"
+        )
     return True

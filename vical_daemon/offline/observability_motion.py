@@ -1,24 +1,23 @@
-"""The motion of a recording for `vical observability`: attitude from the gyro, position from the board."""
+"""The motion of a recording: attitude from the gyro, position from the board."""
 
 from __future__ import annotations
 
-import argparse
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
-from vical_daemon.cli.errors import EXIT_USAGE, CliError
-from vical_daemon.cli.td_icp import choose_gyro, prior_of
-from vical_daemon.cli.td_icp_sources import board_poses, lens_of, seconds
-from vical_daemon.config.priors import Initial, read_initial
+from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.init.lens_refinement import LensFit
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 from vical_daemon.estimation.tools.observability import Motion, Setup
 from vical_daemon.logs import open_recording
+from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
+from vical_daemon.offline.td_icp.request import choose_gyro, prior_of
+from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,28 +26,45 @@ _MAX_FRAMES = 150
 _HOLE_S = 0.35
 
 
-def motion_of(args: argparse.Namespace, blocks: frozenset[str]) -> tuple[Motion, Setup, npt.NDArray[np.intp]]:
+def motion_of(
+    path: str,
+    blocks: frozenset[str],
+    *,
+    target: str | None,
+    initial: Initial,
+    camera: str | None = None,
+    imu: str | None = None,
+    warn: Warn = ignore,
+) -> tuple[Motion, Setup, npt.NDArray[np.intp]]:
     """Rebuild the motion of the longest stretch (at most 30 s) in which the board stays in view.
 
+    Args:
+        path: Recording.
+        blocks: Further unknowns, see `Setup`.
+        target: Target file.
+        initial: What is known of the lens and the mounting.
+        camera: Which, where there are several.
+        imu: Which, where there are several.
+        warn: Takes what is unusual.
+
     Raises:
-        CliError: No board, no imu, or no motion to work with.
+        InputError: No board, no imu, or no motion to work with.
     """
-    recording = open_recording(args.input, cameras=[args.camera] if args.camera else (), check=False)
-    initial = read_initial(args.initial) if args.initial else Initial()
+    recording = open_recording(path, cameras=[camera] if camera else (), check=False)
     cameras = recording.cameras
-    name = args.camera or next(iter(cameras), None)
-    if name is None or name not in cameras or (args.camera is None and len(cameras) > 1):
-        raise CliError(
-            f"choose one camera of {recording.path} with --camera: {', '.join(cameras) or 'there is none'}",
-            EXIT_USAGE,
+    name = camera or next(iter(cameras), None)
+    if name is None or name not in cameras or (camera is None and len(cameras) > 1):
+        raise OptionError(
+            f"choose one camera of {recording.path} with --camera: {', '.join(cameras) or 'there is none'}"
         )
     stream, prior = cameras[name], prior_of(initial, name)
     if stream.kind == "tracks":
-        raise CliError(f"{name}: tracks of unknown points do not give the motion; a board is needed")
+        raise InputError(f"{name}: tracks of unknown points do not give the motion; a board is needed")
     lens = lens_of(stream, prior)
-    poses, fit = board_poses(recording, stream, lens, prior is None or prior.intrinsics is None, args.target)
-    imu, t_ns, gyro = choose_gyro(recording, args.imu)
-    force = recording.imu_arrays(imu).specific_force_mps2
+    guess = prior is None or prior.intrinsics is None
+    poses, fit = board_poses(recording, stream, lens, guess, target, warn)
+    chosen, t_ns, gyro = choose_gyro(recording, imu)
+    force = recording.imu_arrays(chosen).specific_force_mps2
     base = int(t_ns[0])
     t_imu, t_cam = seconds(t_ns, base), seconds(poses.t_cam_ns, base)
     fresh = np.concatenate(([True], np.diff(t_imu) > 1e-6))
@@ -62,13 +78,14 @@ def motion_of(args: argparse.Namespace, blocks: frozenset[str]) -> tuple[Motion,
     motion, frames = _rebuild(
         t_imu, gyro, force, t_cam + result.timeshift_cam_imu_s, poses, result, p_imu_cam
     )
-    return motion, _setup(fit, lens.model, lens.resolution, result, p_imu_cam, blocks, args.target), frames
+    assert target is not None  # or there were no poses
+    return motion, _setup(fit, lens.model, lens.resolution, result, p_imu_cam, blocks, target), frames
 
 
 def _without_motion(poses: Orientations, result: TdIcpResult) -> TdIcpResult:
     """A rig that stands still has an observability too (a poor one); anything else is an error."""
     if not result.still or len(poses.t_cam_ns) < 12:
-        raise CliError(f"the recording cannot be judged: {result.reason}")
+        raise InputError(f"the recording cannot be judged: {result.reason}")
     used = np.ones(len(poses.t_cam_ns), dtype=np.bool_)
     return TdIcpResult(
         "degenerate",
@@ -95,7 +112,7 @@ def _rebuild(
     stretch = _longest(t_frame[inside])
     index = inside[stretch]
     if len(index) < 12:
-        raise CliError("the board is never in view for long enough")
+        raise InputError("the board is never in view for long enough")
     t = t_frame[index]
     use = (t_imu >= t[0]) & (t_imu <= t[-1])
     curve = GyroCurve.integrate(t_imu, gyro, result.gyro_bias_rps)

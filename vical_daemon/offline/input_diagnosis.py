@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vical_daemon.cli.calibration_run import Job
-from vical_daemon.cli.errors import CliError
-from vical_daemon.cli.td_icp_sources import board_poses, lens_of, seconds
 from vical_daemon.estimation.temporal.accelerometer_check import explain_accelerometer
 from vical_daemon.estimation.temporal.td_icp import REFUSED, td_icp
+from vical_daemon.offline.calibrate import Job
+from vical_daemon.offline.errors import InputError
+from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds
 
 
 def diagnose_input(job: Job) -> str:
@@ -30,7 +30,7 @@ def diagnose_input(job: Job) -> str:
         try:
             lens = lens_of(stream, prior)
             poses, _ = board_poses(job.recording, stream, lens, prior.intrinsics is None, job.config.target)
-        except CliError as error:
+        except InputError as error:
             return str(error)
         t_cam_s = seconds(poses.t_cam_ns, int(imu.t_ns[0]))
         found = td_icp(t_imu_s, imu.gyro_rps, t_cam_s, poses.R_world_cam, poses.covariance)

@@ -1,8 +1,7 @@
-"""Recorded orientations for `vical td-icp`: topics of any log of ROS messages, and trajectory files."""
+"""Recorded orientations: topics of any log of ROS messages, and trajectory files."""
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.cli.errors import CliError
-from vical_daemon.cli.td_icp_sources import seconds
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
 from vical_daemon.logs.trajectory import read_trajectory
+from vical_daemon.offline.errors import InputError, Warn, ignore
+from vical_daemon.offline.td_icp.sources import seconds
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -45,7 +44,7 @@ def pose_topic(path: Path, topic: str, base_ns: int | None) -> tuple[Orientation
         The stream, and the base that was used, ns.
 
     Raises:
-        CliError: No such topic, of a type without an orientation, or nobody filled it in.
+        InputError: No such topic, of a type without an orientation, or nobody filled it in.
     """
     stamps: list[int] = []
     quaternions: list[tuple[float, ...]] = []
@@ -57,7 +56,7 @@ def pose_topic(path: Path, topic: str, base_ns: int | None) -> tuple[Orientation
             continue
         if type_name not in _POSE_TYPES:
             known = ", ".join(_POSE_TYPES)
-            raise CliError(f"{topic} is a {type_name}: it holds no orientation (known: {known})")
+            raise InputError(f"{topic} is a {type_name}: it holds no orientation (known: {known})")
         quaternion, covariance = _POSE_TYPES[type_name]
         decoded = message()
         q = _member(decoded, quaternion)
@@ -66,11 +65,11 @@ def pose_topic(path: Path, topic: str, base_ns: int | None) -> tuple[Orientation
         variances.append(_variance(_member(decoded, covariance)) if covariance else 0.0)
     if not stamps:
         others = ", ".join(sorted(name for name, n in found.items() if n))
-        raise CliError(f"{path} holds no topic {topic}; with orientations: {others or 'none'}")
+        raise InputError(f"{path} holds no topic {topic}; with orientations: {others or 'none'}")
     if min(variances) < 0.0:
-        raise CliError(f"{topic}: its sender says that it holds no orientation (covariance[0] is -1)")
+        raise InputError(f"{topic}: its sender says that it holds no orientation (covariance[0] is -1)")
     if max(stamps) == 0:
-        raise CliError(f"{topic}: all stamps are zero (not filled in by the sender)")
+        raise InputError(f"{topic}: all stamps are zero (not filled in by the sender)")
     t_ns = np.array(stamps, dtype=np.int64)
     base = int(t_ns.min()) if base_ns is None else base_ns
     sigma = np.sqrt(np.array(variances))
@@ -103,7 +102,7 @@ def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
     if folder or (path.suffix != ".bag" and path.is_file() and path.suffix != ".db3"):
         files = sorted(path.glob("*.mcap")) if folder else [path]
         if not files:
-            raise CliError(f"{path} is no log of messages: topics need an MCAP or a bag")
+            raise InputError(f"{path} is no log of messages: topics need an MCAP or a bag")
         try:
             for file in files:
                 for m in LogReader(file).messages():
@@ -112,7 +111,7 @@ def _messages(path: Path) -> Iterator[tuple[str, str, Any]]:
                         data, kind = m.payload, channel.type_name
                         yield channel.topic, kind, lambda d=data, k=kind: store.deserialize_cdr(d, k)
         except LogError as error:
-            raise CliError(str(error)) from None
+            raise InputError(str(error)) from None
         return
     yield from _bag_messages(path.parent if path.suffix == ".db3" else path)
 
@@ -125,25 +124,26 @@ def _bag_messages(path: Path) -> Iterator[tuple[str, str, Any]]:
             yield c.topic, c.msgtype, lambda d=data, k=c.msgtype: reader.deserialize(d, k)
 
 
-def trajectory_file(path: Path, base_ns: int | None) -> tuple[OrientationStream, int]:
-    """Read a trajectory file (see `recording.trajectory`); what is unusual about it goes to stderr.
+def trajectory_file(path: Path, base_ns: int | None, warn: Warn = ignore) -> tuple[OrientationStream, int]:
+    """Read a trajectory file (see `logs.trajectory`).
 
     Args:
         path: The file.
         base_ns: Subtracted from stamps; None: the file's first stamp.
+        warn: Takes what is unusual about it.
 
     Returns:
         The stream, and the base that was used, ns.
 
     Raises:
-        CliError: Too few poses, or no orientations.
+        InputError: Too few poses, or no orientations.
         RecordingError: The file is no trajectory, or its columns can be read in two ways.
     """
     found = read_trajectory(path)
     for warning in found.warnings:
-        print(f"vical: warning: {warning}", file=sys.stderr)
+        warn(warning)
     if len(found.t_ns) < _MIN_POSES:
-        raise CliError(f"{path}: {len(found.t_ns)} poses, at least {_MIN_POSES} are needed")
+        raise InputError(f"{path}: {len(found.t_ns)} poses, at least {_MIN_POSES} are needed")
     base = int(found.t_ns[0]) if base_ns is None else base_ns
     return _from_quaternions(path.name, found.t_ns, found.q_wxyz, base), base
 
@@ -155,9 +155,9 @@ def _from_quaternions(
     length = np.linalg.norm(q, axis=1)
     good = np.abs(length - 1.0) < 0.05
     if np.count_nonzero(good) < _MIN_POSES:
-        raise CliError(f"{name}: its orientations are no unit quaternions (not filled in by the sender?)")
+        raise InputError(f"{name}: its orientations are no unit quaternions (not filled in by the sender?)")
     if np.ptp(q[good], axis=0).max() == 0.0:
-        raise CliError(f"{name}: its orientation never changes (not filled in by the sender?)")
+        raise InputError(f"{name}: its orientation never changes (not filled in by the sender?)")
     R = so3.matrix_from_quat(so3.quat_normalise(q[good]))
     told: float | FloatArray = _POSE_SIGMA_RAD
     if sigma is not None and sigma[good].min() > 0.0:

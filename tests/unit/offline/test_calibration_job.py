@@ -1,0 +1,113 @@
+"""A recording through the roles: everything reaches the estimator, everything announced comes out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from vical_daemon.calibrate.estimators import Estimator
+from vical_daemon.cli import calibration_text
+from vical_daemon.config.priors import read_initial
+from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.logs import open_recording
+from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.offline import calibrate
+
+
+def test_all_that_was_announced_on_the_way_is_told_at_the_end(
+    shortest: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Announcer:
+        def __init__(self, inner: Estimator) -> None:
+            self._inner, self.calls = inner, 0
+
+        def estimate(self):
+            self.calls += 1
+            return replace(
+                self._inner.estimate(), events=[Event(EventKind.OTHER, said=f"event {self.calls}")]
+            )
+
+        def __getattr__(self, name: str):
+            return getattr(self._inner, name)
+
+    make = calibrate.make_estimator
+    monkeypatch.setattr(calibrate, "make_estimator", lambda *a: Announcer(make(*a)))
+    job = calibrate.make_job(
+        open_recording(shortest),
+        read_initial(shortest / "initial.yaml"),
+        target=str(shortest / "target.yaml"),
+    )
+    outcome = calibrate.run_job(job, lambda share, estimate: None)
+    told = outcome.estimate.events
+    assert len(told) > 2
+    assert [event.said for event in told] == [f"event {k + 1}" for k in range(len(told))]
+    text = calibration_text.describe(calibrate.document(job, outcome))
+    assert all(event.said in text for event in told)
+
+
+def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
+    short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every sample and every frame reaches the estimator, by stamp, bit for bit."""
+    fed: list[tuple] = []
+
+    class Listener:
+        def __init__(self, inner: Estimator) -> None:
+            self._inner = inner
+
+        def add_imu(self, t_imu_ns, gyro_rps, specific_force_mps2) -> None:
+            fed.append((t_imu_ns, *gyro_rps, *specific_force_mps2))
+
+        def add_points(self, frame) -> None:
+            fed.append((frame.t_cam_ns, frame.ids.tobytes(), frame.uv_px.tobytes()))
+
+        waiting = 0
+
+        def process(self) -> list:
+            return []
+
+        finish = process
+
+        def __getattr__(self, name: str):
+            return getattr(self._inner, name)
+
+    make = calibrate.make_estimator
+    monkeypatch.setattr(calibrate, "make_estimator", lambda *a: Listener(make(*a)))
+    recording = open_recording(short)
+    job = calibrate.make_job(
+        recording, read_initial(short / "initial.yaml"), target=str(short / "target.yaml")
+    )
+    calibrate.run_job(job, lambda share, estimate: None)
+    samples = recording.imu_arrays("imu0")
+    expected = [
+        (int(t), *map(float, g), *map(float, a))
+        for t, g, a in zip(samples.t_ns, samples.gyro_rps, samples.specific_force_mps2, strict=True)
+    ]
+    assert [entry for entry in fed if len(entry) == 7] == expected
+    frames = [(f.t_cam_ns, f.ids.tobytes(), f.uv_px.tobytes()) for f in recording.points_frames("cam0")]
+    assert [entry for entry in fed if len(entry) == 3] == frames
+    assert [entry[0] for entry in fed] == sorted(entry[0] for entry in fed)
+
+
+def test_only_the_part_that_was_asked_for_is_used(short: Path) -> None:
+    recording = open_recording(short)
+    job = calibrate.make_job(
+        recording,
+        read_initial(short / "initial.yaml"),
+        target=str(short / "target.yaml"),
+        skip_s=2.5,
+        seconds=3.0,
+    )
+    begin_ns = recording.begin_ns + 2_500_000_000
+    everything = [(key, payload) for key, payload in recording.messages()]
+    expected = [
+        item for item in everything if begin_ns <= (stamp_of(item[1]) or 0) <= begin_ns + 3_000_000_000
+    ]
+    assert 500 < len(expected) < len(everything) / 2
+    assert list(job.messages()) == expected
+    assert job.duration_s == 3.0
+    job.seconds = None
+    assert job.duration_s == pytest.approx(recording.duration_s - 2.5)
+    assert list(job.messages())[-1] == everything[-1]

@@ -1,0 +1,76 @@
+"""What the detectors compute, against a second way to compute it."""
+
+import cv2
+import numpy as np
+import pytest
+
+from vical_daemon.vision.aprilgrid import PASSES, _passes
+from vical_daemon.vision.grid_model import _project, _project_with_jacobian
+from vical_daemon.vision.layout import BoardLayout
+from vical_daemon.vision.saddle import SaddleImage, pixel_noise
+from vical_daemon.vision.tag_code import bit_centres, bit_places
+from vical_daemon.vision.target import AprilGrid, Checkerboard
+
+SHAPE = (480, 640)
+
+
+def test_the_jacobian_is_the_derivative():
+    rng = np.random.default_rng(0)
+    x = np.vstack([rng.uniform(-1, 1, (2, 12)), np.ones(12)])
+    parameters = np.array([0.6, 0.1, 0.05, -0.08, 0.5, 0.1, 0.15, -0.1, -0.2])
+    _, J = _project_with_jacobian(parameters, x, SHAPE)
+    for k, step in enumerate(np.eye(9) * 1e-6):
+        there, back = (_project(parameters + s, x, SHAPE) for s in (step, -step))
+        np.testing.assert_allclose(J[k].T, (there - back) / 2e-6, atol=1e-4)
+
+
+def test_bits_lie_where_the_homography_of_the_corners_puts_them():
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    quads = np.array([[[10, 90], [80, 70], [95, 12], [20, 8]], [[5, 50], [50, 50], [50, 5], [5, 5]]], float)
+    for quad, places in zip(quads, bit_places(quads), strict=True):
+        H = cv2.getPerspectiveTransform(unit, quad.astype(np.float32))
+        np.testing.assert_allclose(places, cv2.perspectiveTransform(bit_centres()[None], H)[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("sigma_dn", [1.0, 2.5, 8.0])
+def test_pixel_noise_is_that_of_the_pixels(sigma_dn):
+    ramp = np.linspace(40, 200, 640)[None] + np.linspace(0, 30, 480)[:, None]
+    noisy = ramp + np.random.default_rng(1).normal(0, sigma_dn, SHAPE)
+    estimate = pixel_noise(np.clip(np.round(noisy), 0, 255).astype(np.uint8))
+    assert estimate == pytest.approx(np.hypot(sigma_dn, 0.29), rel=0.06)
+
+
+@pytest.mark.parametrize("board", [AprilGrid(3, 2, 0.05, 0.3), Checkerboard(5, 4, 0.03, 0.02)])
+def test_axes_are_the_pixels_of_a_metre(board):
+    layout = BoardLayout.of(board)
+    axes = np.array([[900.0, 200.0], [-100.0, 800.0]])  # pixels of a metre along x, along y
+    uv = layout.xy_m @ axes + [100, 200]
+    np.testing.assert_allclose(layout.steps.axes_px(uv), np.broadcast_to(axes, (len(uv), 2, 2)))
+
+
+def test_corners_with_windows_of_several_sizes_are_refined_together():
+    """One batch gives what each corner gives alone."""
+    u, v = np.meshgrid(np.arange(200.0), np.arange(160.0))
+    places = np.array([[50.3, 40.7], [120.6, 40.2], [50.8, 110.1], [120.1, 110.9]])
+    picture = 120 + sum(
+        90 * np.tanh((u - a) / 0.9) * np.tanh((v - b) / 0.9) * (np.hypot(u - a, v - b) < 25)
+        for a, b in places
+    )
+    image = SaddleImage(np.round(picture).astype(np.uint8))
+    radius = np.array([2.0, 3.4, 5.0, 9.0])
+    together = image.refine(places + 0.6, radius)
+    assert together.ok.all()
+    assert np.abs(together.uv_px - places).max() < 0.02
+    for k in range(4):
+        alone = image.refine(places[k : k + 1] + 0.6, radius[k : k + 1])
+        np.testing.assert_allclose(together.uv_px[k], alone.uv_px[0], atol=2e-3)
+        assert together.sigma_px[k] == pytest.approx(alone.sigma_px[0], rel=0.02)
+
+
+def test_every_pass_has_its_turn_while_there_is_no_board():
+    for width in (320, 640, 1280):
+        first = _passes(width, 0)
+        assert first[-len(PASSES) :] == list(PASSES)
+        later = [_passes(width, misses) for misses in range(1, len(PASSES) + 1)]
+        assert {passes[-1] for passes in later} == set(PASSES)
+        assert all(passes[:-1] == first[: -len(PASSES)] for passes in later)

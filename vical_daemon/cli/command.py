@@ -1,0 +1,133 @@
+"""`vical command WORD`: what the buttons of the page do, from a terminal."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.errors import EXIT_USAGE, CliError
+from vical_daemon.cli.options import add_config, add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.bus.interface import Bus, Sample
+
+WORDS = {  # role and word on the bus
+    "accept": ("estimate", "accept"),
+    "discard": ("estimate", "discard"),
+    "reset": ("estimate", "reset"),
+    "record-start": ("record", "start"),
+    "record-stop": ("record", "stop"),
+}
+_ANSWERED = ("accept", "discard")
+_BUS_S = 3.0
+_ANSWER_S = 5.0  # estimates come five times a second, also from a busy machine
+_EPILOG = """\
+  vical command accept            store the present result as the calibration of these devices
+  vical command discard           forget it, and put back what was stored when it began
+  vical command reset             forget it and begin anew; the store stays as it is
+  vical command record-start      begin a recording (record-stop ends it)
+
+exit code: 0 done; 1 nobody answers, or the result is not one to accept; 2 bad usage
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the word, and which bus."""
+    parser.add_argument("word", choices=WORDS, metavar="WORD", help=", ".join(WORDS))
+    add_config(parser, required=False)
+    parser.add_argument("--connect", metavar="ENDPOINT", help="router to connect to, e.g. tcp/127.0.0.1:7447")
+    parser.add_argument("--rig", metavar="NAME", help="which rig, where the bus has several")
+    parser.epilog = _EPILOG
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Send the command; wait for the answer of those that have one."""
+    from vical_daemon.cli.bus_wait import wait_for_bus
+
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    end_s = time.monotonic() + _BUS_S
+    bus = wait_for_bus(args.config, args.connect, end_s=end_s, stop=stop, quiet=args.quiet)
+    if bus is None:
+        return 0
+    try:
+        rig = args.rig or _rig(bus)
+        answer = send(bus, rig, args.word)
+    finally:
+        bus.close()
+    if answer.startswith("not "):
+        raise CliError(answer)
+    print(json.dumps({"rig": rig, "sent": args.word, "answer": answer}) if args.json else answer)
+    return 0
+
+
+def send(bus: Bus, rig: str, word: str, answer_s: float = _ANSWER_S) -> str:
+    """Send a command, and return the answer; of a command that has none, what was sent.
+
+    Args:
+        bus: The bus of the rig.
+        rig: Its name.
+        word: One of `WORDS`.
+        answer_s: How long to wait for an answer, s.
+
+    Raises:
+        CliError: No answer came.
+    """
+    from vical_daemon.bus import topics
+    from vical_daemon.bus.messages import encode_string
+
+    answers: list[str] = []
+    came = threading.Event()
+
+    def listen(sample: Sample) -> None:
+        found = _answer(sample)
+        if found:
+            answers.append(found)
+            came.set()
+
+    role, said = WORDS[word]
+    subscription = bus.subscribe(topics.CALIBRATION.key(rig, "x").replace("/x", "/*"), listen)
+    try:
+        bus.publish(topics.COMMAND.key(rig, role), encode_string(said))
+        if word not in _ANSWERED:
+            return f"sent: {word} to {rig}"
+        if not came.wait(answer_s):
+            raise CliError(f"no answer from {rig}: is the role estimate (vical-calibrate) running?")
+    finally:
+        subscription.close()
+    return answers[0]
+
+
+def _answer(sample: Sample) -> str:
+    """Return the answer to a command in an estimate; empty: it has none."""
+    from vical_daemon.bus.messages import MessageError, decode_calibration
+    from vical_daemon.estimation.wording import event_text
+
+    try:
+        events = decode_calibration(sample.payload).estimate.events
+    except MessageError:
+        return ""
+    texts = [event_text(event) for event in events]
+    return next((t for t in texts if t.startswith(("accepted", "not accepted", "discarded"))), "")
+
+
+def _rig(bus: Bus) -> str:
+    """Return the only rig on the bus.
+
+    Raises:
+        CliError: There is none, or several.
+    """
+    from vical_daemon.bus import topics
+
+    parsed = [topics.parse_key(sample.key) for sample in bus.latest(f"{topics.ROOT}/**", 2.0)]
+    rigs = sorted({entry.rig for entry in parsed if entry is not None})
+    if not rigs:
+        raise CliError("nothing on the bus yet; is `vical run` (vical.target) up?")
+    if len(rigs) > 1:
+        raise CliError(f"there are the rigs {', '.join(rigs)}: say which with --rig", EXIT_USAGE)
+    return rigs[0]

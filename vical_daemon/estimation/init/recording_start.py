@@ -1,0 +1,100 @@
+"""The motion at the beginning of another recording of the same rig: biases and gravity are new, too.
+
+As `motion_restart`, with gravity and the biases among the unknowns: the board may stand elsewhere, the imu
+was switched off. With the calibration known, all are linear in poses of the target over a second or two:
+p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a; the gyro's bias is by what its turns differ from those seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_model import strapdown
+from vical_daemon.estimation.init.initial_filter import ACCEL_BIAS_SIGMA, GRAVITY_SIGMA, GYRO_BIAS_SIGMA
+from vical_daemon.estimation.init.linear_start import integrate_twice
+from vical_daemon.estimation.init.motion_restart import MotionRestart
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.model.state import BiasStart, Layout, MotionStart, State
+
+_LEAST_IMAGES = 8
+_LEAST_S = 1.5
+"""Of motion: 2 mm of position noise in 15 images are then 10 mm/s^2 of gravity, a milliradian."""
+_MOST_S = 4.0  # of images without enough poses among them; what is older says nothing of the motion now
+_POSITION_SIGMA_M = 2e-3  # of a pose of the target, m: weighs the prior of the bias
+
+
+class RecordingStart(MotionRestart):
+    """Collects the first images of another recording until its motion can start from them."""
+
+    def take(self, frame: PointsFrame, t_cam_s: float, state: State, buffer: ImuBuffer) -> None:
+        """See `MotionRestart.take`; images of long ago are left out."""
+        super().take(frame, t_cam_s, state, buffer)
+        self.drop_before(t_cam_s - _MOST_S)
+
+    def motion(
+        self, state: State, layout: Layout, sigmas: FloatArray, buffer: ImuBuffer
+    ) -> MotionStart | None:
+        """See `MotionRestart.motion`; the time between the recordings is not known, and taken as none."""
+        poses = self._poses(state)
+        if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
+            return None
+        gyro_bias = _gyro_bias(buffer, poses.t_s, poses.R)
+        integrals = None if gyro_bias is None else integrate_twice(buffer, poses.t_s, poses.R, gyro_bias)
+        if gyro_bias is None or integrals is None:
+            return None
+        position, velocity, gravity, accel_bias = _linear(poses.t_s, poses.p, *integrals, state)
+        span_s = float(poses.t_s[-1] - poses.t_s[0])
+        wide = self._sigmas(poses.first, layout, sigmas, span_s)
+        biases = BiasStart(gyro_bias, accel_bias, gravity, GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA, GRAVITY_SIGMA)
+        return MotionStart(float(poses.t_s[0]), poses.R[0], position, velocity, wide, 0.0, biases)
+
+    def gyro_bias(self, state: State, buffer: ImuBuffer) -> FloatArray:
+        """Bias of the gyro by the images so far, rad/s, shape (3,); the state's where they say nothing."""
+        poses = self._poses(state)
+        found = None if poses is None or len(poses.t_s) < 3 else _gyro_bias(buffer, poses.t_s, poses.R)
+        return state.gyro_bias if found is None else found
+
+
+def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> FloatArray | None:
+    """Bias of the gyro by the attitudes seen, rad/s, shape (3,); None where readings are missing.
+
+    log(dR_gyro' dR_seen) = -integral of dR(t)' b dt, with dR from t to the end of each interval.
+    """
+    zero = np.zeros((1, 3))
+    rows, misses = [], []  # unknown beside the bias: the error of the first attitude
+    for k in range(1, len(t_s)):
+        segment = buffer.segment(float(t_s[0]), float(t_s[k]))
+        if segment is None:
+            return None
+        dR = strapdown(segment, zero, zero).dR[0]
+        dt = np.diff(segment.t_s)
+        middle = 0.5 * (dR[1:] + dR[:-1])
+        turned = np.einsum("n,nij->ij", dt, middle)  # of a constant vector, seen from the first attitude
+        rows.append(np.hstack([dR[-1].T @ turned, dR[-1].T]))
+        misses.append(so3.log(dR[-1].T @ R_world_imu[0].T @ R_world_imu[k]))
+    x, *_ = np.linalg.lstsq(np.concatenate(rows), -np.concatenate(misses), rcond=None)
+    return np.asarray(x[:3])
+
+
+def _linear(
+    t_s: FloatArray, p_world_imu: FloatArray, D: FloatArray, B: FloatArray, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Position and velocity at the first pose, gravity of its known length, and the accelerometer's bias."""
+    T = t_s - t_s[0]
+    n, eye = len(T), np.eye(3)
+    A = np.zeros((n, 3, 12))
+    A[:, :, 0:3], A[:, :, 3:6] = eye, T[:, None, None] * eye
+    A[:, :, 6:9], A[:, :, 9:12] = (0.5 * T * T)[:, None, None] * eye, -B
+    noise_m = _POSITION_SIGMA_M
+    prior = np.zeros((3, 12))
+    prior[:, 9:12] = noise_m / ACCEL_BIAS_SIGMA * eye
+    rows = np.concatenate([A.reshape(-1, 12), prior])
+    y = np.concatenate([(p_world_imu - D).ravel(), noise_m / ACCEL_BIAS_SIGMA * state.accel_bias])
+    x, *_ = np.linalg.lstsq(rows, y, rcond=None)
+    gravity = x[6:9] * (np.linalg.norm(state.gravity) / np.linalg.norm(x[6:9]))
+    rest = y - rows[:, 6:9] @ gravity
+    free = [*range(6), *range(9, 12)]
+    x, *_ = np.linalg.lstsq(rows[:, free], rest, rcond=None)
+    return x[:3], x[3:6], gravity, x[6:9]

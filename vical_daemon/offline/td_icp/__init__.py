@@ -1,0 +1,1 @@
+"""Temporal calibration of recordings: where orientations come from, one camera, or any number of sensors."""
