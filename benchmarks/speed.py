@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from benchmarks import speed_detection
+from benchmarks import speed_detection, speed_estimator
 
-PARTS = {"detection": speed_detection.run}
+PARTS = {"detection": speed_detection.run, "estimator": speed_estimator.run}
 """Each prints its Markdown tables; the argument is the number of images a sequence has."""
 
 

@@ -142,7 +142,7 @@ def write(
     args: argparse.Namespace, result: dict[str, Any], more: Callable[[dict[str, Any]], str] | None = None
 ) -> None:
     """Print the result and write it where it was asked for; `more`: text that goes before, for people."""
-    text = json.dumps(_finite(result), allow_nan=False)
+    text = json.dumps(finite(result), allow_nan=False)
     if args.output:
         Path(args.output).write_text(text + "\n", encoding="utf-8")
     if args.json:
@@ -207,13 +207,13 @@ def _words(option: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
     return words
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """Replace NaN and infinity, which JSON has not, by null."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    return [_finite(item) for item in value] if isinstance(value, list | tuple) else value
+        return {key: finite(item) for key, item in value.items()}
+    return [finite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 class ProgressBar:

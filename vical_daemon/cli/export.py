@@ -7,7 +7,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.options import add_json
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from vical_daemon.results.export import ExportFile, Rig
 
 FORMATS = ("kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json")
-_RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recording: 18 hours
 _EPILOG = """\
   vical calibrate log.mcap --target target.yaml -o result.json
   vical export result.json --format kalibr -o camchain-imucam.yaml
@@ -56,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, convert, write."""
+    from vical_daemon.offline.sources import read_source
     from vical_daemon.results.export import export
 
     rig = _complete(read_source(args.source), args)
@@ -99,106 +99,6 @@ def write_files(files: list[ExportFile], output: Path) -> list[Path]:
         path.write_text(file.text, encoding="utf-8")
         paths.append(path)
     return paths
-
-
-def read_source(source: str) -> Rig:
-    """Read a rig from whatever the source is.
-
-    Raises:
-        CliError: Nothing there that holds a calibration.
-    """
-    from vical_daemon.results.export import rig_from_json
-    from vical_daemon.results.export.kalibr import read_camchain
-
-    path = Path(source)
-    if source == "store" and not path.exists():
-        return _from_store()
-    if not path.exists():
-        raise CliError(f"{source}: no such file")
-    if path.suffix in (".yaml", ".yml"):
-        return read_camchain(path)
-    if path.is_dir() or path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
-        return _from_log(path)
-    return rig_from_json(_read_json(path), note=f"vical, from {path.name}")
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    """Read a result; of a file with several lines (`vical demo --json`) the last one counts."""
-    from vical_drivers.user_files import read_text
-
-    try:
-        text = read_text(path, _RESULT_LIMIT)
-        document = json.loads(text)
-    except json.JSONDecodeError as error:
-        lines = [line for line in text.splitlines() if line.strip()]
-        try:
-            document = json.loads(lines[-1]) if lines else None
-        except json.JSONDecodeError:
-            raise CliError(f"{path}: not JSON: {error}") from None
-    except (UnicodeDecodeError, RecursionError):
-        raise CliError(f"{path}: not JSON; give the result of `vical calibrate -o`") from None
-    if not isinstance(document, dict):
-        raise CliError(f"{path}: not a result of `vical calibrate --json`")
-    return document
-
-
-def _from_log(path: Path) -> Rig:
-    """Read the last calibration of every camera, and image sizes, from our own log."""
-    from vical_daemon.bus.messages import (
-        CALIBRATION_TYPE,
-        CAMERA_INFO_TYPE,
-        POSE_TYPE,
-        decode_calibration,
-        decode_camera_info,
-        decode_pose,
-        merge_calibrations,
-    )
-    from vical_daemon.logs.mcap import LogReader
-    from vical_daemon.results.export import rig_from_estimate
-
-    last: dict[str, bytes] = {}
-    sizes: dict[str, tuple[int, int]] = {}
-    devices: dict[str, str] = {}
-    frames: set[str] = set()
-    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-    for file in files:
-        reader = LogReader(file)
-        for message in reader.messages():
-            if message.channel.type_name == CALIBRATION_TYPE:
-                last[message.channel.topic] = message.payload
-            elif message.channel.type_name == POSE_TYPE:
-                frames.add(decode_pose(message.payload).frame_id)
-            elif message.channel.type_name == CAMERA_INFO_TYPE:
-                info = decode_camera_info(message.payload)
-                sizes[info.frame_id] = (info.width, info.height)
-        for name, values in reader.metadata:
-            devices |= values if name == "devices" else {}
-    if not last:
-        raise CliError(
-            f"{path}: no calibration in this log; run `vical calibrate {path} --target FILE -o result.json` "
-            "and export result.json"
-        )
-    estimate = merge_calibrations(decode_calibration(data) for data in last.values())
-    rig = rig_from_estimate(estimate, sizes, note=f"vical, from {path.name}")
-    return replace(rig, devices=devices, imu_frame=frames.pop() if len(frames) == 1 else rig.imu_frame)
-
-
-def _from_store() -> Rig:
-    """Read the newest stored calibration of every camera."""
-    from dataclasses import replace as with_changes
-
-    from vical_daemon.config.paths import state_directory
-    from vical_daemon.results.export import rig_from_estimate
-    from vical_daemon.results.store import CalibrationStore
-
-    folder = state_directory() / "calibration"
-    stored = sorted(CalibrationStore(folder).all(), key=lambda entry: entry.saved_ns)
-    if not stored:
-        raise CliError(f"no calibration is stored in {folder}: nothing has converged on this machine yet")
-    cameras = {entry.camera: entry.known for entry in stored}
-    estimate = with_changes(stored[-1].estimate, cameras=cameras)
-    devices = {"imu": stored[-1].imu_serial} | {f"camera/{e.camera}": e.camera_serial for e in stored}
-    return replace(rig_from_estimate(estimate, note="vical, from the store"), devices=devices)
 
 
 def _complete(rig: Rig, args: argparse.Namespace) -> Rig:

@@ -66,6 +66,7 @@ COMMANDS = (
         "merge", CALIBRATION, "merge recordings of one rig into one calibration, and name those that disagree"
     ),
     Command("td-icp", CALIBRATION, "find the time shift between sensors from their rotations"),
+    Command("verify", CALIBRATION, "check whether a calibration still holds for a recording"),
     Command(
         "observability", CALIBRATION, "show which parameters a motion determines, and what motion is missing"
     ),
@@ -74,6 +75,7 @@ COMMANDS = (
     Command("info", LOGS, "show topics, rates, gaps, drops, jitter and duration of a recording"),
     Command("replay", LOGS, "play a recording on the bus in real time"),
     Command("recover", LOGS, "repair an unfinished MCAP file"),
+    Command("compare", RESULTS, "compare calibrations: in joint sigmas, and in pixels over the image"),
     Command("export", RESULTS, "export a calibration to the format of other software"),
 )
 

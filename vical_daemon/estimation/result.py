@@ -59,11 +59,10 @@ class CameraEstimate:
         readout_axis: What a rolling shutter reads one after the other, `rows` or `columns`; empty: rows, or
             not known (it does not travel in the message, but the announcement that found it does).
         withheld: The same as `unobservable`, as data; [] in logs of older versions.
+        calibration_covariance: Of [px py pz rx ry rz, time shift, fx fy cx cy, distortion] together, m, rad,
+            s, px, rotation error local (right); zero rows where not estimated; lens model errors
+            are not correlated with the pose, unlike above; []: not known (it does not travel in the message).
         stamp_jitter_s: Measured jitter of the image stamps, one standard deviation, s; 0: none found.
-        joint_order: Names of the rows of `joint_covariance`: px py pz rx ry rz timeshift, and where the lens
-            is in doubt fx fy cx cy and its coefficients.
-        joint_covariance: Of mounting, time shift and lens together, m, rad, s, px: the filter's correlations
-            with the sigmas above. [] without a target (neither of the two travels in the message).
     """
 
     T_imu_cam: PoseEstimate
@@ -83,8 +82,7 @@ class CameraEstimate:
     readout_axis: str = ""
     withheld: list[WeakDirection] = field(default_factory=list)
     stamp_jitter_s: float = 0.0
-    joint_order: list[str] = field(default_factory=list)
-    joint_covariance: list[list[float]] = field(default_factory=list)
+    calibration_covariance: list[list[float]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)

@@ -236,7 +236,12 @@ def _config(rig: str, imu: Stream, priors: dict[str, CameraPrior], noise: ImuNoi
 
 
 def run_job(
-    job: Job, progress: Progress, *, keep_frames: bool = False, only: Sequence[int] | None = None
+    job: Job,
+    progress: Progress,
+    *,
+    keep_frames: bool = False,
+    only: Sequence[int] | None = None,
+    enough: Callable[[CalibrationEstimate], bool] | None = None,
 ) -> Outcome:
     """Push the recordings through the roles.
 
@@ -245,6 +250,7 @@ def run_job(
         progress: Called now and then with the share done and the estimate.
         keep_frames: Collect the verdict on every frame.
         only: Numbers of the recordings that are used (`Job.parts`), in this order; None: all.
+        enough: Called with each estimate, once a second of data; True: the rest is not needed.
     """
     frames: list[FrameReport] = []
     bus = LocalBus()
@@ -252,8 +258,12 @@ def run_job(
     keep = frames.extend if keep_frames else None
     events: list[Event] = []
 
+    stop = False
+
     def listen(estimate: CalibrationEstimate) -> CalibrationEstimate:
+        nonlocal stop
         events.extend(estimate.events)
+        stop = stop or (enough is not None and enough(estimate))
         return estimate
 
     role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, inspect=listen, keep=keep)
@@ -272,6 +282,8 @@ def run_job(
         if stamp_sigma_s is not None:
             estimator.stamps_known_to(stamp_sigma_s)
         for key, payload in part.messages():
+            if stop:
+                break
             key = keys[key]
             bus.publish(key, _later(payload, later_ns) if later_ns else payload)
             done += 1
@@ -356,6 +368,7 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     """Return the result as `--json` prints it; `cpu_s` counts from the start of the process."""
     result = outcome.estimate.to_json()
     result["status"] = str(outcome.estimate.status)
+    result["fixed"] = sorted(job.config.calibration.fix)
     result["duration_s"] = job.duration_s
     if outcome.inputs:
         result["duration_s"] = sum(use.duration_s for use in outcome.inputs)

@@ -43,7 +43,8 @@ class Junk:
         self._extreme: dict[str, Callable[[int, str], bytes]] = {
             "imu": self._imu, "image": self._image, "compressed": self._compressed,
             "camera_info": self._camera_info, "points": self._points, "tracks": self._points,
-            "predicted": self._points, "calibration": self._calibration, "pose": self._pose,
+            "predicted": self._points, "calibration": self._calibration, "stored": self._calibration,
+            "pose": self._pose,
             "tf_static": self._transforms, "status": self._status, "command": self._command,
         }  # fmt: skip
 

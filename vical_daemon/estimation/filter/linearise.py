@@ -173,8 +173,10 @@ def view_derivatives(
     R = state.R_world_imu @ turn
     p = state.p_world_imu + ahead_s * (state.v_world_imu + (0.5 * ahead_s) * rates.accel)
     place = image.points * state.target_scale
+    fields = None
     if layout.target_modes is not None and layout.target_shape is not None:
-        place = place + layout.target_modes.fields(image.points) @ state.target_shape
+        fields = layout.target_modes.fields(image.points)
+        place = place + fields @ state.target_shape
     arm = place - p
     x_cam = (arm @ R - cam.p_imu_cam) @ cam.R_imu_cam
     with np.errstate(all="ignore"):
@@ -189,13 +191,12 @@ def view_derivatives(
         ways[:, 6 : 6 + n] = J_lens.reshape(-1, n)
         by_error[6 : 6 + n, where.intrinsics.start : where.distortion.stop] = np.eye(n)
     at = len(by_error) - MODES * (layout.target_shape is not None)
+    by_point = (J @ (R @ cam.R_imu_cam).T).reshape(-1, 2, 3)  # moved in the world
     if layout.target_scale is not None:
-        grown = image.points @ (R @ cam.R_imu_cam)
-        ways[:, at - 1] = np.einsum("ij,ij->i", J, np.repeat(grown, 2, axis=0))
+        ways[:, at - 1] = np.matmul(by_point, image.points[:, :, None]).ravel()
         by_error[at - 1, layout.target_scale] = 1.0
-    if layout.target_modes is not None and layout.target_shape is not None:
-        moved = (R @ cam.R_imu_cam).T @ layout.target_modes.fields(image.points)
-        ways[:, at:] = (J.reshape(-1, 2, 3) @ moved).reshape(-1, MODES)
+    if fields is not None:
+        ways[:, at:] = np.matmul(by_point, fields).reshape(-1, MODES)
         by_error[at:, layout.target_shape] = np.eye(MODES)
     return uv, ways, by_error
 

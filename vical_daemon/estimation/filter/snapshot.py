@@ -6,7 +6,6 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
 from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
@@ -31,7 +30,6 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     q = so3.quat_from_matrix(camera.R_imu_cam)
     pose = spread**2 * pose_covariance(f, where)
     shift_sigma = _timeshift_sigma(f, sigma, where)
-    order, joint = _joint(f, name, np.concatenate([np.sqrt(np.diag(pose)), [shift_sigma], lens_sigma]))
     return CameraEstimate(
         PoseEstimate(
             camera.p_imu_cam.tolist(),
@@ -52,34 +50,40 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         float(sigma[where.readout]) if where.readout is not None else 0.0,
         [int(size) for size in camera.resolution],
         camera.readout_axis,
-        stamp_jitter_s=float(f.shared[name].jitter_s),
-        joint_order=order,
-        joint_covariance=joint.tolist(),
+        stamp_jitter_s=float(f.shared[name].jitter_s) if name in f.shared else 0.0,
+        calibration_covariance=_calibration_covariance(f, name, spread, lens_sigma).tolist(),
     )
 
 
-def _joint(f: CalibrationFilter, name: str, stated: FloatArray) -> tuple[list[str], FloatArray]:
-    """Names and covariance of mounting, time shift and lens: the filter's correlations, the stated sigmas.
+def _calibration_covariance(
+    f: CalibrationFilter, name: str, spread: float, lens_sigma: FloatArray
+) -> FloatArray:
+    """Of [lever arm, rotation, time shift, lens], with the filter's correlations, zeros where not estimated.
 
-    Args:
-        f: The filter.
-        name: Of the camera.
-        stated: Sigmas of pose, time shift and lens, shape (7 + n,); what has none is left out.
+    A lens that is free has the sigmas that are published: what those exceed the filter's is error of the lens
+    model, which is not correlated with the pose. A lens that is held has the filter's own: what the pose
+    would be for another lens follows from its correlation with the pose.
     """
-    where, model = f.layout.cameras[name], f.state.cameras[name].distortion_model
-    names = [*["px", "py", "pz", "rx", "ry", "rz", "timeshift", "fx", "fy", "cx", "cy"], *COEFFICIENTS[model]]
-    slices = (where.position, where.rotation, where.timeshift, where.intrinsics, where.distortion)
-    sizes = (3, 3, 1, 4, len(COEFFICIENTS[model]))
-    rows = np.concatenate(
-        [
-            np.full(n, -1) if s is None else np.arange(s.start, s.stop) if isinstance(s, slice) else [s]
-            for s, n in zip(slices, sizes, strict=True)
-        ]
-    ).astype(int)
-    use = np.flatnonzero((rows >= 0) & (stated > 0.0))
-    raw = f.covariance([int(row) for row in rows[use]])
-    scale = stated[use] / np.sqrt(np.maximum(np.diag(raw), 1e-300))
-    return [names[i] for i in use], raw * np.outer(scale, scale)
+    where, free = f.layout.cameras[name], f.layout.lens_free(name)
+    places = (where.position, where.rotation, where.timeshift, where.intrinsics, where.distortion)
+    first = np.cumsum([0, 3, 3, 1, 4])
+    rows: list[int] = []
+    at: list[int] = []
+    for place, begin in zip(places, first, strict=True):
+        if place is not None:
+            found = [place] if isinstance(place, int) else list(range(place.start, place.stop))
+            rows += found
+            at += range(begin, begin + len(found))
+    out = np.zeros((7 + len(lens_sigma),) * 2)
+    if rows:
+        out[np.ix_(at, at)] = spread**2 * f.covariance(rows)
+    if free:
+        lens = slice(7, None)
+        out[lens, lens] += np.diag(np.maximum(lens_sigma**2 - np.diag(out)[lens], 0.0))
+    if f.unshown is not None:
+        out[:6, :6] += f.unshown.covariance()
+        out[6, 6] += f.unshown.timeshift_sigma_s**2
+    return out
 
 
 def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:

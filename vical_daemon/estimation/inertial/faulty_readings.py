@@ -5,13 +5,15 @@ Both are left out before integration; what remains is a short gap that interpola
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
-
 T = TypeVar("T")
+Six = Sequence[float]
+"""One reading in plain numbers, rad/s and m/s^2: of six, numpy takes ten times as long."""
 
 _AT_RANGE = 8
 """So many readings of one channel at exactly its extreme value, and so many different values close to it: a
@@ -24,13 +26,15 @@ _VALUES = 64
 """Different values close to the extreme that are counted."""
 _SPIKE = 10.0
 """Times the largest error of prediction of late by which a reading must stand out."""
-_HARMFUL = np.array([0.1, 1.0])
+_HARMFUL = (0.1, 1.0)
 """Smaller spikes are left in, rad/s and m/s^2: at 100 Hz one such reading turns the attitude by 1 mrad and
 changes the velocity by 10 mm/s, about what one image leaves open."""
 _FADES = 1.0 - 1.0 / 200.0
 """Of that largest error, a reading: some hundred readings are remembered."""
 _LEARN = 20
 """Readings that show how well the motion is predicted, before any of them can be a spike."""
+_CHANNELS = ((0, 1, 2, 6, 7, 8), (3, 4, 5, 9, 10, 11))
+"""Of each sensor, upwards and downwards."""
 
 
 class RangeLimits:
@@ -42,36 +46,32 @@ class RangeLimits:
     """
 
     def __init__(self) -> None:
-        self._extreme = np.full(12, 1e-9)
-        self._at = np.zeros(12, dtype=np.int64)
+        self._extreme = [1e-9] * 12
+        self._at = [0] * 12
         self._values: list[dict[float, int]] = [{} for _ in range(12)]
-        self._clips = np.zeros(12, dtype=bool)
+        self._clips = [False] * 12
 
-    def clipped(self, six: FloatArray) -> BoolArray:
-        """Tell which channels of a reading (rad/s, m/s^2, shape (6,)) are at their range; shape (6,)."""
-        both = np.concatenate([six, -six])
-        high = both > _NEAR * self._extreme
-        if high.any():
-            for i in np.flatnonzero(high).tolist():
-                self._follow(i, float(both[i]))
-        if not self._clips.any():
-            return self._clips[:6]
-        at_end = both == self._extreme
-        for sensor in (slice(0, 3), slice(3, 6)):
-            opposite = slice(sensor.start + 6, sensor.stop + 6)
-            ends = {
-                *self._extreme[sensor][self._clips[sensor]],
-                *self._extreme[opposite][self._clips[opposite]],
-            }
-            for part in (sensor, opposite):
-                at_end[part] &= np.isin(self._extreme[part], list(ends))
-        clipped: BoolArray = at_end[:6] | at_end[6:]
-        return clipped
+    def clipped(self, six: Six) -> bool:
+        """Whether a channel of a reading (rad/s, m/s^2) is at the end of its range."""
+        both = [*six, *[-x for x in six]]
+        extreme = self._extreme
+        for i, value in enumerate(both):
+            if value > _NEAR * extreme[i]:
+                self._follow(i, value)
+        return any(self._clips) and any(
+            both[i] == extreme[i] and extreme[i] in self._ends(channels)
+            for channels in _CHANNELS
+            for i in channels
+        )
+
+    def _ends(self, channels: Sequence[int]) -> set[float]:
+        """Where the range of a sensor ends."""
+        return {self._extreme[i] for i in channels if self._clips[i]}
 
     def _follow(self, i: int, value: float) -> None:
-        extreme, values = float(self._extreme[i]), self._values[i]
+        extreme, values = self._extreme[i], self._values[i]
         if value > extreme:
-            values[extreme] = int(self._at[i])
+            values[extreme] = self._at[i]
             self._values[i] = {v: n for v, n in values.items() if v > _NEAR * value}
             self._extreme[i], self._at[i], self._clips[i] = value, 1, False
         elif value == extreme:
@@ -97,55 +97,64 @@ class SpikeFilter(Generic[T]):
     """
 
     def __init__(self) -> None:
-        self.held: tuple[FloatArray, T] | None = None
+        self.held: tuple[Six, T] | None = None
         self.spikes = 0
-        self._last: FloatArray = np.full(6, np.nan)
-        self._before: FloatArray = np.full(6, np.nan)
-        self._largest = np.zeros(2)  # error of prediction of late: gyro rad/s, accelerometer m/s^2
-        self._first: list[FloatArray] = []
+        self._last: Six = (math.nan,) * 6
+        self._before: Six = (math.nan,) * 6
+        self._largest = [0.0, 0.0]  # error of prediction of late: gyro rad/s, accelerometer m/s^2
+        self._first: list[tuple[float, float]] = []
         self._count = 0
 
     def restart(self) -> None:
         """Another recording follows: its first readings do not go on from the last ones."""
         self.held, self._count = None, 0
-        self._last, self._before = np.full(6, np.nan), np.full(6, np.nan)
+        self._last = self._before = (math.nan,) * 6
 
-    def sift(self, six: FloatArray, item: T) -> list[T]:
-        """Take a reading (rad/s, m/s^2, shape (6,)) and return the items of those that are good, in order."""
+    def sift(self, six: Six, item: T) -> list[T]:
+        """Take a reading (rad/s, m/s^2) and return the items of those that are good, in order."""
         if self.held is not None:
             held_six, held_item = self.held
             self.held = None
-            back = np.linalg.norm((six - self._last).reshape(2, 3), axis=1)
-            off = np.linalg.norm((held_six - self._last).reshape(2, 3), axis=1)
-            which = int((off / np.maximum(self._largest, 1e-12)).argmax())
+            back, off = _apart(six, self._last), _apart(held_six, self._last)
+            gyro, accel = (x / max(usual, 1e-12) for x, usual in zip(off, self._largest, strict=True))
+            which = int(accel > gyro)
             if back[which] < 0.5 * off[which]:
                 self.spikes += 1
-                self._note(six)
+                self._note(six, self._missed(six))
                 return [item]
-            self._note(held_six)
-            self._note(six)
+            self._note(held_six, self._missed(held_six))
+            self._note(six, self._missed(six))
             return [held_item, item]
         missed = self._missed(six)
-        stands_out = missed > np.maximum(_SPIKE * self._largest, _HARMFUL)
-        if len(self._first) >= _LEARN and stands_out.sum() == 1:
+        gyro_off, accel_off = (
+            size > max(_SPIKE * usual, harmful)
+            for size, usual, harmful in zip(missed, self._largest, _HARMFUL, strict=True)
+        )
+        if len(self._first) >= _LEARN and gyro_off != accel_off:
             self.held = six, item
             return []
-        self._note(six)
+        self._note(six, missed)
         return [item]
 
-    def _missed(self, six: FloatArray) -> FloatArray:
-        error = (six - 2.0 * self._last + self._before).reshape(2, 3)
-        size: FloatArray = np.sqrt((error**2).sum(axis=1))
-        return size
+    def _missed(self, six: Six) -> tuple[float, float]:
+        """Errors of the prediction: gyro rad/s, accelerometer m/s^2."""
+        return _apart(six, [2.0 * x - y for x, y in zip(self._last, self._before, strict=True)])
 
-    def _note(self, six: FloatArray) -> None:
+    def _note(self, six: Six, missed: tuple[float, float]) -> None:
         if self._count >= 2:
-            missed = self._missed(six)
             if len(self._first) < _LEARN:  # there may be spikes among the first readings
                 self._first.append(missed)
-                self._largest = 2.0 * np.median(self._first, axis=0)
+                self._largest = (2.0 * np.median(self._first, axis=0)).tolist()
             else:  # one that was not noticed at most doubles it
-                missed = np.minimum(missed, 2.0 * self._largest)
-                self._largest = np.maximum(missed, _FADES * self._largest)
+                self._largest = [
+                    max(min(size, 2.0 * usual), _FADES * usual)
+                    for size, usual in zip(missed, self._largest, strict=True)
+                ]
         self._before, self._last = self._last, six
         self._count += 1
+
+
+def _apart(a: Six, b: Six) -> tuple[float, float]:
+    """How far two readings are from each other: gyro rad/s, accelerometer m/s^2."""
+    x, y, z, u, v, w = [p - q for p, q in zip(a, b, strict=True)]
+    return math.sqrt(x * x + y * y + z * z), math.sqrt(u * u + v * v + w * w)

@@ -15,7 +15,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _LEARN = 20  # readings by which the usual interval is known
-_MOST = np.repeat([MOST_RPS, MOST_MPS2], 3)
+_MOST = (MOST_RPS,) * 3 + (MOST_MPS2,) * 3
 _CLIPPED_S = 5.0  # after the first clipped reading, their share is announced
 _UNSEEN_S = 0.5
 """After a jump of the stamps an image is waited for so long, s: a slow camera takes two a second."""
@@ -63,7 +63,7 @@ class ImuIntake:
         self._set_back_s = 0.0  # by how much the clock has been set back in all
         self._newest_s = -np.inf  # stamp as it came, plus what the clock has been set back
         self._held: tuple[float, Reading] | None = None
-        self._last = np.full(6, np.nan)
+        self._last: tuple[float, ...] = ()
         self._repeats = 0  # of the newest reading
         self._limits = RangeLimits()
         self._spikes: SpikeFilter[Reading] = SpikeFilter()
@@ -110,12 +110,11 @@ class ImuIntake:
         Returns:
             The readings added: none, this one, or the one held before and this one.
         """
-        reading = Reading(t_imu_ns, np.array(gyro_rps, np.float64), np.array(specific_force_mps2, np.float64))
-        six = np.concatenate([reading.gyro_rps, reading.specific_force_mps2])
-        if not (np.abs(six) <= _MOST).all():  # NaN is not, either
+        six = (*map(float, gyro_rps), *map(float, specific_force_mps2))
+        if not all(-most <= x <= most for x, most in zip(six, _MOST, strict=True)):  # NaN is not, either
             self.refused += 1
             return []
-        if (six == self._last).all():
+        if six == self._last:
             self.repeated += 1
             self._repeats += 1
             return []
@@ -123,8 +122,9 @@ class ImuIntake:
         if self.buffer is None:
             self.base_ns = t_imu_ns
             self.buffer = ImuBuffer(t_imu_ns)
+        values = np.array(six)
         added = []
-        for good in self._spikes.sift(six, reading):
+        for good in self._spikes.sift(six, Reading(t_imu_ns, values[:3], values[3:])):
             added += self._unless_clipped(self.buffer, good)
         return added
 
@@ -132,7 +132,7 @@ class ImuIntake:
         """Add a reading whose channels are all within their range; what others read is not known."""
         t_s = (reading.t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
         self._taken += 1
-        if self._limits.clipped(np.concatenate([reading.gyro_rps, reading.specific_force_mps2])).any():
+        if self._limits.clipped([*reading.gyro_rps.tolist(), *reading.specific_force_mps2.tolist()]):
             self.clipped += 1
             self._clips += 1
             self._clipping = self._clipping or (t_s, self._taken, self.clipped)

@@ -47,11 +47,11 @@ def by_entries(
     Returns:
         By [bias 6, entries 15], rows as in `Influence`, shape (9, 21).
     """
-    at = errors.weights[:, None, None] * errors.at
-    turned, forced = at[:, :, :3], at[:, :, 3:]
-    rate, force = segment.gyro - bias[:3], segment.accel - bias[3:]
-    out, by_bias = np.empty((9, 6 + ENTRIES)), errors.by_bias()
+    at = (errors.weights[:, None, None] * errors.at).reshape(-1, 54)
+    readings = np.concatenate([segment.gyro - bias[:3], segment.accel - bias[3:]], axis=1)
+    both = (at.T @ readings).reshape(9, 6, 6)  # end, error of rate or force, reading
+    out, by_bias = np.empty((9, 6 + ENTRIES)), -at.sum(axis=0).reshape(9, 6)
     out[:, :3], out[:, 3:6] = by_bias[:, :3] @ gyro_matrix, by_bias[:, 3:] @ accel_matrix
-    out[:, 6:15] = np.einsum("nai,nj->aij", turned, rate).reshape(9, 9)
-    out[:, 15:] = np.einsum("nai,nj->aij", forced, force)[:, LOWER[:, 0], LOWER[:, 1]]
+    out[:, 6:15] = both[:, :3, :3].reshape(9, 9)
+    out[:, 15:] = both[:, 3 + LOWER[:, 0], 3 + LOWER[:, 1]]
     return out

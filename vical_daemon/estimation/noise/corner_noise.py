@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,6 @@ class CornerNoise:
             keep = self.memory / self._dof
             self._sum *= keep
             self._dof *= keep
-        guess = _GUESS_DOF * np.exp(-self._dof / _GUESS_FADES)
+        guess = _GUESS_DOF * math.exp(-self._dof / _GUESS_FADES)
         square = (self._sum + guess * self.guess_px**2) / (self._dof + guess)
-        self.sigma_px = float(np.clip(np.sqrt(square), _LEAST_PX, 20.0))
+        self.sigma_px = min(max(math.sqrt(square), _LEAST_PX), 20.0)

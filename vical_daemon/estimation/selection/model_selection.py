@@ -130,20 +130,26 @@ def log_bayes_factor(
         factor: What was learnt beyond the prior is worth so many times less than the covariance says.
         share: Not zero, but as near to it as that share of the prior's sigma, shape (n,); None: zero.
     """
-    information = np.linalg.inv(covariance)
-    learnt = (information - np.eye(len(values))) / factor
-    weighted = information @ values / factor
-    off = _log_evidence(learnt, weighted)
+    L = root(covariance)
+    standard = fitted = solve_lower(L, values)
+    size = -np.log(L.diagonal()).sum() - 0.5 * len(values) * np.log(factor)
+    if factor != 1.0:
+        # with C = L L' and M M' = I + (factor - 1) L'L: I + (C^-1 - I) / factor = L^-T M M' L^-1 / factor
+        M = root(np.eye(len(values)) + (factor - 1.0) * (L.T @ L))
+        fitted, size = solve_lower(M, standard), size + np.log(M.diagonal()).sum()
+    off = 0.5 * min(float(fitted @ fitted) / factor, 2.0 * _MOST) - float(size)
     if share is None or not share.any():
         return off
-    return off - _log_evidence(share[:, None] * learnt * share, share * weighted)
+    inverse = solve_lower(L, np.diag(share))  # with the share of each value on its right
+    learnt = (inverse.T @ inverse - np.diag(share**2)) / factor
+    return off - _log_evidence(learnt, inverse.T @ standard / factor)
 
 
 def _log_evidence(learnt: FloatArray, weighted: FloatArray) -> float:
     """Logarithm of how likely data are under a prior of unit variance, over that under exact zeros."""
-    total = np.eye(len(weighted)) + learnt
-    fits = float(weighted @ np.linalg.solve(total, weighted))
-    return 0.5 * min(fits, 2.0 * _MOST) - 0.5 * float(np.linalg.slogdet(total)[1])
+    L = root(np.eye(len(weighted)) + learnt)
+    fitted = solve_lower(L, weighted)
+    return 0.5 * min(float(fitted @ fitted), 2.0 * _MOST) - float(np.log(L.diagonal()).sum())
 
 
 def factor(f: CalibrationFilter) -> float:
@@ -204,14 +210,16 @@ def posterior(
     """
     ends = np.cumsum([len(x) for x in values.values()])
     places = {name: np.arange(end - len(x), end) for (name, x), end in zip(values.items(), ends, strict=True)}
+    every = np.concatenate([np.zeros(0), *values.values()])
+    stated = [(shares or {}).get(name, np.zeros(len(x))) for name, x in values.items()]
+    share = np.concatenate(stated) if shares else None
     logs = {}
     for true in (c for n in range(len(values) + 1) for c in combinations(values, n)):
         logs[true] = len(true) * np.log(1.0 - OFF) + (len(values) - len(true)) * np.log(OFF)
         if true:
             at = np.concatenate([places[name] for name in true])
-            zero = np.concatenate([values[name] for name in true])
-            share = np.concatenate([(shares or {}).get(name, np.zeros(len(values[name]))) for name in true])
-            logs[true] -= log_bayes_factor(zero, covariance[np.ix_(at, at)], less, share)
+            near = None if share is None else share[at]
+            logs[true] -= log_bayes_factor(every[at], covariance[at[:, None], at], less, near)
     most = max(logs.values())
     total = sum(np.exp(x - most) for x in logs.values())
     return {true: float(np.exp(x - most) / total) for true, x in logs.items()}

@@ -183,7 +183,8 @@ class Bundle:
         S = Y.T @ Y
         s = Y.T @ u
         H, g = normal.H.copy(), normal.g.copy()
-        at = np.concatenate([order.frames[:, :6].reshape(6 * F), order.calib])
+        camera = order.calib[: len(self.problem.of_camera)]
+        at = np.concatenate([order.frames[:, :6].reshape(6 * F), camera])
         n, m = 9 * (F - 1), 6 * (F - 1)  # by a view where unknowns lie evenly: a fifth of the time
         H[:n, :n].reshape(F - 1, 9, F - 1, 9)[:, :6, :, :6] -= S[:m, :m].reshape(F - 1, 6, F - 1, 6)
         H[np.ix_(at[m:], at)] -= S[m:]
@@ -214,7 +215,7 @@ class Bundle:
                 lam = max(10.0 * lam, 1e-6)
                 continue
             H[np.diag_indices_from(H)] *= 1.0 + lam
-            root, info = dpotrf(H, lower=1, overwrite_a=1)
+            root, info = _in_place(H)
             if info == 0:
                 dx = -dpotrs(root, g, lower=1)[0]
                 right = normal.gl + np.matmul(normal.W, dx[at])
@@ -282,13 +283,13 @@ class Bundle:
             H = self._reduced(normal, 0.0)[0]
         except np.linalg.LinAlgError:
             return None
-        root, info = dpotrf(H, lower=1, overwrite_a=1)
+        root, info = _in_place(H)
         if info:
             return None
         tail = order.tail
         L22 = np.tril(root[tail:, tail:])
         try:
-            covariance = np.linalg.inv(L22 @ L22.T)
+            covariance = np.asarray(np.linalg.inv(L22 @ L22.T), dtype=np.float64)
         except np.linalg.LinAlgError:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
@@ -314,6 +315,15 @@ class Bundle:
             len(seen.begin),
             parallax_deg(w, seen),
         )
+
+
+def _in_place(H: FloatArray) -> tuple[FloatArray, int]:
+    """Lower Cholesky factor of a symmetric matrix in its place, with rubbish above it; and LAPACK's info.
+
+    Seen as its transpose it is in LAPACK's order: neither copying nor zeroing it saves a third of the time.
+    """
+    root, info = dpotrf(H.T, lower=1, overwrite_a=1, clean=0)
+    return root, int(info)
 
 
 def orthonormal_all(R: FloatArray) -> FloatArray:

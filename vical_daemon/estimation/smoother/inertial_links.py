@@ -16,6 +16,8 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer, ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence, Strapdown, influence, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
+from vical_daemon.estimation.model.unscented import root as root_of
+from vical_daemon.estimation.model.unscented import solve_lower
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
 _EYE = np.eye(3)
@@ -70,7 +72,7 @@ def make_link(
     if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
         return None
     motion, errors, by_imu = _integrated(segment, imu[:6], imu[6:])
-    root = np.linalg.inv(np.linalg.cholesky(errors.noise(noise)[_ORDER[:, None], _ORDER]))
+    root = solve_lower(root_of(errors.noise(noise)[_ORDER[:, None], _ORDER]), np.eye(9))
     return Link(
         float(motion.t_s[-1]),
         motion.dR[0, -1],

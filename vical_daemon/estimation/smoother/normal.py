@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
 from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import read_share
@@ -16,7 +16,7 @@ from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.smoother.carry import (
     ARM,
     DRIFT,
-    FULL,
+    INERTIAL,
     LENS,
     READOUT,
     SHIFT,
@@ -42,7 +42,7 @@ class Normal(NamedTuple):
         H: Of the states, ordered as `Order`, shape (n, n).
         g: Gradient, shape (n,).
         V: Blocks of the landmarks, shape (L, 3, 3).
-        W: Coupling of landmarks to [turn, position] of the images and to the calibration, (L, 3, 6 F + k).
+        W: Coupling of landmarks to [turn, position] of the images and to the camera, (L, 3, 6 F + c).
         gl: Gradient of the landmarks, shape (L, 3).
         cost: Sum of the (robust) squares.
     """
@@ -72,6 +72,8 @@ class Problem:
         self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
         self.jitter_s = jitter_s
         self.active = np.flatnonzero(carry.active)
+        self.of_camera = self.active[self.active < INERTIAL.start]  # the imu's own do not move pixels
+        self._columns = _slice(self.of_camera)
 
     def order(self) -> Order:
         """Places of the unknowns."""
@@ -112,7 +114,7 @@ class Problem:
         y = self._rays(seen)[0]
         cam = self.window.camera
         with np.errstate(all="ignore"):
-            uv = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)[0]
+            uv = project(y, cam.intrinsics, cam.distortion, cam.distortion_model)
         return self._weigh(seen, uv)
 
     def _weigh(self, seen: Seen, uv: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
@@ -141,13 +143,13 @@ class Problem:
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
         JW = JR @ Rt  # by the point in the world
         Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
-        Jc = np.zeros((len(e), 2, FULL))
+        Jc = np.empty((len(e), 2, INERTIAL.start))
         Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, cross(Jy, y[:, None])
         Jc[:, :, SHIFT] = self._by_shift(seen, JR, R, x_imu, rates)
         Jc[:, :, LENS] = Jlens
         Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
         Jc[:, :, READOUT] = Jc[:, :, SHIFT] * seen.row[:, None]
-        Jc = Jc[:, :, self.active]
+        Jc = Jc[:, :, self._columns]
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
         by_rho = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
@@ -212,8 +214,9 @@ class Problem:
         cost: float,
     ) -> Normal:
         w = self.window
-        F, k, L = len(w.frames), len(self.active), len(seen.begin)
+        F, k, L = len(w.frames), len(self.of_camera), len(seen.begin)
         order = self.order()
+        calib = order.calib[:k]
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
         begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
         Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
@@ -222,12 +225,12 @@ class Problem:
         pose = order.frames[:, :6]
         at = pose[fw]
         H[at[:, :, None], at[:, None, :]] += blocks[:, :, :6]
-        H[at[:, :, None], order.calib] += blocks[:, :, 6:-1]
-        H[order.calib[:, None], at.reshape(1, -1)] += blocks[:, :, 6:-1].reshape(-1, k).T
+        H[at[:, :, None], calib] += blocks[:, :, 6:-1]
+        H[calib[:, None], at.reshape(1, -1)] += blocks[:, :, 6:-1].reshape(-1, k).T
         g[at] += blocks[:, :, -1]
         flat = Jc.reshape(-1, k)
-        H[order.calib[:, None], order.calib] += flat.T @ flat
-        g[order.calib] += flat.T @ e.reshape(-1)
+        H[calib[:, None], calib] += flat.T @ flat
+        g[calib] += flat.T @ e.reshape(-1)
         own = _products(Jl, np.concatenate([Jl, Jall[:, :, 6:]], axis=2), begin)
         V = own[:, :, :3].copy()
         V[:, 2, 2] += _INVERSE_SIGMA**-2
@@ -279,6 +282,11 @@ class Problem:
         H[turn[:, None], turn] += _GAUGE * np.outer(up, up)
         H[place, place] += _GAUGE
         return float(e @ e)
+
+
+def _slice(index: IntArray) -> IntArray | slice:
+    """The same places as a slice where they are the first ones: that copies nothing."""
+    return slice(len(index)) if np.array_equal(index, np.arange(len(index))) else index
 
 
 def _products(A: FloatArray, B: FloatArray, begin: IntArray) -> FloatArray:

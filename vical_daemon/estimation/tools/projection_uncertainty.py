@@ -44,7 +44,7 @@ def projection_sigma_px(
         intrinsics: fx fy cx cy, px, shape (4,).
         distortion: Coefficients of the model, shape (d,).
         model: radtan, plumb_bob or equidistant.
-        order: Names of the rows of `covariance`, as in `CameraEstimate.joint_order`.
+        order: Names of the rows of `covariance`: px py pz rx ry rz timeshift fx fy cx cy and coefficients.
         covariance: Joint covariance; what is not in it counts as known.
 
     Returns:

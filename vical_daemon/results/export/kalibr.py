@@ -61,13 +61,13 @@ def write_imu(noise: ImuNoise, topic: str = "/imu0", note: str = "") -> str:
 
 
 def read_camchain(path: Path) -> Rig:
-    """Read camchain-imucam.yaml (every camera needs its own T_cam_imu, or a chain to one).
+    """Read camchain-imucam.yaml (every camera needs its own T_cam_imu, or a chain to one), or OpenVINS's.
 
     Raises:
         ExportError: Not such a file; the message says which key is missing or wrong.
     """
     try:
-        text = read_text(path, MAX_BYTES)
+        text = read_text(path, MAX_BYTES).removeprefix("%YAML:1.0")  # OpenCV's first line, in OpenVINS's file
         refuse_hostile(text, path.name)
         document = yaml.safe_load(text)
     except OSError as error:
@@ -99,6 +99,8 @@ def _read_camera(name: str, block: Any, T_before_imu: FloatArray | None, path: P
         raise ExportError(f"{path}: {name}.distortion_model {model!r} is neither radtan nor equidistant")
     if "T_cam_imu" in block:
         T_cam_imu = _matrix(block["T_cam_imu"], f"{name}.T_cam_imu", path)
+    elif "T_imu_cam" in block:  # OpenVINS
+        T_cam_imu = np.asarray(np.linalg.inv(_matrix(block["T_imu_cam"], f"{name}.T_imu_cam", path)))
     elif "T_cn_cnm1" in block and T_before_imu is not None:
         T_cam_imu = _matrix(block["T_cn_cnm1"], f"{name}.T_cn_cnm1", path) @ T_before_imu
     else:

@@ -35,6 +35,8 @@ class RigCamera:
         topic: ROS topic of the images.
         rate_hz: Frames a second; None: not known.
         unobservable: Directions that the motion did not reveal: do not use their values.
+        lens_sigma: Standard deviations of fx fy cx cy and the distortion; (): not known.
+        calibration_covariance: See `CameraEstimate`, shape (7 + n, 7 + n); None: not known.
     """
 
     name: str
@@ -52,6 +54,8 @@ class RigCamera:
     rate_hz: float | None = None
     unobservable: tuple[str, ...] = ()
     readout_axis: str = ""
+    lens_sigma: tuple[float, ...] = ()
+    calibration_covariance: FloatArray | None = None
 
     @property
     def T_imu_cam(self) -> FloatArray:
@@ -114,6 +118,9 @@ class Rig:
         reason: Reason of the status, as text.
         t_ns: Stamp of the newest data used, UNIX ns; 0: not known.
         devices: Serial numbers by device, e.g. ``camera/cam0``.
+        duration_s: Seconds of data used; 0: not known.
+        fixed: What was held at given values (as `--fix`).
+        bias_sigmas: Of gyro (rad/s) and accelerometer (m/s^2) biases, shape (6,); None: not known.
     """
 
     cameras: dict[str, RigCamera]
@@ -130,6 +137,9 @@ class Rig:
     reason: str = ""
     t_ns: int = 0
     devices: dict[str, str] = field(default_factory=dict)
+    duration_s: float = 0.0
+    fixed: tuple[str, ...] = ()
+    bias_sigmas: FloatArray | None = None
 
     @property
     def header(self) -> str:

@@ -66,7 +66,15 @@ def rig_from_json(document: dict[str, Any], noise: ImuNoise | None = None, note:
         reason=str(document.get("reason") or document.get("guidance") or ""),
         t_ns=int(document.get("t_ns") or 0),
         devices={str(k): str(v) for k, v in (document.get("devices") or {}).items()},
+        duration_s=float(document.get("duration_s") or 0.0),
+        fixed=tuple(str(what) for what in document.get("fixed") or ()),
+        bias_sigmas=_bias_sigmas(imu),
     )
+
+
+def _bias_sigmas(imu: dict[str, Any]) -> FloatArray | None:
+    sigmas = [*(imu.get("gyro_bias_sigma_rps") or ()), *(imu.get("accel_bias_sigma_mps2") or ())]
+    return np.array(sigmas, dtype=np.float64) if len(sigmas) == 6 else None
 
 
 def _camera(name: str, entry: Any) -> RigCamera:
@@ -82,6 +90,8 @@ def _camera(name: str, entry: Any) -> RigCamera:
             raise ValueError(f"{len(distortion)} distortion coefficients for {model!r}")
         size = entry.get("resolution")
         sigma = entry.get("timeshift_sigma_s")
+        lens_sigma = [*(entry.get("intrinsics_sigma") or ()), *(entry.get("distortion_sigma") or ())]
+        joint, n = entry.get("calibration_covariance"), 11 + len(distortion)
         camera = RigCamera(
             name=name,
             R_imu_cam=so3.matrix_from_quat(q / np.linalg.norm(q)),
@@ -96,6 +106,8 @@ def _camera(name: str, entry: Any) -> RigCamera:
             readout_s=float(entry.get("readout_s") or 0.0),
             readout_axis=str(entry.get("readout_axis") or ""),
             unobservable=tuple(entry.get("unobservable") or ()),
+            lens_sigma=tuple(float(v) for v in lens_sigma) if len(lens_sigma) == n - 7 else (),
+            calibration_covariance=None if not joint else np.array(joint, dtype=np.float64).reshape(n, n),
         )
     except KeyError as error:
         raise ExportError(f"cameras.{name}: no key {error}") from error

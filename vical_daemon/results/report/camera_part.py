@@ -15,7 +15,7 @@ from vical_daemon.estimation.tools.projection_uncertainty import over_image
 from vical_daemon.results.report import coverage_figures, figures, page, scene, values, worst
 from vical_daemon.results.report.board_views import BoardView, board_views
 from vical_daemon.results.report.residuals import FrameResiduals, cells, gather
-from vical_daemon.results.report.verdict import limits
+from vical_daemon.results.report.verdict import joint_covariance, limits
 
 if TYPE_CHECKING:
     from vical_daemon.results.report.writer import Gallery, Images
@@ -114,10 +114,10 @@ class CameraPart:
         )
 
     def _projection(self) -> list[str]:
-        order, joint = self.camera.get("joint_order"), self.camera.get("joint_covariance")
-        if not order or not joint:
+        order, covariance = joint_covariance(self.camera)
+        if not order:
             return []
-        covariance, maps, words = np.array(joint, dtype=np.float64), [], []
+        maps, words = [], []
         for distance, title in _DISTANCES:
             sigma = over_image(self.size, distance, self.R, self.K, self.D, self.model, order, covariance)
             if not np.isfinite(sigma).any() or not np.nanmax(sigma) > 0:

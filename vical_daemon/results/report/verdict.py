@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,12 +106,22 @@ def main_cause(camera: Mapping[str, Any], *, lens_held: bool = False) -> str:
     )
 
 
+def joint_covariance(camera: Mapping[str, Any]) -> tuple[list[str], FloatArray]:
+    """Names and covariance of what is estimated of a camera; empty where the result does not hold it."""
+    stored = camera.get("calibration_covariance")
+    if not stored:
+        return [], np.zeros((0, 0))
+    names = [*POSITION, *ROTATION, "timeshift", *lens_names(str(camera["distortion_model"]))]
+    whole = np.array(stored, dtype=np.float64).reshape(len(names), len(names))
+    use = np.flatnonzero(np.diag(whole) > 0.0)
+    return [names[i] for i in use], whole[np.ix_(use, use)]
+
+
 def lens_share(camera: Mapping[str, Any]) -> float:
     """Share of the variance of the lever arm (worst direction) that the unknown lens adds; 0: not known."""
-    order = camera.get("joint_order") or []
+    order, joint = joint_covariance(camera)
     if "px" not in order or "fx" not in order:
         return 0.0
-    joint = np.array(camera["joint_covariance"], dtype=np.float64)
     whole = sigma_if_known(order, joint, POSITION, ())
     known = sigma_if_known(order, joint, POSITION, lens_names(str(camera.get("distortion_model"))))
     return 1.0 - (known / whole) ** 2 if whole > 0 else 0.0
@@ -153,11 +163,11 @@ def limits(result: Mapping[str, Any], camera: Mapping[str, Any]) -> list[tuple[s
 
 def _stamps(camera: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """How well the time shift is known, and how well the data alone would have it."""
-    stated, order = float(camera["timeshift_sigma_s"]), camera.get("joint_order") or []
+    stated, (order, joint) = float(camera["timeshift_sigma_s"]), joint_covariance(camera)
     if "timeshift" not in order or stated <= 0:
         return []
     k = order.index("timeshift")
-    data = math.sqrt(max(float(camera["joint_covariance"][k][k]), 0.0))
+    data = math.sqrt(float(joint[k, k]))
     text = f"time shift {_two(1e3 * stated)} ms"
     if data < _DATA_ALONE * stated:
         return [
@@ -168,10 +178,9 @@ def _stamps(camera: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def _shares(camera: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """What lens and time shift add to the sigmas of the mounting."""
-    order: Sequence[str] = camera.get("joint_order") or []
+    order, joint = joint_covariance(camera)
     if not order:
         return []
-    joint = np.array(camera["joint_covariance"], dtype=np.float64)
     lens = lens_names(str(camera.get("distortion_model")))
     rows = []
     for cause, known in (("lens", lens), ("time shift", ("timeshift",))):

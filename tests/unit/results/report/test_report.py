@@ -242,7 +242,7 @@ def with_joint(result, lens_sigma_px):
     sigma = np.concatenate([np.sqrt(np.diag(pose)), [1.8e-5], [lens_sigma_px] * 4, [1e-3] * 4])
     correlation = np.eye(len(order))
     correlation[2, 7] = correlation[7, 2] = 0.9 if lens_sigma_px > 1 else 0.1
-    camera["joint_order"], camera["joint_covariance"] = order, (correlation * np.outer(sigma, sigma)).tolist()
+    camera["calibration_covariance"] = (correlation * np.outer(sigma, sigma)).tolist()
     return camera
 
 

@@ -1,0 +1,69 @@
+"""Are the differences that `vical compare` finds as large as it says? Independent halves of rigs of the zoo.
+
+python -m benchmarks compare --trials 30
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from vical_mocks.harness.feed import CAMERA, StartErrors, camera_prior
+from vical_mocks.random_rigs import draw
+
+from benchmarks import runner
+from benchmarks.verify import again, estimate
+from vical_daemon.results.compare import FALSE_ALARM, judge
+from vical_daemon.results.difference import difference
+from vical_daemon.results.export import rig_from_estimate
+from vical_daemon.results.known import keys, known_cameras
+
+
+def trial(target_free: bool, seconds: float, seed: int) -> runner.Result:
+    """One rig, calibrated twice with independent noise."""
+    run, _ = draw(seed, seconds, target_free=target_free)
+    known = []
+    for which in (run, again(run, run.rig, seed, seconds, target_free=target_free)):
+        last = estimate(
+            which, camera_prior(run, seed, StartErrors(), exact_lens=True), target_free=target_free
+        )
+        if not last.cameras:
+            return {"z": None}
+        camera = known_cameras(rig_from_estimate(last), "half")[CAMERA]
+        known.append(replace(camera, begin_ns=0, end_ns=0))
+    apart = difference(*known)
+    verdict = judge(apart)
+    z = (apart.d / apart.sigma).tolist()
+    return {
+        "z": z,
+        "names": keys(apart.model, lens=True),
+        "chi_square": verdict.chi_square,
+        "p": verdict.probability,
+    }
+
+
+def main(argv: list[str]) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks compare", description=__doc__)
+    runner.add_arguments(parser, trials=30, seconds=12.0)
+    parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
+    args = parser.parse_args(argv)
+    name = f"compare_{'free' if args.target_free else 'board'}_{args.seconds:g}s"
+    code = runner.fingerprint("vical_daemon", "benchmarks", "mocks/vical_mocks")
+    work = partial(trial, args.target_free, args.seconds)
+    results = [r for r in runner.run_trials(name, work, runner.seeds_of(args), args, code) if r["z"]]
+    z, p = runner.array(results, "z"), runner.array(results, "p")
+    print("| pairs | RMS of z: position | rotation | time shift | lens | chi2 / 15: median, mean | changed |")
+    print("|---|---|---|---|---|---|---|")
+    rms = [
+        f"{np.sqrt(np.mean(z[:, at] ** 2)):.2f}"
+        for at in (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 15))
+    ]
+    ratio = runner.array(results, "chi_square") / 15.0
+    print(
+        f"| {len(results)} | {' | '.join(rms)} | {np.median(ratio):.2f}, {np.mean(ratio):.2f} "
+        f"| {int(np.sum(p < FALSE_ALARM))} |"
+    )
+    return 0

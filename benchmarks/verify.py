@@ -1,0 +1,173 @@
+"""Does `vical verify` see what has changed, in time, and leave alone what has not?
+
+python -m benchmarks verify --trials 40                 rigs of the zoo, a board, 5 s
+python -m benchmarks verify --trials 20 --target-free   without a board, 20 s
+
+Every rig is calibrated once (`--stored` seconds, other noise), then verified with a recording of its
+own. Half of the rigs have changed in between, one block each, by what counts as a change.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from vical_mocks.harness.feed import (
+    CAMERA,
+    CalibratorSubject,
+    StartErrors,
+    camera_prior,
+    events_in_order,
+    imu_noise,
+    points_frame,
+)
+from vical_mocks.points import SimulatedFrame, SimulatedRun, simulate
+from vical_mocks.random_rigs import draw
+from vical_mocks.rig import Rig
+from vical_mocks.rotations import exp_so3
+from vical_mocks.tracks import simulate_tracks
+
+from benchmarks import runner
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.result import CalibrationEstimate
+from vical_daemon.offline.verify import Answer, CameraCheck, Verifier
+from vical_daemon.results.change_odds import Counts
+from vical_daemon.results.export import rig_from_estimate
+from vical_daemon.results.known import KnownCamera, known_cameras
+
+WAYS = ("none", "rotation", "none", "position", "none", "time shift", "none", "lens")
+"""What has changed, by the seed: every other rig has not."""
+_SEED_OF_TODAY = 100_000
+
+
+def changed(rig: Rig, way: str, seed: int) -> Rig:
+    """The rig with one block changed by what counts, in a random direction."""
+    rng, counts = np.random.default_rng([seed, 91]), Counts()
+    axis = rng.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    sign = float(rng.choice([-1.0, 1.0]))
+    if way == "rotation":
+        return replace(rig, R_imu_cam=rig.R_imu_cam @ exp_so3(counts.rotation_rad * axis))
+    if way == "position":
+        return replace(rig, p_imu_cam=rig.p_imu_cam + counts.position_m * axis)
+    if way == "time shift":
+        return replace(rig, timeshift_cam_imu_s=rig.timeshift_cam_imu_s + sign * counts.timeshift_s)
+    if way == "lens":
+        fx, fy, cx, cy = rig.lens.intrinsics
+        f = 1.0 + sign * counts.lens_share
+        return replace(rig, lens=replace(rig.lens, intrinsics=(f * fx, f * fy, cx, cy)))
+    return rig
+
+
+def again(run: SimulatedRun, rig: Rig, seed: int, seconds: float, *, target_free: bool) -> SimulatedRun:
+    """Another recording of a rig, with the sampling of the first."""
+    options = {k: v for k, v in vars(run.options).items() if k != "epoch_ns"}
+    if not target_free:
+        return simulate(_SEED_OF_TODAY + seed, seconds, rig=rig, points_m=run.points_m, **options)
+    return simulate_tracks(_SEED_OF_TODAY + seed, seconds, rig=rig, landmarks_m=run.points_m, **options)
+
+
+def estimate(
+    run: SimulatedRun, prior: CameraPrior, *, target_free: bool, verifier: Verifier | None = None
+) -> Any:
+    """Calibrate; with a verifier until it knows, looking once a second."""
+    options = CalibrationOptions(target_free=target_free, imu_noise=imu_noise(run))
+    subject = CalibratorSubject(options, prior, None if target_free else run.points_m)
+    next_s = 1.0
+    for t_s, event in events_in_order(run):
+        if isinstance(event, SimulatedFrame):
+            subject.add_points(points_frame(event))
+        else:
+            subject.add_imu(int(run.t_imu_ns[event]), run.gyro_rps[event], run.specific_force_mps2[event])
+        if verifier is not None and t_s >= next_s:
+            next_s += 1.0
+            if verifier.look(subject.calibrator.estimate()):
+                return verifier
+    subject.finish()
+    last: CalibrationEstimate = subject.calibrator.estimate()
+    if verifier is not None:
+        verifier.look(last)
+        return verifier
+    return last
+
+
+def stored_calibration(run: SimulatedRun, seed: int, *, target_free: bool) -> KnownCamera | None:
+    """What was known before; None if the first recording gave no calibration."""
+    last = estimate(run, camera_prior(run, seed, StartErrors(), exact_lens=True), target_free=target_free)
+    if not last.cameras:
+        return None
+    known = known_cameras(rig_from_estimate(last), "stored")[CAMERA]
+    return replace(known, begin_ns=0, end_ns=0)  # another day, whatever the simulation's clock says
+
+
+def trial(target_free: bool, stored_s: float, seconds: float, seed: int) -> runner.Result:
+    """One rig, stored and verified."""
+    way = WAYS[seed % len(WAYS)]
+    run, _ = draw(seed, stored_s, target_free=target_free)
+    known = stored_calibration(run, seed, target_free=target_free)
+    if known is None or known.lens is None:
+        return {"way": way, "answer": "not stored"}
+    today = again(run, changed(run.rig, way, seed), seed, seconds, target_free=target_free)
+    fx, fy, cx, cy, *distortion = (float(x) for x in known.lens)
+    prior = CameraPrior(run.rig.lens.resolution, (fx, fy, cx, cy), known.model, tuple(distortion))
+    verifier = Verifier({CAMERA: CameraCheck(known, lens_asked=True)})
+    estimate(today, prior, target_free=target_free, verifier=verifier)
+    document = verifier.document()
+    return {
+        "way": way,
+        "answer": document["verdict"],
+        "document": document,
+        "sigma": known.sigma[:7].tolist(),
+    }
+
+
+def print_summary(results: list[runner.Result]) -> None:
+    """One row for each way."""
+    print("| changed since | rigs | holds | changed | of it the right block | cannot tell, block visible |")
+    print("|---|---|---|---|---|---|")
+    for way in dict.fromkeys(WAYS):
+        own = [r for r in results if r["way"] == way and r["answer"] != "not stored"]
+        answers = [r["answer"] for r in own]
+        right = sum(r["answer"] == Answer.CHANGED and _named(r) == {way} for r in own)
+        unsure = [r for r in own if r["answer"] == Answer.CANNOT_TELL and _visible(r, way)]
+        print(
+            f"| {way} | {len(own)} | {answers.count('holds')} | {answers.count('changed')} "
+            f"| {right} | {len(unsure)} |"
+        )
+    times = [r["document"]["seconds_used"] for r in results if r["answer"] in ("holds", "changed")]
+    print(f"\nseconds until an answer, median and worst: {np.median(times):.0f}, {np.max(times):.0f}")
+
+
+def _named(result: runner.Result) -> set[str]:
+    return {change["what"] for change in result["document"]["changes"]}
+
+
+def _visible(result: runner.Result, way: str) -> bool:
+    """Whether a change that counts of this block (of all, where nothing changed) shows in this recording."""
+    blocks = result["document"]["cameras"][CAMERA]["blocks"]
+    asked = blocks if way == "none" else [way]
+    return bool(blocks) and all(blocks[b]["visible_from"] <= blocks[b]["counts_from"] for b in asked)
+
+
+def main(argv: list[str]) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks verify", description=__doc__)
+    runner.add_arguments(parser, trials=40, seconds=5.0)
+    parser.add_argument(
+        "--stored", type=float, default=30.0, metavar="S", help="length of the first recording"
+    )
+    parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
+    args = parser.parse_args(argv)
+    name = f"verify_{'free' if args.target_free else 'board'}_{args.stored:g}_{args.seconds:g}s"
+    code = runner.fingerprint("vical_daemon", "benchmarks/verify.py", "mocks/vical_mocks")
+    work = partial(trial, args.target_free, args.stored, args.seconds)
+    results = runner.run_trials(name, work, runner.seeds_of(args), args, code)
+    print_summary(results)
+    for seed, r in zip(runner.seeds_of(args), results, strict=True):
+        wrong = {"none": "changed"}.get(r["way"], "holds")
+        if r["answer"] == wrong:
+            print(f"seed {seed}: {r['way']}, answered {r['answer']}: {r['document']['changes']}")
+    return 0

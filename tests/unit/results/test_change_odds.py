@@ -1,0 +1,87 @@
+"""Odds of a change: sizes, blocks, and looks as often as one likes; Gaussians drawn by numpy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from vical_daemon.results.change_odds import FALSE_ALARM, MISSED, VISIBLE, Counts, odds
+
+COUNTS = Counts().of_errors(460.0, 15)
+SURE = math.log(1.0 / FALSE_ALARM)
+
+
+def test_counts_are_in_the_units_of_the_errors():
+    assert COUNTS[:7] == pytest.approx([2e-3] * 3 + [np.deg2rad(0.2)] * 3 + [1e-3])
+    assert COUNTS[7:11] == pytest.approx([2.3] * 4)
+    assert len(Counts().of_errors(460.0, 7)) == 7
+
+
+def test_odds_are_ratios_of_gaussians():
+    """All ways alike: the mean of the ratios of densities over the subsets of blocks, by scipy."""
+    rng = np.random.default_rng(3)
+    mixed = rng.standard_normal((7, 7))
+    P, e = mixed @ mixed.T + np.eye(7), rng.standard_normal(7)  # in units of what counts
+    blocks = [(0, 1, 2), (3, 4, 5), (6,)]
+    ratios = []
+    for k in range(1, 8):
+        W = np.zeros(7)
+        W[[i for b, block in enumerate(blocks) if k >> b & 1 for i in block]] = 3.0**2
+        logs = [multivariate_normal.logpdf(e, np.zeros(7), V) for V in (P + np.diag(W), P)]
+        ratios.append(np.exp(logs[0] - logs[1]))
+    d, S = e * COUNTS[:7], P * np.outer(COUNTS[:7], COUNTS[:7])
+    found = odds(d, S, 0.1 * S, COUNTS[:7])
+    assert found.log_changed == pytest.approx(np.log(np.mean(ratios)), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("block", "places"), [("position", [0, 1, 2]), ("rotation", [3]), ("time shift", [6]), ("lens", [7, 8])]
+)
+def test_a_change_that_counts_is_found_named_and_sized(block, places):
+    S = np.diag((COUNTS / 12.0) ** 2)
+    d = np.zeros(15)
+    d[places] = COUNTS[places]
+    found = odds(d, S, 0.5 * S, COUNTS)
+    assert found.log_changed > SURE
+    assert found.blocks == (block,)
+    assert found.moved[places] == pytest.approx(d[places], rel=0.01)
+    assert block in found.undecided
+    same = odds(np.zeros(15), S, 0.5 * S, COUNTS)
+    assert not same.undecided
+    assert same.probability < 0.01
+
+
+def test_what_is_not_visible_is_not_decided():
+    """A sigma as large as what counts: neither `holds` nor `changed`; a stored sigma raises what counts."""
+    S = np.diag(COUNTS**2)
+    found = odds(np.zeros(15), S, 0.01 * S, COUNTS)
+    assert found.undecided == ["position", "rotation", "time shift", "lens"]
+    assert found.log_changed < 0.0
+    assert found.visible["time shift"] == pytest.approx(VISIBLE)
+    stored = np.diag((COUNTS * np.where(np.arange(15) < 3, 2.0, 0.01)) ** 2)
+    assert odds(np.zeros(15), stored + 1e-6 * S, stored, COUNTS).floor["position"] == pytest.approx(
+        2.0 * VISIBLE
+    )
+
+
+def test_looking_every_time_raises_no_more_false_alarms_and_misses_than_promised():
+    """Data come one by one, and the first decision counts: the bounds hold for all looks together [Ville]."""
+    rng = np.random.default_rng(11)
+    stored = np.diag((COUNTS[:7] / 20.0) ** 2)
+    wrong = {0.0: 0, 1.0: 0}
+    for truth in wrong:
+        for _ in range(60):
+            offset = truth * COUNTS[:7] * (np.arange(7) == 5) + rng.normal(0.0, COUNTS[:7] / 20.0)
+            seen = offset + rng.normal(0.0, 3.0 * COUNTS[:7], (400, 7))
+            for n in range(10, 401, 30):
+                S = stored + np.diag((3.0 * COUNTS[:7]) ** 2 / n)
+                found = odds(seen[:n].mean(axis=0), S, stored, COUNTS[:7])
+                if not found.undecided or found.log_changed > SURE:
+                    wrong[truth] += found.undecided == [] if truth else found.undecided != []
+                    break
+    assert wrong[0.0] <= 1  # FALSE_ALARM * 60 = 0.06
+    assert wrong[1.0] <= 4  # MISSED * 60 = 0.6: the probability of 5 or more is below 0.001
+    assert MISSED == 0.01

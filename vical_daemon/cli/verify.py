@@ -1,0 +1,183 @@
+"""`vical verify INPUT --against RESULT`: does a calibration still hold for this recording?"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vical_daemon.cli.calibrate import ProgressBar, finite
+from vical_daemon.cli.errors import EXIT_CANNOT_TELL, EXIT_CHANGED, EXIT_USAGE, CliError
+from vical_daemon.cli.options import add_json
+
+if TYPE_CHECKING:
+    from vical_daemon.config.priors import Initial
+    from vical_daemon.offline.verify import Verifier
+    from vical_daemon.results.change_odds import Counts
+    from vical_daemon.results.export import Rig
+    from vical_daemon.results.known import KnownCamera
+
+_EPILOG = """\
+examples:
+  vical verify today.mcap --against store --target board.yaml
+  vical verify today.mcap --against result.json                        without a board
+  vical verify euroc/mav0 --against camchain-imucam.yaml --initial imu.yaml --target april.yaml
+  vical verify euroc/mav0 --against mounting.yaml --initial lens.yaml --target april.yaml
+
+The last one asks about mounting and time shift alone, for the lens of --initial, because the file gives none.
+
+exit code: 0 holds; 4 no longer holds; 5 this recording cannot tell; 1 it cannot be read; 2 bad usage
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the recording, the calibration, and what counts as a change."""
+    parser.epilog = _EPILOG
+    parser.add_argument("input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder")
+    parser.add_argument(
+        "--against",
+        metavar="SOURCE",
+        required=True,
+        help="the calibration: result, log, store, Kalibr's or OpenVINS's camchain",
+    )
+    parser.add_argument("--target", metavar="FILE", help="the board, Kalibr's format; without: target-free")
+    parser.add_argument("--camera", metavar="NAME", help="only this camera")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, where there are several")
+    parser.add_argument(
+        "--initial", metavar="FILE", help="the lens and the IMU's noise, where SOURCE does not give them"
+    )
+    parser.add_argument(
+        "--fix",
+        choices=("intrinsics",),
+        help="ask about mounting and time shift alone, for the lens as given",
+    )
+    parser.add_argument("--skip", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
+    parser.add_argument("--seconds", type=float, metavar="S", help="use only S seconds (after --skip)")
+    counts = parser.add_argument_group("what counts as a change")
+    counts.add_argument("--position-mm", type=float, default=2.0, metavar="MM", help="default 2")
+    counts.add_argument("--rotation-deg", type=float, default=0.2, metavar="DEG", help="default 0.2")
+    counts.add_argument("--timeshift-ms", type=float, default=1.0, metavar="MS", help="default 1")
+    counts.add_argument(
+        "--focal-percent",
+        type=float,
+        default=0.5,
+        metavar="P",
+        help="default 0.5; of the principal point, too",
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Verify and print; 4 if it does not hold, 5 if the recording cannot tell."""
+    counts = _counts(args)
+    if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
+        raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
+    from vical_daemon.logs import open_recording
+    from vical_daemon.offline.calibrate import make_job, run_job
+    from vical_daemon.offline.sources import read_known
+
+    known, rig = read_known(args.against)
+    if args.target:
+        from vical_daemon.vision.target import load_target
+
+        load_target(Path(args.target))
+    recording = open_recording(args.input, cameras=[args.camera] if args.camera else ())
+    for warning in recording.warnings:
+        print(f"vical: warning: {warning}", file=sys.stderr)
+    initial = _initial(args, known, rig)
+    held = args.fix == "intrinsics" or any(camera.lens is None for camera in known.values())
+    job = make_job(
+        recording,
+        initial,
+        target=args.target,
+        camera=args.camera,
+        imu=args.imu,
+        fix=("intrinsics",) if held else (),
+        skip_s=args.skip,
+        seconds=args.seconds,
+    )
+    verifier = _verifier(known, list(job.cameras), held, counts, args.against)
+    bar = ProgressBar(hidden=args.quiet or not sys.stderr.isatty())
+    run_job(job, bar.show, enough=verifier.look)
+    bar.close()
+    document = verifier.document()
+    if args.json:
+        print(json.dumps(finite(document), allow_nan=False))
+    else:
+        from vical_daemon.cli.verify_text import describe
+
+        print(describe(document, Path(args.against).name))
+    return {"holds": 0, "changed": EXIT_CHANGED}.get(document["verdict"], EXIT_CANNOT_TELL)
+
+
+def _verifier(
+    known: dict[str, KnownCamera], cameras: list[str], held: bool, counts: Counts, against: str
+) -> Verifier:
+    """Pair the recording's cameras with those of the calibration."""
+    from vical_daemon.offline.verify import CameraCheck, Verifier
+
+    if len(known) == len(cameras) == 1:
+        known = {cameras[0]: next(iter(known.values()))}
+    missing = [name for name in cameras if name not in known]
+    if missing:
+        there = ", ".join(known)
+        raise CliError(
+            f"{against} has no camera {missing[0]!r} (it has {there}); choose with --camera", EXIT_USAGE
+        )
+    checks = {
+        name: CameraCheck(known[name].given_lens() if held else known[name], lens_asked=not held)
+        for name in cameras
+    }
+    return Verifier(checks, counts)
+
+
+def _initial(args: argparse.Namespace, known: dict[str, KnownCamera], rig: Rig | None) -> Initial:
+    """What the estimator starts from: the lens in question, nothing about mounting and time shift."""
+    from vical_daemon.config.priors import Initial, read_initial
+    from vical_daemon.estimation.measurements import CameraPrior
+
+    given = read_initial(args.initial) if args.initial else Initial()
+    cameras = {
+        name: replace(prior, T_imu_cam=None, timeshift_cam_imu_s=None)
+        for name, prior in given.cameras.items()
+    }
+    for name, camera in known.items():
+        if camera.lens is None:
+            continue
+        fx, fy, cx, cy, *distortion = (float(x) for x in camera.lens)
+        readout_s = rig.cameras[name].readout_s if rig is not None else 0.0
+        cameras[name] = CameraPrior(
+            camera.resolution or (0, 0),
+            (fx, fy, cx, cy),
+            camera.model,
+            tuple(distortion),
+            readout_s=readout_s,
+        )
+    lacking = [name for name in known if name not in cameras and len(cameras) != 1]
+    if lacking:
+        raise CliError(f"{args.against} has no lens of {lacking[0]}; give it with --initial", EXIT_USAGE)
+    return Initial(cameras, given.imu_noise or (rig.noise if rig is not None else None), given.imu_rate_hz)
+
+
+def _counts(args: argparse.Namespace) -> Counts:
+    from vical_daemon.results.change_odds import Counts
+
+    sizes = {
+        "--position-mm": args.position_mm,
+        "--rotation-deg": args.rotation_deg,
+        "--timeshift-ms": args.timeshift_ms,
+        "--focal-percent": args.focal_percent,
+    }
+    for option, value in sizes.items():
+        if not (value > 0.0 and math.isfinite(value)):
+            raise CliError(f"{option} must be above 0", EXIT_USAGE)
+    return Counts(
+        math.radians(args.rotation_deg),
+        1e-3 * args.position_mm,
+        1e-3 * args.timeshift_ms,
+        1e-2 * args.focal_percent,
+    )

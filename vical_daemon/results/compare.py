@@ -1,0 +1,68 @@
+"""The verdict on two calibrations: same or changed, and which part; docs/math/verify.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.stats import chi2
+
+from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.results.difference import Difference
+from vical_daemon.results.known import BLOCKS
+
+FALSE_ALARM = 1e-3
+"""Probability of `changed` for two calibrations of the same rig, if their sigmas are right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a comparison says.
+
+    Attributes:
+        changed: The difference is more than chance.
+        chi_square: Of all errors together.
+        dof: Its degrees of freedom.
+        probability: Of a larger one by chance.
+        blocks: The fewest blocks that must differ; empty: none.
+    """
+
+    changed: bool
+    chi_square: float
+    dof: int
+    probability: float
+    blocks: tuple[str, ...]
+
+
+def judge(difference: Difference) -> Verdict:
+    """Test whether the difference is zero, and if not, which blocks are to blame."""
+    everything = np.arange(len(difference.d))
+    square, probability = _test(difference, everything)
+    changed = probability < FALSE_ALARM
+    blocks = _blocks(difference) if changed else ()
+    return Verdict(changed, square, len(everything), probability, blocks)
+
+
+def _blocks(difference: Difference) -> tuple[str, ...]:
+    """The fewest blocks without which the rest agrees; of as many, those that leave the best agreement."""
+    present = [name for name in BLOCKS if name != "lens" or difference.has_lens]
+    index = np.arange(len(difference.d))
+    for count in range(1, len(present)):
+        scored = []
+        for blamed in combinations(present, count):
+            out = np.concatenate([index[BLOCKS[name]] for name in blamed])
+            scored.append((_test(difference, np.setdiff1d(index, out))[1], blamed))
+        best, blamed = max(scored)
+        if best >= FALSE_ALARM:
+            return blamed
+    return tuple(present)
+
+
+def _test(difference: Difference, kept: IntArray) -> tuple[float, float]:
+    """Sum of squares of some errors in joint sigmas, and the probability of a larger one."""
+    d, S = difference.d[kept], difference.covariance[np.ix_(kept, kept)]
+    scale = np.sqrt(np.diag(S))
+    e = d / scale
+    square = float(e @ np.linalg.solve(S / np.outer(scale, scale) + 1e-12 * np.eye(len(e)), e))
+    return square, float(chi2.sf(square, len(kept)))
