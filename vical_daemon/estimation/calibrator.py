@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.events import ROLLING, Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.frame_queue import FrameQueue
 from vical_daemon.estimation.filter.image_intake import (
@@ -210,8 +210,8 @@ class Calibrator:
             return
         found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
         for _ in range(_MOST_SURPRISES):
-            if found.rolling:
-                self._estimate_readout(found.rolling)
+            if found.rolling is not None:
+                self._estimate_readout(*found.rolling)
             elif found.size is not None:
                 self._resize(found.size)
             else:
@@ -260,12 +260,13 @@ class Calibrator:
             self._reports.append(report)
         return []
 
-    def _estimate_readout(self, camera: str) -> None:
+    def _estimate_readout(self, camera: str, axis: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self._states |= {"readout"}
+        self.priors[camera] = replace(self.priors[camera], readout_axis=axis)
         self.layout = self.judge.layout = self._lay_out()
         self._starting.go_on_with(self.layout, self.target)
-        self.judge.announce(Event(EventKind.ROLLING_SHUTTER, camera))
+        self.judge.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
         """The target is by far not as large as stated: go on with one that is; its size is asked for."""

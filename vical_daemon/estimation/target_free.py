@@ -41,6 +41,7 @@ from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTIN
 from vical_daemon.estimation.smoother.handover import afresh, aged, next_window, of_another_recording
 from vical_daemon.estimation.smoother.judge import FreeJudge
 from vical_daemon.estimation.smoother.reports import window_reports
+from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
 from vical_daemon.estimation.smoother.starter import Starter
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
@@ -274,15 +275,33 @@ class TargetFreeCalibrator:
 
     def _adjusted(self, window: Window, known: Carry | None, reopened: Collection[int] = ()) -> _Begun | None:
         """Adjust a first window with what is known but for some errors; None where it does not fit."""
-        assert self._buffer is not None
-        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened)
-        bundle = Bundle(window, carry, *self._noise)
-        fit = bundle.solve(self._buffer, _STEPS_START)
+        bundle, carry, fit = self._solved(window, known, reopened)
+        if known is None and self._axis_open and fit is not None and shows_columns(bundle, fit):
+            by_columns = self._solved(read_by_columns(window), known, reopened)
+            if by_columns[2] is not None and by_columns[2].sigma_px < fit.sigma_px:
+                bundle, carry, fit = by_columns
         if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
             return None
         if known is not None and not self.judge.agrees(fit, carry, complete=False):
             return None
+        if known is None and self._axis_open:
+            axis = bundle.window.camera.readout_axis
+            self.prior = self.starter.prior = replace(self.prior, readout_axis=axis)
         return _Begun(bundle, fit)
+
+    def _solved(
+        self, window: Window, known: Carry | None, reopened: Collection[int]
+    ) -> tuple[Bundle, Carry, Fit | None]:
+        """Adjust a window with what is known but for some errors."""
+        assert self._buffer is not None
+        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened)
+        bundle = Bundle(window, carry, *self._noise)
+        return bundle, carry, bundle.solve(self._buffer, _STEPS_START)
+
+    @property
+    def _axis_open(self) -> bool:
+        """Whether nothing was said, or found, of what a rolling shutter would read one after the other."""
+        return not (self.prior.readout_axis or self.prior.readout_s)
 
     def _go_on(self, frames: list[Stamped], known: Carry) -> _Begun | str:
         """Start a window after a pause; where it contradicts what was known, find what has changed."""
@@ -430,7 +449,7 @@ class TargetFreeCalibrator:
             keep: The window as adjusted last was good.
             against_s: For how long images have contradicted the calibration, s; 0: they do not.
         """
-        window = self.window
+        window, unproven = self.window, against_s > 0.0 and not self.judge.proven
         self.window = None
         if window is not None and against_s and self.judge.against_s:
             self._confirmed = True
@@ -441,6 +460,8 @@ class TargetFreeCalibrator:
                 self.judge.closed()
             else:
                 self.latest = self.carry if self._closed else None
+        if unproven:  # one window stands against one: neither is known to be right
+            self.latest, self._closed, self._confirmed = None, 0, False
         self.carry = None
         self.starter.again()
         self.judge.lost(why, value, self.latest, against_s)

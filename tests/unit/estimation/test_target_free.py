@@ -20,7 +20,7 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 from vical_mocks.trajectory import one_axis, still
 
-from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.carry import FULL
 from vical_daemon.estimation.smoother.judge import FreeJudge
@@ -172,12 +172,13 @@ def test_the_lens_is_found_too():
     assert np.abs(last.error[7:9]).max() < 2.0  # px, from five percent
 
 
-def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told():
-    rig = reference_rig(2, timeshift_cam_imu_s=0.01, readout_s=0.02)
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told(axis):
+    rig = reference_rig(2, timeshift_cam_imu_s=0.01, readout_s=0.02, readout_axis=axis)
     run = simulate_tracks(2, 8.0, rig=rig, camera_rate_hz=20.0)
     subject = subject_for(run, lens_known=False)
     record = feed(run, subject)
-    assert any(e.kind is EventKind.ROLLING_SHUTTER and e.camera == "cam0" for _, e in record.events)
+    assert any(e.kind is ROLLING[axis] and e.camera == "cam0" for _, e in record.events)
     for snapshot in record.snapshots:
         assert nees(snapshot.error, snapshot.covariance, 7) < chi2.isf(1e-4, 7)
     camera = subject.calibrator.estimate().cameras["cam0"]
@@ -187,7 +188,7 @@ def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told():
 
 def test_nothing_is_told_of_the_readout_of_a_global_shutter(followed):
     _, subject, record = followed
-    assert not any(e.kind is EventKind.ROLLING_SHUTTER for _, e in record.events)
+    assert not any(e.kind in ROLLING.values() for _, e in record.events)
     camera = subject.calibrator.estimate().cameras["cam0"]
     assert camera.readout_s == camera.readout_sigma_s == 0.0
 

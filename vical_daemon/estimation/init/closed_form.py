@@ -15,7 +15,7 @@ from vical_daemon.estimation.init.accel_alignment import Alignment, align, align
 from vical_daemon.estimation.init.accel_evidence import CameraPath
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.linear_start import still_axes
-from vical_daemon.estimation.init.readout_start import readout
+from vical_daemon.estimation.init.readout_start import likely_axis, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache, SeenPose
 from vical_daemon.estimation.init.velocity_gravity_init import StartResult, motion_start
@@ -158,10 +158,11 @@ def _with_motion(
 def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, list[SeenPose]]:
     """Lens of a camera, as known or estimated, and its poses since a stamp."""
     lens, readout_s = Lens.from_prior(data.priors[name]), data.priors[name].readout_s
-    rows = lens.resolution[1]
     if data.layout.cameras[name].readout is not None:
+        if not (lens.readout_axis or readout_s):
+            lens.readout_axis = likely_axis(data.frames[name], lens, data.target)
         readout_s = readout(data.frames[name], lens, data.target, readout_s)
-    frames = at_middle_row(data.frames[name], readout_s, rows)
+    frames = at_middle_row(data.frames[name], readout_s, lens.resolution, lens.readout_axis)
     if data.layout.lens_free(name):
         estimate_intrinsics(lens, [f for _, f in frames], data.target)
     cache = data.caches.setdefault(name, PoseCache())
@@ -186,6 +187,7 @@ def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift
         lens.model,
         lens.resolution,
         lens.readout_s,
+        readout_axis=lens.readout_axis,
     )
 
 

@@ -24,6 +24,7 @@ class Lens:
     model: str
     resolution: tuple[int, int]
     readout_s: float = 0.0
+    readout_axis: str = ""
 
     @classmethod
     def from_prior(cls, prior: CameraPrior) -> Lens:
@@ -34,6 +35,7 @@ class Lens:
             prior.distortion_model,
             prior.resolution,
             prior.readout_s,
+            prior.readout_axis,
         )
 
 
@@ -98,7 +100,7 @@ class PoseCache:
     """Poses already found, so that repeated attempts cost little; a new lens empties it."""
 
     def __init__(self) -> None:
-        self._lens: tuple[float, ...] = ()
+        self._lens: tuple[float | str, ...] = ()
         self._poses: dict[int, SeenPose | None] = {}
 
     def poses(
@@ -116,7 +118,7 @@ class PoseCache:
             target: Points of the target, m, shape (n, 3).
             since_s: Older frames are left out, s.
         """
-        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist(), lens.readout_s)
+        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist(), lens.readout_s, lens.readout_axis)
         if key != self._lens:
             self._lens, self._poses = key, {}
         known = {f.t_cam_ns: self._poses[f.t_cam_ns] for _, f in frames if f.t_cam_ns in self._poses}

@@ -153,7 +153,10 @@ def make_layout(
 
 @dataclass(slots=True)
 class CameraState:
-    """Nominal values of one camera (see `CameraEstimate`); `skew` is the drift of the time shift, s/s."""
+    """Nominal values of one camera (see `CameraEstimate`); `skew` is the drift of the time shift, s/s.
+
+    `readout_axis`: see `CameraPrior`; it is no number, and stays.
+    """
 
     R_imu_cam: FloatArray
     p_imu_cam: FloatArray
@@ -164,6 +167,7 @@ class CameraState:
     resolution: tuple[int, int]
     readout_s: float = 0.0
     skew: float = 0.0
+    readout_axis: str = ""
 
 
 @dataclass(slots=True)

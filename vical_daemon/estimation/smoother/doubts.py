@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.events import Event, EventKind
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.events import ROLLING, Event, EventKind
+from vical_daemon.estimation.measurements import ROWS, FloatArray
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, LAG_SIGMA_S, OFF, SURE
 from vical_daemon.estimation.selection import model_selection as hypotheses
 from vical_daemon.estimation.selection.clock_drift import (
@@ -70,7 +70,8 @@ class FreeDoubts:
             readout_s, sigma_s = carry.camera.readout_s, float(sigmas[READOUT])
             self.rolling = abs(readout_s) > max(_SURELY_ROLLING * sigma_s, _SHORTEST_S)
             if self.rolling:
-                events.append(Event(EventKind.ROLLING_SHUTTER, self._camera, float(readout_s), sigma_s))
+                kind = ROLLING[carry.camera.readout_axis or ROWS]
+                events.append(Event(kind, self._camera, float(readout_s), sigma_s))
         if compared:
             weights = self._weights(carry, factor)
             known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > SURE}

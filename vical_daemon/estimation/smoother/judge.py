@@ -73,6 +73,8 @@ class FreeJudge:
         self._started_s: float | None = None
         self._now_s = 0.0
         self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
+        self._growing = 0.0, 0  # the same of the window that is not complete yet
+        self._withdrawn: list[tuple[float, int]] = []  # and of those that contradicted a single window
         self._windows = 0
         self._squares: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
@@ -131,6 +133,8 @@ class FreeJudge:
         """
         if kept is not None and against_s:
             self.contradicted(against_s)
+        if kept is None and against_s and self._growing[1]:
+            self._withdrawn.append(self._growing)
         self._reason, self._motion_missing = cause_text(why, value), False
         if kept is not None and not self._quiet[0]:
             self._quiet = why, value
@@ -138,6 +142,7 @@ class FreeJudge:
             self._started_s, self._windows, self._given_up = None, 0, (why, value)
             self._against_since_s = None
             self._agreement.clear()
+            self._growing = 0.0, 0
 
     def next_recording(self) -> None:
         """Another recording begins: it has not contradicted anything yet."""
@@ -167,6 +172,7 @@ class FreeJudge:
         self._bumped, self._quiet, self.doubts.drifting = why, (Cause.NONE, None), False
         self._started_s, self._windows, self._against_since_s = None, 0, None
         self._agreement.clear()
+        self._growing = 0.0, 0
         self._steady.reset(Status.CONVERGING)
 
     def stepped(self, step_s: float) -> None:
@@ -225,6 +231,8 @@ class FreeJudge:
 
     def closed(self) -> None:
         """A window is complete and agreed."""
+        if self._windows + 1 >= _ENOUGH_WINDOWS:
+            self._withdrawn.clear()
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
         self._against_since_s = None
         if self.jitter_s >= ANNOUNCED_S:
@@ -253,6 +261,7 @@ class FreeJudge:
         full = np.zeros(FULL)
         full[np.flatnonzero(self.active)] = fit.change
         agree = self.excess(statistic, dof, full) <= 1.0
+        self._growing = (0.0, 0) if complete else (statistic, dof)
         if complete:
             self._agreement.append((min(statistic, self._limit(dof)), dof))
         return agree
@@ -278,6 +287,19 @@ class FreeJudge:
         dof = float(np.count_nonzero(self.active)) - float(self.active[DRIFT])
         total = sum(s for s, _ in self._agreement) + _PRIOR_WINDOWS * dof
         return max(1.0, total / (sum(n for _, n in self._agreement) + _PRIOR_WINDOWS * dof))
+
+    def _reported_factor(self) -> float:
+        """What the variances are multiplied by when they are reported.
+
+        Until a second window has confirmed the answer nothing but the windows themselves says how wrong it
+        may be: what they disagree by counts at once, and in full, without the belief that sigmas are right.
+        What contradicted answers that were withdrawn counts, too.
+        """
+        if self.proven:
+            return self.factor()
+        seen = [*self._withdrawn, *self._agreement, self._growing]
+        dof = sum(n for _, n in seen)
+        return max(self.factor(), sum(s for s, _ in seen) / dof if dof else 1.0)
 
     # ------------------------------------------------------------------ what is said
     def trace(self) -> list[TracePoint]:
@@ -326,7 +348,7 @@ class FreeJudge:
     def _camera(self, carry: Carry) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
-        doubts = self.doubts.weighed(carry, self.factor(), bool(self._agreement))
+        doubts = self.doubts.weighed(carry, self._reported_factor(), bool(self._agreement))
         return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
     def _missing(self, e: CameraEstimate, carry: Carry) -> list[WeakDirection]:

@@ -81,6 +81,7 @@ def camera_estimate(
         [],
         float(camera.readout_s) if doubts.rolling else 0.0,
         float(sigma[READOUT]) if doubts.rolling else 0.0,
+        readout_axis=camera.readout_axis if doubts.rolling else "",
         calibration_covariance=covariance[: LENS.stop, : LENS.stop].tolist(),
     )
 

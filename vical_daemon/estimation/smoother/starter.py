@@ -147,6 +147,7 @@ class Starter:
             T_imu_cam=(c.R_imu_cam, c.p_imu_cam),
             timeshift_cam_imu_s=c.timeshift_s,
             readout_s=c.readout_s,
+            readout_axis=c.readout_axis,
         )
         found = self._rotations(buffer, frames, prior, known)
         if isinstance(found, str):
@@ -273,6 +274,7 @@ def starting_camera(prior: CameraPrior) -> CameraState:
         prior.distortion_model,
         prior.resolution,
         prior.readout_s,
+        readout_axis=prior.readout_axis,
     )
 
 
@@ -302,6 +304,7 @@ def _known(known: Carry) -> _Found:
         c.resolution,
         c.readout_s,
         c.skew,
+        c.readout_axis,
     )
     return _Found(copy, np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
-from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
 from vical_daemon.estimation.model.inertial_links import Link, Links, make_link
 from vical_daemon.estimation.model.state import CameraState
@@ -245,7 +245,7 @@ def _listed(frame: IntArray, landmark: IntArray, uv: FloatArray, camera: CameraS
     by_frame = np.argsort(frame, kind="stable")
     sorted_frames = frame[by_frame]
     frame_begin = np.flatnonzero(np.diff(sorted_frames, prepend=-1))
-    row = uv[:, 1] / camera.resolution[1] - 0.5
+    row = read_share(uv, camera.resolution, camera.readout_axis)
     return Seen(frame, landmark, uv, row, begin, by_frame, frame_begin, sorted_frames[frame_begin])
 
 
