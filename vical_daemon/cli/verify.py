@@ -142,7 +142,7 @@ def _verifier(
         known = {cameras[0]: next(iter(known.values()))}
     missing = [name for name in cameras if name not in known]
     if missing:
-        there = ", ".join(known)
+        there = ", ".join(known) or "none"
         raise CliError(
             f"{against} has no camera {missing[0]!r} (it has {there}); choose with --camera", EXIT_USAGE
         )
