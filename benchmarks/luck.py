@@ -149,5 +149,3 @@ def main(argv: list[str]) -> int:
         for t_s in (t for t in TIMES_S if t <= args.seconds):
             table(case, f"{t_s:g}", ours, best)
     return 0
-
-

@@ -23,7 +23,7 @@ from vical_mocks.trajectory import one_axis, still
 from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.carry import FULL
-from vical_daemon.estimation.smoother.judge import FreeJudge
+from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 pytestmark = pytest.mark.timeout(400)
@@ -209,7 +209,7 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 
 
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
-    judge = FreeJudge(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
+    judge = TargetFreeStatus(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
     judge.doubts.drifting = True
     judge.changed()
     assert not judge.doubts.drifting

@@ -237,7 +237,7 @@ def _pose_by_error(
 
 
 @dataclass(slots=True)
-class Straightness:
+class LinearityMonitor:
     """Remembers down to which sigmas a model was seen to be straight.
 
     Attributes:

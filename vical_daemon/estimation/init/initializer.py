@@ -12,7 +12,7 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.board_window import Frames
-from vical_daemon.estimation.init.initial_filter import wide_filter
+from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.readout_start import looks_rolling
 from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache
@@ -50,7 +50,7 @@ class Attempt:
     size: float | None = None
 
 
-class Starting:
+class Initializer:
     """Collects the images of the first seconds and tries to start from them.
 
     Args:
@@ -148,7 +148,7 @@ class Starting:
         ]
         frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
         make = partial(
-            wide_filter,
+            initial_filter,
             layout=self._layout,
             options=self._options,
             still_axes=result.still_axes,

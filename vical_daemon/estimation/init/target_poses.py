@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.planar_pose import PlanarPose, belonging, planar_pose
+from vical_daemon.estimation.geometry.planar_pose import PlanarPose, inliers, planar_pose
 from vical_daemon.estimation.measurements import BoolArray, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 
@@ -40,7 +40,7 @@ class Lens:
 
 
 @dataclass(slots=True)
-class SeenPose:
+class TargetPose:
     """Pose of the camera from one image: instant in the camera's clock and pose in the target frame."""
 
     t_cam_s: float
@@ -68,7 +68,7 @@ class SeenPose:
         return float(np.sqrt(np.trace(self.pose.covariance[3:, 3:]) / 3.0))
 
 
-def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) -> SeenPose | None:
+def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) -> TargetPose | None:
     """Planar pose of one frame; None where too few points are seen or the two-fold ambiguity is open."""
     if len(frame.ids) < _MIN_POINTS:
         return None
@@ -85,7 +85,7 @@ def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) 
         found = planar_pose(points, xy)
     if not found.candidates or found.ambiguous:
         return None
-    return SeenPose(t_cam_s, found.candidates[0], frame)
+    return TargetPose(t_cam_s, found.candidates[0], frame)
 
 
 def _fitting(pose: PlanarPose, points: FloatArray, xy: FloatArray) -> BoolArray:
@@ -93,7 +93,7 @@ def _fitting(pose: PlanarPose, points: FloatArray, xy: FloatArray) -> BoolArray:
     seen = points @ pose.R_cam_target.T + pose.p_cam_target
     with np.errstate(all="ignore"):
         far = np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy, axis=1)
-    return belonging(far)
+    return inliers(far)
 
 
 class PoseCache:
@@ -101,7 +101,7 @@ class PoseCache:
 
     def __init__(self) -> None:
         self._lens: tuple[float | str, ...] = ()
-        self._poses: dict[int, SeenPose | None] = {}
+        self._poses: dict[int, TargetPose | None] = {}
 
     def poses(
         self,
@@ -109,7 +109,7 @@ class PoseCache:
         lens: Lens,
         target: FloatArray,
         since_s: float = -np.inf,
-    ) -> list[SeenPose]:
+    ) -> list[TargetPose]:
         """Poses of at most 160 of the frames since a stamp, evenly thinned, in order of time.
 
         Args:

@@ -9,7 +9,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import LinearStart, linear_start, still_axes
-from vical_daemon.estimation.init.target_poses import SeenPose
+from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
@@ -43,13 +43,13 @@ class StartResult:
     motion_missing: bool = False
     still_axes: FloatArray | None = None
     turn_axis_cam: FloatArray | None = None
-    poses: list[SeenPose] = field(default_factory=list)
+    poses: list[TargetPose] = field(default_factory=list)
     size: float | None = None
 
 
 def motion_start(
     buffer: ImuBuffer,
-    seen: dict[str, list[SeenPose]],
+    seen: dict[str, list[TargetPose]],
     cameras: dict[str, CameraState],
     gyro_bias_rps: dict[str, FloatArray],
     options: CalibrationOptions,
@@ -72,7 +72,7 @@ def motion_start(
     """
     state: State | None = None
     size, still = 0.0, None
-    used: list[SeenPose] = []
+    used: list[TargetPose] = []
     for name, poses in seen.items():
         camera = cameras[name]
         # Only the latest stretch: the double integral drifts, and what was long ago costs more than it gives.
@@ -108,7 +108,7 @@ def motion_start(
 
 def _other_size(
     buffer: ImuBuffer,
-    poses: list[SeenPose],
+    poses: list[TargetPose],
     camera: CameraState,
     gyro_bias: FloatArray,
     options: CalibrationOptions,
@@ -128,7 +128,7 @@ def _other_size(
 
 
 def _poses_of_imu(
-    poses: list[SeenPose], camera: CameraState
+    poses: list[TargetPose], camera: CameraState
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Attitudes of the imu (n, 3, 3), positions of the camera (n, 3), their sigmas (n,), instants (n,)."""
     R = np.array([p.R_target_cam for p in poses]) @ camera.R_imu_cam.T
@@ -139,7 +139,7 @@ def _poses_of_imu(
 
 def _linear(
     buffer: ImuBuffer,
-    poses: list[SeenPose],
+    poses: list[TargetPose],
     camera: CameraState,
     gyro_bias: FloatArray,
     partial: bool,
@@ -171,7 +171,7 @@ def _smooth(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bi
 
 
 def _state_at(
-    seen: SeenPose,
+    seen: TargetPose,
     camera: CameraState,
     linear: LinearStart,
     gyro_bias: FloatArray,

@@ -20,8 +20,8 @@ from vical_daemon.estimation.result import (
     TracePoint,
 )
 from vical_daemon.estimation.smoother.bundle import Fit
-from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, Carry
-from vical_daemon.estimation.smoother.doubts import FreeDoubts
+from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, MarginalPrior
+from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.excitation import (
     ALL_WAYS,
@@ -47,7 +47,7 @@ _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
-class FreeJudge:
+class TargetFreeStatus:
     """Watches what goes in and out of the windows.
 
     Args:
@@ -84,7 +84,7 @@ class FreeJudge:
         self._bumped = Cause.NONE
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
-        self.doubts = FreeDoubts(camera, asked=options.estimate, rolling=rolling)
+        self.doubts = TargetFreeDoubts(camera, asked=options.estimate, rolling=rolling)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -122,7 +122,9 @@ class FreeJudge:
             self._announce(EventKind.WENT_ON, cause=cause, cause_value=value)
             self._quiet = Cause.NONE, None
 
-    def lost(self, why: Cause, value: float | None, kept: Carry | None, against_s: float = 0.0) -> None:
+    def lost(
+        self, why: Cause, value: float | None, kept: MarginalPrior | None, against_s: float = 0.0
+    ) -> None:
         """The window was given up.
 
         Args:
@@ -238,7 +240,7 @@ class FreeJudge:
         if self.jitter_s >= ANNOUNCED_S:
             self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter")
 
-    def agrees(self, fit: Fit, carry: Carry, *, complete: bool) -> bool:
+    def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.
 
         For consistent sigmas, cov(new - old) = P_old - P_new.
@@ -311,7 +313,9 @@ class FreeJudge:
         dof = sum(n for _, n in self._agreement)
         return sum(s for s, _ in self._agreement) / dof if dof else 0.0
 
-    def estimate(self, carry: Carry | None, *, running: bool, gravity: list[float]) -> CalibrationEstimate:
+    def estimate(
+        self, carry: MarginalPrior | None, *, running: bool, gravity: list[float]
+    ) -> CalibrationEstimate:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
         missing = [] if camera is None or carry is None else self._missing(camera, carry)
@@ -345,13 +349,13 @@ class FreeJudge:
             told.guidance,
         )
 
-    def _camera(self, carry: Carry) -> CameraEstimate:
+    def _camera(self, carry: MarginalPrior) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
         doubts = self.doubts.weighed(carry, self._reported_factor(), bool(self._agreement))
         return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
-    def _missing(self, e: CameraEstimate, carry: Carry) -> list[WeakDirection]:
+    def _missing(self, e: CameraEstimate, carry: MarginalPrior) -> list[WeakDirection]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
         return weak_directions(
             covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, carry.bias[:3]

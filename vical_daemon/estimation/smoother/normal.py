@@ -13,7 +13,7 @@ from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import read_share
-from vical_daemon.estimation.model.inertial_links import Links
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.smoother.carry import (
     ARM,
@@ -23,7 +23,7 @@ from vical_daemon.estimation.smoother.carry import (
     READOUT,
     SHIFT,
     TURN,
-    Carry,
+    MarginalPrior,
     calibration_difference,
 )
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
@@ -67,7 +67,7 @@ class Problem:
     """
 
     def __init__(
-        self, window: Window, carry: Carry, sigma_px: float, spread: float, jitter_s: float = 0.0
+        self, window: Window, carry: MarginalPrior, sigma_px: float, spread: float, jitter_s: float = 0.0
     ) -> None:
         self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
         self.jitter_s = jitter_s
@@ -124,7 +124,7 @@ class Problem:
         weight = np.where(ok, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
         return e, ok, weight
 
-    def normal(self, seen: Seen, links: Links) -> Normal:
+    def normal(self, seen: Seen, links: PreintegratedLinks) -> Normal:
         """Normal equations with landmarks kept apart."""
         w, cam = self.window, self.window.camera
         y, x_imu, R, rates = self._rays(seen)
@@ -206,7 +206,7 @@ class Problem:
     def _assemble(
         self,
         seen: Seen,
-        links: Links,
+        links: PreintegratedLinks,
         e: FloatArray,
         Jf: FloatArray,
         Jc: FloatArray,
@@ -245,7 +245,7 @@ class Problem:
         cost += self._add_prior(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 
-    def stamps_doubted(self, seen: Seen, links: Links) -> float:
+    def stamps_doubted(self, seen: Seen, links: PreintegratedLinks) -> float:
         """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
 
         A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.

@@ -49,7 +49,7 @@ _RECENT = 60
 _KEPT_CHECKS = 2400  # one every 1.5 s: an hour
 
 
-class Judge:
+class StatusEvaluator:
     """Watches what goes in and out of the filter.
 
     Args:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from vical_mocks.points import board_points
 
-from vical_daemon.estimation.init.initializer import Starting
+from vical_daemon.estimation.init.initializer import Initializer
 from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
 from vical_daemon.estimation.model.state import make_layout
@@ -46,7 +46,7 @@ def test_images_that_share_no_corners_show_no_rest():
 
 def test_no_start_is_tried_from_a_minute_at_rest_and_soon_from_what_follows():
     layout = make_layout({"cam0": "radtan"}, fix=frozenset(), estimate=frozenset(), target_m=board_points())
-    starting = Starting(CalibrationOptions(), layout, board_points(), None)
+    starting = Initializer(CalibrationOptions(), layout, board_points(), None)
     rng, why = np.random.default_rng(2), None
     for t_s in np.arange(0.0, 60.0, 1.0 / RATE_HZ):
         starting.take([(t_s, image(t_s, 0.0, rng))])

@@ -8,8 +8,8 @@ import pytest
 from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import CALIBRATION, FULL, Carry, root_of
-from vical_daemon.estimation.smoother.judge import FreeJudge
+from vical_daemon.estimation.smoother.carry import CALIBRATION, FULL, MarginalPrior, root_of
+from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 
 SIGMA = np.array(
     [1e-2] * 3 + [1e-3] * 3 + [1e-4] + [2.0] * 4 + [1e-3] * 4 + [1e-5, 1e-4] + [1e-3] * (FULL - 17)
@@ -23,7 +23,9 @@ def carry(shrunk=1.0):
     whole = np.eye(CALIBRATION + FULL)
     whole[CALIBRATION:, CALIBRATION:] = shrunk * np.diag(SIGMA**2)
     active = np.ones(FULL, dtype=bool)
-    return Carry(np.eye(3), np.zeros(3), np.zeros(6), LENS, root_of(whole), active, 0.0, np.zeros(FULL - 17))
+    return MarginalPrior(
+        np.eye(3), np.zeros(3), np.zeros(6), LENS, root_of(whole), active, 0.0, np.zeros(FULL - 17)
+    )
 
 
 def fit(times):
@@ -37,7 +39,7 @@ def focal_sigma(judge):
 
 @pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (4.0, 4.0), (30.0, 30.0)])
 def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(times, wider):
-    judge = FreeJudge(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    judge = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
     assert focal_sigma(judge) == pytest.approx(np.sqrt(0.5) * 2.0)
     judge.closed()
     judge.agrees(fit(times), carry(), complete=False)
@@ -47,7 +49,7 @@ def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(ti
 
 
 def test_what_contradicted_an_answer_that_was_withdrawn_widens_the_next_one():
-    judge = FreeJudge(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    judge = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
     judge.closed()
     judge.agrees(fit(30.0), carry(), complete=False)
     judge.lost(Cause.WINDOW_CONTRADICTED, None, None, 2.0)
@@ -58,7 +60,7 @@ def test_what_contradicted_an_answer_that_was_withdrawn_widens_the_next_one():
 
 
 def test_two_windows_that_agree_are_believed_again():
-    judge = FreeJudge(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    judge = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
     judge.closed()
     judge.agrees(fit(1.5), carry(), complete=True)
     judge.closed()
