@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import itertools
 import json
 import os
 import socket
@@ -282,8 +283,8 @@ SCENES = {  # what the rig sends, and what must stand on the page
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize(("width", "dark"), [(390, True), (390, False), (1400, False), (1400, True)])
-def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, width, dark):
+def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene):
+    """In windows of two widths, light and dark: one browser opens the page in each."""
     keep, bus, rng = shots() or tmp_path, served.bus, np.random.default_rng(0)
     status = Status.CONVERGED if scene in ("converged", "edges") else Status.CONVERGING
     reason = "lever arm along the optical axis: +-12.0 mm" if status is Status.CONVERGING else ""
@@ -292,15 +293,16 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
         events = [event] if k == 60 else []
         sent = web_feed.estimate(0.2 * k, rng, status, reason=reason, events=events, **SCENES[scene])
         web_feed.publish_estimate(bus, sent)
+    numbers = itertools.count(1)
     fault = (Level.ERROR, "no data for 3.0 s: is the cable plugged in?") if scene == "fault" else ()
-    web_feed.publish_status(bus, *fault)
 
-    async def script(page):
+    async def look(page, width, dark):
+        web_feed.publish_status(bus, *fault)
         await page.open(served.address, width, 844 if width < 600 else 1250, dark=dark)
         await page.wait("document.getElementById('link').textContent === 'live'")
         await page.wait("document.querySelectorAll('#devices tbody tr').length > 1")
-        for number in range(1, 50):  # points alone, as from a log without images
-            web_feed.publish_points(bus, number)
+        for _ in range(49):  # points alone, as from a log without images
+            web_feed.publish_points(bus, next(numbers))
             await asyncio.sleep(0.02)
         web_feed.publish_estimate(bus, sent)  # however long the browser took to start, this is fresh
         await page.wait("!page.latest.cam0.stale")
@@ -324,11 +326,21 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
         if width < 600:
             await page.evaluate("document.getElementById('devices').scrollIntoView()")
             await page.screenshot(keep / f"{scene}_{width}_{'dark' if dark else 'light'}_devices.png")
-        return texts, page.errors
+        return texts
 
-    texts, errors = browser.drive(script, tmp_path / "profile")
+    windows = [(390, True), (390, False), (1400, False), (1400, True)]
+
+    async def script(page):
+        return {window: await look(page, *window) for window in windows}, page.errors
+
+    seen, errors = browser.drive(script, tmp_path / "profile")
     assert errors == []
-    assert texts["wide"] <= width  # nothing to scroll sideways, tables neither
+    for (width, _), texts in seen.items():
+        assert texts["wide"] <= width  # nothing to scroll sideways, tables neither
+        check_what_stands_there(scene, reason, texts)
+
+
+def check_what_stands_there(scene, reason, texts):
     assert texts["low"] < 300
     assert "no images arrive" in texts["misfit"] and "1 sigma" in texts["facts"]
     assert "12 s: cam0: the stamps of the images jitter" in texts["news"]
@@ -348,25 +360,23 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
         assert texts["guidance"] == "" and texts["edges"] == 0
 
 
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (820, 1180), (1400, 1000)])
-def test_what_the_operator_needs_is_seen_without_scrolling(
-    served, web_feed, browser, tmp_path, width, height, dark
-):
+def test_what_the_operator_needs_is_seen_without_scrolling(served, web_feed, browser, tmp_path):
+    """In windows of three sizes, light and dark: one browser opens the page in each."""
     keep, bus, rng = shots() or tmp_path, served.bus, np.random.default_rng(0)
     stored = encode_calibration(web_feed.estimate(60.0, np.random.default_rng(5)), "cam0")
     bus.publish(topics.STORED.key(web_feed.RIG, "cam0"), stored)
     for k in range(1, 40):
         web_feed.publish_estimate(bus, web_feed.estimate(0.2 * k, rng))
-    web_feed.publish_status(bus)
     for number in range(1, 30):
         web_feed.publish_image(bus, number)
+    numbers = itertools.count(30)
 
-    async def script(page):
+    async def look(page, width, height, dark):
+        web_feed.publish_status(bus)
         await page.open(served.address, width, height, dark=dark)
         await page.wait("document.querySelectorAll('.meter').length === 7")
-        for number in range(30, 60):
-            web_feed.publish_estimate(bus, web_feed.estimate(0.2 * (number + 10), rng))
+        for number in itertools.islice(numbers, 30):
+            web_feed.publish_estimate(bus, web_feed.estimate(0.2 * (number + 10), rng, Status.CONVERGING))
             web_feed.publish_image(bus, number)
             await asyncio.sleep(0.05)
         await page.wait("document.querySelector('#corners path.wanted') !== null")
@@ -393,12 +403,23 @@ def test_what_the_operator_needs_is_seen_without_scrolling(
             " scene.canvas.dispatchEvent(new PointerEvent(kind, { pointerId: 1, clientX: x, clientY: 50 }))"
         )
         turned = await page.evaluate("JSON.stringify(scene.turn)") != before
-        return low, texts, wide, drawn, turned, page.errors
+        return low, texts, wide, drawn, turned
 
-    low, texts, wide, drawn, turned, errors = browser.drive(script, tmp_path / "profile")
-    assert errors == [] and wide <= width and low <= height
+    windows = [(*size, dark) for size in ((390, 844), (820, 1180), (1400, 1000)) for dark in (False, True)]
+
+    async def script(page):
+        return {window: await look(page, *window) for window in windows}, page.errors
+
+    seen, errors = browser.drive(script, tmp_path / "profile")
+    assert errors == []
+    for (width, height, _), (low, texts, wide, drawn, turned) in seen.items():
+        assert wide <= width and low <= height
+        check_operator_texts(texts)
+        assert drawn and turned
+
+
+def check_operator_texts(texts):
     assert texts["wanted"].startswith("bring the board into the outline")
     assert "in an exposure of 12 ms: shorten it to" in texts["imageadvice"]
     assert "images/s" in texts["imagefacts"] and "of the image covered" in texts["imagefacts"]
     assert "joint sigmas" in texts["storedsays"] and "lever arm x" in texts["storedrows"]
-    assert drawn and turned
