@@ -169,12 +169,12 @@ def main(argv: list[str]) -> int:
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     halves = [[i for i in items if (i[0] < split) == first] for first in (True, False)]
-    held_lens, free = (
+    fixed_lens, free = (
         CalibrationOptions(fix=f, imu_noise=NOISE) for f in (frozenset({"intrinsics"}), frozenset())
     )
     five = replace(PRIOR, distortion_model="plumb_bob", distortion=(*DISTORTION, 0.0))
     for name, options, prior in (
-        ("fixed", held_lens, PRIOR),
+        ("fixed", fixed_lens, PRIOR),
         ("free", free, PRIOR),
         ("free, plumb_bob", free, five),
     ):

@@ -322,8 +322,7 @@ def code_under_test(kind: str) -> str:
 
 @cache
 def _code_of_the_bound() -> str:
-    files = ("bound", "information", "error_model", "projection")
-    return runner.fingerprint(*(f"benchmarks/{name}.py" for name in files), "mocks/vical_mocks")
+    return runner.fingerprint("mocks/vical_mocks")
 
 
 def results_of(name: str, case: Case, kind: str, args: argparse.Namespace) -> list[runner.Result]:

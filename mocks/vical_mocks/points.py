@@ -217,9 +217,8 @@ def project_points(
     uv, visible = rig.lens.project(rig.points_in_camera(t_s, points_m))
     if rig.readout_s == 0.0:
         return uv, visible
-    height = rig.lens.resolution[1]
     for _ in range(4):  # where a point appears says when its row is read, which moves the point
-        t_row = t_s[:, None] + rig.readout_s * (np.clip(uv[..., 1] / height, 0.0, 1.0) - 0.5)
+        t_row = t_s[:, None] + rig.readout_s * np.clip(rig.row_share(uv), -0.5, 0.5)
         R, p = rig.camera_pose_target(t_row)
         uv, visible = rig.lens.project(np.einsum("fnji,fnj->fni", R, points_m - p))
     return uv, visible

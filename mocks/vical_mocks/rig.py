@@ -114,6 +114,7 @@ class Rig:
         lens: Intrinsics and distortion.
         readout_s: First to last row; 0: global shutter. The frame's stamp is that of the middle row:
             row v is taken readout_s * (v / height - 0.5) later.
+        readout_axis: "rows", or "columns": column u is taken readout_s * (u / width - 0.5) later.
         densities: White noise and bias walks of the imu.
         gyro_bias, accel_bias: rad/s and m/s^2.
         gyro_matrix, accel_matrix: Scale and misalignment: reading = matrix @ truth + bias + noise.
@@ -128,12 +129,18 @@ class Rig:
     gravity_world_mps2: FloatArray = field(default_factory=nominal_gravity)
     lens: Lens = field(default_factory=Lens)
     readout_s: float = 0.0
+    readout_axis: str = "rows"
     densities: ImuDensities = field(default_factory=ImuDensities)
     gyro_bias: BiasWalk = field(default_factory=lambda: BiasWalk(np.zeros(3), 0.0, 0))
     accel_bias: BiasWalk = field(default_factory=lambda: BiasWalk(np.zeros(3), 0.0, 0))
     gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     accel_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
     bumps: tuple[Bump, ...] = ()
+
+    def row_share(self, uv_px: FloatArray) -> FloatArray:
+        """When points (..., 2) are read from the middle of the image on, as a share of the readout."""
+        axis = ("columns", "rows").index(self.readout_axis)
+        return np.asarray(uv_px[..., axis] / self.lens.resolution[axis] - 0.5)
 
     # --- time -----------------------------------------------------------------------------------------
     def timeshift_at(self, t_s: npt.ArrayLike) -> FloatArray:

@@ -318,7 +318,9 @@ def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]
 
 def _merge(given: CameraPrior, stored: CameraPrior, fix: tuple[str, ...]) -> CameraPrior:
     """Return the stored prior, with the fixed parameters of the config."""
-    merged = replace(stored, readout_s=given.readout_s or stored.readout_s)
+    merged = replace(stored, readout_axis=given.readout_axis or stored.readout_axis)
+    if given.readout_s:
+        merged = replace(merged, readout_s=given.readout_s, readout_axis=given.readout_axis)
     if "intrinsics" in fix:
         merged = replace(
             merged,

@@ -77,7 +77,8 @@ def _readout_lines(camera: dict[str, Any]) -> list[str]:
     readout_s, sigma_s = camera.get("readout_s", 0.0), camera.get("readout_sigma_s", 0.0)
     if not (readout_s or sigma_s):
         return []
-    return [_row("readout", [1e3 * readout_s], [1e3 * sigma_s], "ms", 3) + "  (first row to last)"]
+    what = "column" if camera.get("readout_axis") == "columns" else "row"
+    return [_row("readout", [1e3 * readout_s], [1e3 * sigma_s], "ms", 3) + f"  (first {what} to last)"]
 
 
 def _row(name: str, values: list[float], sigmas: list[float] | None, unit: str, digits: int) -> str:

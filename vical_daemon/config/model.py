@@ -95,6 +95,7 @@ class LensConfig:
     T_cam_imu: Matrix4 | None = None
     timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
     readout_s: Annotated[float, Bound(low=0, high=0.2)] = 0.0
+    readout_axis: Literal["rows", "columns"] | None = None
 
 
 @dataclass(frozen=True, slots=True)

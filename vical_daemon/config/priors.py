@@ -44,6 +44,7 @@ class _KalibrCamera:
     timeshift_cam_imu: Annotated[float, Bound(low=-5, high=5, hint="seconds")] | None = None
     line_delay: Annotated[float, Bound(low=0, high=1e-3, hint="seconds a line")] | None = None
     readout_s: Annotated[float, Bound(low=0, high=0.2)] | None = None
+    readout_axis: Literal["rows", "columns"] | None = None
     resolution: tuple[Annotated[int, Bound(low=16)], Annotated[int, Bound(low=16)]] | None = None
     rostopic: str | None = None
     cam_overlaps: tuple[int, ...] | None = None
@@ -122,6 +123,7 @@ def camera_prior(config: Config, name: str) -> CameraPrior:
         T_imu_cam=_inverse(lens.T_cam_imu),
         timeshift_cam_imu_s=lens.timeshift_cam_imu,
         readout_s=lens.readout_s,
+        readout_axis=lens.readout_axis or "",
         intrinsics_sigma=lens.intrinsics_sigma,
         distortion_sigma=lens.distortion_sigma,
     )
@@ -159,7 +161,7 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
     if camera.T_cam_imu is not None and (text := rigid_error(camera.T_cam_imu)):
         raise ConfigError(schema.mistake(document, f"{name}.T_cam_imu", text))
     resolution = camera.resolution or (0, 0)
-    readout_s = camera.readout_s or (camera.line_delay or 0.0) * resolution[1]
+    readout_s = camera.readout_s or (camera.line_delay or 0.0) * resolution[camera.readout_axis != "columns"]
     return CameraPrior(
         resolution=resolution,
         intrinsics=camera.intrinsics,
@@ -168,6 +170,7 @@ def _camera_prior(document: Document, name: str, camera: _KalibrCamera) -> Camer
         T_imu_cam=_inverse(camera.T_cam_imu),
         timeshift_cam_imu_s=camera.timeshift_cam_imu,
         readout_s=readout_s,
+        readout_axis=camera.readout_axis or "",
         intrinsics_sigma=camera.intrinsics_sigma,
         distortion_sigma=camera.distortion_sigma,
     )

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.events import ROLLING, Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.frame_queue import FrameQueue
 from vical_daemon.estimation.filter.image_intake import (
@@ -23,7 +23,7 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.init.board_window import Frames
-from vical_daemon.estimation.init.initializer import LATE_S, Starting
+from vical_daemon.estimation.init.initializer import LATE_S, Initializer
 from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
 from vical_daemon.estimation.init.recording_start import RecordingStart
 from vical_daemon.estimation.measurements import (
@@ -33,17 +33,17 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.model.held_lens import HeldLens
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, Layout, make_layout
 from vical_daemon.estimation.plausible import stamp_sigma_problem, usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.selection import model_selection as hypotheses
-from vical_daemon.estimation.selection.model_acceptance import BeyondDoubt
+from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
-from vical_daemon.estimation.status.holdout_check import HeldBack
+from vical_daemon.estimation.status.holdout_check import HoldoutCheck
 from vical_daemon.estimation.status.recent_past import RecentPast
-from vical_daemon.estimation.status.status_evaluator import Judge
+from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
@@ -82,7 +82,7 @@ class Calibrator:
         if "intrinsics" not in options.fix or self._held:  # else what is missed may as well be the lens
             self._states |= {hypotheses.TARGET}
         self.layout = self._lay_out()
-        self.judge = Judge(options, self.layout)
+        self.judge = StatusEvaluator(options, self.layout)
         self.filter: CalibrationFilter | None = None
         self._imu = ImuIntake()
         self._images = ImageIntake()
@@ -92,8 +92,8 @@ class Calibrator:
         self._stale: CalibrationFilter | None = None
         self._lost: MotionRestart | None = None
         self._used_ns: dict[str, int] = {}  # stamp of the last image used, by camera
-        self._held_back = HeldBack()
-        self._beyond_doubt = BeyondDoubt()
+        self._held_back = HoldoutCheck()
+        self._beyond_doubt = ModelAcceptance()
         self._past = RecentPast()
         self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
         self._stamp_sigma_s = 0.0
@@ -110,18 +110,18 @@ class Calibrator:
             models, fix=self.options.fix, estimate=self._states, target_m=self.target, held=self._held
         )
 
-    def _held_lenses(self) -> dict[str, HeldLens]:
+    def _held_lenses(self) -> dict[str, FixedLens]:
         """Lenses whose errors matter to something that is estimated, by camera."""
         fix = self.options.fix
         if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
             return {}
-        lenses = {name: HeldLens.of(prior) for name, prior in self.priors.items()}
+        lenses = {name: FixedLens.of(prior) for name, prior in self.priors.items()}
         return {name: lens for name, lens in lenses.items() if lens is not None}
 
-    def _new_starting(self, off: Collection[str] = ()) -> Starting:
+    def _new_starting(self, off: Collection[str] = ()) -> Initializer:
         """For a rig of which it is known what is not as stated."""
         options = replace(self.options, estimate=self.options.estimate | set(off))
-        return Starting(options, self.layout, self.target, self._step)
+        return Initializer(options, self.layout, self.target, self._step)
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
@@ -210,8 +210,8 @@ class Calibrator:
             return
         found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
         for _ in range(_MOST_SURPRISES):
-            if found.rolling:
-                self._estimate_readout(found.rolling)
+            if found.rolling is not None:
+                self._estimate_readout(*found.rolling)
             elif found.size is not None:
                 self._resize(found.size)
             else:
@@ -230,7 +230,7 @@ class Calibrator:
             f.keep_from(self._stale)
             self._kept_until_s = f.state.t_s + _PROVEN_S
         self._stale = None
-        self._held_back, self._lost, self._past = HeldBack(), None, RecentPast()
+        self._held_back, self._lost, self._past = HoldoutCheck(), None, RecentPast()
         self.judge.started(f.state.t_s, found.reason)
         self.watch.started(f.state.t_s)
         self._starting.anew()
@@ -260,12 +260,13 @@ class Calibrator:
             self._reports.append(report)
         return []
 
-    def _estimate_readout(self, camera: str) -> None:
+    def _estimate_readout(self, camera: str, axis: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self._states |= {"readout"}
+        self.priors[camera] = replace(self.priors[camera], readout_axis=axis)
         self.layout = self.judge.layout = self._lay_out()
         self._starting.go_on_with(self.layout, self.target)
-        self.judge.announce(Event(EventKind.ROLLING_SHUTTER, camera))
+        self.judge.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
         """The target is by far not as large as stated: go on with one that is; its size is asked for."""
@@ -314,7 +315,7 @@ class Calibrator:
 
     def _lose_motion(self) -> None:
         """Forget where the rig is, not its calibration; images to come will show it."""
-        self._lost, self._held_back = MotionRestart(self.target, self._used_ns), HeldBack()
+        self._lost, self._held_back = MotionRestart(self.target, self._used_ns), HoldoutCheck()
 
     def _find_motion(self, lost: MotionRestart, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
         """Take the motion anew as soon as images show it, and follow those it was taken from."""
@@ -506,7 +507,7 @@ class Calibrator:
         self._used_ns.clear()
         self._seek_shift.clear()
         self._starting.anew()
-        self._held_back, self._lost = HeldBack(), None
+        self._held_back, self._lost = HoldoutCheck(), None
         if f is not None:
             self.watch.shift_reopened()
             self._lost = RecordingStart(self.target, {})

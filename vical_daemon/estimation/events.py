@@ -41,6 +41,7 @@ class EventKind(StrEnum):
     TARGET_SHAPE = "target_shape"
     FIXED_LENS = "fixed_lens"
     ROLLING_SHUTTER = "rolling_shutter"
+    ROLLING_COLUMNS = "rolling_shutter_columns"
     LENS_TERM_MISSING = "lens_term_missing"
     DEVICE_REPLACED = "device_replaced"
     ESTIMATOR_RESTARTED = "estimator_restarted"
@@ -106,6 +107,8 @@ class Event:
 
 SAID = frozenset({EventKind.OTHER, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED})
 """Kinds whose details (serial numbers, a line of code) are text only."""
+ROLLING = {"rows": EventKind.ROLLING_SHUTTER, "columns": EventKind.ROLLING_COLUMNS}
+"""What is announced of a rolling shutter, by `CameraPrior.readout_axis`."""
 _CHANGES = frozenset(
     {
         EventKind.BUMPED,
@@ -215,7 +218,7 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.STAMP_JITTER: About(
         "The stamps of the images jitter; allowed for. Value: standard deviation.",
         "s",
-        "Once per camera, from 0.3 ms.",
+        "Once per camera, from 0.3 ms; with a board, once neighbours are known to be late independently.",
     ),
     EventKind.STAMPS_STEPPED: About(
         "A camera's clock was set. Value: step against the IMU's stamps.",
@@ -285,6 +288,11 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.ROLLING_SHUTTER: About(
         "A rolling shutter that the config does not mention; its readout is estimated. Value: readout, where "
         "already known.",
+        "s",
+        "Once per camera.",
+    ),
+    EventKind.ROLLING_COLUMNS: About(
+        "The same, read by columns: a phone held upright.",
         "s",
         "Once per camera.",
     ),

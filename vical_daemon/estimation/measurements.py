@@ -13,6 +13,9 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
+ROWS, COLUMNS = "rows", "columns"
+"""What a rolling shutter reads one after the other; columns: a phone's sensor, of images turned upright."""
+
 
 @dataclass(frozen=True, slots=True)
 class ImuNoise:
@@ -39,7 +42,9 @@ class CameraPrior:
         distortion: The model's coefficients; None: zeros.
         T_imu_cam: (R_imu_cam (3,3), p_imu_cam (3,)) or None: nothing known, found from the data.
         timeshift_cam_imu_s: t_imu = t_cam + shift, s; None: nothing known, found from the data.
-        readout_s: Rolling-shutter readout, first to last row, s; 0: global shutter.
+        readout_s: Rolling-shutter readout, first to last row (or column), s; 0: global shutter.
+        readout_axis: What is read one after the other, `ROWS` or `COLUMNS`; empty: rows where a readout is
+            given, found from the data where it is estimated.
         intrinsics_sigma: How well fx fy cx cy are known where they are held, px; None: exactly.
         distortion_sigma: Likewise the coefficients.
     """
@@ -51,6 +56,7 @@ class CameraPrior:
     T_imu_cam: tuple[FloatArray, FloatArray] | None = None
     timeshift_cam_imu_s: float | None = None
     readout_s: float = 0.0
+    readout_axis: str = ""
     intrinsics_sigma: tuple[float, float, float, float] | None = None
     distortion_sigma: tuple[float, ...] | None = None
 

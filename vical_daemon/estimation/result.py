@@ -56,6 +56,8 @@ class CameraEstimate:
         readout_s: Rolling-shutter readout first to last row, s (0: global shutter).
         readout_sigma_s: Its standard deviation, s.
         resolution: width, height of the images, px; []: not known (it does not travel in the message).
+        readout_axis: What a rolling shutter reads one after the other, `rows` or `columns`; empty: rows, or
+            not known (it does not travel in the message, but the announcement that found it does).
         withheld: The same as `unobservable`, as data; [] in logs of older versions.
         calibration_covariance: Of [px py pz rx ry rz, time shift, fx fy cx cy, distortion] together, m, rad,
             s, px, rotation error local (right); zero rows where not estimated; lens model errors
@@ -77,6 +79,7 @@ class CameraEstimate:
     readout_s: float = 0.0
     readout_sigma_s: float = 0.0
     resolution: list[int] = field(default_factory=list)
+    readout_axis: str = ""
     withheld: list[WeakDirection] = field(default_factory=list)
     stamp_jitter_s: float = 0.0
     calibration_covariance: list[list[float]] = field(default_factory=list)

@@ -34,13 +34,19 @@ from vical_daemon.estimation.smoother.carry import (
     FULL,
     LENS,
     SHIFT,
-    Carry,
+    MarginalPrior,
     calibration_difference,
 )
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.handover import afresh, aged, next_window, of_another_recording
-from vical_daemon.estimation.smoother.judge import FreeJudge
+from vical_daemon.estimation.smoother.handover import (
+    initial_prior,
+    next_window,
+    of_another_recording,
+    with_process_noise,
+)
+from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 from vical_daemon.estimation.smoother.reports import window_reports
+from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
 from vical_daemon.estimation.smoother.starter import Starter
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
@@ -91,11 +97,11 @@ class TargetFreeCalibrator:
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         self.active[LENS] = "intrinsics" not in options.fix
         rolling = "readout" in options.estimate or self.prior.readout_s != 0.0
-        self.judge = FreeJudge(options, self.camera, self.active, rolling=rolling)
+        self.judge = TargetFreeStatus(options, self.camera, self.active, rolling=rolling)
         self.starter = Starter(options, self.prior)
         self.window: Window | None = None
-        self.carry: Carry | None = None  # before the window
-        self.latest: Carry | None = None  # after its last adjustment
+        self.carry: MarginalPrior | None = None  # before the window
+        self.latest: MarginalPrior | None = None  # after its last adjustment
         self._closed = 0
         self._noise = (options.corner_sigma_px, 1.0, 0.0)  # px, how long errors last, jitter of stamps in s
         self._imu = ImuIntake()
@@ -253,7 +259,7 @@ class TargetFreeCalibrator:
             self._close(fit, begun.bundle)
         return True
 
-    def _begin(self, frames: list[Stamped], known: Carry | None) -> _Begun | str:
+    def _begin(self, frames: list[Stamped], known: MarginalPrior | None) -> _Begun | str:
         """Start a window from a stretch, with the calibration of before where there is one; or why not."""
         assert self._buffer is not None
         window = self.starter.window(self._buffer, frames, known)
@@ -261,7 +267,7 @@ class TargetFreeCalibrator:
             return window
         return self._adjusted(window, known) or _DOES_NOT_FIT
 
-    def _of_another(self, frames: list[Stamped], known: Carry) -> Carry | str:
+    def _of_another(self, frames: list[Stamped], known: MarginalPrior) -> MarginalPrior | str:
         """What was known, with the biases by the first images of another recording; or why there are none."""
         assert self._buffer is not None
         window = self.starter.window(self._buffer, frames, None)
@@ -272,19 +278,41 @@ class TargetFreeCalibrator:
             return "the rig turns about one axis only so far: turn it about a second one"
         return of_another_recording(known, window, self._stepped_s)
 
-    def _adjusted(self, window: Window, known: Carry | None, reopened: Collection[int] = ()) -> _Begun | None:
+    def _adjusted(
+        self, window: Window, known: MarginalPrior | None, reopened: Collection[int] = ()
+    ) -> _Begun | None:
         """Adjust a first window with what is known but for some errors; None where it does not fit."""
-        assert self._buffer is not None
-        carry = afresh(window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened)
-        bundle = Bundle(window, carry, *self._noise)
-        fit = bundle.solve(self._buffer, _STEPS_START)
+        bundle, carry, fit = self._solved(window, known, reopened)
+        if known is None and self._axis_open and fit is not None and shows_columns(bundle, fit):
+            by_columns = self._solved(read_by_columns(window), known, reopened)
+            if by_columns[2] is not None and by_columns[2].sigma_px < fit.sigma_px:
+                bundle, carry, fit = by_columns
         if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
             return None
         if known is not None and not self.judge.agrees(fit, carry, complete=False):
             return None
+        if known is None and self._axis_open:
+            axis = bundle.window.camera.readout_axis
+            self.prior = self.starter.prior = replace(self.prior, readout_axis=axis)
         return _Begun(bundle, fit)
 
-    def _go_on(self, frames: list[Stamped], known: Carry) -> _Begun | str:
+    def _solved(
+        self, window: Window, known: MarginalPrior | None, reopened: Collection[int]
+    ) -> tuple[Bundle, MarginalPrior, Fit | None]:
+        """Adjust a window with what is known but for some errors."""
+        assert self._buffer is not None
+        carry = initial_prior(
+            window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened
+        )
+        bundle = Bundle(window, carry, *self._noise)
+        return bundle, carry, bundle.solve(self._buffer, _STEPS_START)
+
+    @property
+    def _axis_open(self) -> bool:
+        """Whether nothing was said, or found, of what a rolling shutter would read one after the other."""
+        return not (self.prior.readout_axis or self.prior.readout_s)
+
+    def _go_on(self, frames: list[Stamped], known: MarginalPrior) -> _Begun | str:
         """Start a window after a pause; where it contradicts what was known, find what has changed."""
         assert self._buffer is not None
         surely = self._seek_shift or self._confirmed
@@ -372,7 +400,7 @@ class TargetFreeCalibrator:
         if _full(window):
             self._close(fit, bundle)
 
-    def _agrees(self, fit: Fit, carry: Carry, *, complete: bool) -> bool:
+    def _agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Whether a window agrees with what was known of calibration and stamps, as far as it tells."""
         if fit.parallax_deg < _MIN_PARALLAX_DEG:
             return True
@@ -393,10 +421,10 @@ class TargetFreeCalibrator:
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
         drifting, noise = self.judge.doubts.drifting, self.options.imu_noise
-        self.carry = aged(fit.carry, noise, self.active, window.span_s, drifting=drifting)
+        self.carry = with_process_noise(fit.carry, noise, self.active, window.span_s, drifting=drifting)
         self.window = next_window(window, self.carry)
 
-    def _forget(self, known: Carry) -> None:
+    def _forget(self, known: MarginalPrior) -> None:
         """What was kept over a change contradicts the images, too: start over, with the lens as a guess."""
         lens = known.camera
         self.prior = replace(
@@ -430,7 +458,7 @@ class TargetFreeCalibrator:
             keep: The window as adjusted last was good.
             against_s: For how long images have contradicted the calibration, s; 0: they do not.
         """
-        window = self.window
+        window, unproven = self.window, against_s > 0.0 and not self.judge.proven
         self.window = None
         if window is not None and against_s and self.judge.against_s:
             self._confirmed = True
@@ -441,6 +469,8 @@ class TargetFreeCalibrator:
                 self.judge.closed()
             else:
                 self.latest = self.carry if self._closed else None
+        if unproven:  # one window stands against one: neither is known to be right
+            self.latest, self._closed, self._confirmed = None, 0, False
         self.carry = None
         self.starter.again()
         self.judge.lost(why, value, self.latest, against_s)

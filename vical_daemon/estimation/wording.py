@@ -294,10 +294,13 @@ def _imu_noise(event: Event) -> str:
 
 
 def _rolling(event: Event) -> str:
+    shutter = "a rolling shutter"
+    if event.kind is EventKind.ROLLING_COLUMNS:
+        shutter += " that reads columns (a phone held upright does)"
     if event.value is None:
-        return "a rolling shutter, by how the target is bent in motion: its readout is estimated, too"
+        return f"{shutter}, by how the target is bent in motion: its readout is estimated, too"
     readout = _of(event, 1e3, "ms", ".1f")
-    return f"a rolling shutter, by how features move: its readout takes {readout}, and is allowed for"
+    return f"{shutter}, by how features move: its readout takes {readout}, and is allowed for"
 
 
 def _drift(why: str) -> Callable[[Event], str]:
@@ -389,6 +392,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         ),
     ),
     EventKind.ROLLING_SHUTTER: ("", _rolling),
+    EventKind.ROLLING_COLUMNS: ("", _rolling),
     EventKind.LENS_TERM_MISSING: (
         "",
         lambda _: "the lens needs one term more than radtan has: give it distortion_model: plumb_bob",

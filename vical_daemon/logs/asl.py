@@ -30,10 +30,13 @@ from vical_daemon.logs.model import (
     Stream,
     stream_statistics,
 )
+from vical_daemon.logs.stamp_column import column_ns
+from vical_daemon.logs.stamps import StampError, numbers
 
 RIG = "rig0"
 _IMU_ROW = np.dtype([("t", "<i8"), ("values", "<f8", (6,))])
 _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
+_NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
 _IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
@@ -177,8 +180,14 @@ class AslRecording(Recording):
             self.warnings.append(f"{folder.name}: {len(lost)} images listed but not there, first {lost[0]}")
         if not stamps:
             raise RecordingError(f"{table}: no images listed")
-        order = np.argsort(np.array(stamps, dtype=np.int64), kind="stable")
-        t_ns = np.array(stamps, dtype=np.int64)[order]
+        try:
+            t_ns, report = column_ns(numbers(stamps), "", imu=False)
+        except StampError as error:
+            raise RecordingError(f"{table}: the stamp {stamps[error.index]} is no number") from None
+        if report:
+            self.warnings.append(f"{folder.name}: {report}")
+        order = np.argsort(t_ns, kind="stable")
+        t_ns = t_ns[order]
         files = [files[i] for i in order.tolist()]
 
         def build(i: int) -> bytes:
@@ -201,13 +210,27 @@ class AslRecording(Recording):
             self.warnings.append(
                 f"{path.parent.name}: the last line of {path.name} is cut off; 1 line left out"
             )
-        title = text[: text.find(b"\n")].decode("utf-8", "replace") if dtype == _IMU_ROW else ""
-        if _accelerometer_first(title):
+        title = text[: text.find(b"\n")].decode("utf-8", "replace")
+        if dtype == _IMU_ROW and _accelerometer_first(title):
             raise RecordingError(
                 f"{path}: its title names the accelerometer before the gyro; {columns} are expected in this "
                 "order: swap the columns"
             )
-        return _load(whole, path, dtype, columns)
+        rows = _load(whole, path, dtype, columns)
+        try:
+            stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())
+            t_ns, report = column_ns(stamps, title, imu=dtype == _IMU_ROW)
+        except StampError as error:
+            raise RecordingError(
+                f"{path}: row {error.index + 1} of the data: its stamp is no number"
+            ) from None
+        if report:
+            self.warnings.append(f"{path.parent.name}: {report}")
+        out = np.empty(len(rows), dtype)
+        out["t"] = t_ns
+        for name in (dtype.names or ())[1:]:
+            out[name] = rows[name]
+        return out
 
     def _even(self, rows: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
         """Put readings that were stamped on arrival on an even grid; others in order of their stamps."""
@@ -266,8 +289,10 @@ def _without_cut_line(text: bytes, columns: int) -> bytes:
 
 
 def _load(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
-    """Parse a table of numbers; stamps as integers, no digit is lost."""
+    """Parse a table of numbers; stamps keep all digits: integers, or text where the first is a fraction."""
     begin = _first_data_row(text)
+    if _fractional(text, begin):
+        dtype = np.dtype([("t", "U40"), *((name, dtype[name]) for name in (dtype.names or ())[1:])])
     try:
         rows: npt.NDArray[Any] = np.loadtxt(
             io.BytesIO(text[begin:]),
@@ -281,6 +306,19 @@ def _load(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.ND
         reason = str(error).split(";")[0].rstrip(".")
         raise RecordingError(f"{path}: {reason}; expected {columns}") from None
     return rows
+
+
+def _fractional(text: bytes, begin: int) -> bool:
+    """Whether the first stamp is written with a point or an exponent."""
+    first = next(
+        (
+            line
+            for line in io.BytesIO(text[begin : begin + 2**20])
+            if line.strip() and line.lstrip()[:1] != b"#"
+        ),
+        b"",
+    )
+    return any(mark in first.split(b",")[0].lower() for mark in (b".", b"e"))
 
 
 def _accelerometer_first(title: str) -> bool:
@@ -334,15 +372,16 @@ def _first_data_row(text: bytes) -> int:
     return 0
 
 
-def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path], list[str]]:
+def _image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[str]]:
     """Return stamps and files of ``data.csv``, and names without a file; names cannot leave the folder."""
-    stamps, files, lost = [], [], []
+    stamps: list[str] = []
+    files, lost = [], []
     for number, line in enumerate(_read_text(table).decode("utf-8", "replace").splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         stamp, _, name = (part.strip() for part in line.partition(","))
         name = name.split(",")[0].strip() or f"{stamp}.png"
-        if not stamp.lstrip("-").isdigit() or Path(name).name != name:
+        if not _NUMBER.fullmatch(stamp) or Path(name).name != name:
             raise RecordingError(
                 f"{table} line {number}: expected 'timestamp [ns],filename', found '{line[:80]}'"
             )
@@ -352,7 +391,7 @@ def _image_list(table: Path, folder: Path) -> tuple[list[int], list[Path], list[
             continue
         if path.suffix.lower() not in _IMAGE_SUFFIXES:
             raise RecordingError(f"{path}: images must be png or jpg")
-        stamps.append(int(stamp))
+        stamps.append(stamp)
         files.append(path)
     return stamps, files, lost
 

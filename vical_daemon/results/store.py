@@ -75,6 +75,7 @@ class StoredCalibration:
             T_imu_cam=pose,
             timeshift_cam_imu_s=known.timeshift_cam_imu_s,
             readout_s=known.readout_s,
+            readout_axis=known.readout_axis,
         )
 
 

@@ -119,6 +119,7 @@ def pixel_jacobians(
         R_imu_cam,
         p_imu_cam,
         rig.lens,
+        rig.row_share,
     )
     together = jacobians(view, np.concatenate(points_m))
     ends = 2 * np.cumsum(counts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ class View:
         R_imu_cam: (3, 3).
         p_imu_cam: m.
         lens: Intrinsics.
+        share_read: By pixels (..., 2): when they are read, as a share of the readout; None: by rows.
     """
 
     R_world_imu: FloatArray
@@ -34,6 +36,7 @@ class View:
     R_imu_cam: FloatArray
     p_imu_cam: FloatArray
     lens: Lens
+    share_read: Callable[[FloatArray], FloatArray] | None = None
 
     def points_in_imu(self, points_m: FloatArray) -> FloatArray:
         """World points (n, 3) in the imu frame, m."""
@@ -65,7 +68,7 @@ def jacobians(view: View, points_m: FloatArray) -> dict[str, FloatArray]:
     moving = np.cross(in_imu, view.omega_imu_rps) - resting
     by_time = np.einsum("nij,nj->ni", by_imu, moving)
     uv, _ = view.lens.project(in_cam)
-    row_share = uv[:, 1] / view.lens.resolution[1] - 0.5
+    share = view.share_read(uv) if view.share_read else uv[:, 1] / view.lens.resolution[1] - 0.5
     blocks = {
         "attitude": by_imu @ skew(in_imu),
         "position": -by_world,
@@ -73,7 +76,7 @@ def jacobians(view: View, points_m: FloatArray) -> dict[str, FloatArray]:
         "p_imu_cam": -by_imu,
         "r_imu_cam": by_cam @ skew(in_cam),
         "timeshift": by_time[..., None],
-        "readout": (by_time * row_share[:, None])[..., None],
+        "readout": (by_time * share[:, None])[..., None],
         "intrinsics": by_lens[..., :4],
         "distortion": by_lens[..., 4:],
         "target_scale": np.einsum("nij,nj->ni", by_world, points_m)[..., None],

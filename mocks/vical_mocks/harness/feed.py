@@ -336,6 +336,7 @@ def camera_prior(run: SimulatedRun, seed: int, errors: StartErrors, *, exact_len
         extrinsics,
         shift,
         run.rig.readout_s,
+        run.rig.readout_axis if run.rig.readout_s else "",
     )
 
 

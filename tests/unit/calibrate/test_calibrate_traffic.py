@@ -43,7 +43,7 @@ class Recorded:
         self.frames = self.imu_samples = 0
         self.sigma_s: float | None = None
         self.waiting = 0
-        self.left_out: dict[str, int] = {}
+        self.left_out = {"imu_clipped": 3, "imu_spikes": 1}
         self.hangs = self.fails = False
 
     def stamps_known_to(self, sigma_s: float) -> None:
@@ -127,7 +127,9 @@ class TestEstimate:
             role.step()
         role.finish()
         assert estimator.frames == estimator.imu_samples == 100
-        assert role.statuses()[0].values["stamps_refused"] == "8"
+        values = role.statuses()[0].values
+        assert values["stamps_refused"] == "8"
+        assert (values["imu_clipped"], values["imu_spikes"]) == ("3", "1")
 
     def test_progress_counts_what_is_used_or_refused(self, config: Config) -> None:
         estimator = Recorded()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -87,6 +87,8 @@ def test_the_estimator_starts_without_knowing_delay_or_mounting(shift: float) ->
 
 class Believer:
     """An estimator that knows everything, and the delay as it is told to."""
+
+    left_out: ClassVar[dict[str, int]] = {}
 
     def __init__(self, run: SimulatedRun, wrong_s: float) -> None:
         rig, lens = run.rig, run.rig.lens

@@ -20,10 +20,10 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 from vical_mocks.trajectory import one_axis, still
 
-from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.carry import FULL
-from vical_daemon.estimation.smoother.judge import FreeJudge
+from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 
@@ -170,12 +170,13 @@ def test_the_lens_is_found_too():
     assert np.abs(last.error[7:9]).max() < 2.0  # px, from five percent
 
 
-def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told():
-    rig = reference_rig(2, timeshift_cam_imu_s=0.01, readout_s=0.02)
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told(axis):
+    rig = reference_rig(2, timeshift_cam_imu_s=0.01, readout_s=0.02, readout_axis=axis)
     run = simulate_tracks(2, 8.0, rig=rig, camera_rate_hz=20.0)
     subject = subject_for(run, lens_known=False)
     record = feed(run, subject)
-    assert any(e.kind is EventKind.ROLLING_SHUTTER and e.camera == "cam0" for _, e in record.events)
+    assert any(e.kind is ROLLING[axis] and e.camera == "cam0" for _, e in record.events)
     for snapshot in record.snapshots:
         assert nees(snapshot.error, snapshot.covariance, 7) < chi2.isf(1e-4, 7)
     camera = subject.calibrator.estimate().cameras["cam0"]
@@ -185,7 +186,7 @@ def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told():
 
 def test_nothing_is_told_of_the_readout_of_a_global_shutter(followed):
     _, subject, record = followed
-    assert not any(e.kind is EventKind.ROLLING_SHUTTER for _, e in record.events)
+    assert not any(e.kind in ROLLING.values() for _, e in record.events)
     camera = subject.calibrator.estimate().cameras["cam0"]
     assert camera.readout_s == camera.readout_sigma_s == 0.0
 
@@ -206,7 +207,7 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 
 
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
-    judge = FreeJudge(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
+    judge = TargetFreeStatus(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
     judge.doubts.drifting = True
     judge.changed()
     assert not judge.doubts.drifting

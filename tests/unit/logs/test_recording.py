@@ -278,8 +278,6 @@ def bad_imu(tmp_path, change, a_motion, write_asl):
     (lambda t, w, f: (t, w, f * 5), "check its unit"),
     (lambda t, w, f: (t, np.rad2deg(w), f), "looks like deg/s"),
     (lambda t, w, f: (t, np.deg2rad(w), f), "check its unit"),
-    (lambda t, w, f: (t // 1000, w, f), "look like microseconds"),
-    (lambda t, w, f: (t // 1000000, w, f), "look like milliseconds"),
     (lambda t, w, f: (t[0] + (t - t[0]) * 40, w, f), "10 Hz and more"),
     (lambda t, w, f: (t[:10], w[:10], f[:10]), "only 10 samples"),
 ])  # fmt: skip

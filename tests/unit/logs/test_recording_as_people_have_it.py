@@ -106,3 +106,56 @@ def test_our_points_in_a_bag_of_ros_1_are_read(tmp_path: Path):
     frames = list(recording.points_frames(camera.name))
     assert [f.t_cam_ns for f in frames] == [1_700_000_000 * 10**9 + i * 10**8 for i in range(5)]
     assert frames[2].uv_px.ravel().tolist() == (uv + 2).tolist() and frames[2].ids.tolist() == [4, 5, 6]
+
+
+def _in_unit(path, factor, digits):
+    lines = path.read_text().splitlines()
+    for i, line in enumerate(lines):
+        stamp, comma, rest = line.partition(",")
+        if stamp.isdigit():
+            whole, part = divmod(int(stamp), factor)
+            text = f"{whole}.{part:0{len(str(factor)) - 1}d}"[: len(str(whole)) + 1 + digits].rstrip(".")
+            lines[i] = text + comma + rest
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "digits"),
+    [("seconds", 10**9, 9), ("milliseconds", 10**6, 3), ("microseconds", 10**3, 0)],
+)
+def test_stamps_in_another_unit_are_recognised_and_reported(tmp_path, write_asl, unit, factor, digits):
+    folder = write_asl(tmp_path / "a")
+    before = open_recording(folder)
+    for table in ("mav0/imu0/data.csv", "mav0/cam0/corners.csv"):
+        _in_unit(folder / table, factor, digits)
+    after = open_recording(folder)
+    for name in ("imu0", "cam0"):
+        assert any(w.startswith(f"{name}: by their spacing the stamps are {unit}") for w in after.warnings)
+    truth, found = (r.imu_arrays("imu0").t_ns for r in (before, after))
+    assert np.abs(found - truth).max() < max(factor // 10**digits, 1)
+    assert after.cameras["cam0"].count == before.cameras["cam0"].count
+    assert abs(after.cameras["cam0"].rate_hz / before.cameras["cam0"].rate_hz - 1.0) < 1e-3
+
+
+def test_stamps_of_images_in_seconds_are_recognised(tmp_path, write_asl):
+    folder = write_asl(tmp_path / "a", corners=False)
+    camera = folder / "mav0/cam0"
+    (camera / "data").mkdir()
+    names = [f"1600000000.{i:02d}" for i in range(0, 100, 5)]
+    for name in names:
+        (camera / "data" / f"{name}.png").write_bytes(b"image")
+    (camera / "data.csv").write_text("#timestamp [s],filename\n" + "\n".join(f"{n},{n}.png" for n in names))
+    recording = open_recording(folder)
+    assert recording.cameras["cam0"].rate_hz == pytest.approx(20.0)
+    assert any("stamps are seconds" in w for w in recording.warnings)
+
+
+def test_a_stamp_that_is_no_number_is_named(tmp_path, write_asl):
+    folder = write_asl(tmp_path / "a")
+    path = folder / "mav0/imu0/data.csv"
+    _in_unit(path, 10**9, 9)
+    lines = path.read_text().splitlines()
+    lines[7] = "soon" + lines[7][lines[7].index(",") :]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordingError, match="its stamp is no number"):
+        open_recording(folder)

@@ -24,12 +24,12 @@ from vical_daemon.estimation.filter.image_update import (
 from vical_daemon.estimation.filter.linearise import (
     Image,
     Linear,
-    Straightness,
+    LinearityMonitor,
     by_derivatives,
     by_sigma_points,
 )
-from vical_daemon.estimation.filter.propagate import Moved, move_by_derivatives, move_by_sigma_points
-from vical_daemon.estimation.filter.unobservable_directions import UnshownAxes
+from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives, move_by_sigma_points
+from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
@@ -91,15 +91,15 @@ class CalibrationFilter:
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     shared: dict[str, SharedErrors] = field(default_factory=dict)
-    unshown: UnshownAxes | None = None
+    unshown: UnobservableDirections | None = None
     drifting: set[str] = field(default_factory=set)
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
     stamp_sigma_s: float = 0.0
     began_s: float = 0.0
-    _motion_straight: Straightness = field(default_factory=Straightness)
-    _view_straight: dict[str, Straightness] = field(default_factory=dict)
+    _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
+    _view_straight: dict[str, LinearityMonitor] = field(default_factory=dict)
 
     # ------------------------------------------------------------------ propagation
     def predict(self, segment: ImuSegment) -> None:
@@ -114,7 +114,7 @@ class CalibrationFilter:
         state.t_s = float(segment.t_s[-1])
         self.rates = rates_after(state, segment, self.rates)
 
-    def _moved(self, segment: ImuSegment) -> tuple[Moved, FloatArray]:
+    def _moved(self, segment: ImuSegment) -> tuple[Propagated, FloatArray]:
         """The motion at the end of a segment and the covariance of the noise gathered on the way."""
         d = self.layout.dynamic
         S = self.S[:d, :d]
@@ -134,7 +134,7 @@ class CalibrationFilter:
         """Covariance of the noise gathered on the way, shape (9, 9)."""
         return influence.noise(self.imu_noise) + _TINY
 
-    def _grow(self, moved: Moved, Q: FloatArray) -> None:
+    def _grow(self, moved: Propagated, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""
         n, d, c = self.layout.size, self.layout.dynamic, moved.curved.shape[1]
         A = self.S.copy()
@@ -228,7 +228,7 @@ class CalibrationFilter:
         if owed:
             column = np.zeros(self.layout.size)
             column[index] = np.sqrt(owed)
-            self.loosen(column)
+            self.inflate_covariance(column)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""
@@ -258,7 +258,7 @@ class CalibrationFilter:
         """The image about the nominal state, with the spread of the prior."""
         where, known = self.layout.cameras[image.camera], self.state.cameras[image.camera]
         rolling = where.readout is not None or known.readout_s != 0.0
-        straight = self._view_straight.setdefault(image.camera, Straightness())
+        straight = self._view_straight.setdefault(image.camera, LinearityMonitor())
         sigmas = self.sigmas()
         if not rolling and straight.holds(sigmas):
             return self._with_shared(
@@ -306,9 +306,9 @@ class CalibrationFilter:
         """Add independent uncertainty to one error: what was known about it is in doubt."""
         column = np.zeros(self.layout.size)
         column[index] = sigma
-        self.loosen(column)
+        self.inflate_covariance(column)
 
-    def loosen(self, columns: FloatArray) -> None:
+    def inflate_covariance(self, columns: FloatArray) -> None:
         """Add the covariance `columns columns'`: directions of the errors, shape (n,) or (n, k), in doubt."""
         added = columns.reshape(self.layout.size, -1)
         self.S = unscented.lower_root(np.concatenate([self.S, added], axis=1))
@@ -410,7 +410,7 @@ class CalibrationFilter:
             self,
             state=deepcopy(self.state),
             S=self.S.copy(),
-            _motion_straight=Straightness(),
+            _motion_straight=LinearityMonitor(),
             _view_straight={},
         )
 

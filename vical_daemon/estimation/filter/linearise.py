@@ -20,6 +20,7 @@ from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
 from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.retract import camera_points, pose_points
 from vical_daemon.estimation.model.state import ATTITUDE, POSITION, VELOCITY, Layout, State
@@ -124,7 +125,7 @@ def project_errors(
     if where.readout is not None or known.readout_s != 0.0:
         if uv is None:
             uv = view(world, motion, cam, rates, ahead, known.distortion_model)[0]
-        rows = uv[:, 1] / known.resolution[1] - 0.5
+        rows = read_share(uv, known.resolution, known.readout_axis)
     return view(world, motion, cam, rates, ahead, known.distortion_model, rows)
 
 
@@ -236,7 +237,7 @@ def _pose_by_error(
 
 
 @dataclass(slots=True)
-class Straightness:
+class LinearityMonitor:
     """Remembers down to which sigmas a model was seen to be straight.
 
     Attributes:

@@ -30,7 +30,7 @@ _BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
 _EYE = np.eye(3)
 
 
-class Moved(NamedTuple):
+class Propagated(NamedTuple):
     """Motion at the end of a segment.
 
     Attributes:
@@ -50,7 +50,7 @@ class Moved(NamedTuple):
     seconds: float
 
 
-def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
+def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Propagated:
     """Statistical linearisation of the strapdown equations over one segment; S of the dynamic errors."""
     points = motion_points(state, layout, unscented.offsets(S))
     relative = strapdown(
@@ -66,7 +66,7 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
         [grp_from_rotation(end.R[0].T @ end.R[1:]), end.p[1:] - end.p[0], end.v[1:] - end.v[0]], axis=1
     )
     m = unscented.moments(values)
-    return Moved(
+    return Propagated(
         end.R[0] @ rotation_from_grp(m.shift[ATTITUDE]),
         end.p[0] + m.shift[POSITION],
         end.v[0] + m.shift[VELOCITY],
@@ -77,7 +77,7 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
     )
 
 
-def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Moved:
+def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Propagated:
     """The same to first order about the nominal state."""
     entries = layout.gyro_matrix is not None and layout.accel_matrix is not None
     M_g, M_a = (state.gyro_matrix[None], state.accel_matrix[None]) if entries else (None, None)
@@ -102,7 +102,7 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
         F[:, _BIASES] = errors.by_bias()
     if layout.accel_lag is not None and segment.accel_slope is not None:
         F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)
-    return Moved(
+    return Propagated(
         R @ dR,
         state.p_world_imu + T * state.v_world_imu + (0.5 * T * T) * g + R @ dp,
         state.v_world_imu + T * g + R @ dv,

@@ -49,6 +49,7 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         float(camera.readout_s),
         float(sigma[where.readout]) if where.readout is not None else 0.0,
         [int(size) for size in camera.resolution],
+        camera.readout_axis,
         stamp_jitter_s=float(f.shared[name].jitter_s) if name in f.shared else 0.0,
         calibration_covariance=_calibration_covariance(f, name, spread, lens_sigma).tolist(),
     )

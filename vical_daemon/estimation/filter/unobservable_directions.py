@@ -43,7 +43,7 @@ _EVERY_S = 1.0
 
 
 @dataclass(slots=True)
-class UnshownAxes:
+class UnobservableDirections:
     """Follows the attitude of a filter from its partial start on.
 
     Attributes:
@@ -100,7 +100,7 @@ class UnshownAxes:
         for where in f.layout.cameras.values():
             if where.position is not None:
                 column[where.position] = UNKNOWN_M * axis
-        f.loosen(column)
+        f.inflate_covariance(column)
 
     @property
     def projector(self) -> FloatArray:

@@ -94,7 +94,7 @@ def planar_pose(points_m: FloatArray, xy: FloatArray, sigma: float | None = None
     return _rank(R, p, rms, information, len(xy), sigma)
 
 
-def belonging(far: FloatArray) -> npt.NDArray[np.bool_]:
+def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
     """Which points lie within six sigmas of where they should, by the sigma that half of them show.
 
     Args:

@@ -21,9 +21,9 @@ from vical_daemon.estimation.filter.linearise import Image, by_small_steps, view
 from vical_daemon.estimation.filter.linearised_filter import Instant, LinearisedFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.target_poses import SeenPose
+from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
-from vical_daemon.estimation.model.inertial_links import Link, Links, make_link
+from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_link
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
@@ -105,13 +105,13 @@ class BoardWindow:
         self,
         state: State,
         nodes: list[Node],
-        links: list[Link],
+        links: list[PreintegratedLink],
         prior: CalibrationFilter,
         buffer: ImuBuffer,
         target: FloatArray,
     ) -> None:
         self.state, self.nodes, self._buffer, self._target = state, nodes, buffer, target
-        self._links = Links.stack(links)
+        self._links = PreintegratedLinks.stack(links)
         self.layout, self._noise, self._S = prior.layout, prior.imu_noise, prior.S
         root = np.linalg.inv(prior.S[MOTION.stop :, MOTION.stop :])
         self._information = root.T @ root
@@ -122,7 +122,7 @@ class BoardWindow:
     def begin(
         cls,
         state: State,
-        poses: Sequence[SeenPose],
+        poses: Sequence[TargetPose],
         frames: Frames,
         prior: CalibrationFilter,
         buffer: ImuBuffer,
@@ -229,7 +229,7 @@ class BoardWindow:
         links = _integrated(self.nodes, self.state, self._noise, self._buffer)
         if links is None:
             return False
-        self._links = Links.stack(links)
+        self._links = PreintegratedLinks.stack(links)
         self._find_rates()
         return True
 
@@ -345,10 +345,10 @@ class BoardWindow:
             self.sigma_px[name] = float(np.clip(sigma, _LEAST_PX, _MOST_PX))
 
 
-def _nodes(state: State, poses: Sequence[SeenPose], frames: Frames, buffer: ImuBuffer) -> list[Node]:
+def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: ImuBuffer) -> list[Node]:
     """Evenly chosen images with poses, by instant; velocities are still to be found."""
     originals = {(f.camera, f.t_cam_ns): (t, f) for t, f in frames}  # poses are of rows put right
-    chosen: list[tuple[float, SeenPose]] = []
+    chosen: list[tuple[float, TargetPose]] = []
     for name, camera in state.cameras.items():
         own = [p for p in poses if p.frame.camera == name]
         chosen += [(p.t_cam_s + camera.timeshift_s, p) for p in own[:: max(1, -(-len(own) // _IMAGES))]]
@@ -375,9 +375,11 @@ def _numbers(s: State) -> FloatArray:
     )
 
 
-def _integrated(nodes: list[Node], state: State, noise: ImuNoise, buffer: ImuBuffer) -> list[Link] | None:
+def _integrated(
+    nodes: list[Node], state: State, noise: ImuNoise, buffer: ImuBuffer
+) -> list[PreintegratedLink] | None:
     """Links between the instants; None where these are not in order or readings do not reach."""
-    links: list[Link] = []
+    links: list[PreintegratedLink] = []
     for a, b in pairwise(nodes):
         apart = b.at.t_s - a.at.t_s > 0.5 * _TOGETHER_S
         link = make_link(buffer, a.at.t_s, b.at.t_s, _numbers(state), noise) if apart else None

@@ -15,14 +15,14 @@ from vical_daemon.estimation.init.accel_alignment import Alignment, align, align
 from vical_daemon.estimation.init.accel_evidence import CameraPath
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.linear_start import still_axes
-from vical_daemon.estimation.init.readout_start import readout
+from vical_daemon.estimation.init.readout_start import likely_axis, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
-from vical_daemon.estimation.init.target_poses import Lens, PoseCache, SeenPose
+from vical_daemon.estimation.init.target_poses import Lens, PoseCache, TargetPose
 from vical_daemon.estimation.init.velocity_gravity_init import StartResult, motion_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
-from vical_daemon.estimation.temporal.td_icp_refusals import at_one_rate
+from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
 
 _SHIFT_SIGMA_S = 1.0e-3
 _PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
@@ -60,7 +60,7 @@ class _Rough:
     """One camera before its lever arm is known."""
 
     camera: CameraState
-    poses: list[SeenPose]
+    poses: list[TargetPose]
     gyro_bias_rps: FloatArray
 
 
@@ -131,7 +131,7 @@ def _steady(data: StartData, name: str, path: CameraPath) -> tuple[Alignment | N
     shift_s = data.priors[name].timeshift_cam_imu_s or 0.0
     rows = data.buffer.rows
     during = (rows[:, 0] > path.t_cam_s[0] + shift_s) & (rows[:, 0] < path.t_cam_s[-1] + shift_s)
-    if np.count_nonzero(during) < 100 or not at_one_rate(rows[during, 0], rows[during, 1:4]):
+    if np.count_nonzero(during) < 100 or not is_constant_rotation(rows[during, 0], rows[during, 1:4]):
         return None, None
     axes = still_axes(path.R_target_cam.mean(axis=0))
     return (align_at(path, rows, shift_s, axes[0]), axes[0]) if len(axes) == 1 else (None, None)
@@ -155,13 +155,14 @@ def _with_motion(
     )
 
 
-def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, list[SeenPose]]:
+def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, list[TargetPose]]:
     """Lens of a camera, as known or estimated, and its poses since a stamp."""
     lens, readout_s = Lens.from_prior(data.priors[name]), data.priors[name].readout_s
-    rows = lens.resolution[1]
     if data.layout.cameras[name].readout is not None:
+        if not (lens.readout_axis or readout_s):
+            lens.readout_axis = likely_axis(data.frames[name], lens, data.target)
         readout_s = readout(data.frames[name], lens, data.target, readout_s)
-    frames = at_middle_row(data.frames[name], readout_s, rows)
+    frames = at_middle_row(data.frames[name], readout_s, lens.resolution, lens.readout_axis)
     if data.layout.lens_free(name):
         estimate_intrinsics(lens, [f for _, f in frames], data.target)
     cache = data.caches.setdefault(name, PoseCache())
@@ -186,15 +187,16 @@ def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift
         lens.model,
         lens.resolution,
         lens.readout_s,
+        readout_axis=lens.readout_axis,
     )
 
 
-def _attitude_sigmas(poses: list[SeenPose], lens: Lens) -> FloatArray:
+def _attitude_sigmas(poses: list[TargetPose], lens: Lens) -> FloatArray:
     """Of the poses as stated, but at least a fifth of a pixel, rad, shape (n,)."""
     return np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0]))
 
 
-def _timing(buffer: ImuBuffer, poses: list[SeenPose], lens: Lens) -> TdIcpResult:
+def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: Lens) -> TdIcpResult:
     rows = buffer.rows
     return td_icp(
         rows[:, 0],

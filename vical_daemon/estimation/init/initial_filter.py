@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.unobservable_directions import UNKNOWN_M, UnshownAxes
+from vical_daemon.estimation.filter.unobservable_directions import UNKNOWN_M, UnobservableDirections
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.priors import (
@@ -38,7 +38,7 @@ from vical_daemon.estimation.noise.shared_errors import SharedErrors
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET
 
 
-def wide_filter(
+def initial_filter(
     state: State,
     layout: Layout,
     options: CalibrationOptions,
@@ -59,7 +59,7 @@ def wide_filter(
     walk = np.zeros(layout.size)
     off = {IMU, LAG, SIZE, TARGET} & options.estimate
     root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, off=off))
-    unshown = None if still_axes is None else UnshownAxes(still_axes, turn_axis_cam)
+    unshown = None if still_axes is None else UnobservableDirections(still_axes, turn_axis_cam)
     if unshown is not None:
         for where in layout.cameras.values():
             unshown.hold(root, where)

@@ -1,4 +1,4 @@
-"""The first seconds: what was seen is kept, and a start is tried from it, ever less often."""
+"""The first seconds: what was seen is kept, and a start is tried from it, ever less often, not at rest."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.board_window import Frames
-from vical_daemon.estimation.init.initial_filter import wide_filter
+from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.readout_start import looks_rolling
+from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache
 from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
@@ -21,7 +22,7 @@ from vical_daemon.estimation.model.state import Layout
 
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
-_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0  # a rig that does not move must cost little
+_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0
 _LOOK_S = 2.0  # a look takes 0.2 to 0.3 s of CPU
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
@@ -36,7 +37,8 @@ class Attempt:
         frames: Those it begins with, in order of the imu's time.
         reason: Why there is none, or what the motion does not show.
         motion_missing: It is motion that is missing, not time.
-        rolling: Name of a camera that has a rolling shutter of which nothing was said.
+        rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
+            the other (`ROWS`, `COLUMNS`); None: there is none.
         size: See `WindowStart`.
     """
 
@@ -44,11 +46,11 @@ class Attempt:
     frames: Frames
     reason: str
     motion_missing: bool = False
-    rolling: str = ""
+    rolling: tuple[str, str] | None = None
     size: float | None = None
 
 
-class Starting:
+class Initializer:
     """Collects the images of the first seconds and tries to start from them.
 
     Args:
@@ -68,26 +70,41 @@ class Starting:
         """Forget what was seen and try often again."""
         self._next_s, self._every_s = -np.inf, _ATTEMPT_FIRST_S
         self._next_look_s = -np.inf
+        self._tried = False
+        self._rest = {name: RestDetector() for name in self._frames}
         self._caches.clear()
         for frames in self._frames.values():
             frames.clear()
 
     def take(self, items: Sequence[tuple[float, PointsFrame]]) -> None:
-        """Keep images (stamp in the camera's clock in s, points); of too many, the older half is dropped."""
+        """Keep images (stamp in the camera's clock in s, points).
+
+        Of too many, the older half is dropped; of a rest before any motion, all but the last image.
+        """
         for t_cam_s, frame in items:
-            frames = self._frames[frame.camera]
+            frames, rest = self._frames[frame.camera], self._rest[frame.camera]
             frames.append((t_cam_s, frame))
+            rest.take(t_cam_s, frame)
             if len(frames) > _MAX_FRAMES:
                 del frames[: len(frames) // 2]
+            if rest.rests_since(frames[0][0]):
+                for name, kept in self._frames.items():
+                    self._frames[name] = [x for x in kept if x[0] >= t_cam_s]
 
     @property
     def oldest_s(self) -> float:
         """Stamp of the oldest image kept, s; infinite when there is none."""
         return min((f[0][0] for f in self._frames.values() if f), default=np.inf)
 
+    @property
+    def _rests(self) -> bool:
+        """Whether some camera shows a rig at rest by now, and none that it moves."""
+        seen = [r for r in self._rest.values() if r.seen]
+        return bool(seen) and all(r.rests for r in seen)
+
     def due(self, newest_s: float) -> bool:
-        """Whether it is time for another attempt."""
-        if newest_s < self._next_s:
+        """Whether it is time for another attempt; a rig at rest adds nothing to the last one."""
+        if newest_s < self._next_s or (self._tried and self._rests):
             return False
         self._next_s = newest_s + self._every_s
         self._every_s = min(1.25 * self._every_s, _ATTEMPT_MOST_S)
@@ -103,14 +120,20 @@ class Starting:
         """
         spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
         if len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S:
+            self._every_s = _ATTEMPT_FIRST_S
+            if self._rests:
+                return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
             return _none("collecting the first seconds: move the rig, keep the target in view")
+        self._tried = True
         data = start.StartData(
             buffer, self._frames, priors, self._options, self._layout, self._target, self._caches
         )
         rolling = self._rolling(buffer.newest_s, priors)
-        if rolling:
+        if rolling is not None:
             return Attempt(None, [], "", rolling=rolling)
         result = start.attempt(data)
+        if result.size is not None:
+            return Attempt(None, [], "", size=result.size)
         if result.state is None and result.motion_missing and may_be_partial:
             result = start.partial_attempt(data, result.reason)
         if result.state is None:
@@ -125,7 +148,7 @@ class Starting:
         ]
         frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
         make = partial(
-            wide_filter,
+            initial_filter,
             layout=self._layout,
             options=self._options,
             still_axes=result.still_axes,
@@ -145,17 +168,18 @@ class Starting:
         self._options = replace(self._options, estimate=self._options.estimate | set(off))
         self._caches.clear()
 
-    def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> str:
-        """Name of a camera whose images a rolling shutter has bent, though nobody said so; or empty."""
+    def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> tuple[str, str] | None:
+        """A camera whose images a rolling shutter has bent, though nobody said so, and its axis; or None."""
         if newest_s < self._next_look_s:
-            return ""
+            return None
         self._next_look_s = newest_s + _LOOK_S
         for name, where in self._layout.cameras.items():
             if where.readout is None and priors[name].readout_s == 0.0:
                 lens = Lens.from_prior(priors[name])
-                if looks_rolling(self._frames[name], lens, self._target):
-                    return name
-        return ""
+                axis = looks_rolling(self._frames[name], lens, self._target)
+                if axis:
+                    return name, axis
+        return None
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:

@@ -12,7 +12,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
-from vical_daemon.estimation.geometry.planar_pose import belonging, planar_pose
+from vical_daemon.estimation.geometry.planar_pose import inliers, planar_pose
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 
@@ -124,7 +124,7 @@ def _without_outliers(
     """The view without the corners that do not belong."""
     uv = project_jacobians(target[view.ids] @ R.T + p, theta[:4], theta[4:], model)[0]
     far = np.linalg.norm(view.uv_px - uv, axis=1)
-    good = belonging(far)
+    good = inliers(far)
     if good.all() or good.sum() < _LEAST_POINTS:
         return view
     return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])

@@ -29,6 +29,8 @@ class LinearStart:
         gravity: Acceleration of free fall, m/s^2, as found (not yet of the right length).
         accel_bias: m/s^2.
         sigma_p_imu_cam: Standard deviations, m, shape (3,).
+        size: True size of the target over the stated one; 1 where that was not asked for.
+        sigma_size: Its standard deviation; 0 likewise.
     """
 
     p_imu_cam: FloatArray
@@ -36,6 +38,8 @@ class LinearStart:
     gravity: FloatArray
     accel_bias: FloatArray
     sigma_p_imu_cam: FloatArray
+    size: float = 1.0
+    sigma_size: float = 0.0
 
 
 def linear_start(
@@ -46,11 +50,14 @@ def linear_start(
     gyro_bias: FloatArray,
     position_sigma: FloatArray,
     held_axes: FloatArray | None = None,
+    *,
+    free_size: bool = False,
 ) -> LinearStart | None:
     """Solve velocity, gravity, accelerometer bias and lever arm from poses of the camera.
 
-    p_cam(t_k) = p_0 + v_0 t + g t^2/2 + D_k - B_k b_a + R_k p_imu_cam, with D_k the double integral of
-    the rotated specific force and B_k that of the rotation itself.
+    s p_cam(t_k) = p_0 + v_0 t + g t^2/2 + D_k - B_k b_a + R_k p_imu_cam, with D_k the double integral of
+    the rotated specific force and B_k that of the rotation itself; s is the true size of the target over the
+    stated one, by which positions scale, and 1 unless `free_size`.
 
     Args:
         buffer: Inertial readings that cover all instants.
@@ -61,6 +68,7 @@ def linear_start(
         position_sigma: Standard deviation of each camera position, m, shape (n,).
         held_axes: Of the imu, along which the lever arm is held at zero, shape (k, 3): where an axis hardly
             turns (`still_axes`), errors of the attitudes would be taken for a lever arm along it.
+        free_size: Find the size of the target, too.
 
     Returns:
         The solution, or None where the readings do not cover the instants.
@@ -71,17 +79,19 @@ def linear_start(
     D, B = integrals
     n = len(t_imu_s)
     T = t_imu_s - t_imu_s[0]
-    A = np.zeros((n, 3, 15))
+    A = np.zeros((n, 3, 15 + free_size))
     eye = np.eye(3)
     A[:, :, 0:3] = eye
     A[:, :, 3:6] = T[:, None, None] * eye
     A[:, :, 6:9] = (0.5 * T * T)[:, None, None] * eye
     A[:, :, 9:12] = R_world_imu
     A[:, :, 12:15] = -B
+    if free_size:
+        A[:, :, 15] = -p_world_cam
     w = 1.0 / position_sigma
-    rows = (A * w[:, None, None]).reshape(-1, 15)
-    y = ((p_world_cam - D) * w[:, None]).ravel()
-    prior = np.zeros((6, 15))
+    rows = (A * w[:, None, None]).reshape(3 * n, -1)
+    y = (((0.0 if free_size else p_world_cam) - D) * w[:, None]).ravel()
+    prior = np.zeros((6, A.shape[2]))
     prior[:3, 12:15] = eye / ACCEL_BIAS_SIGMA_MPS2
     if held_axes is not None:
         prior[3:, 9:12] = held_axes.T @ held_axes / HELD_M
@@ -90,7 +100,9 @@ def linear_start(
     residual = (y - rows @ x).reshape(-1, 3)
     variance = float(np.mean(residual**2))
     cov = np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)
-    return LinearStart(x[9:12], x[3:6], x[6:9], x[12:15], np.sqrt(np.diag(cov)[9:12]))
+    sigma = np.sqrt(np.diag(cov))
+    size, sigma_size = (float(x[15]), float(sigma[15])) if free_size else (1.0, 0.0)
+    return LinearStart(x[9:12], x[3:6], x[6:9], x[12:15], sigma[9:12], size, sigma_size)
 
 
 def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import integrate_twice
-from vical_daemon.estimation.init.target_poses import Lens, SeenPose, pose_of
+from vical_daemon.estimation.init.target_poses import Lens, TargetPose, pose_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import (
     ATTITUDE,
@@ -48,7 +48,7 @@ class Poses(NamedTuple):
     t_s: FloatArray
     R: FloatArray
     p: FloatArray
-    first: SeenPose
+    first: TargetPose
 
 
 class MotionRestart:
@@ -63,7 +63,7 @@ class MotionRestart:
         self._target = target
         self._before_ns = dict(before_ns)
         self.frames: list[tuple[float, PointsFrame]] = []
-        self._seen: list[SeenPose | None] = []
+        self._seen: list[TargetPose | None] = []
 
     def take(self, frame: PointsFrame, t_cam_s: float, state: State, buffer: ImuBuffer) -> None:
         """Add an image; where readings are missing since the one before, only the new one counts.
@@ -138,7 +138,7 @@ class MotionRestart:
         by_camera_s = np.inf if before_ns is None else 1e-9 * (frame.t_cam_ns - before_ns)
         return max(min(by_imu_s, by_camera_s), 0.0)
 
-    def _sigmas(self, seen: SeenPose, layout: Layout, sigmas: FloatArray, span_s: float) -> FloatArray:
+    def _sigmas(self, seen: TargetPose, layout: Layout, sigmas: FloatArray, span_s: float) -> FloatArray:
         """Many times what the images give, which will be used once more to correct the motion."""
         where = layout.cameras[seen.frame.camera]
         turn = float(sigmas[where.rotation].max()) if where.rotation is not None else 0.0

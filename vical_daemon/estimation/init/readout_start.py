@@ -1,7 +1,7 @@
 """The readout of a rolling shutter to start with: the one with which a board in motion is flattest.
 
 A board that moves is bent by a rolling shutter as no pose and no lens bends it. Images turned upside down are
-read from below: their readout is negative.
+read from below: their readout is negative. Images turned upright from a phone's side are read by columns.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vical_daemon.estimation.init.intrinsics_start import (
 )
 from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
 from vical_daemon.estimation.init.target_poses import Lens
-from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray, IntArray, PointsFrame
 
 _TRIED_S = 0.008 * np.arange(6)
 _SIGNIFICANT = 25.0
@@ -50,24 +50,41 @@ def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> f
     return float(tried[least] - 0.5 * b / a)
 
 
-def looks_rolling(frames: Frames, lens: Lens, target: FloatArray) -> bool:
-    """Whether the board is flatter beyond doubt if rows are read over 4 ms than if all are taken at once.
+def likely_axis(frames: Frames, lens: Lens, target: FloatArray) -> str:
+    """`ROWS` or `COLUMNS`: with which of them, read over 8 ms, the board is flatter.
 
-    It is where the readout is longer than 2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as
-    for `readout`. The same corners are compared, each time from lens and poses that a first adjustment found.
+    Arguments as for `readout`.
     """
-    ways = [_upright(frames, r, lens) for r in (0.0, _SHORT_S, -_SHORT_S)]
+    tried = (-float(_TRIED_S[1]), float(_TRIED_S[1]))
+
+    def bent(axis: str) -> float:
+        return min(_bent(frames, replace(lens, readout_axis=axis), target, r) for r in tried)
+
+    return min((ROWS, COLUMNS), key=bent)
+
+
+def looks_rolling(frames: Frames, lens: Lens, target: FloatArray) -> str:
+    """Whether the board is flatter beyond doubt if rows, or columns, are read over 4 ms, not all at once.
+
+    Returns `ROWS`, `COLUMNS`, or empty: no rolling shutter shows. It does where the readout is longer than
+    2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as for `readout`. The same corners are
+    compared, each time from lens and poses that a first adjustment found.
+    """
+    tried = [(ROWS, 0.0), *((axis, r) for axis in (ROWS, COLUMNS) for r in (_SHORT_S, -_SHORT_S))]
+    ways = [_upright(frames, r, replace(lens, readout_axis=axis)) for axis, r in tried]
     chosen = spread(ways[0], lens)
     fit = fit_lens([ways[0][k] for k in chosen], lens, target)
     if fit is None:
-        return False
+        return ""
     found = replace(lens, intrinsics=fit.theta[:4], distortion=fit.theta[4:])
     squares = []
     for way in ways:
         views = [_only(way[chosen[k]], v.ids) for k, v in zip(fit.which, fit.views, strict=True)]
         squares.append(adjusted(views, fit.poses, found, target)[2] ** 2)
-    flattest, numbers = min(squares[1:]), 2.0 * sum(len(v.ids) for v in fit.views)
-    return bool(squares[0] - flattest > _BEYOND_DOUBT * flattest / numbers)
+    best = 1 + int(np.argmin(squares[1:]))
+    numbers = 2.0 * sum(len(v.ids) for v in fit.views)
+    surely = squares[0] - squares[best] > _BEYOND_DOUBT * squares[best] / numbers
+    return tried[best][0] if surely else ""
 
 
 def _only(frame: PointsFrame, ids: IntArray) -> PointsFrame:
@@ -92,5 +109,7 @@ def _upright(frames: Frames, readout_s: float, lens: Lens) -> list[PointsFrame]:
 
     `at_middle_row` does not know how corners move there.
     """
-    found = at_middle_row(frames, readout_s, lens.resolution[1]) if readout_s else frames[1:-1]
+    found = (
+        at_middle_row(frames, readout_s, lens.resolution, lens.readout_axis) if readout_s else frames[1:-1]
+    )
     return [frame for _, frame in found]

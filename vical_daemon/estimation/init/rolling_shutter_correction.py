@@ -1,7 +1,8 @@
 """Images of a rolling shutter as if all rows had been taken with the middle one: for starts.
 
-A row is taken `readout * (v / height - 1/2)` after the stamp; meanwhile its corners move as they do from the
-image before to the image after. The filter needs none of this: there each row has its own instant.
+A row (or a column) is taken `readout * (v / height - 1/2)` after the stamp; meanwhile its corners move as
+they do from the image before to the image after. The filter needs none of this: there each row has its own
+instant.
 """
 
 from __future__ import annotations
@@ -11,20 +12,22 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import ROWS, FloatArray, PointsFrame
+from vical_daemon.estimation.model.camera_rays import read_share
 
 Frames = list[tuple[float, PointsFrame]]
 
 _MAX_STEP_S = 0.25  # images further apart do not tell how corners move
 
 
-def at_middle_row(frames: Frames, readout_s: float, height: int) -> Frames:
+def at_middle_row(frames: Frames, readout_s: float, resolution: tuple[int, int], axis: str = ROWS) -> Frames:
     """Corners where they were when the middle row was taken.
 
     Args:
         frames: (stamp in s, points), in order; ids tell which corner is which.
         readout_s: First row to last, s; 0: nothing is changed.
-        height: Rows of the image.
+        resolution: width, height, px.
+        axis: See `read_share`.
 
     Returns:
         The same frames but the first and the last, of which only half the motion is known.
@@ -40,7 +43,7 @@ def at_middle_row(frames: Frames, readout_s: float, height: int) -> Frames:
             _, mine, theirs = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)
             speed[mine] += px_per_s[theirs]
             count[mine] += 1.0
-        late_s = readout_s * (frame.uv_px[:, 1] / height - 0.5)
+        late_s = readout_s * read_share(frame.uv_px, resolution, axis)
         uv = frame.uv_px - late_s[:, None] * speed / np.maximum(count, 1.0)[:, None]
         out.append((t_s, PointsFrame(frame.camera, frame.t_cam_ns, frame.ids, uv, frame.sigma_px)))
     return out

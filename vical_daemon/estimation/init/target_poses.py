@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.planar_pose import PlanarPose, belonging, planar_pose
+from vical_daemon.estimation.geometry.planar_pose import PlanarPose, inliers, planar_pose
 from vical_daemon.estimation.measurements import BoolArray, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 
@@ -24,6 +24,7 @@ class Lens:
     model: str
     resolution: tuple[int, int]
     readout_s: float = 0.0
+    readout_axis: str = ""
 
     @classmethod
     def from_prior(cls, prior: CameraPrior) -> Lens:
@@ -34,11 +35,12 @@ class Lens:
             prior.distortion_model,
             prior.resolution,
             prior.readout_s,
+            prior.readout_axis,
         )
 
 
 @dataclass(slots=True)
-class SeenPose:
+class TargetPose:
     """Pose of the camera from one image: instant in the camera's clock and pose in the target frame."""
 
     t_cam_s: float
@@ -66,7 +68,7 @@ class SeenPose:
         return float(np.sqrt(np.trace(self.pose.covariance[3:, 3:]) / 3.0))
 
 
-def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) -> SeenPose | None:
+def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) -> TargetPose | None:
     """Planar pose of one frame; None where too few points are seen or the two-fold ambiguity is open."""
     if len(frame.ids) < _MIN_POINTS:
         return None
@@ -83,7 +85,7 @@ def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) 
         found = planar_pose(points, xy)
     if not found.candidates or found.ambiguous:
         return None
-    return SeenPose(t_cam_s, found.candidates[0], frame)
+    return TargetPose(t_cam_s, found.candidates[0], frame)
 
 
 def _fitting(pose: PlanarPose, points: FloatArray, xy: FloatArray) -> BoolArray:
@@ -91,15 +93,15 @@ def _fitting(pose: PlanarPose, points: FloatArray, xy: FloatArray) -> BoolArray:
     seen = points @ pose.R_cam_target.T + pose.p_cam_target
     with np.errstate(all="ignore"):
         far = np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy, axis=1)
-    return belonging(far)
+    return inliers(far)
 
 
 class PoseCache:
     """Poses already found, so that repeated attempts cost little; a new lens empties it."""
 
     def __init__(self) -> None:
-        self._lens: tuple[float, ...] = ()
-        self._poses: dict[int, SeenPose | None] = {}
+        self._lens: tuple[float | str, ...] = ()
+        self._poses: dict[int, TargetPose | None] = {}
 
     def poses(
         self,
@@ -107,7 +109,7 @@ class PoseCache:
         lens: Lens,
         target: FloatArray,
         since_s: float = -np.inf,
-    ) -> list[SeenPose]:
+    ) -> list[TargetPose]:
         """Poses of at most 160 of the frames since a stamp, evenly thinned, in order of time.
 
         Args:
@@ -116,7 +118,7 @@ class PoseCache:
             target: Points of the target, m, shape (n, 3).
             since_s: Older frames are left out, s.
         """
-        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist(), lens.readout_s)
+        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist(), lens.readout_s, lens.readout_axis)
         if key != self._lens:
             self._lens, self._poses = key, {}
         known = {f.t_cam_ns: self._poses[f.t_cam_ns] for _, f in frames if f.t_cam_ns in self._poses}

@@ -9,12 +9,15 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import LinearStart, linear_start, still_axes
-from vical_daemon.estimation.init.target_poses import SeenPose
+from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _STRETCH_S = 10.0
+_FAR_SIZE = 0.1  # from here to the size of a target the filter does not get by itself
+_SIZES = (0.1, 10.0)  # true over stated; beyond, something else is wrong
+_SURE = 5.0  # sigmas
 _DRIFT_M = 5e-3  # of the double integral over the stretch; with little motion it counts
 
 
@@ -31,6 +34,8 @@ class StartResult:
         turn_axis_cam: Of a rig that turned about it at one rate all the time, camera frame, shape (3,): the
             delay and the mounting about this axis are guessed, too; None: not so.
         poses: Of all images used, by camera and in order.
+        size: True size of the target over the stated one, where it is surely and by far another; None: it may
+            be as stated.
     """
 
     state: State | None
@@ -38,12 +43,13 @@ class StartResult:
     motion_missing: bool = False
     still_axes: FloatArray | None = None
     turn_axis_cam: FloatArray | None = None
-    poses: list[SeenPose] = field(default_factory=list)
+    poses: list[TargetPose] = field(default_factory=list)
+    size: float | None = None
 
 
 def motion_start(
     buffer: ImuBuffer,
-    seen: dict[str, list[SeenPose]],
+    seen: dict[str, list[TargetPose]],
     cameras: dict[str, CameraState],
     gyro_bias_rps: dict[str, FloatArray],
     options: CalibrationOptions,
@@ -66,7 +72,7 @@ def motion_start(
     """
     state: State | None = None
     size, still = 0.0, None
-    used: list[SeenPose] = []
+    used: list[TargetPose] = []
     for name, poses in seen.items():
         camera = cameras[name]
         # Only the latest stretch: the double integral drifts, and what was long ago costs more than it gives.
@@ -75,6 +81,10 @@ def motion_start(
         used += inside
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
+        if not partial:
+            other = _other_size(buffer, inside, camera, gyro_bias_rps[name], options)
+            if other is not None:
+                return StartResult(None, "", size=other)
         held = None if turn_axis_cam is None else np.eye(3)
         linear, axes = _linear(buffer, inside, camera, gyro_bias_rps[name], partial, held)
         invisible = linear is not None and float(np.max(linear.sigma_p_imu_cam)) > 0.1
@@ -96,19 +106,47 @@ def motion_start(
     return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used)
 
 
+def _other_size(
+    buffer: ImuBuffer,
+    poses: list[TargetPose],
+    camera: CameraState,
+    gyro_bias: FloatArray,
+    options: CalibrationOptions,
+) -> float | None:
+    """Size of the target over the stated one, where positions and accelerations fit with another one alone.
+
+    Gravity must come out right with it: an accelerometer in g, too, makes the world look another size.
+    """
+    R, p, sigma, t = _poses_of_imu(poses, camera)
+    found = linear_start(buffer, t, R, p, gyro_bias, sigma, free_size=True)
+    if found is None or not _SIZES[0] < found.size < _SIZES[1]:
+        return None
+    if abs(found.size - 1.0) < max(_FAR_SIZE, _SURE * found.sigma_size):
+        return None
+    gravity = float(np.linalg.norm(found.gravity)) / options.gravity_mps2
+    return found.size if 0.9 < gravity < 1.1 else None
+
+
+def _poses_of_imu(
+    poses: list[TargetPose], camera: CameraState
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Attitudes of the imu (n, 3, 3), positions of the camera (n, 3), their sigmas (n,), instants (n,)."""
+    R = np.array([p.R_target_cam for p in poses]) @ camera.R_imu_cam.T
+    p = np.array([p.p_target_cam for p in poses])
+    sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
+    return R, p, sigma, np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
+
+
 def _linear(
     buffer: ImuBuffer,
-    poses: list[SeenPose],
+    poses: list[TargetPose],
     camera: CameraState,
     gyro_bias: FloatArray,
     partial: bool,
     held: FloatArray | None,
 ) -> tuple[LinearStart | None, FloatArray | None]:
     """The linear start, and the axes along which a partial one guesses: `held`, or those that are still."""
-    R = np.array([p.R_target_cam for p in poses]) @ camera.R_imu_cam.T
-    p = np.array([p.p_target_cam for p in poses])
-    sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
-    t = np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
+    R, p, sigma, t = _poses_of_imu(poses, camera)
     if not partial:
         return linear_start(buffer, t, R, p, gyro_bias, sigma), None
     R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
@@ -133,7 +171,7 @@ def _smooth(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bi
 
 
 def _state_at(
-    seen: SeenPose,
+    seen: TargetPose,
     camera: CameraState,
     linear: LinearStart,
     gyro_bias: FloatArray,

@@ -17,7 +17,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.board_window import BoardWindow, Frames, View
-from vical_daemon.estimation.init.target_poses import SeenPose
+from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.state import State
@@ -45,7 +45,7 @@ class WindowStart(NamedTuple):
 
 def window_start(
     state: State,
-    poses: Sequence[SeenPose],
+    poses: Sequence[TargetPose],
     frames: Frames,
     make: Callable[[State], CalibrationFilter],
     step: Step,

@@ -11,7 +11,7 @@ from vical_daemon.estimation.geometry.camera_model import (
     distort,
     radtan_derivative,
 )
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 
 _NEWTON_STEPS = 25
 _PATCHES = (8, 6)
@@ -50,6 +50,18 @@ def unproject(
     sine_ratio = np.where(theta_d > 0.0, np.sin(theta) / np.where(theta_d > 0.0, theta_d, 1.0), 1.0)
     rays = np.concatenate((d * sine_ratio[..., None], np.cos(theta)[..., None]), axis=-1)
     return rays, ok
+
+
+def read_share(uv_px: FloatArray, resolution: tuple[int, int], axis: str) -> FloatArray:
+    """Return when points of a rolling shutter are read, in readouts: -1/2 (first) to 1/2 (last).
+
+    Args:
+        uv_px: Pixels, shape (..., 2).
+        resolution: width, height, px.
+        axis: `ROWS` or `COLUMNS`; empty is rows.
+    """
+    k = 0 if axis == COLUMNS else 1
+    return np.asarray(uv_px[..., k] / resolution[k] - 0.5)
 
 
 def rays_over_image(

@@ -22,7 +22,7 @@ _WIDER = 3.0  # times the sigma that is stated: which may be too small
 
 
 @dataclass(frozen=True, slots=True)
-class HeldLens:
+class FixedLens:
     """What is known of a lens that is held: fx fy cx cy (px), distortion.
 
     Attributes:
@@ -36,7 +36,7 @@ class HeldLens:
     off_sigma: FloatArray
 
     @classmethod
-    def of(cls, prior: CameraPrior) -> HeldLens | None:
+    def of(cls, prior: CameraPrior) -> FixedLens | None:
         """Return the lens of a camera; None where none is given."""
         if prior.intrinsics is None:
             return None

@@ -26,7 +26,7 @@ _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 
 
 @dataclass(slots=True)
-class Link:
+class PreintegratedLink:
     """Motion from one image to the next, in the imu frame of the first.
 
     Attributes:
@@ -56,7 +56,7 @@ def make_link(
     to_s: float,
     imu: FloatArray,
     noise: ImuNoise,
-) -> Link | None:
+) -> PreintegratedLink | None:
     """Integrate between two instants of the imu's clock.
 
     Args:
@@ -78,7 +78,7 @@ def make_link(
         root = solve_lower(root_of(covariance), np.eye(9))
     except np.linalg.LinAlgError:
         return None
-    return Link(
+    return PreintegratedLink(
         float(motion.t_s[-1]),
         motion.dR[0, -1],
         motion.dv[0, -1],
@@ -108,7 +108,7 @@ def _integrated(
     return motion, errors, by_imu
 
 
-class Links(NamedTuple):
+class PreintegratedLinks(NamedTuple):
     """Links of a window stacked, for batched arithmetic (m of them)."""
 
     dt: FloatArray
@@ -120,7 +120,7 @@ class Links(NamedTuple):
     imu: FloatArray  # (m, 6) or (m, 22)
 
     @classmethod
-    def stack(cls, links: list[Link]) -> Links:
+    def stack(cls, links: list[PreintegratedLink]) -> PreintegratedLinks:
         """Put links side by side."""
         return cls(
             np.array([x.dt_s for x in links]),

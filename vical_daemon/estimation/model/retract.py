@@ -188,7 +188,8 @@ def _moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> C
         K, D = K + dx[where.intrinsics], D + dx[where.distortion]
     if where.readout is not None:
         readout += float(dx[where.readout])
-    return CameraState(R, p, shift, K, D, camera.distortion_model, camera.resolution, readout, skew)
+    model, axis = camera.distortion_model, camera.readout_axis
+    return CameraState(R, p, shift, K, D, model, camera.resolution, readout, skew, axis)
 
 
 def orthonormal(R: FloatArray) -> FloatArray:

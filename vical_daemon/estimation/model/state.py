@@ -16,7 +16,7 @@ import numpy as np
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.held_lens import HeldLens
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.target_modes import MODES, TargetModes
 
 MOTION = slice(0, 9)  # attitude rad, position m, velocity m/s: what moves
@@ -71,7 +71,7 @@ class Layout:
     target_scale: int | None
     target_shape: slice | None = None
     target_modes: TargetModes | None = None
-    held: Mapping[str, HeldLens] = field(default_factory=dict)
+    held: Mapping[str, FixedLens] = field(default_factory=dict)
 
     def lens(self, camera: str) -> slice:
         """Where fx fy cx cy and the distortion of a lens lie, which must be among the errors."""
@@ -91,7 +91,7 @@ def make_layout(
     fix: frozenset[str],
     estimate: frozenset[str],
     target_m: FloatArray | None = None,
-    held: Mapping[str, HeldLens] | None = None,
+    held: Mapping[str, FixedLens] | None = None,
 ) -> Layout:
     """Lay the error state out.
 
@@ -153,7 +153,10 @@ def make_layout(
 
 @dataclass(slots=True)
 class CameraState:
-    """Nominal values of one camera (see `CameraEstimate`); `skew` is the drift of the time shift, s/s."""
+    """Nominal values of one camera (see `CameraEstimate`); `skew` is the drift of the time shift, s/s.
+
+    `readout_axis`: see `CameraPrior`; it is no number, and stays.
+    """
 
     R_imu_cam: FloatArray
     p_imu_cam: FloatArray
@@ -164,6 +167,7 @@ class CameraState:
     resolution: tuple[int, int]
     readout_s: float = 0.0
     skew: float = 0.0
+    readout_axis: str = ""
 
 
 @dataclass(slots=True)

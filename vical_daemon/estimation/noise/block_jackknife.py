@@ -27,17 +27,17 @@ _LONGEST_RUN = 4
 _RIDGE = 1e-12  # corners in one line leave a turn about it open
 
 
-class _Stretch(NamedTuple):
+class _JackknifeBlock(NamedTuple):
     """Information of some images about the unknowns; that times the values they would have."""
 
     information: FloatArray
     weighted: FloatArray
 
-    def plus(self, other: _Stretch) -> _Stretch:
-        return _Stretch(self.information + other.information, self.weighted + other.weighted)
+    def plus(self, other: _JackknifeBlock) -> _JackknifeBlock:
+        return _JackknifeBlock(self.information + other.information, self.weighted + other.weighted)
 
 
-class Told(NamedTuple):
+class JackknifeResult(NamedTuple):
     """What all stretches say together.
 
     Attributes:
@@ -52,7 +52,7 @@ class Told(NamedTuple):
 
 
 @dataclass(slots=True)
-class Stretches:
+class BlockJackknife:
     """Gathers images.
 
     Args:
@@ -60,8 +60,8 @@ class Stretches:
     """
 
     length_s: float
-    _done: list[_Stretch] = field(default_factory=list)
-    _now: _Stretch | None = None
+    _done: list[_JackknifeBlock] = field(default_factory=list)
+    _now: _JackknifeBlock | None = None
     _begin_s: float = np.inf
 
     def learn(
@@ -89,7 +89,7 @@ class Stretches:
         posed = N[:p, :p] + _RIDGE * np.trace(N[:p, :p]) * np.eye(p)
         N = N[p:, p:] - N[p:, :p] @ np.linalg.solve(posed, N[:p, p:])
         A, b = N[:-1, :-1], N[:-1, -1]
-        said = _Stretch(A, b + A @ values)
+        said = _JackknifeBlock(A, b + A @ values)
         self._now = said if self._now is None else self._now.plus(said)
         return closed and len(self._done) >= _LEAST
 
@@ -100,7 +100,7 @@ class Stretches:
         if len(self._done) > _MOST:
             self._done[:2] = [self._done[0].plus(self._done[1])]
 
-    def compared(self, sigmas: FloatArray) -> Told:
+    def compared(self, sigmas: FloatArray) -> JackknifeResult:
         """Leave out each run of stretches in turn.
 
         Args:
@@ -130,4 +130,4 @@ class Stretches:
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
         limit = chdtri(dof, _SIGNIFICANT / k) / dof
         student = dof / np.maximum(dof - 2.0, 1.0)
-        return Told(values, P, np.where(ratio > limit, student * ratio, 1.0))
+        return JackknifeResult(values, P, np.where(ratio > limit, student * ratio, 1.0))

@@ -15,7 +15,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.noise.block_jackknife import Stretches
+from vical_daemon.estimation.noise.block_jackknife import BlockJackknife
 
 _STRETCH_S = 5.0
 _BEYOND_DOUBT = 4.0  # sigmas of the next power of the radius: by chance once in 16000
@@ -41,7 +41,7 @@ class LensAgreement:
     model: str
     factors: FloatArray = field(init=False)
     moved: FloatArray = field(init=False)
-    _stretches: Stretches = field(default_factory=lambda: Stretches(_STRETCH_S))
+    _stretches: BlockJackknife = field(default_factory=lambda: BlockJackknife(_STRETCH_S))
 
     def __post_init__(self) -> None:
         n = 4 + len(COEFFICIENTS[self.model])

@@ -24,7 +24,10 @@ _EVERY = 5  # images between two looks at all that is remembered
 _SELDOM_FROM, _SELDOM = 100, 4  # later it changes little: one look in so many
 _SIGNIFICANT = 5.0  # standard deviations above what images without such errors would give
 _STILL_SIGNIFICANT = 1.0  # to go on with what was found
+_CLIP = 6.0  # standard deviations: one outlier is no correlation
 _FLOOR = np.array([2e-5, 5e-3])  # s, px
+_TELLING = 100  # images; the correlation of neighbours is then known to 0.1
+_PERSISTENT = 0.5  # of the variance: nearer to that of a model error (1) than to that of a jitter (0)
 _GROWN = 1.5  # the variance; less is scatter
 WAYS = 3  # late, to the side, down
 
@@ -58,6 +61,27 @@ class SharedErrors:
     def sigmas(self) -> FloatArray:
         """Standard deviations in the three ways, shape (3,)."""
         return np.array([self.jitter_s, self.shift_px, self.shift_px])
+
+    @property
+    def stamps_jitter(self) -> bool:
+        """Whether what looks like a jitter of the stamps is one: images are late independently of each other.
+
+        A lens, a board or an imu that is not as stated makes images look late or early, too, but neighbours
+        alike. False as well while too few images are known.
+        """
+        n = min(self.images, _MEMORY)
+        size = self._A[:n, 0, 0]
+        if n < _TELLING or not self.jitter_s or not (size > 0.0).all():
+            return False
+        late, usual = self._b[:n, 0] / size, self._C[:n, 0, 0] / size**2
+        weight = 1.0 / (usual + self.jitter_s**2)
+        late = np.clip(late, -_CLIP / np.sqrt(weight), _CLIP / np.sqrt(weight))
+        pairs = weight[1:] * weight[:-1]
+        newest = self.images % _MEMORY  # where the oldest follows the newest
+        if self.images > _MEMORY and newest:
+            pairs[newest - 1] = 0.0
+        alike = float((pairs * late[1:] * late[:-1]).sum() / pairs.sum())
+        return alike < _PERSISTENT * self.jitter_s**2
 
     def learn(self, innovation: FloatArray, ways: FloatArray, state: FloatArray, level: float = 1.0) -> None:
         """Take in one image before it is used.

@@ -101,7 +101,7 @@ def averaged(f: CalibrationFilter) -> CalibrationFilter:
     return f
 
 
-def as_if_alike(f: CalibrationFilter, camera: str) -> CalibrationFilter:
+def conditioned_on_no_drift(f: CalibrationFilter, camera: str) -> CalibrationFilter:
     """Return the filter on the assumption that this camera's clock does not drift."""
     return _mixed(f, camera, 0.0, f.S)
 

@@ -62,7 +62,7 @@ def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
     L = root(np.eye(len(entries)) / c - entries @ entries.T)
     W = solve_lower(L, entries @ f.S.T).T
     dx = W @ solve_lower(L, block.values)
-    f.loosen(W)
+    f.inflate_covariance(W)
     f.state = retract(f.state, f.layout, dx)
 
 
@@ -70,7 +70,7 @@ _KNOWN_SIGMA = {IMU: KNOWN_OFF_SIGMA, SIZE: KNOWN_SIZE_SIGMA}
 
 
 @dataclass(slots=True)
-class BeyondDoubt:
+class ModelAcceptance:
     """Asks once a second what is known not to be as stated."""
 
     _next_s: float = -np.inf

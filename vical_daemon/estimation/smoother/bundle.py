@@ -15,13 +15,13 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.inertial_links import Links
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.retract import orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.carry import (
     FULL,
     INERTIAL,
-    Carry,
+    MarginalPrior,
     calibration_difference,
     carried_out,
     moved,
@@ -61,7 +61,7 @@ class Fit(NamedTuple):
         parallax_deg: Typical angle under which a landmark's rays cross.
     """
 
-    carry: Carry
+    carry: MarginalPrior
     squares: float
     dof: int
     inertial: float
@@ -81,7 +81,7 @@ class Fit(NamedTuple):
 class _Step(NamedTuple):
     states: FloatArray
     landmarks: FloatArray  # (L, 3)
-    promise: float  # by how much the sum of squares should fall
+    predicted_reduction: float  # by how much the sum of squares should fall
 
 
 _Saved = tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray]
@@ -99,7 +99,12 @@ class Bundle:
     """
 
     def __init__(
-        self, window: Window, carry: Carry, sigma_px: float, spread: float = 1.0, jitter_s: float = 0.0
+        self,
+        window: Window,
+        carry: MarginalPrior,
+        sigma_px: float,
+        spread: float = 1.0,
+        jitter_s: float = 0.0,
     ) -> None:
         self.window, self.carry = window, carry
         self.problem = Problem(window, carry, sigma_px, spread, jitter_s)
@@ -121,17 +126,19 @@ class Bundle:
             step = self._step(normal, lam)
             if step is None:
                 return None
-            if cleaned and step.promise < _DONE and lam > _DAMPING:
+            if cleaned and step.predicted_reduction < _DONE and lam > _DAMPING:
                 lam = max(0.01 * lam, _DAMPING)  # damped, a step promises little
                 continue
-            if cleaned and step.promise < _DONE:
+            if cleaned and step.predicted_reduction < _DONE:
                 self._apply(step)
                 settled = not self._doubts_stamps(seen, links)
                 if settled:
                     break
                 w.bad.clear()  # late images had looked like outliers
                 seen, cleaned, gain = w.observe(), False, np.inf
-            elif not cleaned and (step.promise < _SMALL * normal.cost or gain < _STUCK * normal.cost):
+            elif not cleaned and (
+                step.predicted_reduction < _SMALL * normal.cost or gain < _STUCK * normal.cost
+            ):
                 # close enough to tell what does not belong; or stuck, because of it
                 self._apply(step)
                 cleaned = True
@@ -243,7 +250,7 @@ class Bundle:
         w.landmarks = Landmarks(m.ids, m.anchor, bearing, inverse)
 
     # ------------------------------------------------------------------ noise, outliers, result
-    def _doubts_stamps(self, seen: Seen, links: Links) -> bool:
+    def _doubts_stamps(self, seen: Seen, links: PreintegratedLinks) -> bool:
         """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
         if self.problem.jitter_s:
             return False
@@ -278,7 +285,9 @@ class Bundle:
             w.bad.add((w.frames[seen.frame[n]][1].t_cam_ns, int(w.landmarks.ids[seen.landmark[n]])))
         return int(out.sum())
 
-    def _result(self, seen: Seen, links: Links, normal: Normal, steps: int, settled: bool) -> Fit | None:
+    def _result(
+        self, seen: Seen, links: PreintegratedLinks, normal: Normal, steps: int, settled: bool
+    ) -> Fit | None:
         w, order = self.window, self.problem.order()
         try:
             H = self._reduced(normal, 0.0)[0]

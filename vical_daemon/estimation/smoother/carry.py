@@ -30,7 +30,7 @@ CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 
 
 
 @dataclass(slots=True)
-class Carry:
+class MarginalPrior:
     """What is known at the first image of a window before its own data.
 
     Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of `FULL`).
@@ -60,7 +60,7 @@ class Carry:
         inverse = np.linalg.inv(self.root)
         return np.asarray(inverse @ inverse.T)
 
-    def at(self, t_cam_s: float) -> Carry:
+    def at(self, t_cam_s: float) -> MarginalPrior:
         """The same at another stamp of the camera's clock: its drift moves the time shift."""
         seconds = t_cam_s - self.t_cam_s
         camera = replace(self.camera, timeshift_s=self.camera.timeshift_s + self.camera.skew * seconds)
@@ -98,7 +98,7 @@ def camera_difference(now: CameraState, then: CameraState) -> FloatArray:
     )
 
 
-def calibration_difference(window: Window, carry: Carry) -> FloatArray:
+def calibration_difference(window: Window, carry: MarginalPrior) -> FloatArray:
     """Errors of the calibration that lead from what was carried in to the window's, shape (FULL,)."""
     imu = window.imu - carry.imu if len(window.imu) else np.zeros(NUMBERS)
     return np.concatenate([camera_difference(window.camera, carry.camera), imu])
@@ -118,7 +118,7 @@ def moved(camera: CameraState, d: FloatArray) -> CameraState:
     )
 
 
-def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
+def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> MarginalPrior:
     """Next to nothing known: wide sigmas around a start.
 
     Args:
@@ -130,10 +130,10 @@ def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Carry:
     wide = np.concatenate([[1.0] * 2, [5.0] * 3, biases, sigmas[np.flatnonzero(active)]])
     R, t_s = window.R[0], window.frames[0][0]
     root, speed = np.diag(1.0 / wide), R.T @ window.v[0]
-    return Carry(R.copy(), speed, np.zeros(6), window.camera, root, active, t_s, window.imu)
+    return MarginalPrior(R.copy(), speed, np.zeros(6), window.camera, root, active, t_s, window.imu)
 
 
-def held_along(carry: Carry, axis: FloatArray) -> Carry:
+def held_along(carry: MarginalPrior, axis: FloatArray) -> MarginalPrior:
     """The same with the lever arm as good as known along an axis of the imu (unit, shape (3,))."""
     if not carry.active[:3].all():
         return carry
@@ -143,7 +143,7 @@ def held_along(carry: Carry, axis: FloatArray) -> Carry:
     return replace(carry, root=np.linalg.qr(stacked)[1])
 
 
-def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Carry:
+def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> MarginalPrior:
     """Turn the marginal at a window's last image into coordinates without origin and heading.
 
     Args:
@@ -162,7 +162,9 @@ def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Ca
     J[5:11, 9:15] = np.eye(6)
     J[11:, 15:] = later(active, span_s)
     root = root_of(J @ covariance @ J.T)
-    return Carry(R, speed, window.bias[-1].copy(), camera, root, active, window.frames[-1][0], window.imu)
+    return MarginalPrior(
+        R, speed, window.bias[-1].copy(), camera, root, active, window.frames[-1][0], window.imu
+    )
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

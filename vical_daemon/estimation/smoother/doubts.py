@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.events import Event, EventKind
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.events import ROLLING, Event, EventKind
+from vical_daemon.estimation.measurements import ROWS, FloatArray
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, LAG_SIGMA_S, OFF, SURE
 from vical_daemon.estimation.selection import model_selection as hypotheses
 from vical_daemon.estimation.selection.clock_drift import (
@@ -15,7 +15,7 @@ from vical_daemon.estimation.selection.clock_drift import (
     stamps_variance,
 )
 from vical_daemon.estimation.selection.model_acceptance import known_off
-from vical_daemon.estimation.smoother.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, Carry
+from vical_daemon.estimation.smoother.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
 _SURELY_ROLLING = 5.0  # sigmas
@@ -26,7 +26,7 @@ _SIGMA = {hypotheses.IMU: ENTRY_SIGMA, hypotheses.LAG: LAG_SIGMA_S}
 Weights = dict[tuple[str, ...], float]
 
 
-class FreeDoubts:
+class TargetFreeDoubts:
     """Follows what the windows say about clocks, imu and shutter.
 
     Args:
@@ -52,7 +52,7 @@ class FreeDoubts:
         self.stamp_sigma_s = 0.0
         self._began_s = np.inf
 
-    def watch(self, carry: Carry, factor: float, compared: bool) -> list[Event]:
+    def watch(self, carry: MarginalPrior, factor: float, compared: bool) -> list[Event]:
         """Announce what has got beyond doubt.
 
         Args:
@@ -70,7 +70,8 @@ class FreeDoubts:
             readout_s, sigma_s = carry.camera.readout_s, float(sigmas[READOUT])
             self.rolling = abs(readout_s) > max(_SURELY_ROLLING * sigma_s, _SHORTEST_S)
             if self.rolling:
-                events.append(Event(EventKind.ROLLING_SHUTTER, self._camera, float(readout_s), sigma_s))
+                kind = ROLLING[carry.camera.readout_axis or ROWS]
+                events.append(Event(kind, self._camera, float(readout_s), sigma_s))
         if compared:
             weights = self._weights(carry, factor)
             known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > SURE}
@@ -79,7 +80,7 @@ class FreeDoubts:
             self._off |= known
         return events
 
-    def reason(self, carry: Carry, factor: float, *, converged: bool) -> str:
+    def reason(self, carry: MarginalPrior, factor: float, *, converged: bool) -> str:
         """What may not be as it is taken to be, in words; empty where nothing speaks for it.
 
         For `converged` see `hypotheses.in_doubt`.
@@ -93,7 +94,7 @@ class FreeDoubts:
                 return CLOCKS_IN_DOUBT
         return ""
 
-    def weighed(self, carry: Carry, factor: float, compared: bool) -> Doubts:
+    def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> Doubts:
         """How likely each is, for what is told; arguments as for `watch`."""
         weights = self._weights(carry, factor)
         every = max(weights, key=len)
@@ -106,7 +107,7 @@ class FreeDoubts:
         )
         return Doubts(factor, self.drifting, stated, gyro_frame=not self.imu_asked, rolling=self.rolling)
 
-    def _drift(self, carry: Carry, factor: float) -> float:
+    def _drift(self, carry: MarginalPrior, factor: float) -> float:
         """How much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated."""
         if not carry.active[DRIFT]:
             return 0.0
@@ -115,7 +116,7 @@ class FreeDoubts:
         variance += stamps_variance(self.stamp_sigma_s, carry.t_cam_s - self._began_s)
         return evidence(carry.camera.skew, variance)
 
-    def _weights(self, carry: Carry, factor: float) -> Weights:
+    def _weights(self, carry: MarginalPrior, factor: float) -> Weights:
         """Probability of each hypothesis about the imu, named by what is as stated.
 
         Where windows disagree although all is free, it is the images, and what they say about the imu is
@@ -132,7 +133,7 @@ class FreeDoubts:
         return hypotheses.posterior(values, covariance, factor**2)
 
 
-def _numbers(carry: Carry) -> FloatArray:
+def _numbers(carry: MarginalPrior) -> FloatArray:
     """What is not as stated of the imu, at its place among the errors, shape (FULL,)."""
     out = np.zeros(FULL)
     out[INERTIAL] = carry.imu

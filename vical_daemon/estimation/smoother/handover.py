@@ -1,4 +1,4 @@
-"""What a window of the target-free calibration hands to the next: knowledge, aged a little, and an image."""
+"""What a window of the target-free calibration hands to the next: a prior with process noise, an image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vical_daemon.estimation.smoother.carry import (
     CALIBRATION,
     DRIFT,
     SHIFT,
-    Carry,
+    MarginalPrior,
     first_carry,
     held_along,
     root_of,
@@ -28,14 +28,14 @@ _SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
 _GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2 = 4e-4, 5e-3  # by which biases may have walked while nothing was seen
 
 
-def afresh(
+def initial_prior(
     window: Window,
-    known: Carry | None,
+    known: MarginalPrior | None,
     active: BoolArray,
     held: FloatArray | None,
     imu_sigma: float,
     reopened: Collection[int] = (),
-) -> Carry:
+) -> MarginalPrior:
     """Prior of a window that starts from nothing: wide, or with the calibration and biases known before.
 
     Args:
@@ -66,7 +66,7 @@ def afresh(
     return replace(wide, root=root_of(covariance), bias=known.bias.copy(), camera=camera)
 
 
-def of_another_recording(known: Carry, window: Window, stepped_s: float) -> Carry:
+def of_another_recording(known: MarginalPrior, window: Window, stepped_s: float) -> MarginalPrior:
     """What was known, for the first window of another recording: its biases are those that its start finds.
 
     Args:
@@ -85,7 +85,9 @@ def of_another_recording(known: Carry, window: Window, stepped_s: float) -> Carr
     return replace(known, bias=window.bias[0].copy(), root=root_of(P), t_cam_s=window.frames[0][0])
 
 
-def aged(carry: Carry, noise: ImuNoise, active: BoolArray, span_s: float, *, drifting: bool) -> Carry:
+def with_process_noise(
+    carry: MarginalPrior, noise: ImuNoise, active: BoolArray, span_s: float, *, drifting: bool
+) -> MarginalPrior:
     """Let biases and delay walk a little before the next window."""
     P = carry.covariance()
     P[range(5, 8), range(5, 8)] += noise.gyro_walk**2 * KNOT_S
@@ -97,7 +99,7 @@ def aged(carry: Carry, noise: ImuNoise, active: BoolArray, span_s: float, *, dri
     return replace(carry, root=root_of(P))
 
 
-def next_window(window: Window, carry: Carry) -> Window:
+def next_window(window: Window, carry: MarginalPrior) -> Window:
     """A window that begins at the last image of this one, which has told what it had to tell."""
     t, last = window.frames[-1]
     none = PointsFrame(last.camera, last.t_cam_ns, last.ids[:0], last.uv_px[:0])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.inertial_links import Links
-from vical_daemon.estimation.smoother.jitter import Lateness
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
+from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
 
 _LEAST_JITTER_S = 3e-5
@@ -38,14 +38,14 @@ class Order:
         return np.concatenate([self.frames[:-1], self.frames[1:], self.knots[knots], entries], axis=1)
 
 
-def link_errors(window: Window, links: Links) -> tuple[FloatArray, FloatArray]:
+def link_errors(window: Window, links: PreintegratedLinks) -> tuple[FloatArray, FloatArray]:
     """Whitened errors (F - 1, 9) of the links about the present values; derivatives (F - 1, 9, 24 or 40)."""
     w = window
     return links.errors(w.R, w.p, w.v, w.imu_by_link(), w.gravity)
 
 
 def add_links(
-    window: Window, links: Links, jitter_s: float, order: Order, H: FloatArray, g: FloatArray
+    window: Window, links: PreintegratedLinks, jitter_s: float, order: Order, H: FloatArray, g: FloatArray
 ) -> float:
     """Add the links and the walk of the biases to the normal equations, in place.
 
@@ -87,7 +87,7 @@ def add_links(
             _add_side(H, frames.reshape(-1), order.imu, side)
     cost = float((e**2).sum()) + _add_walk(window, order, H, g)
     if jitter_s:
-        late = Lateness(window, e, J, jitter_s)
+        late = StampOffsets(window, e, J, jitter_s)
         late.eliminate(H, g, J, order.of_links(knots))
         cost -= late.explained()
     return cost
@@ -117,7 +117,7 @@ def _add_walk(window: Window, order: Order, H: FloatArray, g: FloatArray) -> flo
 
 
 def links_left(
-    window: Window, links: Links, jitter_s: float, order: Order, root: FloatArray
+    window: Window, links: PreintegratedLinks, jitter_s: float, order: Order, root: FloatArray
 ) -> tuple[float, float, bool]:
     """Mean squared error of the links, the jitter of the stamps that they show, s, and whether it lasts.
 
@@ -131,7 +131,7 @@ def links_left(
     e, J = link_errors(window, links)
     if not jitter_s:
         return float((e**2).mean()), 0.0, False
-    late = Lateness(window, e, J, jitter_s)
+    late = StampOffsets(window, e, J, jitter_s)
     shown_s = float(np.sqrt(late.mean_square(J, order.of_links(window.knots()), root)))
     left = (float((e**2).sum()) - late.explained()) / e.size
     return left, shown_s if shown_s > _LEAST_JITTER_S else 0.0, late.lasts()

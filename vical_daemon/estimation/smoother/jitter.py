@@ -22,7 +22,7 @@ _SURE = 5.0  # sigmas
 _OPEN_S = 1.0  # as good as no prior, where a rig that stands still shows nothing
 
 
-class Lateness:
+class StampOffsets:
     """The delays tau of the stamps of a window, given its motion.
 
     Args:
@@ -98,7 +98,7 @@ class Lateness:
 
 def first_guess(window: Window, e: FloatArray, J: FloatArray) -> float:
     """Jitter, s, that errors of links show whose stamps were believed; 0 where it may be chance."""
-    tau, variance = Lateness(window, e, J).delays()
+    tau, variance = StampOffsets(window, e, J).delays()
     return excess(tau**2, variance)
 
 

@@ -20,8 +20,8 @@ from vical_daemon.estimation.result import (
     TracePoint,
 )
 from vical_daemon.estimation.smoother.bundle import Fit
-from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, Carry
-from vical_daemon.estimation.smoother.doubts import FreeDoubts
+from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, MarginalPrior
+from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.excitation import (
     ALL_WAYS,
@@ -47,7 +47,7 @@ _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
-class FreeJudge:
+class TargetFreeStatus:
     """Watches what goes in and out of the windows.
 
     Args:
@@ -73,6 +73,8 @@ class FreeJudge:
         self._started_s: float | None = None
         self._now_s = 0.0
         self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
+        self._growing = 0.0, 0  # the same of the window that is not complete yet
+        self._withdrawn: list[tuple[float, int]] = []  # and of those that contradicted a single window
         self._windows = 0
         self._squares: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
@@ -82,7 +84,7 @@ class FreeJudge:
         self._bumped = Cause.NONE
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
-        self.doubts = FreeDoubts(camera, asked=options.estimate, rolling=rolling)
+        self.doubts = TargetFreeDoubts(camera, asked=options.estimate, rolling=rolling)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -120,7 +122,9 @@ class FreeJudge:
             self._announce(EventKind.WENT_ON, cause=cause, cause_value=value)
             self._quiet = Cause.NONE, None
 
-    def lost(self, why: Cause, value: float | None, kept: Carry | None, against_s: float = 0.0) -> None:
+    def lost(
+        self, why: Cause, value: float | None, kept: MarginalPrior | None, against_s: float = 0.0
+    ) -> None:
         """The window was given up.
 
         Args:
@@ -131,6 +135,8 @@ class FreeJudge:
         """
         if kept is not None and against_s:
             self.contradicted(against_s)
+        if kept is None and against_s and self._growing[1]:
+            self._withdrawn.append(self._growing)
         self._reason, self._motion_missing = cause_text(why, value), False
         if kept is not None and not self._quiet[0]:
             self._quiet = why, value
@@ -138,6 +144,7 @@ class FreeJudge:
             self._started_s, self._windows, self._given_up = None, 0, (why, value)
             self._against_since_s = None
             self._agreement.clear()
+            self._growing = 0.0, 0
 
     def next_recording(self) -> None:
         """Another recording begins: it has not contradicted anything yet."""
@@ -167,6 +174,7 @@ class FreeJudge:
         self._bumped, self._quiet, self.doubts.drifting = why, (Cause.NONE, None), False
         self._started_s, self._windows, self._against_since_s = None, 0, None
         self._agreement.clear()
+        self._growing = 0.0, 0
         self._steady.reset(Status.CONVERGING)
 
     def stepped(self, step_s: float) -> None:
@@ -225,12 +233,14 @@ class FreeJudge:
 
     def closed(self) -> None:
         """A window is complete and agreed."""
+        if self._windows + 1 >= _ENOUGH_WINDOWS:
+            self._withdrawn.clear()
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
         self._against_since_s = None
         if self.jitter_s >= ANNOUNCED_S:
             self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter")
 
-    def agrees(self, fit: Fit, carry: Carry, *, complete: bool) -> bool:
+    def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.
 
         For consistent sigmas, cov(new - old) = P_old - P_new.
@@ -253,6 +263,7 @@ class FreeJudge:
         full = np.zeros(FULL)
         full[np.flatnonzero(self.active)] = fit.change
         agree = self.excess(statistic, dof, full) <= 1.0
+        self._growing = (0.0, 0) if complete else (statistic, dof)
         if complete:
             self._agreement.append((min(statistic, self._limit(dof)), dof))
         return agree
@@ -279,6 +290,19 @@ class FreeJudge:
         total = sum(s for s, _ in self._agreement) + _PRIOR_WINDOWS * dof
         return max(1.0, total / (sum(n for _, n in self._agreement) + _PRIOR_WINDOWS * dof))
 
+    def _reported_factor(self) -> float:
+        """What the variances are multiplied by when they are reported.
+
+        Until a second window has confirmed the answer nothing but the windows themselves says how wrong it
+        may be: what they disagree by counts at once, and in full, without the belief that sigmas are right.
+        What contradicted answers that were withdrawn counts, too.
+        """
+        if self.proven:
+            return self.factor()
+        seen = [*self._withdrawn, *self._agreement, self._growing]
+        dof = sum(n for _, n in seen)
+        return max(self.factor(), sum(s for s, _ in seen) / dof if dof else 1.0)
+
     # ------------------------------------------------------------------ what is said
     def trace(self) -> list[TracePoint]:
         """The development of the calibration."""
@@ -289,7 +313,9 @@ class FreeJudge:
         dof = sum(n for _, n in self._agreement)
         return sum(s for s, _ in self._agreement) / dof if dof else 0.0
 
-    def estimate(self, carry: Carry | None, *, running: bool, gravity: list[float]) -> CalibrationEstimate:
+    def estimate(
+        self, carry: MarginalPrior | None, *, running: bool, gravity: list[float]
+    ) -> CalibrationEstimate:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
         missing = [] if camera is None or carry is None else self._missing(camera, carry)
@@ -323,13 +349,13 @@ class FreeJudge:
             told.guidance,
         )
 
-    def _camera(self, carry: Carry) -> CameraEstimate:
+    def _camera(self, carry: MarginalPrior) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
-        doubts = self.doubts.weighed(carry, self.factor(), bool(self._agreement))
+        doubts = self.doubts.weighed(carry, self._reported_factor(), bool(self._agreement))
         return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
-    def _missing(self, e: CameraEstimate, carry: Carry) -> list[WeakDirection]:
+    def _missing(self, e: CameraEstimate, carry: MarginalPrior) -> list[WeakDirection]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
         return weak_directions(
             covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, carry.bias[:3]

@@ -11,8 +11,9 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_model import cross
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.model.inertial_links import Links
+from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
+from vical_daemon.estimation.model.camera_rays import read_share
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.smoother.carry import (
     ARM,
@@ -22,7 +23,7 @@ from vical_daemon.estimation.smoother.carry import (
     READOUT,
     SHIFT,
     TURN,
-    Carry,
+    MarginalPrior,
     calibration_difference,
 )
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
@@ -66,7 +67,7 @@ class Problem:
     """
 
     def __init__(
-        self, window: Window, carry: Carry, sigma_px: float, spread: float, jitter_s: float = 0.0
+        self, window: Window, carry: MarginalPrior, sigma_px: float, spread: float, jitter_s: float = 0.0
     ) -> None:
         self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
         self.jitter_s = jitter_s
@@ -123,7 +124,7 @@ class Problem:
         weight = np.where(ok, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
         return e, ok, weight
 
-    def normal(self, seen: Seen, links: Links) -> Normal:
+    def normal(self, seen: Seen, links: PreintegratedLinks) -> Normal:
         """Normal equations with landmarks kept apart."""
         w, cam = self.window, self.window.camera
         y, x_imu, R, rates = self._rays(seen)
@@ -166,18 +167,34 @@ class Problem:
 
     def pixels_late(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
         """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""
+        by_shift, e = self._whitened_by_shift(seen)
+        F = len(self.window.frames)
+        size = np.bincount(seen.frame, (by_shift**2).sum(axis=1), F)
+        late = np.bincount(seen.frame, (by_shift * e).sum(axis=1), F)
+        shown = size > 0.0
+        return late[shown] / size[shown], self.spread**2 / size[shown]
+
+    def late_by_columns(self, seen: Seen) -> float:
+        """By how much at least the squared errors would fall if columns were read one after the other.
+
+        At the optimum of all else this is the score test of one more parameter, with the information that
+        it would have were all else known: a lower bound. [Rao 1948]
+        """
+        by_shift, e = self._whitened_by_shift(seen)
+        by_column = by_shift * read_share(seen.uv, self.window.camera.resolution, COLUMNS)[:, None]
+        size = float((by_column**2).sum())
+        return float((by_column * e).sum()) ** 2 / max(size, 1e-300) / self.spread**2
+
+    def _whitened_by_shift(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
+        """How pixels move with the exposure's time, and their errors, both over their noise, (N, 2) each."""
         cam = self.window.camera
         y, x_imu, R, rates = self._rays(seen)
         with np.errstate(all="ignore"):
             uv, Jy, _ = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)
         e, ok, weight = self._weigh(seen, uv)
         JR = (np.where(ok[:, None, None], Jy, 0.0).reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)
-        by_shift = self._by_shift(seen, JR, R, x_imu, rates) * (np.sqrt(weight) / self.sigma_px)[:, None]
-        F = len(self.window.frames)
-        size = np.bincount(seen.frame, (by_shift**2).sum(axis=1), F)
-        late = np.bincount(seen.frame, (by_shift * e * np.sqrt(weight)[:, None]).sum(axis=1), F)
-        shown = size > 0.0
-        return late[shown] / size[shown], self.spread**2 / size[shown]
+        root = np.sqrt(weight)[:, None]
+        return self._by_shift(seen, JR, R, x_imu, rates) * root / self.sigma_px, e * root
 
     def _robust_cost(self, e: FloatArray, weight: FloatArray) -> float:
         """Sum of the Huber losses (e is weighted already: weight * size^2)."""
@@ -189,7 +206,7 @@ class Problem:
     def _assemble(
         self,
         seen: Seen,
-        links: Links,
+        links: PreintegratedLinks,
         e: FloatArray,
         Jf: FloatArray,
         Jc: FloatArray,
@@ -228,7 +245,7 @@ class Problem:
         cost += self._add_prior(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 
-    def stamps_doubted(self, seen: Seen, links: Links) -> float:
+    def stamps_doubted(self, seen: Seen, links: PreintegratedLinks) -> float:
         """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
 
         A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.

@@ -25,7 +25,7 @@ from vical_daemon.estimation.smoother.carry import (
     READOUT,
     SHIFT,
     TURN,
-    Carry,
+    MarginalPrior,
     moved,
 )
 
@@ -51,7 +51,7 @@ class Doubts(NamedTuple):
 
 
 def camera_estimate(
-    carry: Carry, doubts: Doubts, sigma_px: float, rms_px: float, held: FloatArray | None = None
+    carry: MarginalPrior, doubts: Doubts, sigma_px: float, rms_px: float, held: FloatArray | None = None
 ) -> CameraEstimate:
     """The camera as it is known.
 
@@ -81,11 +81,12 @@ def camera_estimate(
         [],
         float(camera.readout_s) if doubts.rolling else 0.0,
         float(sigma[READOUT]) if doubts.rolling else 0.0,
+        readout_axis=camera.readout_axis if doubts.rolling else "",
         calibration_covariance=covariance[: LENS.stop, : LENS.stop].tolist(),
     )
 
 
-def _told(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray]:
+def _told(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
     """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `hypotheses`."""
     camera, numbers, P = _over_imu(carry, doubts)
     if doubts.gyro_frame:
@@ -98,7 +99,7 @@ def _told(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray]:
     return moved(camera, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(k, k)
 
 
-def _over_imu(carry: Carry, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
+def _over_imu(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
     """Camera, what is not as stated of the imu, and covariance over the hypotheses about these."""
     P, numbers = carry.calibration() * doubts.factor, np.zeros(FULL)
     numbers[INERTIAL] = carry.imu
@@ -122,7 +123,7 @@ def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> t
     return camera, J @ P @ J.T
 
 
-def imu_estimate(carry: Carry, *, matrices_told: bool) -> ImuEstimate:
+def imu_estimate(carry: MarginalPrior, *, matrices_told: bool) -> ImuEstimate:
     """Biases and their sigmas; where asked for, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[5:11])
     told = [m.tolist() for m in matrices(carry.imu)] if matrices_told else [[], []]

@@ -19,7 +19,7 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
-from vical_daemon.estimation.model.inertial_links import Link, make_link
+from vical_daemon.estimation.model.inertial_links import PreintegratedLink, make_link
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.window import Landmarks, Window, rays_of
 
@@ -71,7 +71,8 @@ class LinearStart:
         buffer: Inertial readings.
         frames: (stamp in the camera's clock in s, tracks), in order.
         camera: Time shift and lens must be roughly right.
-        imu: Biases, and numbers of `imu_scale` where they are estimated, see `Link`, shape (6,) or (22,).
+        imu: Biases, and numbers of `imu_scale` where they are estimated, see `PreintegratedLink`, shape (6,)
+            or (22,).
         noise: Densities.
         gravity_mps2: Magnitude of gravity.
 
@@ -89,7 +90,7 @@ class LinearStart:
         gravity_mps2: float,
     ) -> None:
         shift = camera.timeshift_s
-        links: list[Link] = []
+        links: list[PreintegratedLink] = []
         for (t0, _), (t1, _) in pairwise(frames):
             link = make_link(buffer, t0 + shift, t1 + shift, imu, noise)
             if link is None:
@@ -196,7 +197,7 @@ class LinearStart:
         return _Linear(z, gravity, misfit)
 
 
-def _centres(links: list[Link]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _centres(links: list[PreintegratedLink]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Attitudes R_i, and positions q_i + A_i z without the lever arm, in the first image's imu frame."""
     R, P, V = np.eye(3), np.zeros(3), np.zeros(3)
     PB, VB, T = np.zeros((3, 3)), np.zeros((3, 3)), 0.0

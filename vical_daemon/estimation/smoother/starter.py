@@ -15,7 +15,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
 from vical_daemon.estimation.model.priors import LAG_SIGMA_S, SKEW_SIGMA
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import Carry
+from vical_daemon.estimation.smoother.carry import MarginalPrior
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.smoother.window import Window
@@ -33,7 +33,7 @@ class _Found(NamedTuple):
     """What rotations say, or what was known before."""
 
     camera: CameraState
-    imu: FloatArray  # biases, and numbers of `imu_scale`, see `Link`
+    imu: FloatArray  # biases, and numbers of `imu_scale`, see `PreintegratedLink`
     arm_sigma_m: float
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 
@@ -79,7 +79,7 @@ class Starter:
         self._next_s, self._every_s = -np.inf, _EVERY_S
 
     def stretch(
-        self, buffer: ImuBuffer, frames: Frames, end_s: float, known: Carry | None, *, last: bool
+        self, buffer: ImuBuffer, frames: Frames, end_s: float, known: MarginalPrior | None, *, last: bool
     ) -> Frames | str | None:
         """Choose the images of an attempt when it is time for one.
 
@@ -110,7 +110,7 @@ class Starter:
             return "the camera stands still: move the rig to and fro while turning it"
         return usable
 
-    def window(self, buffer: ImuBuffer, frames: Frames, known: Carry | None) -> Window | str:
+    def window(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior | None) -> Window | str:
         """Make a window of a stretch, with the calibration of before where there is one.
 
         Args:
@@ -126,7 +126,7 @@ class Starter:
         found = self._rotations(buffer, frames, self.prior) if known is None else _known(known)
         return found if isinstance(found, str) else self._structure(buffer, frames, found)
 
-    def window_anew(self, buffer: ImuBuffer, frames: Frames, known: Carry) -> Window | str:
+    def window_anew(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior) -> Window | str:
         """Make a window of a stretch with mounting and time shift found anew, and all else as known.
 
         Args:
@@ -147,6 +147,7 @@ class Starter:
             T_imu_cam=(c.R_imu_cam, c.p_imu_cam),
             timeshift_cam_imu_s=c.timeshift_s,
             readout_s=c.readout_s,
+            readout_axis=c.readout_axis,
         )
         found = self._rotations(buffer, frames, prior, known)
         if isinstance(found, str):
@@ -179,7 +180,7 @@ class Starter:
         return window
 
     def _rotations(
-        self, buffer: ImuBuffer, frames: Frames, prior: CameraPrior, known: Carry | None = None
+        self, buffer: ImuBuffer, frames: Frames, prior: CameraPrior, known: MarginalPrior | None = None
     ) -> _Found | str:
         """Mounting, delay, lens (unless `known`) and gyro bias from the epipolar constraint; or why not."""
         camera = starting_camera(prior)
@@ -273,6 +274,7 @@ def starting_camera(prior: CameraPrior) -> CameraState:
         prior.distortion_model,
         prior.resolution,
         prior.readout_s,
+        readout_axis=prior.readout_axis,
     )
 
 
@@ -290,7 +292,7 @@ def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
     return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA, _READOUT_SIGMA_S] + imu)
 
 
-def _known(known: Carry) -> _Found:
+def _known(known: MarginalPrior) -> _Found:
     c = known.camera
     copy = CameraState(
         c.R_imu_cam.copy(),
@@ -302,6 +304,7 @@ def _known(known: Carry) -> _Found:
         c.resolution,
         c.readout_s,
         c.skew,
+        c.readout_axis,
     )
     return _Found(copy, np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
 

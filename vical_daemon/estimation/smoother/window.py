@@ -17,9 +17,9 @@ import numpy.typing as npt
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
-from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
-from vical_daemon.estimation.model.inertial_links import Link, Links, make_link
+from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_link
 from vical_daemon.estimation.model.state import CameraState
 
 KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
@@ -96,7 +96,7 @@ class Window:
     p: FloatArray
     v: FloatArray
     bias: FloatArray
-    links: list[Link]
+    links: list[PreintegratedLink]
     shift_s: float
     landmarks: Landmarks
     gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
@@ -165,7 +165,7 @@ class Window:
         """Integrate anew at the present time shift and biases; False where inertial data do not reach."""
         shift_s = self.camera.timeshift_s
         d = shift_s - self.shift_s
-        links: list[Link] = []
+        links: list[PreintegratedLink] = []
         for ((t0, _), (t1, _)), imu in zip(pairwise(self.frames), self.imu_by_link(), strict=True):
             link = make_link(buffer, t0 + shift_s, t1 + shift_s, imu, self.noise)
             if link is None:
@@ -199,9 +199,9 @@ class Window:
             or float(off[:, 6:].max(initial=0.0)) > 5e-3
         )
 
-    def stacked(self) -> Links:
+    def stacked(self) -> PreintegratedLinks:
         """The links for batched arithmetic."""
-        return Links.stack(self.links)
+        return PreintegratedLinks.stack(self.links)
 
     # ------------------------------------------------------------------ landmarks
     def observe(self) -> Seen:
@@ -245,12 +245,12 @@ def _listed(frame: IntArray, landmark: IntArray, uv: FloatArray, camera: CameraS
     by_frame = np.argsort(frame, kind="stable")
     sorted_frames = frame[by_frame]
     frame_begin = np.flatnonzero(np.diff(sorted_frames, prepend=-1))
-    row = uv[:, 1] / camera.resolution[1] - 0.5
+    row = read_share(uv, camera.resolution, camera.readout_axis)
     return Seen(frame, landmark, uv, row, begin, by_frame, frame_begin, sorted_frames[frame_begin])
 
 
 def carried(
-    link: Link, R: FloatArray, p: FloatArray, v: FloatArray, gravity: FloatArray
+    link: PreintegratedLink, R: FloatArray, p: FloatArray, v: FloatArray, gravity: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Motion at the end of a link."""
     T = link.dt_s

@@ -13,7 +13,7 @@ from enum import Enum, auto
 from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.selection.clock_drift import as_if_alike, surely_apart
+from vical_daemon.estimation.selection.clock_drift import conditioned_on_no_drift, surely_apart
 from vical_daemon.estimation.status.drift_watch import DriftWatch
 
 _REFUSED_POSE = 10  # images in a row before the pose is taken anew
@@ -106,7 +106,7 @@ class ChangeWatch:
         if surely_apart(f, camera):
             self._drift.pop(camera)
             return Action.SKEW
-        alike = as_if_alike(f, camera)
+        alike = conditioned_on_no_drift(f, camera)
         variance = float(alike.S[index] @ alike.S[index])
         value = alike.state.cameras[camera].timeshift_s
         if not watch.drifts(t_s, value, variance, f.consistency[camera].factor):

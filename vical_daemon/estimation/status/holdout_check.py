@@ -24,7 +24,7 @@ _FITS = 2.0  # corner scale above which it is the images that do not fit
 
 
 @dataclass(slots=True)
-class HeldBack:
+class HoldoutCheck:
     """Takes a copy of the filter every 1.5 s and asks it 0.3 s later what it would have expected."""
 
     _copy: CalibrationFilter | None = None
@@ -58,7 +58,7 @@ def imu_noise_error(ratios: Sequence[float], scale: float) -> float | None:
     """What held-back predictions say about the imu's noise densities; None: they agree.
 
     Args:
-        ratios: What `HeldBack.follow` returned of late.
+        ratios: What `HoldoutCheck.follow` returned of late.
         scale: `Consistency.scale` of the camera: with images that do not fit nothing can be said.
 
     Returns:

@@ -26,14 +26,14 @@ class Cover:
     """The pictures of all cameras whose lenses are estimated."""
 
     def __init__(self) -> None:
-        self._pictures: dict[str, PictureCover] = {}
+        self._pictures: dict[str, ImageCoverage] = {}
 
     def saw(self, report: FrameReport, f: CalibrationFilter) -> None:
         """Take the corners that the filter used; pictures of a fisheye may be round, and are left out."""
         camera = f.state.cameras[report.camera]
         if not f.layout.lens_free(report.camera) or camera.distortion_model == EQUIDISTANT:
             return
-        picture = self._pictures.setdefault(report.camera, PictureCover(camera.resolution))
+        picture = self._pictures.setdefault(report.camera, ImageCoverage(camera.resolution))
         picture.add(report.uv_px[report.accepted])
 
     def advice(self) -> Guidance:
@@ -45,7 +45,7 @@ class Cover:
         return Guidance()
 
 
-class PictureCover:
+class ImageCoverage:
     """Counts corners by part of the picture.
 
     Args:

@@ -49,7 +49,7 @@ _RECENT = 60
 _KEPT_CHECKS = 2400  # one every 1.5 s: an hour
 
 
-class Judge:
+class StatusEvaluator:
     """Watches what goes in and out of the filter.
 
     Args:
@@ -177,8 +177,9 @@ class Judge:
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
-        jitter_s = f.shared[report.camera].jitter_s
-        if jitter_s >= ANNOUNCED_S:
+        shared = f.shared[report.camera]
+        jitter_s = shared.jitter_s
+        if jitter_s >= ANNOUNCED_S and shared.stamps_jitter:
             event = Event(EventKind.STAMP_JITTER, report.camera, float(jitter_s))
             self.announce(event, once=f"jitter {report.camera}")
         lens = f.agreement[report.camera]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import Start, coarse_start, debiased_start
-from vical_daemon.estimation.temporal.stamp_stretch import find_stretch
+from vical_daemon.estimation.temporal.stamp_stretch import estimate_clock_rate
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def explain(
             "frame must be right-handed"
         )
     curve = GyroCurve.integrate(t_imu_s, gyro_rps, np.zeros(3))
-    factor = find_stretch(curve, t_cam_s, q_world_cam, shifts_s)
+    factor = estimate_clock_rate(curve, t_cam_s, q_world_cam, shifts_s)
     return "" if factor is None else stretched(1.0 / factor - 1.0)
 
 
@@ -77,7 +77,7 @@ def explain_stream(
             "its orientations or the reference's are inverted: the world's in the sensor, not the sensor's "
             "in the world (with the inverses the rotations fit)"
         )
-    factor = find_stretch(curve, t_s, q_world_sensor, shifts_s)
+    factor = estimate_clock_rate(curve, t_s, q_world_sensor, shifts_s)
     return "" if factor is None else stretched(1.0 / factor - 1.0, "sensor", "reference")
 
 

@@ -30,7 +30,7 @@ _AGREE = 0.6
 _BETTER = 0.6  # misfit over that of the stamps as they are
 
 
-def find_stretch(
+def estimate_clock_rate(
     curve: RotationCurve, t_cam_s: FloatArray, q_world_cam: FloatArray, shifts_s: tuple[float, float]
 ) -> float | None:
     """Find the factor by which the camera's stamps must be divided to agree with the curve.

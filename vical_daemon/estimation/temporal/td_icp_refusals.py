@@ -78,7 +78,7 @@ def refuse_motion(
     return Refusal(_wrong_unit(ratio))
 
 
-def at_one_rate(t_imu: FloatArray, gyro: FloatArray) -> bool:
+def is_constant_rotation(t_imu: FloatArray, gyro: FloatArray) -> bool:
     """Whether the rig turns at one rate about one axis all the time.
 
     Args:

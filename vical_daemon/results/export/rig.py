@@ -31,6 +31,7 @@ class RigCamera:
         covariance: Of [px py pz rx ry rz], m and rad, rotation error local, shape (6, 6); None: not known.
         timeshift_sigma_s: Its standard deviation, s; None: not known.
         readout_s: First to last row of a rolling shutter, s; 0: global shutter.
+        readout_axis: What it reads one after the other, `rows` or `columns`; empty: rows, or not known.
         topic: ROS topic of the images.
         rate_hz: Frames a second; None: not known.
         unobservable: Directions that the motion did not reveal: do not use their values.
@@ -52,6 +53,7 @@ class RigCamera:
     topic: str = ""
     rate_hz: float | None = None
     unobservable: tuple[str, ...] = ()
+    readout_axis: str = ""
     lens_sigma: tuple[float, ...] = ()
     calibration_covariance: FloatArray | None = None
 

@@ -148,6 +148,7 @@ def write_json(rig: Rig) -> str:
             "distortion": list(camera.distortion),
             "resolution": None if camera.resolution is None else list(camera.resolution),
             "readout_s": camera.readout_s,
+            "readout_axis": camera.readout_axis,
             "unobservable": list(camera.unobservable),
         }
     noise = rig.noise

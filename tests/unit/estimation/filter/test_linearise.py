@@ -5,7 +5,7 @@ import pytest
 
 from vical_daemon.estimation.filter.linearise import (
     Image,
-    Straightness,
+    LinearityMonitor,
     by_derivatives,
     by_sigma_points,
     project_errors,
@@ -126,7 +126,7 @@ def test_derivatives_of_the_motion_agree_with_sigma_points(estimate):
 
 
 def test_straightness_is_measured_again_when_a_sigma_grows_or_time_passes():
-    s = Straightness()
+    s = LinearityMonitor()
     sigmas = np.array([1.0, 2.0])
     assert not s.holds(sigmas)
     s.measured(sigmas, 0.001)

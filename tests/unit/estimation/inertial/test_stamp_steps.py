@@ -101,6 +101,7 @@ def test_a_calibration_goes_on_as_if_nothing_had_happened(target_free):
     make = simulate_tracks if target_free else simulate
     rate = {"camera_rate_hz": 10.0} if target_free else {}
     run = make(3, 10.0, rig=reference_rig(3, timeshift_cam_imu_s=0.01), **rate)
+    run = replace(run, frames=[f for f in run.frames if f.t_s > 0.1])  # readings cover all of them either way
     step_ns = np.where(run.t_imu_ns < run.t_imu_ns[0] + 1_200_000_000, 3_000_000, 0)
     step_ns += np.where(run.t_imu_ns < run.t_imu_ns[0] + 7_000_000_000, 0, 500_000)
     even, trace, _ = calibrated(run, target_free=target_free)

@@ -7,25 +7,27 @@ import pytest
 from vical_mocks.points import board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
 
-from vical_daemon.estimation.init.readout_start import looks_rolling, readout
+from vical_daemon.estimation.init.readout_start import likely_axis, looks_rolling, readout
 from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import PointsFrame
 
 BOARD = board_points()
 
 
-def seen(seed, readout_s, seconds=4.0, **options):
-    rig = replace(reference_rig(seed, timeshift_cam_imu_s=0.01), readout_s=readout_s)
+def seen(seed, readout_s, seconds=4.0, axis="rows", **options):
+    rig = replace(reference_rig(seed, timeshift_cam_imu_s=0.01), readout_s=readout_s, readout_axis=axis)
     run = simulate(seed, seconds, rig=rig, **options)
     frames = [(f.t_s, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px)) for f in run.frames]
     return frames, Lens(np.array([530.0, 530.0, 322.0, 236.0]), np.zeros(4), "radtan", (640, 480))
 
 
 @pytest.mark.parametrize("readout_s", [-0.03, 0.008, 0.033])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_rolling_shutter_is_seen_either_way_up(seed, readout_s):
-    frames, lens = seen(seed, readout_s)
-    assert looks_rolling(frames, lens, BOARD)
+@pytest.mark.parametrize(("seed", "axis"), [(1, "rows"), (2, "rows"), (2, "columns")])
+def test_a_rolling_shutter_is_seen_either_way_up(seed, axis, readout_s):
+    frames, lens = seen(seed, readout_s, axis=axis)
+    assert looks_rolling(frames, lens, BOARD) == axis
+    assert likely_axis(frames, lens, BOARD) == axis
+    lens.readout_axis = axis
     assert readout(frames, lens, BOARD, 0.0) == pytest.approx(readout_s, abs=1e-3 + 0.1 * abs(readout_s))
 
 

@@ -14,7 +14,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.snapshot import camera_estimate
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise
 from vical_daemon.estimation.model import unscented
-from vical_daemon.estimation.model.held_lens import HeldLens
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
@@ -33,7 +33,7 @@ class Linear:
 
     def __init__(self, off: float, told: bool = False):
         rng = np.random.default_rng(3)
-        self.lens = HeldLens.of(
+        self.lens = FixedLens.of(
             CameraPrior(
                 (640, 480), (460.0, 455.0, 325.0, 238.0), "radtan", (-0.2, 0.1, 0.0, 0.0),
                 intrinsics_sigma=STATED if told else None, distortion_sigma=(1e-3,) * 4 if told else None,

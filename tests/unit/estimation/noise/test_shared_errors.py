@@ -176,3 +176,30 @@ def test_sharp_corners_with_late_stamps_start(rate_hz, jitter_s):
     assert record.snapshots
     for shot in record.snapshots:
         assert shot.error[:7] @ np.linalg.solve(shot.covariance[:7, :7], shot.error[:7]) < chi2.isf(1e-4, 7)
+
+
+@pytest.mark.parametrize("images", [150, 1000])
+@pytest.mark.parametrize(("memory", "jitters"), [(0.0, True), (0.9, False)])
+def test_only_what_is_independent_from_image_to_image_is_a_jitter_of_the_stamps(memory, jitters, images):
+    """Errors of a lens or an imu make neighbours late alike: for 0.2 to 0.3 s on EuRoC."""
+    rng, late_s, shared = np.random.default_rng(4), 0.0, SharedErrors()
+    for _ in range(images):
+        late_s = memory * late_s + np.sqrt(1.0 - memory**2) * 1e-3 * rng.standard_normal()
+        ways = np.zeros((60, 3))
+        ways[:, 0] = 1000.0 * rng.standard_normal(60)  # of corners of 0.3 px at 300 px/s
+        ways[::2, 1] = ways[1::2, 2] = 3.0
+        shared.learn(ways[:, 0] * late_s + rng.standard_normal(60), ways, np.zeros((3, 1)))
+    assert shared.jitter_s == pytest.approx(1e-3, rel=0.4)
+    assert shared.stamps_jitter == jitters
+
+
+def test_nothing_is_blamed_on_the_stamps_before_it_is_known_whether_neighbours_are_late_alike():
+    rng, shared = np.random.default_rng(5), SharedErrors()
+    for _ in range(60):
+        ways = np.zeros((60, 3))
+        ways[:, 0] = 1000.0 * rng.standard_normal(60)
+        shared.learn(
+            ways[:, 0] * 1e-3 * rng.standard_normal() + rng.standard_normal(60), ways, np.zeros((3, 1))
+        )
+    assert shared.jitter_s > 0.0
+    assert not shared.stamps_jitter

@@ -17,8 +17,8 @@ from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.selection.clock_drift import (
     apart,
-    as_if_alike,
     averaged,
+    conditioned_on_no_drift,
     stamps_variance,
 )
 
@@ -57,7 +57,7 @@ def test_clocks_that_run_alike_are_the_gaussian_conditioned_on_no_drift():
     index, shift = f.layout.cameras[NAME].skew, f.layout.cameras[NAME].timeshift
     P = f.S @ f.S.T
     gain = P[:, index] / P[index, index]
-    alike = as_if_alike(f, NAME)
+    alike = conditioned_on_no_drift(f, NAME)
     np.testing.assert_allclose(alike.S @ alike.S.T, P - np.outer(gain, P[index]), atol=1e-18)
     moved = alike.state.cameras[NAME]
     assert moved.skew == pytest.approx(0.0, abs=1e-18)

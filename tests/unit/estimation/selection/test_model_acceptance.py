@@ -5,7 +5,7 @@ import pytest
 
 from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
 from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA
-from vical_daemon.estimation.selection.model_acceptance import BeyondDoubt
+from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, off
 from vical_daemon.estimation.wording import event_text
 
@@ -18,7 +18,7 @@ def surest(values, P, where):
 
 def test_an_imu_announced_gives_the_answer_of_a_wide_prior():
     f, _, _, dense = some_filter(3.0)
-    beyond = BeyondDoubt()
+    beyond = ModelAcceptance()
     told = beyond.look(f)
     assert list(told) == [IMU]
     assert off(f, IMU) == pytest.approx(1.0, abs=1e-12)
@@ -40,7 +40,7 @@ def test_an_imu_announced_gives_the_answer_of_a_wide_prior():
 def test_a_target_announced_is_left_as_it_was_found(factor):
     f, x, P, dense = some_filter(0.0, 4.0, factor=factor)
     agreement = f.agreement[NAME]
-    told = BeyondDoubt().look(f)
+    told = ModelAcceptance().look(f)
     assert list(told) == [TARGET]
     assert off(f, TARGET) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-9, atol=1e-15)
@@ -54,7 +54,7 @@ def test_a_target_announced_is_left_as_it_was_found(factor):
 
 def test_it_is_asked_once_a_second():
     f, *_ = some_filter(0.0)
-    beyond = BeyondDoubt()
+    beyond = ModelAcceptance()
     assert beyond.look(f) == {}
     f.state.gyro_matrix = f.state.gyro_matrix + 0.01
     f.state.t_s += 0.5
@@ -66,9 +66,9 @@ def test_it_is_asked_once_a_second():
 @pytest.mark.parametrize(("lag", "told"), [(6.0, "behind"), (-6.0, "ahead of")])
 def test_a_lag_is_announced_once_it_is_measured_how_well_images_fit(lag, told):
     f, x, P, dense = some_filter(0.0, lag=lag)
-    assert BeyondDoubt().look(f) == {}
+    assert ModelAcceptance().look(f) == {}
     f.consistency[NAME].images = 400
-    events = BeyondDoubt().look(f)
+    events = ModelAcceptance().look(f)
     assert list(events) == [LAG]
     value, sigma = surest(x, P, dense.where[LAG])
     assert f"is {1e3 * value:.2f} +- {1e3 * sigma:.2f} ms {told} the gyro" in event_text(events[LAG])
@@ -79,7 +79,7 @@ def test_a_lag_is_announced_once_it_is_measured_how_well_images_fit(lag, told):
 @pytest.mark.parametrize(("size", "told"), [(6.0, "larger"), (-6.0, "smaller")])
 def test_a_size_announced_gives_the_answer_of_a_wide_prior(size, told):
     f, _, _, dense = some_filter(0.0, size=size)
-    events = BeyondDoubt().look(f)
+    events = ModelAcceptance().look(f)
     assert list(events) == [SIZE]
     assert off(f, SIZE) == pytest.approx(1.0, abs=1e-12)
     wide, where = dense.prior.copy(), dense.where[SIZE]

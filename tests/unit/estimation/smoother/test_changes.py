@@ -14,7 +14,7 @@ from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.carry import FULL
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.jitter import Lateness
+from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
 DISTURBANCES = {
@@ -185,7 +185,7 @@ def test_what_is_held_fixed_never_changed():
     assert changed_blocks(found, covariance, prior, active, excess) == CLOCK
 
 
-class _Delays(Lateness):
+class _Delays(StampOffsets):
     def __init__(self, tau):
         self._tau = tau
 

@@ -7,8 +7,16 @@ from scipy.stats import multivariate_normal
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import CALIBRATION, FULL, IMU, INERTIAL, LAG, Carry, root_of
-from vical_daemon.estimation.smoother.doubts import FreeDoubts
+from vical_daemon.estimation.smoother.carry import (
+    CALIBRATION,
+    FULL,
+    IMU,
+    INERTIAL,
+    LAG,
+    MarginalPrior,
+    root_of,
+)
+from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.snapshot import camera_estimate
 
 PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])
@@ -35,7 +43,7 @@ def carry(seed, off):
         (640, 480),
     )
     active = np.ones(FULL, dtype=bool)
-    return Carry(np.eye(3), np.zeros(3), np.zeros(6), camera, root_of(whole), active, 0.0, imu), P
+    return MarginalPrior(np.eye(3), np.zeros(3), np.zeros(6), camera, root_of(whole), active, 0.0, imu), P
 
 
 def given_stated(P, x, at):
@@ -71,7 +79,7 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     known, P = carry(seed, off)
     x = np.zeros(FULL)
     x[NUMBERS] = known.imu
-    doubts = FreeDoubts("cam0", asked=frozenset(), rolling=True)
+    doubts = TargetFreeDoubts("cam0", asked=frozenset(), rolling=True)
     doubts.drifting = True
     told = camera_estimate(
         known, doubts.weighed(known, 1.0, compared=True)._replace(gyro_frame=False), 0.5, 0.5
@@ -85,14 +93,14 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
 
 def test_what_is_asked_for_is_never_taken_as_stated():
     known, _ = carry(5, 0.0)
-    doubts = FreeDoubts("cam0", asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
+    doubts = TargetFreeDoubts("cam0", asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
     ((p, stated),) = doubts.weighed(known, 1.0, compared=True).stated
     assert (p, len(stated)) == (1.0, 0)
 
 
 def test_until_windows_can_be_compared_the_imu_is_as_likely_true_as_not():
     known, _ = carry(6, 8.0)
-    doubts = FreeDoubts("cam0", asked=frozenset(), rolling=False)
+    doubts = TargetFreeDoubts("cam0", asked=frozenset(), rolling=False)
     for compared, least in ((False, 0.5), (True, 0.0)):
         shares = {len(stated): p for p, stated in doubts.weighed(known, 1.0, compared=compared).stated}
         assert shares[16] == pytest.approx(least, abs=1e-6)

@@ -12,7 +12,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
-from vical_daemon.estimation.model.inertial_links import Links, make_link
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_link
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
 from vical_daemon.estimation.smoother.carry import (
@@ -25,7 +25,7 @@ from vical_daemon.estimation.smoother.carry import (
     moved,
 )
 from vical_daemon.estimation.smoother.inertial import Order
-from vical_daemon.estimation.smoother.jitter import Lateness
+from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.quality import correlation
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart
 from vical_daemon.estimation.smoother.starter import start_sigmas
@@ -80,7 +80,7 @@ def scene():
 @pytest.mark.parametrize("numbers", [6, 22])
 def test_links_derivatives_agree_with_differences(scene, numbers):
     zero = np.zeros(numbers)
-    links = Links.stack(
+    links = PreintegratedLinks.stack(
         [make_link(scene.buffer, 0.3 + 0.05 * k, 0.35 + 0.05 * k, zero, scene.noise) for k in range(3)]
     )
     rng = np.random.default_rng(1)
@@ -229,7 +229,7 @@ def test_late_images_move_the_errors_of_links_as_told(scene):
     M = B.T @ B + np.eye(F) / sigma_s**2
     gain = np.linalg.solve(M, B.T)
     H, g = wide.T @ wide, wide.T @ e.ravel()
-    delays = Lateness(window, e, J, sigma_s)
+    delays = StampOffsets(window, e, J, sigma_s)
     wanted_H, wanted_g = H - wide.T @ B @ gain @ wide, g - wide.T @ B @ gain @ e.ravel()
     delays.eliminate(H, g, J, at)
     np.testing.assert_allclose(H, wanted_H, atol=1e-4 * np.abs(wanted_H).max())

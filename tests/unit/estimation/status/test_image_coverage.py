@@ -9,7 +9,7 @@ from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prio
 from vical_mocks.points import simulate
 
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.status.image_coverage import Cover, PictureCover
+from vical_daemon.estimation.status.image_coverage import Cover, ImageCoverage
 
 
 def spread(low, high, count=4000):
@@ -29,7 +29,7 @@ PARTLY_SEEN = np.full((8, 2), 300.0)  # a target that is partly in the picture
     ],
 )
 def test_edges_without_corners_are_named(low, high, edges):
-    cover = PictureCover((640, 480))
+    cover = ImageCoverage((640, 480))
     cover.add(spread(low, high))
     assert cover.unseen_edges() == ()  # whole targets only: their corners may never come so far out
     cover.add(PARTLY_SEEN)
@@ -37,7 +37,7 @@ def test_edges_without_corners_are_named(low, high, edges):
 
 
 def test_a_few_strays_show_no_edge_and_corners_beyond_the_picture_do_no_harm():
-    cover = PictureCover((640, 480))
+    cover = ImageCoverage((640, 480))
     cover.add(spread((100, 100), (540, 380)))
     cover.add(np.array([[2.0, 240.0], [645.0, 240.0], [-3.0, -3.0]]))
     assert cover.unseen_edges() == ("left", "right", "top", "bottom")

@@ -1,0 +1,27 @@
+"""Whether a rolling shutter reads columns instead of rows: asked of the first window that is adjusted."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+
+from vical_daemon.estimation.measurements import COLUMNS
+from vical_daemon.estimation.smoother.bundle import Bundle, Fit
+from vical_daemon.estimation.smoother.window import Window
+
+_WORTH_A_FIT = 25.0  # chi-square: a readout by columns stands out by five sigmas, as one by rows must
+
+
+def shows_columns(bundle: Bundle, fit: Fit) -> bool:
+    """Whether what rows leave over looks like a readout by columns, so that they are worth an adjustment."""
+    return bundle.seen is not None and bundle.problem.late_by_columns(bundle.seen) > _WORTH_A_FIT * max(
+        fit.squares / fit.dof, 1.0
+    )
+
+
+def read_by_columns(window: Window) -> Window:
+    """The same window, to be adjusted with columns that are read one after the other."""
+    other = deepcopy(window)
+    other.bad.clear()  # what did not fit with rows
+    other.camera = replace(window.camera, readout_axis=COLUMNS, readout_s=0.0)
+    return other
