@@ -1,4 +1,4 @@
-"""The order of the whole run: `pytest -n 2` gives files to whoever is free, so the long ones go first.
+"""The order of the whole run: `pytest -n 4` gives files to whoever is free, so the long ones go first.
 
 A test marked `root` is skipped for everybody else.
 """
@@ -14,20 +14,37 @@ os.environ.setdefault("PYTHONWARNINGS", "error::RuntimeWarning")
 # Before numpy is imported: its threads make small matrices ten times slower.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
-LONGEST_FIRST = (
-    "test_euroc.py",
-    "test_calibrator.py",
-    "test_calibration_statistics.py",
-    "test_iidc.py",
-    "test_calibrate.py",
+LONGEST_FIRST = (  # as `pytest --durations=0 tests` has them
     "test_demo_command.py",
+    "test_partial_start.py",
+    "test_gaps.py",
+    "test_web_page.py",
+    "test_several_recordings.py",
+    "test_shared_memory.py",
+    "test_changes.py",
     "test_run_processes.py",
-    "test_td_icp_command.py",
+    "test_gx3_faults.py",
+    "test_target_modes.py",
+    "test_bus_access.py",
+    "test_target_size.py",
+    "test_rolling_shutter_correction.py",
+    "test_bounded_input.py",
+    "test_web_hostile.py",
+    "test_model_selection.py",
+    "test_target_free.py",
+    "test_held_lens.py",
+    "test_calibrator.py",
+    "test_shared_errors.py",
+    "test_start.py",
+    "test_calibrate.py",
+    "test_target_free_options.py",
+    "test_any_numbers.py",
+    "test_calibrate_traffic.py",
+    "test_euroc.py",
+    "test_iidc.py",
+    "test_target_free_statistics.py",
+    "test_calibration_statistics.py",
     "test_gx3_on_a_terminal.py",
-    "test_simulated_camera.py",
-    "test_record_over_zenoh.py",
-    "test_calibration_filter.py",
-    "test_tracks.py",
 )
 
 

@@ -12,7 +12,7 @@ from vical_drivers.camera import list_cameras, open_camera
 
 from vical_daemon.vision.image_codec import decode_image
 
-pytestmark = [pytest.mark.hardware, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.hardware
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from vical_drivers.microstrain.device import MicrostrainImu, open_imu
 from vical_drivers.microstrain.port import SerialPort, latency_timer_ms, link_of, wait_for_silence
 from vical_drivers.samples import ImuSample
 
-pytestmark = [pytest.mark.hardware, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.hardware
 
 
 @pytest.fixture(scope="module")

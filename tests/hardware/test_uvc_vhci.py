@@ -15,7 +15,7 @@ from vical_drivers.camera import CameraSettings, list_cameras
 from vical_drivers.camera.v4l2.camera import V4l2Camera
 from vical_mocks import usb_camera
 
-pytestmark = [pytest.mark.hardware, pytest.mark.root, pytest.mark.timeout(300)]  # root plugs the camera in
+pytestmark = [pytest.mark.hardware, pytest.mark.root]  # root plugs the camera in
 SECONDS = 20.0
 
 

@@ -12,7 +12,7 @@ from vical_drivers import errors
 from vical_drivers.camera import CameraSettings, check_camera, list_cameras
 from vical_drivers.camera.v4l2.camera import V4l2Camera
 
-pytestmark = [pytest.mark.hardware, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.hardware
 
 OpenVivid = Callable[..., V4l2Camera]
 SMALL = {"width": 320, "height": 180, "rate_hz": 30.0}

@@ -13,13 +13,10 @@ from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 FOLDER = Path(__file__).parents[3] / "shared" / "data" / "openvins_sim_tum"
 
-pytestmark = [
-    pytest.mark.skipif(
-        not FOLDER.is_dir(),
-        reason="OpenVINS's recording lies in ../shared, whose licence does not let us ship it",
-    ),
-    pytest.mark.timeout(400),
-]
+pytestmark = pytest.mark.skipif(
+    not FOLDER.is_dir(),
+    reason="OpenVINS's recording lies in ../shared, whose licence does not let us ship it",
+)
 
 
 def test_ten_seconds_are_better_than_openvins_after_ten_seconds():

@@ -15,7 +15,7 @@ from vical_mocks.rig import reference_rig
 
 from vical_daemon.estimation.measurements import CalibrationOptions
 
-pytestmark = [pytest.mark.statistical, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.statistical
 TRIALS, SECONDS, CAMERA_HZ = 8, 8.0, 10.0
 BLOCKS = ("p_imu_cam", "r_imu_cam", "timeshift")
 

@@ -15,7 +15,7 @@ from vical_mocks.tracks import simulate_tracks
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.carry import IMU
 
-pytestmark = [pytest.mark.statistical, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.statistical
 TRIALS, SECONDS, CAMERA_HZ = 6, 9.0, 8.0
 BLOCKS = ("p_imu_cam", "r_imu_cam", "timeshift")
 

@@ -22,7 +22,6 @@ STARVED = "the demo failed: nothing was estimated"
     os.getloadavg()[0] > 3 * (os.cpu_count() or 1),
     reason="the machine is overloaded (load above 3 per core): nothing runs in real time on it",
 )
-@pytest.mark.timeout(240)
 def test_every_role_takes_part(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "short"
     code, out, err = _demo(folder, 5, capsys)

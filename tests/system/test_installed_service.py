@@ -12,7 +12,7 @@ from vical_mocks.harness.machine import Machine, MachineError
 
 from vical_daemon.cli.process_sets import PROCESSES
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+pytestmark = pytest.mark.system
 REPOSITORY = Path(__file__).resolve().parents[2]
 PROGRAM = "/opt/my robot 100%n/vical"
 STUB = f"""#!{sys.executable}

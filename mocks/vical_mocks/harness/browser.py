@@ -61,7 +61,8 @@ class Page:
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         await self.call("Emulation.setEmulatedMedia", features=[scheme])
-        await self.call("Page.navigate", url=url)
+        for address in ("about:blank", url):  # no answer may come from the page that was open before
+            await self.call("Page.navigate", url=address)
 
     async def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression."""

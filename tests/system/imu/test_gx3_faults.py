@@ -74,7 +74,7 @@ def test_unplug_and_replug_many_times(emulate):
 def test_after_an_outage_it_is_soon_back(emulate, protocol, outage):
     # measured: 1.2 to 2.5 s, of which the clock mapping warms up for 1 s
     emulator = emulate(protocol=protocol, link="uart")
-    with open_imu(emulator.port_name, rate_hz=100.0) as imu:
+    with open_imu(emulator.port_name, rate_hz=100.0, silence_s=0.5) as imu:
         collect(imu, 5)
         leave, come_back = (
             (emulator.unplug, emulator.plug)
@@ -82,7 +82,7 @@ def test_after_an_outage_it_is_soon_back(emulate, protocol, outage):
             else (emulator.power_off, emulator.power_on)
         )
         leave()
-        until_s = time.monotonic() + 6.0  # of them 2 s until silence counts as a loss
+        until_s = time.monotonic() + 4.5  # of them 0.5 s until silence counts as a loss
         while time.monotonic() < until_s:
             with contextlib.suppress(DriverError):
                 imu.read(0.2)

@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import itertools
 import json
 import os
 import socket
@@ -282,8 +283,8 @@ SCENES = {  # what the rig sends, and what must stand on the page
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize(("width", "dark"), [(390, True), (390, False), (1400, False), (1400, True)])
-def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, width, dark):
+def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene):
+    """In windows of two widths, light and dark: one browser opens the page in each."""
     keep, bus, rng = shots() or tmp_path, served.bus, np.random.default_rng(0)
     status = Status.CONVERGED if scene in ("converged", "edges") else Status.CONVERGING
     reason = "lever arm along the optical axis: +-12.0 mm" if status is Status.CONVERGING else ""
@@ -292,15 +293,16 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
         events = [event] if k == 60 else []
         sent = web_feed.estimate(0.2 * k, rng, status, reason=reason, events=events, **SCENES[scene])
         web_feed.publish_estimate(bus, sent)
+    numbers = itertools.count(1)
     fault = (Level.ERROR, "no data for 3.0 s: is the cable plugged in?") if scene == "fault" else ()
-    web_feed.publish_status(bus, *fault)
 
-    async def script(page):
+    async def look(page, width, dark):
+        web_feed.publish_status(bus, *fault)
         await page.open(served.address, width, 844 if width < 600 else 1250, dark=dark)
         await page.wait("document.getElementById('link').textContent === 'live'")
         await page.wait("document.querySelectorAll('#devices tbody tr').length > 1")
-        for number in range(1, 50):  # points alone, as from a log without images
-            web_feed.publish_points(bus, number)
+        for _ in range(49):  # points alone, as from a log without images
+            web_feed.publish_points(bus, next(numbers))
             await asyncio.sleep(0.02)
         web_feed.publish_estimate(bus, sent)  # however long the browser took to start, this is fresh
         await page.wait("!page.latest.cam0.stale")
@@ -324,11 +326,21 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene, 
         if width < 600:
             await page.evaluate("document.getElementById('devices').scrollIntoView()")
             await page.screenshot(keep / f"{scene}_{width}_{'dark' if dark else 'light'}_devices.png")
-        return texts, page.errors
+        return texts
 
-    texts, errors = browser.drive(script, tmp_path / "profile")
+    windows = [(390, True), (390, False), (1400, False), (1400, True)]
+
+    async def script(page):
+        return {window: await look(page, *window) for window in windows}, page.errors
+
+    seen, errors = browser.drive(script, tmp_path / "profile")
     assert errors == []
-    assert texts["wide"] <= width  # nothing to scroll sideways, tables neither
+    for (width, _), texts in seen.items():
+        assert texts["wide"] <= width  # nothing to scroll sideways, tables neither
+        check_what_stands_there(scene, reason, texts)
+
+
+def check_what_stands_there(scene, reason, texts):
     assert texts["low"] < 300
     assert "no images arrive" in texts["misfit"] and "1 sigma" in texts["facts"]
     assert "12 s: cam0: the stamps of the images jitter" in texts["news"]

@@ -15,7 +15,6 @@ from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.cli import main
 
-pytestmark = pytest.mark.timeout(300)
 READOUT_S = 0.018
 
 

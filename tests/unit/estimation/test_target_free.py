@@ -26,8 +26,6 @@ from vical_daemon.estimation.smoother.carry import FULL
 from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
-pytestmark = pytest.mark.timeout(400)
-
 
 def subject_for(run, *, lens_known=True, seed=0, start=None):
     prior = camera_prior(run, seed, start or StartErrors(0.05, 5.0), exact_lens=lens_known)

@@ -13,8 +13,6 @@ from vical_daemon.estimation.smoother.carry import IMU, LAG
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 from vical_daemon.estimation.wording import event_text
 
-pytestmark = pytest.mark.timeout(400)
-
 
 def followed(seed, estimate, *, seconds=9.0, dark=None, accel_lag_s=0.0, rate_hz=10.0, **changes):
     """A recording of a rig with these changes, and the calibration that finds `estimate` beside the usual."""

@@ -15,8 +15,6 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.target_free_rig import TargetFreeRig, together
 
-pytestmark = pytest.mark.timeout(400)
-
 
 @pytest.fixture(scope="module")
 def pair():

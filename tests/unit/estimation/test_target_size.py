@@ -10,8 +10,6 @@ from vical_mocks.rig import reference_rig
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 
-pytestmark = pytest.mark.timeout(400)
-
 
 def calibrated(seed, size, *, seconds=12.0, lens_known=False, estimate=frozenset()):
     """What is told of a rig whose board is `size` times as large as stated."""

@@ -17,8 +17,6 @@ from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTIN
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
-pytestmark = pytest.mark.timeout(400)
-
 DISTURBANCES = {
     EventKind.IMU_GAP,
     EventKind.IMAGE_GAP,

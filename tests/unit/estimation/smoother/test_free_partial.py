@@ -16,8 +16,6 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
 from vical_daemon.estimation.smoother.start import ArmPrior, NoStartError
 
-pytestmark = pytest.mark.timeout(400)
-
 MOUNT = (NOMINAL_R_IMU_CAM, NOMINAL_P_IMU_CAM)
 
 

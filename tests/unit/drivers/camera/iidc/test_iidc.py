@@ -144,7 +144,6 @@ def test_a_closed_camera_is_named_and_nothing_else(tmp_path, monkeypatch) -> Non
 
 
 @pytest.mark.system
-@pytest.mark.timeout(400)
 def test_the_grabber_over_the_real_libdc1394(tmp_path: Path) -> None:
     """Runs `iidc_under_shim.py`, and the contract of frame sources, in a process on the fake bus.
 
