@@ -43,6 +43,7 @@ def payload(topic, k, web_feed):
         "tracks": lambda: m.encode_points(stamp, "cam0", np.arange(6), grid, np.ones(6), (64, 48)),
         "predicted": lambda: m.encode_points(stamp, "cam0", np.arange(6), grid),
         "calibration": lambda: m.encode_calibration(estimate, "cam0"),
+        "stored": lambda: m.encode_calibration(estimate, "cam0"),
         "pose": lambda: m.encode_pose(stamp, "imu0", estimate.cameras["cam0"].T_imu_cam),
         "tf_static": lambda: m.encode_transforms([pose]),
         "status": lambda: m.encode_diagnostics(stamp, "imu", [FINE]),
