@@ -37,7 +37,7 @@ _CONTEXT = mp.get_context("spawn")
 
 def main(argv: list[str]) -> int:
     """One row for each fault."""
-    parser = argparse.ArgumentParser(prog="bus_faults")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks bus_faults")
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--junk", type=int, default=JUNK)
     parser.add_argument("--calibration-junk", type=int, default=CALIBRATION_JUNK, help="messages beside it")

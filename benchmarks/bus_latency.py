@@ -23,7 +23,7 @@ _CONTEXT = mp.get_context("spawn")
 
 def main(argv: list[str]) -> int:
     """One row for each kind of message."""
-    parser = argparse.ArgumentParser(prog="bus_latency")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks bus_latency")
     parser.add_argument("--seconds", type=float, default=10.0)
     args = parser.parse_args(argv)
     print("| message | sent | lost | age p50 / p99 / max ms | processor sender / receiver, % of a core |")

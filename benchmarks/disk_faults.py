@@ -30,7 +30,7 @@ _IMU = topics.IMU.key("rig0", "imu0")
 
 def main(argv: list[str]) -> int:
     """One row for each fault."""
-    argparse.ArgumentParser(prog="disk_faults").parse_args(argv)
+    argparse.ArgumentParser(prog="python -m benchmarks disk_faults").parse_args(argv)
     print(
         "| fault | what the recorder says | messages kept of those before it | after it |\n|---|---|---|---|"
     )

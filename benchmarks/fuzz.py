@@ -29,7 +29,7 @@ Case = tuple[str, bytes, Callable[[bytes], object], tuple[type[Exception], ...]]
 
 def main(argv: list[str]) -> int:
     """Mutate, feed, count."""
-    parser = argparse.ArgumentParser(prog="fuzz")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks fuzz")
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args(argv)

@@ -29,7 +29,7 @@ _RIGS_PER_PROCESS = 10
 
 def main(argv: list[str]) -> int:
     """Run and print."""
-    parser = argparse.ArgumentParser(prog="many_rigs")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks many_rigs")
     parser.add_argument("--rigs", type=int, default=50)
     parser.add_argument("--seconds", type=float, default=20.0)
     args = parser.parse_args(argv)

@@ -37,7 +37,7 @@ _RATE_HZ = 1000
 
 def main(argv: list[str]) -> int:
     """Kill and count."""
-    parser = argparse.ArgumentParser(prog="power_cut")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks power_cut")
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--longest", type=float, default=2.6, help="seconds until the kill, at most")
     parser.add_argument("--seed", type=int, default=1)

@@ -51,7 +51,7 @@ class _Count:
 
 def main(argv: list[str]) -> int:
     """Publish, watch, print."""
-    parser = argparse.ArgumentParser(prog="soak")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks soak")
     parser.add_argument("--minutes", type=float, default=20.0)
     args = parser.parse_args(argv)
     from vical_daemon.bus.zenoh_bus import open_bus
