@@ -11,9 +11,7 @@ from vical_daemon.results.compare import FALSE_ALARM
 from vical_daemon.results.difference import Difference
 from vical_daemon.results.pixel_map import PixelMap
 
-_OPEN_Z = (
-    2.0  # below it a difference is within what both leave open; marked for the eye, no verdict hangs on it
-)
+_OPEN_Z = 2.0  # joint sigmas; smaller differences are marked for the eye, no verdict depends on it
 
 
 def describe(comparison: Comparison, *, with_map: bool) -> str:
@@ -62,7 +60,7 @@ def _rows(apart: Difference) -> list[str]:
         for k, label in labels:
             d, sigma = scale * apart.d[k], scale * apart.sigma[k]
             z = apart.d[k] / apart.sigma[k]
-            left_open = "  left open by both" if abs(z) < _OPEN_Z else ""
+            left_open = "  within 2 sigma" if abs(z) < _OPEN_Z else ""
             name = f"{block} {label}".strip()
             lines.append(
                 f"  {name:<14}{d:>+12.{digits}f}{sigma:>11.{digits}f}{z:>8.1f} {unit:<4}{left_open}".rstrip()
@@ -103,13 +101,13 @@ def _pixels(m: PixelMap, *, full: bool) -> list[str]:
     at = f"at {m.distance_m:g} m"
     head = (
         f"  {at}: projections differ by {_rms(m.apart_px):.2f} px RMS, {np.nanmax(m.apart_px):.2f} at most; "
-        f"after what both leave open: {_rms(m.least_px):.2f} and {np.nanmax(m.least_px):.2f} px"
+        f"beyond what both sigmas allow: {_rms(m.least_px):.2f} and {np.nanmax(m.least_px):.2f} px"
     )
     if not full:
         return [head]
     if not m.least_px.any():
         return [head, *("  " + "".join(f"{x:8.2f}" for x in row) for row in m.apart_px)]
-    lines = [head, f"  {'px, over the image':<{8 * m.apart_px.shape[1] + 2}}  after what both leave open"]
+    lines = [head, f"  {'px, over the image':<{8 * m.apart_px.shape[1] + 2}}  beyond what both sigmas allow"]
     for all_px, least_px in zip(m.apart_px, m.least_px, strict=True):
         lines.append(
             "  " + "".join(f"{x:8.2f}" for x in all_px) + "  |" + "".join(f"{x:8.2f}" for x in least_px)

@@ -151,5 +151,7 @@ def check_camera(stream: Stream, imus: list[Stream]) -> list[str]:
         )
     outside_s = stream.duration_s - overlap_s
     if outside_s > 1.0:
-        return [f"{stream.name}: {outside_s:.1f} s of frames lie outside of the imu's time and are of no use"]
+        return [
+            f"{stream.name}: {outside_s:.1f} s of frames were recorded without IMU samples and are skipped"
+        ]
     return []

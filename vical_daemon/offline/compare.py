@@ -81,7 +81,7 @@ class Comparison:
 
     @property
     def least_px(self) -> float | None:
-        """The same after what both leave open."""
+        """The same, beyond what both sigmas allow."""
         return _largest([m.least_px for camera in self.cameras for m in camera.maps])
 
     def document(self) -> dict[str, Any]:
