@@ -76,9 +76,7 @@ def _matrix(args: argparse.Namespace) -> int:
         return _code(list(found.values()))
     for k, source in enumerate(args.sources):
         print(f"{k + 1}: {source}")
-    print(
-        "\nprobability by chance, and largest difference over the image in px beyond what both sigmas allow\n"
-    )
+    print("\nprobability by chance, and largest difference in px beyond what both sigmas allow\n")
     print("     " + "".join(f"{k + 1:>20}" for k in range(1, len(args.sources))))
     for i in range(len(args.sources) - 1):
         cells = [_cell(found[i, j]) if j > i else "" for j in range(1, len(args.sources))]
