@@ -200,11 +200,15 @@ def _spoil_size(folder: Path) -> list[str]:
     return _arguments(folder)
 
 
-def _spoil_target_size(folder: Path) -> list[str]:
-    """A decimal point slipped: nothing in the images shows it, only the accelerometer."""
+def _with_tag_size(folder: Path, size_m: float) -> list[str]:
     path = folder / "target.yaml"
-    path.write_text(path.read_text().replace("tagSize: 0.088", "tagSize: 0.88"))
+    path.write_text(path.read_text().replace("tagSize: 0.088", f"tagSize: {size_m}"))
     return _arguments(folder)
+
+
+def _spoil_target_size(folder: Path) -> list[str]:
+    """Twenty times too large: nothing in the images shows it, only the accelerometer."""
+    return _with_tag_size(folder, 2.0)
 
 
 def _spoil_no_initial(folder: Path) -> list[str]:
@@ -244,6 +248,17 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
     out, err = capsys.readouterr()
     assert out == "" and "Traceback" not in err
     assert words in err.splitlines()[-1] and err.splitlines()[-1].startswith("vical: error: ")
+
+
+def test_a_slipped_decimal_point_is_reported_and_the_answer_is_right(copy: Path, capsys) -> None:
+    plain = _calibrate(copy, capsys)["cameras"]["cam0"]["T_imu_cam"]
+    assert main([*_with_tag_size(copy, 0.88), "--json", "--accept", "converging"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    (size,) = (e for e in result["events"] if e["kind"] == "target_size")
+    assert size["value"] == pytest.approx(-0.9, abs=0.02)
+    apart_m = np.subtract(result["cameras"]["cam0"]["T_imu_cam"]["p_m"], plain["p_m"])
+    sigma_m = np.sqrt(np.diag(np.reshape(plain["covariance"], (6, 6)))[:3])
+    assert np.all(np.abs(apart_m) < 1.0 * sigma_m)
 
 
 def _part(euroc: Path, folder: Path, begin_s: float, end_s: float, later_ns: int = 0) -> Path:
