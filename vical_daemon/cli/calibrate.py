@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json, suggest, warn
+from vical_daemon.cli.options import add_json, add_sensors, add_stretch, suggest, warn
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.result import CalibrationEstimate
@@ -47,13 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         nargs="+",
         help="MCAP, ROS 1 or 2 bag, or ASL/EuRoC folder; several recordings of one rig make one calibration",
     )
-    parser.add_argument(
-        "--target",
-        metavar="FILE",
-        help="target file of the board, Kalibr's format (default: calibrate without a board)",
-    )
-    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
+    add_sensors(parser)
     parser.add_argument(
         "--initial",
         metavar="FILE",
@@ -71,10 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         default="",
         help=f"comma-separated, estimated from the start instead of on evidence: {', '.join(ESTIMATE)}",
     )
-    parser.add_argument(
-        "--skip", type=float, default=0.0, metavar="S", help="skip the first S seconds (default 0)"
-    )
-    parser.add_argument("--seconds", type=float, metavar="S", help="use at most S seconds (after --skip)")
+    add_stretch(parser)
     parser.add_argument("--report", metavar="F.html", help="write a report, one HTML file")
     parser.add_argument(
         "-o",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from vical_daemon.cli.options import add_stretch
+
 COLUMNS = "timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2] (the ASL/EuRoC order)"
 
 
@@ -11,7 +13,4 @@ def add_input(parser: argparse.ArgumentParser) -> None:
     """Add INPUT, --imu, --skip and --seconds."""
     parser.add_argument("input", metavar="INPUT", help=f"MCAP, bag, ASL folder, or CSV with {COLUMNS}")
     parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
-    parser.add_argument(
-        "--skip", type=float, default=0.0, metavar="S", help="skip the first S seconds (default 0)"
-    )
-    parser.add_argument("--seconds", type=float, metavar="S", help="use at most S seconds (after --skip)")
+    add_stretch(parser)

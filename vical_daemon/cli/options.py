@@ -99,3 +99,22 @@ def _nearest_choice(message: str) -> str:
 def warn(line: str) -> None:
     """Print what is unusual, in one line on stderr."""
     print(f"vical: warning: {line}", file=sys.stderr)
+
+
+def add_sensors(parser: argparse.ArgumentParser) -> None:
+    """Add the board, and which camera and IMU of a recording."""
+    parser.add_argument(
+        "--target",
+        metavar="FILE",
+        help="target file of the board, Kalibr's format (default: calibrate without a board)",
+    )
+    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
+    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
+
+
+def add_stretch(parser: argparse.ArgumentParser) -> None:
+    """Add which part of a recording is used."""
+    parser.add_argument(
+        "--skip", type=float, default=0.0, metavar="S", help="skip the first S seconds (default 0)"
+    )
+    parser.add_argument("--seconds", type=float, metavar="S", help="use at most S seconds (after --skip)")

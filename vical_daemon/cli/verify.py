@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from vical_daemon.cli.calibrate import ProgressBar, finite
 from vical_daemon.cli.errors import EXIT_CANNOT_TELL, EXIT_CHANGED, EXIT_USAGE, CliError
-from vical_daemon.cli.options import add_json
+from vical_daemon.cli.options import add_json, add_sensors, add_stretch
 
 if TYPE_CHECKING:
     from vical_daemon.config.priors import Initial
@@ -44,13 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         help="result, log, file of the store, `store` (the latest), Kalibr's or OpenVINS's camchain",
     )
-    parser.add_argument(
-        "--target",
-        metavar="FILE",
-        help="target file of the board, Kalibr's format (default: calibrate without a board)",
-    )
-    parser.add_argument("--camera", metavar="NAME", help="use only this camera (default: all)")
-    parser.add_argument("--imu", metavar="NAME", help="which IMU, if the recording has several")
+    add_sensors(parser)
     parser.add_argument(
         "--initial",
         metavar="FILE",
@@ -61,10 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("intrinsics",),
         help="test mounting and time shift only, with the lens as given",
     )
-    parser.add_argument(
-        "--skip", type=float, default=0.0, metavar="S", help="skip the first S seconds (default 0)"
-    )
-    parser.add_argument("--seconds", type=float, metavar="S", help="use at most S seconds (after --skip)")
+    add_stretch(parser)
     counts = parser.add_argument_group("the smallest changes that count")
     counts.add_argument(
         "--position-mm", type=float, default=2.0, metavar="MM", help="change of position, mm (default 2)"
