@@ -19,6 +19,7 @@ from vical_daemon.logs import open_recording
 from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline import calibrate
+from vical_daemon.offline.calibration_job import make_job
 
 G = 9.80665
 
@@ -88,7 +89,7 @@ def test_what_the_driver_said_of_its_stamps_counts_as_it_does_live(shortest: Pat
 
 @pytest.fixture(scope="session")
 def outcome(shortest: Path) -> calibrate.Outcome:
-    job = calibrate.make_job(
+    job = make_job(
         open_recording(shortest),
         read_initial(shortest / "initial.yaml"),
         target=str(shortest / "target.yaml"),
