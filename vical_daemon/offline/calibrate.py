@@ -125,7 +125,7 @@ class _Player:
         self,
         job: Job,
         progress: Progress,
-        keep: Callable[[list[FrameReport]], None] | None,
+        keep: Callable[[Sequence[FrameReport]], None] | None,
         enough: Callable[[CalibrationEstimate], bool] | None,
     ) -> None:
         self._job, self._progress, self._enough = job, progress, enough
