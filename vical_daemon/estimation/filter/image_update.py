@@ -7,18 +7,22 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import chdtri
 
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.significance import (
+    CORNER_REFUSED,
+    IMAGE_REFUSED,
+    RESIDUAL_REFUSED,
+    chi_square_limit,
+)
 
 _ITERATIONS = 5
 _LEAST = 4  # points for a correction
 _CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
-_CORNER_GATE = float(chdtri(2, 1e-4))
-_RESIDUAL_GATE = float(chdtri(2, 2e-5))
-_FRAME_GATE_P = 1e-9
+_CORNER_GATE = chi_square_limit(2, CORNER_REFUSED)
+_RESIDUAL_GATE = chi_square_limit(2, RESIDUAL_REFUSED)
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
 Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
@@ -27,7 +31,7 @@ Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread 
 @lru_cache(maxsize=256)
 def frame_limit(dof: int) -> float:
     """Chi-square limit of a whole frame (scipy takes half a millisecond for it)."""
-    return float(chdtri(dof, _FRAME_GATE_P))
+    return chi_square_limit(dof, IMAGE_REFUSED)
 
 
 @dataclass(slots=True)

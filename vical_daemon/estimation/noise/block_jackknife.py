@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.significance import STRETCHES_DISAGREE, chi_square_limit
 
-_SIGNIFICANT = 0.01  # one set of clean data in a hundred may lose by it, not one unknown
 _LEAST_TOLD = 1e-9  # of the variance of all: a run that tells less tells nothing
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3
@@ -128,6 +127,6 @@ class BlockJackknife:
         ratio = ((without - values) ** 2 / usual).mean(axis=0)
         # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
-        limit = chdtri(dof, _SIGNIFICANT / k) / dof
+        limit = chi_square_limit(dof, STRETCHES_DISAGREE / k) / dof
         student = dof / np.maximum(dof - 2.0, 1.0)
         return JackknifeResult(values, P, np.where(ratio > limit, student * ratio, 1.0))

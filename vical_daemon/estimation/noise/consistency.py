@@ -22,12 +22,12 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 MODES = 8
 _MIN_CORNERS = 8
 _LAGS = 20
 _TAPER = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
-_SIGNIFICANT = 5.0
 _FLOOR = 0.5
 _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 16.0
@@ -170,4 +170,4 @@ class Consistency:
             return
         total = 2.0 * float(_TAPER @ self._lagged[1:] / self._lagged[0])
         noise = 2.0 * float(np.sqrt(_TAPER @ _TAPER / (MODES * self._weight)))
-        self.factor = 1.0 + total if total > max(_SIGNIFICANT * noise, _FLOOR) else 1.0
+        self.factor = 1.0 + total if total > max(SURE_SIGMAS * noise, _FLOOR) else 1.0

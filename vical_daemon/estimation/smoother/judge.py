@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.special import chdtri
 
 from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import WeakDirection
@@ -19,6 +18,7 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
+from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, MarginalPrior
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
@@ -38,7 +38,6 @@ _ENOUGH_WINDOWS = 2
 _MOST_SIGMA_PX = 3.0
 _MOST_INERTIAL = 2.5
 _MOST_REFUSED = 0.4
-_DOUBT = 1e-5  # chance of a window that disagrees this much
 _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
@@ -280,7 +279,7 @@ class TargetFreeStatus:
         return min(ratio, 1.0) if self.factor() >= _MODEL_FITS and not _matters(change) else ratio
 
     def _limit(self, dof: int) -> float:
-        limit = float(chdtri(dof, _DOUBT)) * self.factor()
+        limit = chi_square_limit(dof, WINDOW_CONTRADICTS) * self.factor()
         # at first not enough is seen to tell a poor model from a changed rig
         return limit if self._windows >= _LEARNING else 50.0 * limit
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.significance import RATE_SIGMAS
 from vical_daemon.estimation.temporal.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
@@ -24,7 +25,7 @@ from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro, clean_orientations
 from vical_daemon.estimation.temporal.td_icp_joint_result import JointResult, PairDelay, SensorDelay
-from vical_daemon.estimation.temporal.td_icp_refusals import RATE_SIGMAS, UNEVEN, refuse_start
+from vical_daemon.estimation.temporal.td_icp_refusals import UNEVEN, refuse_start
 from vical_daemon.estimation.temporal.td_icp_result import OK, REFUSED, TdIcpOptions, TdIcpResult
 
 __all__ = [
