@@ -112,7 +112,7 @@ class Calibrator:
         ok = usable_points(frame) & (frame.ids < len(self.rig.target))
         nonsense = len(ok) > 0 and not ok.any()  # its stamp is worth no more than its points
         if frame.camera not in self.rig.priors or not self._intake.takes_images or nonsense:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return
         if not ok.all():
             sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
@@ -120,7 +120,7 @@ class Calibrator:
         t_cam_s = self._intake.take_image(frame)
         self.judge.announce_all(self._intake.image_news())
         if t_cam_s is None:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
@@ -142,7 +142,7 @@ class Calibrator:
     @property
     def left_out(self) -> dict[str, int]:
         """Readings and images that were not used, by cause."""
-        return self._intake.left_out(self.judge.frames_ignored)
+        return self._intake.left_out
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
@@ -219,7 +219,7 @@ class Calibrator:
                 return frames[k:]
             report = self._step(f, frame, t_cam_s)
             if report is None:
-                self.judge.frames_ignored += 1
+                self._intake.images_ignored += 1
                 continue
             if f.unshown is not None:
                 self._starting.take([(t_cam_s, frame)])
@@ -304,7 +304,7 @@ class Calibrator:
         assert self._buffer is not None
         report = self._step(f, frame, t_cam_s)
         if report is None:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return []
         if f.unshown is not None:
             self._starting.take([(t_cam_s, frame)])

@@ -121,12 +121,12 @@ class TargetFreeCalibrator:
         count, frame = len(frame.ids), cleaned(frame)
         nonsense = count > 0 and not len(frame.ids)  # its stamp is worth no more than its tracks
         if frame.camera != self.camera or not self._intake.takes_images or nonsense:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return
         t_cam_s = self._intake.take_image(frame)
         self.judge.announce_all(self._intake.image_news())
         if t_cam_s is None or t_cam_s <= self._newest_s:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set()
@@ -153,7 +153,7 @@ class TargetFreeCalibrator:
     @property
     def left_out(self) -> dict[str, int]:
         """Readings and images that were not used, by cause."""
-        return self._intake.left_out(self.judge.frames_ignored)
+        return self._intake.left_out
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:

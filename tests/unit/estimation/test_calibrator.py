@@ -106,7 +106,7 @@ def test_a_doubt_of_a_second_does_not_take_convergence_back(done):
     judge.in_doubt = "a doubt"
     short = judge.estimate(done.filter)
     assert (short.status, short.reason, short.progress) == (Status.CONVERGED, "", 1.0)
-    judge.saw_imu(judge._newest_ns + 3_000_000_000, np.zeros(3), np.zeros(3))
+    judge.saw_imu(judge._in.newest_ns + 3_000_000_000, np.zeros(3), np.zeros(3))
     lasting = judge.estimate(done.filter)
     assert (lasting.status, lasting.reason) == (Status.CONVERGING, "a doubt")
 

@@ -22,10 +22,12 @@ class SensorIntake:
 
     Attributes:
         stamp_sigma_s: How well the imu's driver knows its device's clock now, one sigma, s.
+        images_ignored: Images that were not used; whoever leaves one out counts it.
     """
 
     def __init__(self) -> None:
         self.stamp_sigma_s = 0.0
+        self.images_ignored = 0
         self._imu = ImuIntake()
         self._images = ImageIntake()
         self._followed_s: dict[str, float] = {}  # by camera: steps of its clock that were reported
@@ -57,9 +59,10 @@ class SensorIntake:
         self.stamp_sigma_s = sigma_s
         return True
 
-    def left_out(self, images_ignored: int) -> dict[str, int]:
+    @property
+    def left_out(self) -> dict[str, int]:
         """Readings and images that were not used, by cause."""
-        return {**self._imu.left_out, "images_ignored": images_ignored}
+        return {**self._imu.left_out, "images_ignored": self.images_ignored}
 
     def take_imu(
         self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]
