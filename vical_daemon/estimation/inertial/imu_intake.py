@@ -10,11 +10,10 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
 from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
-from vical_daemon.estimation.inertial.stamp_steps import StampSteps
+from vical_daemon.estimation.inertial.stamp_steps import LEARN, StampSteps
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
-_LEARN = 20  # readings by which the usual interval is known
 _MOST = (MOST_RPS,) * 3 + (MOST_MPS2,) * 3
 _CLIPPED_S = 5.0  # after the first clipped reading, their share is announced
 _UNSEEN_S = 0.5
@@ -170,7 +169,7 @@ class ImuIntake:
         """Whether a reading follows the newest so closely that interpolation will do."""
         if interval_s <= 0.0:
             return False
-        return interval_s <= GAP_S or len(buffer) < _LEARN or interval_s <= buffer.usual_gap_s
+        return interval_s <= GAP_S or len(buffer) < LEARN or interval_s <= buffer.usual_gap_s
 
     def _jump(
         self, buffer: ImuBuffer, held_s: float, held: Reading, t_s: float, reading: Reading
