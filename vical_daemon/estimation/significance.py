@@ -39,6 +39,14 @@ RATE_SIGMAS = 6.0
 DISAGREEMENT_SIGMAS = 4.0
 """6e-5: `td_icp` and the filter disagree about the time shift; several times in a row are needed."""
 
+# Medians, for standard deviations that outliers do not move.
+MEDIAN_ABSOLUTE = 0.6745
+"""Of the size of a standard normal variable."""
+MEDIAN_RAYLEIGH = 1.1774
+"""Of the length of two."""
+MEDIAN_CHI2, MEDIAN_CHI2_3 = 0.455, 2.366
+"""Of a chi-square variable with one degree of freedom, and with three."""
+
 
 def chi_square_limit(dof: int, false_alarm: float) -> float:
     """Largest value of a chi-square variable that may be chance."""

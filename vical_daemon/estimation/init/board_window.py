@@ -28,7 +28,7 @@ from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
-from vical_daemon.estimation.significance import chi_square_limit
+from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is told
 _LEAST_IMAGES = 3
@@ -39,7 +39,6 @@ _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the lea
 _RELINK_S = 3e-4  # of change of the time shift: links are integrated between the new instants
 _RATE_S = 0.03  # of readings before an instant: they show its angular acceleration
 _OUTLIER = 6.0  # sigmas at which a corner weighs a quarter
-_RAYLEIGH = float(np.sqrt(chi_square_limit(2, 0.5)))  # median of the length of two standard normal errors
 
 Frames = list[tuple[float, PointsFrame]]
 
@@ -341,7 +340,7 @@ class BoardWindow:
             lengths = [np.linalg.norm(v.residual[v.seen], axis=1) / v.relative[v.seen] for v in own]
             size = np.concatenate(lengths)
             share = max(1.0 - 6.0 * len(own) / (2.0 * len(size)), 0.05)
-            sigma = float(np.median(size)) / _RAYLEIGH / np.sqrt(share)
+            sigma = float(np.median(size)) / MEDIAN_RAYLEIGH / np.sqrt(share)
             self.sigma_px[name] = float(np.clip(sigma, LEAST_PX, MOST_PX))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import SURE_SIGMAS
+from vical_daemon.estimation.significance import MEDIAN_CHI2, SURE_SIGMAS
 
 _CLIP = 36.0  # squared standard deviations: outliers are not jitter
 _FLOOR_S = 2e-5
@@ -28,8 +28,8 @@ def excess(square: FloatArray, usual: FloatArray) -> float:
     telling = 1.0 / np.maximum(usual, np.median(usual))  # images with a wide prior have little to say
     if telling @ (ratio - 1.0) < SURE_SIGMAS * np.sqrt(2.0 * float(telling @ telling)):
         return 0.0
-    # maximum likelihood by scoring; 0.455 is the median of a chi-square variable
-    variance = max(float(np.median(square)) / 0.455 - float(np.median(usual)), 0.0)
+    # maximum likelihood by scoring
+    variance = max(float(np.median(square)) / MEDIAN_CHI2 - float(np.median(usual)), 0.0)
     for _ in range(_ROUNDS):
         expected = usual + variance
         weight = expected**-2
