@@ -46,7 +46,7 @@ _STEPPED_LEAST_S = 1e-3
 _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
-_MOST_SURPRISES = 4  # in one start: shutters that roll, targets that are not as large as stated
+_MOST_CHANGES = 4  # of the rig's model in one start: rolling shutters, targets of another size
 
 
 class Calibrator:
@@ -184,7 +184,7 @@ class Calibrator:
         """Try to start; where the data contradict the model of the rig, change that and try again."""
         may_be_partial = self.filter is None
         found = self._starting.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
-        for _ in range(_MOST_SURPRISES):
+        for _ in range(_MOST_CHANGES):
             if found.rolling is not None:
                 self._estimate_readout(*found.rolling)
             elif found.size is not None:

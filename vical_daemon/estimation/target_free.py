@@ -328,7 +328,7 @@ class TargetFreeCalibrator:
             self._close(fit, bundle)
 
     def _agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
-        """Whether a window agrees with what was known of calibration and stamps, as far as it tells."""
+        """Whether a window agrees with what was known of calibration and stamps, as far as it shows that."""
         if fit.parallax_deg < _MIN_PARALLAX_DEG:
             return True
         stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise.jitter_s

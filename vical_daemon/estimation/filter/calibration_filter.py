@@ -222,7 +222,7 @@ class CalibrationFilter:
         return lin
 
     def _pay_for_jitter(self, camera: str) -> None:
-        """Take back what the images of before, used with less jitter than is known by now, told too much."""
+        """Inflate the time shift's variance for images fused before the jitter was known."""
         index, shared = self.layout.cameras[camera].timeshift, self.shared.get(camera)
         owed = shared.owed() if index is not None and shared is not None else 0.0
         if owed:

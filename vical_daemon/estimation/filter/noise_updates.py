@@ -1,4 +1,4 @@
-"""What an image says about the noise and the model, beside the state: taken before the image is used."""
+"""Updates of the noise models and of the lens check from an image, before the image corrects the state."""
 
 from __future__ import annotations
 

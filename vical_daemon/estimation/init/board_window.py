@@ -30,7 +30,7 @@ from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, 
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 
-_IMAGES = 50  # of each camera: they say where all is linearised, not what is told
+_IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
 _MOST_STEPS = 20
 _DONE = 0.1  # a step that promises less than this of the sum of squares is the last

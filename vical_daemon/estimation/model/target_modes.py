@@ -40,7 +40,7 @@ class TargetModes:
 
     @property
     def sigma_m(self) -> float:
-        """How far a target's edges are expected beside their stated places in each mode, one sigma, m."""
+        """Expected distance of a target's edges from where the file puts them, by mode, one sigma, m."""
         return _EXPECTED * self.half_m
 
     def fields(self, points_m: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import STRETCHES_DISAGREE, chi_square_limit
 
-_LEAST_TOLD = 1e-9  # of the variance of all: a run that tells less tells nothing
+_LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3
 _LONGEST_RUN = 4
@@ -123,7 +123,7 @@ class BlockJackknife:
         without = np.matmul(Q, (b.sum(axis=0) - out @ b)[..., None])[..., 0]
         # covariance of the changes were errors independent: stretches do not tell equally much
         C = np.einsum("rpi,rsij,sjp->rsp", Q, left, Q, optimize=True) - np.diag(P)
-        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_TOLD * np.diag(P))
+        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_INFORMATION * np.diag(P))
         ratio = ((without - values) ** 2 / usual).mean(axis=0)
         # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))

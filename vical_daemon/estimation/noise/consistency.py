@@ -43,7 +43,7 @@ def modes(uv: FloatArray) -> FloatArray:
 
     Args:
         uv: *Predicted* pixels, shape (n, 2). Over measured ones the modes would contain the very noise
-            they are to be told apart from.
+            they are to be distinguished from.
 
     Returns:
         Columns, shape (2n, 8).
@@ -116,7 +116,7 @@ class Consistency:
     def alarmed(self) -> bool:
         """The innovations have jumped: allowed for by how long this rig's errors usually last, and how large.
 
-        Where lens or board do not fit, the view decides: half a board at the image's edge is no knock.
+        Where lens or board do not fit, the view decides: half a board at the image's edge is no bump.
         """
         return self.images > _LAGS and self.alarm > _CUSUM_LIMIT * self.factor * np.sqrt(self.scale)
 

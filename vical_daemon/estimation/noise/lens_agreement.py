@@ -1,10 +1,9 @@
-"""Do stretches of the data agree about the lens, and is it of its model? How much larger its sigmas must be.
+"""Sigmas of the lens: do stretches of the data agree about it, and does its model lack a term?
 
-A lens model never fits quite, and what it gets wrong depends on where in the image and at which slant the
-target is seen. Each stretch therefore says what it would have the lens be (see `stretches`), and the
-variances of the lens are as much larger as stretches disagree. What all stretches get wrong alike no
-comparison shows. So the model's next power of the radius is estimated beside: where it is there beyond
-doubt, the parameters are known no better than they would move with it.
+A lens model never fits exactly. Its misfit depends on where in the image and at which slant the target is
+seen. So each stretch gives its own lens (block jackknife), and the variances of the lens grow by as much as
+the stretches disagree. No comparison shows an error that all stretches share. So the next power of the radius
+is estimated as well: if it is significant, the sigmas are at least as large as what it would move.
 """
 
 from __future__ import annotations

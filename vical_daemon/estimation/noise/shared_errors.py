@@ -37,7 +37,7 @@ class SharedErrors:
     """Running estimate of one camera.
 
     Attributes:
-        jitter_s: Standard deviation of a stamp, s; 0 while it cannot be told from none.
+        jitter_s: Standard deviation of a stamp, s; 0 while it cannot be distinguished from none.
         shift_px: Standard deviation by which a whole image is off, per axis, px; 0 likewise.
         images: Images taken in.
     """

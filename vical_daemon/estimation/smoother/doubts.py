@@ -1,4 +1,4 @@
-"""What a target-free calibration asks beside: do clocks drift, is the imu off, does the shutter roll?"""
+"""Model selection without a target: do clocks drift, is the imu off, does the shutter roll?"""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class TargetFreeDoubts:
         return ""
 
     def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> Doubts:
-        """How likely each is, for what is told; arguments as for `watch`."""
+        """How likely each model is, for the report; arguments as for `watch`."""
         weights = self._weights(carry, factor)
         every = max(weights, key=len)
         if not compared and weights[every] < 0.5:

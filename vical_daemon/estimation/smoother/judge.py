@@ -230,11 +230,11 @@ class TargetFreeStatus:
         P_new = fit.carry.at(carry.t_cam_s).covariance()[CALIBRATION:, CALIBRATION:]
         scale = np.sqrt(np.diag(P_old))
         values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
-        told = values > 0.02  # directions in which the window had something to say
-        if not told.any():
+        informed = values > 0.02  # directions in which the window has information
+        if not informed.any():
             return True
         d = vectors.T @ (fit.change / scale)
-        statistic, dof = float((d[told] ** 2 / values[told]).sum()), int(told.sum())
+        statistic, dof = float((d[informed] ** 2 / values[informed]).sum()), int(informed.sum())
         full = np.zeros(FULL)
         full[np.flatnonzero(self.active)] = fit.change
         agree = self.excess(statistic, dof, full) <= 1.0
@@ -316,7 +316,7 @@ class TargetFreeStatus:
             self._in.frames_seen,
             self._in.imu_samples,
             {} if camera is None else {self.camera: camera},
-            None if carry is None else imu_estimate(carry, matrices_told=self.doubts.imu_asked),
+            None if carry is None else imu_estimate(carry, matrices_asked=self.doubts.imu_asked),
             gravity,
             self.nis_per_dof(),
             refused / max(seen, 1),

@@ -33,14 +33,14 @@ _GYRO = slice(IMU.start, IMU.start + 9)
 
 
 class Doubts(NamedTuple):
-    """How what is carried is to be told.
+    """How what is carried is to be reported.
 
     Attributes:
-        factor: Measured variance over the stated one; multiplies what is told.
+        factor: Measured variance over the stated one; multiplies the reported covariance.
         drifting: The camera's clock is known to run apart from the imu's.
         stated: Probabilities, each with the errors that are zero then: what of the imu is as stated.
-        gyro_frame: The camera is told in the frame in which the gyro's matrix is symmetric.
-        rolling: The shutter is known to be a rolling one: its readout is told.
+        gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
+        rolling: The shutter is known to be a rolling one: its readout is reported.
     """
 
     factor: float = 1.0
@@ -62,7 +62,7 @@ def camera_estimate(
         rms_px: RMS of the residuals.
         held: Axis of the imu along which the lever arm is not known, unit, shape (3,); None: there is none.
     """
-    camera, covariance = _told(carry, doubts)
+    camera, covariance = _averaged(carry, doubts)
     if held is not None:
         covariance[:3, :3] += held_covariance(np.outer(held, held))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
@@ -86,8 +86,8 @@ def camera_estimate(
     )
 
 
-def _told(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
-    """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `hypotheses`."""
+def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
+    """Camera and covariance (FULL, FULL) over the models of imu and clock; see `model_selection`."""
     camera, numbers, P = _over_imu(carry, doubts)
     if doubts.gyro_frame:
         camera, P = _in_gyro_frame(camera, numbers, P)
@@ -123,9 +123,11 @@ def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> t
     return camera, J @ P @ J.T
 
 
-def imu_estimate(carry: MarginalPrior, *, matrices_told: bool) -> ImuEstimate:
+def imu_estimate(carry: MarginalPrior, *, matrices_asked: bool) -> ImuEstimate:
     """Biases and their sigmas; where asked for, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[5:11])
-    told = [m.tolist() for m in matrices(carry.imu)] if matrices_told else [[], []]
+    reported = [m.tolist() for m in matrices(carry.imu)] if matrices_asked else [[], []]
     bias = carry.bias
-    return ImuEstimate(bias[:3].tolist(), bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist(), *told)
+    return ImuEstimate(
+        bias[:3].tolist(), bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist(), *reported
+    )

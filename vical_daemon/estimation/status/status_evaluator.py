@@ -218,7 +218,7 @@ class StatusEvaluator:
         )
 
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
-        """The filter as it is told: over all hypotheses about imu, target and clocks."""
+        """The filter to be reported: mean and covariance over all models of imu, target and clocks."""
         f = hypotheses.averaged(f)
         return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
 
