@@ -16,7 +16,7 @@ _QUANTILES = {"chdtri", "chdtrc", "ndtri", "ndtr"}  # scipy.special: of a chi-sq
 
 
 def main(argv: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="structure", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks structure", description=__doc__)
     parser.add_argument("--tree", type=Path, default=HERE, help="a checkout (default: this one)")
     parser.add_argument("--longest", action="store_true", help="list files over 400 lines, functions over 55")
     args = parser.parse_args(argv)

@@ -174,7 +174,7 @@ class AslRecording(Recording):
         stamps, files, lost = _image_list(table, folder)
         if lost and not stamps:
             raise RecordingError(
-                f"{table} line 1: there is no image {lost[0]} beside it, nor any other listed"
+                f"{table} line 1: there is no image {lost[0]} next to it, nor any other listed"
             )
         if lost:
             self.warnings.append(f"{folder.name}: {len(lost)} images listed but not there, first {lost[0]}")

@@ -26,9 +26,9 @@ from vical_daemon.estimation.model.unscented import root, solve_lower
 
 IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
 IN_DOUBT = {
-    IMU: "sigmas are small; whether the imu's scale and alignment are true is not sure yet",
-    SIZE: "sigmas are small; whether the target is as large as stated is not sure yet",
-    TARGET: "sigmas are small; whether the target is as stated is not sure yet",
+    IMU: "sigmas are small; it is not clear yet whether the imu's scale and alignment are as specified",
+    SIZE: "sigmas are small; it is not clear yet whether the target has the size in its file",
+    TARGET: "sigmas are small; it is not clear yet whether the target has the shape in its file",
 }
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9

@@ -148,7 +148,7 @@ def _from_alone(
     t, R, covariance, index = cleaned
     curve = GyroCurve.integrate(t_imu, gyro, alone.gyro_bias_rps)
     R_world_ref = _world(curve, t, R, alone.used[index], alone.timeshift_cam_imu_s, alone.R_imu_cam)
-    told = float(np.sqrt(np.trace(covariance.mean(axis=0)) / 3.0))
+    stated = float(np.sqrt(np.trace(covariance.mean(axis=0)) / 3.0))
     return OrientationSensor(
         t,
         R,
@@ -157,7 +157,7 @@ def _from_alone(
         alone.R_imu_cam,
         R_world_ref,
         alone.used[index],
-        log_scale=float(np.log(alone.camera_noise_rad / told)),
+        log_scale=float(np.log(alone.camera_noise_rad / stated)),
         log_slow=float(np.log(alone.slow_noise_ratio)),
         jitter_s=options.stamp_jitter_s,
     )

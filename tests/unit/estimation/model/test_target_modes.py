@@ -135,4 +135,7 @@ def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypat
     )
     c.judge._steady.reset(Status.CONVERGING)  # a converged status would stand for two seconds
     assert c.estimate().status == Status.CONVERGING
-    assert c.estimate().reason == "sigmas are small; whether the target is as stated is not sure yet"
+    assert (
+        c.estimate().reason
+        == "sigmas are small; it is not clear yet whether the target has the shape in its file"
+    )
