@@ -49,7 +49,7 @@ _EXPOSURE = """\
     # exposure_s: 0.005          # now: {exposure}; short is good: blur shifts corners
 """
 _NO_EXPOSURE = """\
-    assume_exposure_s: {guess}      # a guess, the camera does not report it; half its error is in the time shift
+    assume_exposure_s: {guess}      # a guess: not reported; half its error is in the time shift
 """
 _NO_CAMERA = """\
   # cam0:                        # none was found: plug it in, then vical init --force
