@@ -12,8 +12,9 @@ from vical_daemon.estimation.filter.unobservable_directions import held_covarian
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.model.imu_scale import matrices
+from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.clock_drift import evidence, probability
 from vical_daemon.estimation.smoother.carry import (
     ARM,
@@ -66,23 +67,17 @@ def camera_estimate(
     if held is not None:
         covariance[:3, :3] += held_covariance(np.outer(held, held))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
-    q = so3.quat_from_matrix(camera.R_imu_cam)
-    return CameraEstimate(
-        PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), covariance[:6, :6].tolist()),
-        float(camera.timeshift_s),
-        float(sigma[SHIFT]),
-        camera.intrinsics.tolist(),
-        sigma[LENS][:4].tolist(),
-        camera.distortion_model,
-        camera.distortion.tolist(),
-        sigma[LENS][4:].tolist(),
-        rms_px,
-        sigma_px,
-        [],
-        float(camera.readout_s) if doubts.rolling else 0.0,
-        float(sigma[READOUT]) if doubts.rolling else 0.0,
-        readout_axis=camera.readout_axis if doubts.rolling else "",
-        calibration_covariance=covariance[: LENS.stop, : LENS.stop].tolist(),
+    return camera_snapshot(
+        camera,
+        pose=covariance[:6, :6],
+        timeshift_sigma_s=sigma[SHIFT],
+        lens=np.concatenate([camera.intrinsics, camera.distortion]),
+        lens_sigma=sigma[LENS],
+        readout_sigma_s=sigma[READOUT],
+        rms_px=rms_px,
+        sigma_px=sigma_px,
+        joint=covariance[: LENS.stop, : LENS.stop],
+        rolling=doubts.rolling,
     )
 
 
@@ -126,8 +121,4 @@ def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> t
 def imu_estimate(carry: MarginalPrior, *, matrices_asked: bool) -> ImuEstimate:
     """Biases and their sigmas; where asked for, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[5:11])
-    reported = [m.tolist() for m in matrices(carry.imu)] if matrices_asked else [[], []]
-    bias = carry.bias
-    return ImuEstimate(
-        bias[:3].tolist(), bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist(), *reported
-    )
+    return imu_snapshot(carry.bias, sigma, matrices(carry.imu) if matrices_asked else ())
