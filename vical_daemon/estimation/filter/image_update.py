@@ -45,7 +45,7 @@ class ImageFit:
         left: Whitened residuals after the correction, shape (n, 2).
         ways: The ways of the kept rows, whitened and compressed: sums over the rows stay, shape (m, k).
         r: Their innovation, shape (m,).
-        rows: Ways and innovation of the kept rows, whitened, about where the fit is linearised; (2n, k), (2n,).
+        rows: Ways and innovation of the kept rows, whitened, where the fit is linearised; (2n, k), (2n,).
     """
 
     S: FloatArray
