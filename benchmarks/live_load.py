@@ -120,7 +120,7 @@ def _row(title: str, case: Case, folder: Path, quota: CpuQuota) -> str:
     images = case.cameras * int(np.load(folder / "stamps.npy").size)
     gaps = np.diff(heard.imu) - 1
     p50, p99 = np.percentile(heard.latency_ms, [50, 99]) if heard.latency_ms else (np.nan, np.nan)
-    lost = [_total(heard.status, role, names) for role, names in _LOSSES]
+    lost = _lost(images, heard.status)
     cells = [
         title, images, " + ".join(map(str, lost)), len(heard.imu), int(gaps.sum()),
         f"{p50:.0f}", f"{p99:.0f}", heard.frames, heard.verdict,
@@ -129,8 +129,12 @@ def _row(title: str, case: Case, folder: Path, quota: CpuQuota) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
-_LOSSES = (("camera/", ("lost", "dropped")), ("detect/", ("dropped",)), ("detect/", ("skipped", "malformed")))
-"""Status entries by prefix, and counters of each: lost in the source or not sent; not taken; not searched."""
+def _lost(images: int, status: Mapping[str, Mapping[str, str]]) -> tuple[int, int, int]:
+    """Images that were lost in cameras and their queues, on the bus, and before busy detectors."""
+    camera = _total(status, "camera/", ("lost", "queue_dropped"))
+    detector = _total(status, "detect/", ("dropped",))
+    seen = _total(status, "detect/", ("images", "skipped", "malformed"))
+    return camera, images - camera - detector - seen, detector
 
 
 def _total(status: Mapping[str, Mapping[str, str]], prefix: str, names: tuple[str, ...]) -> int:

@@ -141,10 +141,11 @@ class CalibrationFilter:
         A = self.S.copy()
         A[:9, :d] = moved.linear
         self._drift_shifts(A, moved.seconds)
-        noise = np.zeros((n, c + 9))
+        walks = self._random_walk(moved.seconds)
+        noise = np.zeros((n, c + 9 + walks.shape[1]))
         noise[:9, :c] = moved.curved
-        noise[:9, c:] = unscented.root(Q)
-        noise = np.concatenate([noise, self._random_walk(moved.seconds)], axis=1)
+        noise[:9, c : c + 9] = unscented.root(Q)
+        noise[:, c + 9 :] = walks
         self.S = unscented.lower_root_grown(A, noise, d)
 
     # ------------------------------------------------------------------ update

@@ -200,7 +200,7 @@ def view_derivatives(
     if where.intrinsics is not None and where.distortion is not None:
         n = J_lens.shape[-1]
         ways[:, 6 : 6 + n] = J_lens.reshape(-1, n)
-        by_error[6 : 6 + n, where.intrinsics.start : where.distortion.stop] = np.eye(n)
+        by_error[6 : 6 + n, where.intrinsics.start : where.distortion.stop] = unscented.unit(n)
     at = len(by_error) - MODES * (layout.target_shape is not None)
     by_point = (J.reshape(-1, 3) @ (R @ cam.R_imu_cam).T).reshape(-1, 2, 3)  # moved in the world
     if layout.target_scale is not None:
@@ -208,7 +208,7 @@ def view_derivatives(
         by_error[at - 1, layout.target_scale] = 1.0
     if fields is not None:
         ways[:, at:] = np.matmul(by_point, fields).reshape(-1, MODES)
-        by_error[at:, layout.target_shape] = np.eye(MODES)
+        by_error[at:, layout.target_shape] = unscented.unit(MODES)
     return uv, ways, by_error
 
 
@@ -231,7 +231,7 @@ def _pose_by_error(
     out[3:6, POSITION], out[3:6, VELOCITY] = from_world, ahead_s * from_world
     if where.position is not None and where.rotation is not None:
         out[3:6, where.position] = to_cam
-        out[0:3, where.rotation] = np.eye(3)
+        out[0:3, where.rotation] = unscented.unit(3)
     if where.timeshift is not None:
         out[0:3, where.timeshift] = to_cam @ rates.omega
         speed = state.v_world_imu + ahead_s * rates.accel

@@ -18,6 +18,9 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
 
+_EYE = np.eye(3)
+
+
 class Motion(NamedTuple):
     """Attitude, position and velocity of the imu in the world, a batch of S; and the two rates at the end.
 
@@ -85,7 +88,7 @@ def strapdown(
         turn_slope = turn_slope @ gyro_matrix[0].T
     steps = rotation_steps(omega, dt, turn_slope)
     dR = np.empty((len(omega), len(dt) + 1, 3, 3))
-    dR[:, 0] = np.eye(3)
+    dR[:, 0] = _EYE
     for k in range(len(dt)):
         np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
     f_start = np.matmul(dR, force[..., None])[..., 0]

@@ -187,7 +187,7 @@ class _Normal(NamedTuple):
         reduced = np.matmul(inverse, self.C)
         A -= np.tensordot(self.C, reduced, axes=((0, 1), (0, 1)))
         b = self.b + b0 - np.tensordot(reduced, self.c, axes=((0, 1), (0, 1)))
-        d = np.linalg.solve(A, b)
+        d: FloatArray = np.linalg.solve(A, b).astype(np.float64)
         return d, np.matmul(inverse, (self.c - self.C @ d)[..., None])[..., 0]
 
 
