@@ -17,7 +17,6 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
-
 _EYE = np.eye(3)
 
 
