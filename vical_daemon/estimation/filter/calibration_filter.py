@@ -403,14 +403,19 @@ class CalibrationFilter:
         for consistency in self.consistency.values():
             consistency.settle()
 
-    def copy(self) -> CalibrationFilter:
-        """A filter that can be run ahead of this one; what is measured about the noise stays shared."""
+    def copy(self, earlier: CalibrationFilter | None = None) -> CalibrationFilter:
+        """A filter that can be run ahead of this one; what is measured about the noise stays shared.
+
+        Args:
+            earlier: A copy that was run as far ahead before: the same derivatives will do as long as its
+                sigmas were as large.
+        """
         return replace(
             self,
             state=deepcopy(self.state),
             S=self.S.copy(),
-            _motion_straight=LinearityMonitor(),
-            _view_straight={},
+            _motion_straight=LinearityMonitor() if earlier is None else earlier._motion_straight,
+            _view_straight={} if earlier is None else earlier._view_straight,
         )
 
     @property
