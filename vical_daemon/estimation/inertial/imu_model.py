@@ -88,8 +88,12 @@ def strapdown(
     steps = rotation_steps(omega, dt, turn_slope)
     dR = np.empty((len(omega), len(dt) + 1, 3, 3))
     dR[:, 0] = _EYE
-    for k in range(len(dt)):
-        np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
+    if len(omega) == 1:  # of two matrices, dot takes half as long as matmul
+        for k, step in enumerate(steps[0]):
+            np.dot(dR[0, k], step, out=dR[0, k + 1])
+    else:
+        for k in range(len(dt)):
+            np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
     f_start = np.matmul(dR, force[..., None])[..., 0]
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
     dv, dp = np.zeros_like(f_start), np.zeros_like(f_start)
@@ -179,7 +183,7 @@ class Influence(NamedTuple):
 
     def by_force(self, force: FloatArray) -> FloatArray:
         """Return the end by a force error, m/s^2 at each node, shape (n + 1, 3), in shape (9,)."""
-        return np.asarray(np.einsum("k,kij,kj->i", self.weights, self.at[:, :, 3:6], force))
+        return np.asarray(np.einsum("kij,kj->i", self.at[:, :, 3:6], self.weights[:, None] * force))
 
     def noise(self, noise: ImuNoise) -> FloatArray:
         """Covariance of the end that white noise of the readings brings, shape (9, 9)."""
