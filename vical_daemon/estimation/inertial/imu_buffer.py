@@ -186,9 +186,10 @@ def _hermite(
     rows: FloatArray, slope: FloatArray, t_s: FloatArray, k: npt.NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
     """Value and derivative of the cubic through rows k and k + 1 at instants `t_s`, shapes (m, 6)."""
-    h = (rows[k + 1, 0] - rows[k, 0])[:, None]
-    u = (t_s[:, None] - rows[k, :1]) / h
-    a, b = rows[k, 1:], rows[k + 1, 1:]
+    before, after = rows[k], rows[k + 1]
+    h = after[:, :1] - before[:, :1]
+    u = (t_s[:, None] - before[:, :1]) / h
+    a, b = before[:, 1:], after[:, 1:]
     A, B = slope[k] * h, slope[k + 1] * h
     d = b - a
     value = a + u * (A + u * (3.0 * d - 2.0 * A - B + u * (A + B - 2.0 * d)))

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.significance import STRETCHES_DISAGREE
 
 _LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
@@ -74,7 +75,7 @@ class BlockJackknife:
             innovation: Measured minus predicted, over the corner noise, shape (2n,).
             by_pose: Derivatives of the whitened pixels by attitude and position, shape (2n, 6).
             by: By the unknowns, shape (2n, m).
-            values: Present values of these, shape (m,).
+            values: Present values of the first of these; the others are zero, shape (at most m,).
 
         Returns:
             Whether a stretch was closed and there are enough of them to be compared.
@@ -84,12 +85,14 @@ class BlockJackknife:
             self._close()
             self._begin_s = t_s
         # whatever the pose of the image may be: only what no pose explains says something about the rest
-        rows = np.column_stack([by_pose, by, innovation])
+        rows = np.concatenate([by_pose, by, innovation[:, None]], axis=1)
         N, p = rows.T @ rows, by_pose.shape[1]
-        posed = N[:p, :p] + _RIDGE * np.trace(N[:p, :p]) * np.eye(p)
-        N = N[p:, p:] - N[p:, :p] @ np.linalg.solve(posed, N[:p, p:])
+        posed = N[:p, :p].copy()
+        posed.ravel()[:: p + 1] += _RIDGE * posed.trace()
+        explained = solve_lower(root(posed), N[:p, p:])
+        N = N[p:, p:] - explained.T @ explained
         A, b = N[:-1, :-1], N[:-1, -1]
-        said = _JackknifeBlock(A, b + A @ values)
+        said = _JackknifeBlock(A, b + A[:, : len(values)] @ values)
         self._now = said if self._now is None else self._now.plus(said)
         return closed and len(self._done) >= _LEAST
 

@@ -15,6 +15,7 @@ the eight smooth modes of a plane's image, make it honest again:
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -48,14 +49,15 @@ def modes(uv: FloatArray) -> FloatArray:
     Returns:
         Columns, shape (2n, 8).
     """
-    centred = uv - uv.mean(axis=0)
-    x, y = (centred / (np.sqrt((centred**2).mean()) + 1e-9)).T
+    centred = uv - np.add.reduce(uv, axis=0) / len(uv)
+    flat = centred.ravel()
+    centred /= math.sqrt(float(flat @ flat) / len(flat)) + 1e-9
+    half = 0.5 * centred
     out = np.zeros((len(uv), 2, MODES))
     out[:, 0, 0] = out[:, 1, 1] = 1.0
-    out[:, 0, 2] = out[:, 1, 4] = x
-    out[:, 0, 3] = out[:, 1, 5] = y
-    out[:, 0, 6], out[:, 1, 6] = 0.5 * x * x, 0.5 * x * y
-    out[:, 0, 7], out[:, 1, 7] = 0.5 * x * y, 0.5 * y * y
+    out[:, 0, 2:4] = out[:, 1, 4:6] = centred
+    np.multiply(half[:, :1], centred, out=out[:, :, 6])
+    np.multiply(half[:, 1:], centred, out=out[:, :, 7])
     return out.reshape(-1, MODES)
 
 
@@ -69,19 +71,20 @@ def normalised(
     """
     if len(uv) < _MIN_CORNERS:
         return None
-    whitened = 1.0 / np.repeat(sigma, 2)
-    W = modes(uv) * whitened[:, None]
+    W = np.concatenate([modes(uv), ways, innovation.reshape(-1, 1)], axis=1)
+    W /= np.repeat(sigma, 2)[:, None]
+    along = W[:, :MODES].T @ W
     try:
-        L = root(W.T @ W)  # W = Q L'
+        L = root(along[:, :MODES])  # of the modes, Q L'
     except np.linalg.LinAlgError:
         return None
-    diagonal = np.diag(L)
+    diagonal = L.diagonal()
     if diagonal.min() < 1e-6 * diagonal.max():
         return None
-    Q = solve_lower(L, W.T).T * whitened[:, None]
-    seen, state = innovation.ravel() @ Q, (Q.T @ ways) @ moves
-    out: FloatArray = np.clip(seen / np.sqrt(1.0 + (state**2).sum(axis=1)), -_CLIP, _CLIP)
-    return out
+    along = solve_lower(L, along[:, MODES:])  # Q' of ways and innovation
+    state = along[:, :-1] @ moves
+    out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.einsum("ij,ij->i", state, state))
+    return np.minimum(np.maximum(out, -_CLIP), _CLIP)
 
 
 @dataclass(slots=True)

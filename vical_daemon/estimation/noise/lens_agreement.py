@@ -59,7 +59,7 @@ class LensAgreement:
             lens: Present values, shape (n,).
         """
         by = with_next_power(by_lens, self.model)
-        if not self._stretches.learn(t_s, innovation, by_pose, by, np.append(lens, 0.0)):
+        if not self._stretches.learn(t_s, innovation, by_pose, by, lens):
             return
         weak = lens_sigmas(lens[0], len(lens) + 1)
         n = len(lens)
@@ -87,6 +87,6 @@ def with_next_power(by_lens: FloatArray, model: str) -> FloatArray:
         Shape (2k, n + 1).
     """
     below, highest = (by_lens[:, k].reshape(-1, 2) for k in _RADIAL[model])
-    size = np.maximum((below**2).sum(axis=1), 1e-30)  # each power is the one below times radius squared
-    power = (highest * ((below * highest).sum(axis=1) / size)[:, None]).ravel()
-    return np.column_stack([by_lens, power])
+    size = np.maximum(np.einsum("ij,ij->i", below, below), 1e-30)
+    ratio = np.einsum("ij,ij->i", below, highest) / size  # each power is the one below times radius squared
+    return np.concatenate([by_lens, (highest * ratio[:, None]).reshape(-1, 1)], axis=1)
