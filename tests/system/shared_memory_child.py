@@ -62,7 +62,7 @@ def _one_process(socket: str, sessions: int) -> None:
         ended: set[str] = set()
         end = time.monotonic() + 30
         while time.monotonic() < end:
-            # On a busy machine all ten of a size may be dropped: only a size that never gets through is a fault.
+            # A busy machine may drop all ten of a size; only a size that never gets through is a fault.
             missing = {name: size for name, size in sizes.items() if size not in seen}
             if len(ended) == len(sizes) and not missing:
                 break
