@@ -66,6 +66,14 @@ from vical_daemon.bus.messages.poses import (
     encode_transforms,
 )
 from vical_daemon.bus.messages.schemas import ros2_schema
+from vical_daemon.bus.messages.verification import (
+    VERIFY_TYPE,
+    Change,
+    CheckState,
+    VerifyResult,
+    decode_verification,
+    encode_verification,
+)
 
 __all__ = [
     "CALIBRATION_TYPE",
@@ -79,8 +87,11 @@ __all__ = [
     "STRING_TYPE",
     "TF_TYPE",
     "TRACKS_TYPE",
+    "VERIFY_TYPE",
     "CalibrationMessage",
     "CameraInfoMessage",
+    "Change",
+    "CheckState",
     "CompressedImageMessage",
     "DiagnosticStatus",
     "DiagnosticsMessage",
@@ -92,6 +103,7 @@ __all__ = [
     "PointsMessage",
     "PoseMessage",
     "Transform",
+    "VerifyResult",
     "admit_calibration",
     "admit_image",
     "admit_imu",
@@ -108,6 +120,7 @@ __all__ = [
     "decode_pose",
     "decode_string",
     "decode_transforms",
+    "decode_verification",
     "encode_calibration",
     "encode_camera_info",
     "encode_compressed_image",
@@ -118,6 +131,7 @@ __all__ = [
     "encode_pose",
     "encode_string",
     "encode_transforms",
+    "encode_verification",
     "imu_encoder",
     "merge_calibrations",
     "ros2_schema",
