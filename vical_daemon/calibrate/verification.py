@@ -55,8 +55,8 @@ class CameraAnswer:
 class Verification:
     """The checks of one calibration.
 
-    `changed` is the answer when two checks in a row say so of a camera: one alone is wrong in one of a thousand
-    (`change_odds.FALSE_ALARM`), and there are hundreds of checks a day.
+    `changed` is the answer when two checks in a row say so of a camera: one alone is wrong in one of a
+    thousand (`change_odds.FALSE_ALARM`), and there are hundreds of checks a day.
 
     Args:
         config: The rig.

@@ -219,13 +219,12 @@ class _VerifyService:
         self._set(CheckState.RESTING if self._verification is not None else CheckState.UNABLE)
         while not self._stop.wait(_TICK_S):
             self._tick()
-            hurry = "check" in self._words or (
-                self._verification is not None and self._verification.suspected
-            )
+            checks = self._verification
+            hurry = "check" in self._words or (checks is not None and checks.suspected)
             self._words.discard("check")
-            if self._interrupted or (self._verification is not None and (hurry or self._pause.over)):
+            if self._interrupted or (checks is None and self._config.verify.recalibrate):
                 return
-            if self._verification is None and self._config.verify.recalibrate:
+            if checks is not None and (hurry or self._pause.over):
                 return
 
     # ------------------------------------------------------------------------------------------ calibrating

@@ -217,10 +217,10 @@ class _Worker:
         self._key = topics.IMAGE.key(config.rig, camera)
         self._dropped = 0
         self._images: Subscription | None = None
-        self._wanted = (
-            WantedImages(bus, topics.VERIFY.key(config.rig, camera)) if config.mode == "verify" else None
-        )
-        if self._wanted is None:
+        self._wanted: WantedImages | None = None
+        if config.mode == "verify":
+            self._wanted = WantedImages(bus, topics.VERIFY.key(config.rig, camera))
+        else:
             self._open()
         self.thread = threading.Thread(target=self._run, name=f"detect/{camera}", daemon=True)
 

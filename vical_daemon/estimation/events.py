@@ -185,8 +185,8 @@ REFERENCE: dict[EventKind, About] = {
         "The lever arm differs. Value: distance.",
         "m",
         "Once per start, at convergence, if a component differs from the stored calibration by more than 4 "
-        "joint sigma and 2 mm; target-free also with `bumped`. With `mode: verify`, when a second check confirms "
-        "that the stored calibration no longer holds.",
+        "joint sigma and 2 mm; target-free also with `bumped`. With `mode: verify`, when a second check "
+        "confirms that the stored calibration no longer holds.",
     ),
     EventKind.CAMERA_TURNED: About(
         "The mounting rotation differs. Value: angle.",
@@ -199,7 +199,8 @@ REFERENCE: dict[EventKind, About] = {
         "As `camera_moved`: 4 joint sigma and 0.2 ms.",
     ),
     EventKind.LENS_CHANGED: About(
-        "The lens differs. Value: how far it projects points from where the stored one does, RMS over the image.",
+        "The lens differs. Value: how far it projects points from where the stored one does, RMS over the "
+        "image.",
         "px",
         "With `mode: verify`, as `camera_moved`.",
     ),

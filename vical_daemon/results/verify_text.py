@@ -37,6 +37,7 @@ def _headline(document: dict[str, Any], against: str) -> str:
 
 
 def change_text(change: dict[str, Any]) -> str:
+    """Say what has changed, by how much, and along which way."""
     scale, unit = _SCALE[change["unit"]]
     value, sigma = scale * change["value"], scale * change["sigma"]
     axis = change.get("axis")

@@ -83,7 +83,7 @@ vical_msgs/Guidance guidance     # the motion that would reveal it
 string block                     # position rotation timeshift lens
 float64 value                    # m, rad, s, or px RMS over the image
 float64 sigma
-float64[] axis                   # unit vector; of a position in the imu frame, of a rotation in the camera frame
+float64[] axis                   # unit vector: position in the imu frame, rotation in the camera frame
 """,
     "vical_msgs/msg/VerifyResult": """\
 # Whether a stored calibration of one camera still holds
