@@ -21,6 +21,10 @@ class NothingInUseError(Exception):
     """There is no calibration to be checked; the message says why, and what to do."""
 
 
+class DevicesUnknownError(NothingInUseError):
+    """There may be one, but the serial numbers of the devices are not known yet."""
+
+
 @dataclass(frozen=True, slots=True)
 class InUse:
     """A calibration that is checked.
@@ -63,6 +67,7 @@ def calibration_in_use(config: Config, persistence: CalibrationPersistence, now_
 
     Raises:
         NothingInUseError: There is none.
+        DevicesUnknownError: That is not known before the devices are there.
     """
     path = config.verify_path
     if path is None:
@@ -90,6 +95,8 @@ def calibration_in_use(config: Config, persistence: CalibrationPersistence, now_
 def _from_store(config: Config, persistence: CalibrationPersistence, now_ns: int) -> InUse:
     stored = persistence.before
     lacking = [name for name in config.calibration_cameras if name not in stored]
+    if lacking and not persistence.devices:
+        raise DevicesUnknownError("waiting for the serial numbers of imu and cameras")
     if lacking:
         raise NothingInUseError(
             f"no calibration of {', '.join(lacking)} is stored for these devices: `vical command calibrate`"

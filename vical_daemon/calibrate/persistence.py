@@ -137,7 +137,7 @@ class CalibrationPersistence:
         self._announced.append(event)
 
     def said(self, estimate: CalibrationEstimate, events: list[Event]) -> CalibrationEstimate:
-        """Write events to the journal; return an estimate that is not watched, with them and those announced."""
+        """Write events to the journal; return the estimate with them and those announced."""
         for event in events:
             self._journal(event)
         events = [*self._announced, *events]

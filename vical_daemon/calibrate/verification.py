@@ -102,10 +102,14 @@ class Verification:
         return self._conclude()
 
     def end_stretch(self) -> None:
-        """The next data come after a pause."""
+        """The next data come after a pause: they go on with this check if it has an estimate already."""
         self.role.finish()
-        if not self._conclude():
+        if self._conclude():
+            return
+        if self.role.estimator.can_go_on:
             self.role.next_recording()
+        else:
+            self.begin_check()
 
     def events(self) -> list[Event]:
         """Return the announcements since the last call."""

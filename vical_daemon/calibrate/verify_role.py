@@ -29,7 +29,7 @@ from vical_daemon.bus.messages import (
 from vical_daemon.bus.outgoing import publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
 from vical_daemon.calibrate.estimators import input_keys
-from vical_daemon.calibrate.in_use import InUse, NothingInUseError, calibration_in_use
+from vical_daemon.calibrate.in_use import DevicesUnknownError, InUse, NothingInUseError, calibration_in_use
 from vical_daemon.calibrate.pause import Pause
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.calibrate.publications import calibration_messages, companion_messages
@@ -114,6 +114,7 @@ class _VerifyService:
         self._words: set[str] = set()
         self._published_s = -np.inf
         self._unable = ""
+        self._early = False  # devices are not there yet
         self._in_use: InUse | None = None
         self._verification: Verification | None = None
         self._persistence.priors()
@@ -141,10 +142,10 @@ class _VerifyService:
             self._in_use = calibration_in_use(self._config, self._persistence, self._clock.now_ns())
         except NothingInUseError as error:
             self._in_use, self._verification = None, None
-            self._unable = str(error)
+            self._unable, self._early = str(error), isinstance(error, DevicesUnknownError)
             _log.warning("cannot verify: %s", error)
             return
-        self._unable = ""
+        self._unable, self._early = "", False
         self._verification = Verification(self._config, self._in_use)
 
     def _calibration_wanted(self) -> bool:
@@ -153,6 +154,11 @@ class _VerifyService:
         if self._persistence.replaced:
             self._persistence.begin_again()
             self._read_in_use()
+        if self._early and self._persistence.devices:
+            self._persistence.priors(wait_s=0.0)
+            self._read_in_use()
+        if self._early:
+            return asked
         lost = self._verification is None or self._verification.verdict is Answer.CHANGED
         return asked or (self._config.verify.recalibrate and lost)
 
@@ -195,7 +201,7 @@ class _VerifyService:
         return bool(np.isfinite(motion.moved_s))
 
     def _take(self, queue: SubscriberQueue, verification: Verification, motion: Motion) -> None:
-        begin_s = seen_s = time.monotonic()
+        seen_s, before_s = time.monotonic(), verification.used_s
         while not self._stop.is_set() and not self._interrupted:
             self._tick(queue.wait(_TICK_S))
             now_s = time.monotonic()
@@ -208,7 +214,7 @@ class _VerifyService:
             if verification.step():
                 return
             still, blind = now_s - motion.moved_s > _STILL_S, now_s - seen_s > _BLIND_S
-            if still or blind or now_s - begin_s > STRETCH_S:
+            if still or blind or verification.used_s - before_s >= STRETCH_S:
                 return
 
     @property
@@ -222,10 +228,18 @@ class _VerifyService:
             checks = self._verification
             hurry = "check" in self._words or (checks is not None and checks.suspected)
             self._words.discard("check")
-            if self._interrupted or (checks is None and self._config.verify.recalibrate):
+            if self._interrupted:
+                return
+            if self._can_begin():
                 return
             if checks is not None and (hurry or self._pause.over):
                 return
+
+    def _can_begin(self) -> bool:
+        """Whether what nothing could be done without has come: devices, or leave to calibrate."""
+        if self._early:
+            return bool(self._persistence.devices)
+        return self._verification is None and self._config.verify.recalibrate
 
     # ------------------------------------------------------------------------------------------ calibrating
     def _calibrate(self) -> None:
