@@ -179,10 +179,10 @@ class View:
             print(f"{rig}  {text}", flush=True)
 
     def _on_verified(self, rig: str, camera: str, sample: Sample) -> None:
-        from vical_daemon.bus.messages import MessageError, decode_verification
+        from vical_daemon.bus.messages import MessageError, admit_verification
 
         with suppress(MessageError):
-            self.verified[rig, camera] = decode_verification(sample.payload)
+            self.verified[rig, camera] = admit_verification(sample.payload)
 
     def _on_status(self, rig: str, sample: Sample) -> None:
         from vical_daemon.bus.messages import MessageError, decode_diagnostics

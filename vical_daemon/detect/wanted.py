@@ -6,7 +6,7 @@ import threading
 import time
 
 from vical_daemon.bus.interface import Bus, Sample
-from vical_daemon.bus.messages import MessageError, decode_verification
+from vical_daemon.bus.messages import MessageError, admit_verification
 from vical_daemon.service.liveness import FRESH_S
 
 
@@ -40,10 +40,8 @@ class WantedImages:
 
     def _take(self, sample: Sample) -> None:
         try:
-            rate_hz = decode_verification(sample.payload).image_rate_hz
+            rate_hz = admit_verification(sample.payload).image_rate_hz
         except MessageError:
-            return
-        if not 0.0 <= rate_hz <= 1000.0:  # the bound of `detect_rate_hz`
             return
         self._wish = rate_hz, time.monotonic()
         if rate_hz > 0.0:

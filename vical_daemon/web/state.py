@@ -20,8 +20,8 @@ from vical_daemon.bus.messages import (
     MessageError,
     VerifyResult,
     admit_calibration,
+    admit_verification,
     decode_diagnostics,
-    decode_verification,
 )
 from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.guidance import Guidance, Verb
@@ -179,7 +179,7 @@ class WebState:
             self._stored[parsed.name] = admit_calibration(sample.payload)
         elif parsed.topic is topics.VERIFY:
             _admit(parsed.name, self._verified)
-            self._verified[parsed.name] = arrived_s, decode_verification(sample.payload)
+            self._verified[parsed.name] = arrived_s, admit_verification(sample.payload)
         elif parsed.topic is topics.STATUS:
             _admit(parsed.name, self._statuses)
             self._statuses[parsed.name] = arrived_s, decode_diagnostics(sample.payload).statuses

@@ -12,6 +12,7 @@ from vical_daemon.bus.messages.admission import (
     admit_imu,
     admit_points,
     admit_stamp_sigma_s,
+    admit_verification,
 )
 from vical_daemon.bus.messages.calibration import (
     CALIBRATION_TYPE,
@@ -109,6 +110,7 @@ __all__ = [
     "admit_imu",
     "admit_points",
     "admit_stamp_sigma_s",
+    "admit_verification",
     "check_message",
     "decode_calibration",
     "decode_camera_info",
