@@ -21,7 +21,6 @@ from vical_daemon.bus.messages import (
     Level,
     MessageError,
     VerifyResult,
-    admit_imu,
     decode_points,
     decode_string,
     encode_verification,
@@ -30,11 +29,12 @@ from vical_daemon.bus.outgoing import publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
 from vical_daemon.calibrate.estimators import input_keys
 from vical_daemon.calibrate.in_use import DevicesUnknownError, InUse, NothingInUseError, calibration_in_use
+from vical_daemon.calibrate.motion import LISTEN_S, Motion
 from vical_daemon.calibrate.pause import Pause
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.calibrate.publications import calibration_messages, companion_messages
 from vical_daemon.calibrate.verification import Verification
-from vical_daemon.calibrate.verify_words import age, line
+from vical_daemon.calibrate.verify_words import age, line, status
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, Status
@@ -50,12 +50,7 @@ _QUEUE_LIMIT = 20_000  # samples, as for calibrating
 STRETCH_S = 30.0
 """Longest stretch of data between two pauses, s: as a check takes at most where the motion shows enough."""
 _BLIND_S = 3.0  # without points a stretch ends: the board is not in view
-_LISTEN_S = 1.0  # to the IMU, to see whether the rig moves
 _STILL_S = 3.0  # without motion a stretch ends
-_STILL_RPS = float(np.deg2rad(1.0))
-"""Standard deviation of the angular rate below which the rig counts as still, rad/s: there, a time shift of
-1 ms turns the image by 0.001 deg, a hundredth of a pixel."""
-_MOTION_HZ = 50.0  # readings that are looked at for motion; a hand's motion stays below 10 Hz
 _FINE_S = 60.0
 """Calibrating goes on for this long after convergence at most, s, to get a result that can be verified."""
 
@@ -67,37 +62,6 @@ def run_verify(config: Config, bus: Bus, stop: threading.Event, clock: WallClock
         service.loop()
     finally:
         service.close()
-
-
-class Motion:
-    """Whether the rig moves, from the angular rate of the last second.
-
-    Args:
-        rate_hz: Readings per second that arrive.
-    """
-
-    def __init__(self, rate_hz: float) -> None:
-        self._every = max(1, round(rate_hz / _MOTION_HZ))
-        self._count = 0
-        self._rates: list[tuple[float, float, float]] = []
-        self.moved_s = -np.inf  # steady time of the last motion
-        self.looked = False
-
-    def take(self, sample: Sample, now_s: float) -> None:
-        """Take an inertial sample; most are not decoded."""
-        self._count += 1
-        if self._count % self._every:
-            return
-        with suppress(MessageError):
-            gx, gy, gz = admit_imu(sample.payload).gyro_rps
-            self._rates.append((gx, gy, gz))
-        if len(self._rates) < _MOTION_HZ * _LISTEN_S:
-            return
-        spread = float(np.linalg.norm(np.std(self._rates, axis=0)))
-        self._rates.clear()
-        self.looked = True
-        if spread > _STILL_RPS:
-            self.moved_s = now_s
 
 
 class _VerifyService:
@@ -147,6 +111,7 @@ class _VerifyService:
             return
         self._unable, self._early = "", False
         self._verification = Verification(self._config, self._in_use)
+        self._state = CheckState.RESTING
 
     def _calibration_wanted(self) -> bool:
         asked = "calibrate" in self._words
@@ -191,7 +156,7 @@ class _VerifyService:
         """Listen to the IMU for a second."""
         queue = SubscriberQueue(self._bus, [self._imu_key], _QUEUE_LIMIT)
         try:
-            end_s = time.monotonic() + 2.0 * _LISTEN_S
+            end_s = time.monotonic() + 2.0 * LISTEN_S
             while time.monotonic() < end_s and not motion.looked and not self._stop.is_set():
                 self._tick(queue.wait(_TICK_S))
                 for sample in queue.take(_QUEUE_LIMIT):
@@ -329,21 +294,7 @@ class _VerifyService:
         if self._verification is not None:
             counters |= self._verification.role.statuses()[0].values
         mine = DiagnosticStatus(Level.OK, "estimate", f"verify: {self._state}", "", counters)
-        return [mine, *(_status(name, result) for name, result in results.items())]
-
-
-def _status(name: str, result: VerifyResult) -> DiagnosticStatus:
-    bad = result.verdict == "changed" or result.state is CheckState.UNABLE
-    values = {
-        "verdict": result.verdict,
-        "against": result.against,
-        "checks": str(result.checks),
-        "seconds_used": f"{result.seconds_used:.0f}",
-        "missing_motion": "; ".join(result.missing_motion),
-    }
-    if result.probability_changed is not None:
-        values["probability_changed"] = f"{result.probability_changed:.3g}"
-    return DiagnosticStatus(Level.WARN if bad else Level.OK, f"verify/{name}", result.text, "", values)
+        return [mine, *(status(name, result) for name, result in results.items())]
 
 
 def _shows_points(sample: Sample) -> bool:

@@ -1,7 +1,8 @@
-"""A verification of one camera in one line."""
+"""A verification of one camera in words: one line, and its status."""
 
 from __future__ import annotations
 
+from vical_daemon.bus.messages import CheckState, DiagnosticStatus, Level, VerifyResult
 from vical_daemon.calibrate.verification import Verification
 from vical_daemon.results.verifier import Answer
 
@@ -35,3 +36,18 @@ def age(now_ns: int, then_ns: int) -> str:
     if seconds < 3600:
         return f"{seconds / 60:.0f} min ago"
     return f"{seconds / 3600:.0f} h ago"
+
+
+def status(name: str, result: VerifyResult) -> DiagnosticStatus:
+    """Return the component `verify/<camera>` of the role's status."""
+    bad = result.verdict == "changed" or result.state is CheckState.UNABLE
+    values = {
+        "verdict": result.verdict,
+        "against": result.against,
+        "checks": str(result.checks),
+        "seconds_used": f"{result.seconds_used:.0f}",
+        "missing_motion": "; ".join(result.missing_motion),
+    }
+    if result.probability_changed is not None:
+        values["probability_changed"] = f"{result.probability_changed:.3g}"
+    return DiagnosticStatus(Level.WARN if bad else Level.OK, f"verify/{name}", result.text, "", values)

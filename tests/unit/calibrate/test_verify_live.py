@@ -29,8 +29,8 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.calibrate import role
 from vical_daemon.calibrate.in_use import InUse
+from vical_daemon.calibrate.motion import Motion
 from vical_daemon.calibrate.verification import Verification
-from vical_daemon.calibrate.verify_role import Motion
 from vical_daemon.config.model import StoreConfig, VerifyConfig
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
