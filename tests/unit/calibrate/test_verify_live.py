@@ -294,7 +294,7 @@ def test_a_rig_at_rest_asks_for_no_images(run, live, rng):
         )
         for k, r in enumerate(map(tuple, rates.tolist()))
     ]
-    role_run.play(still, lambda: len(role_run.wanted) > 590)
+    role_run.play(still, lambda: len(role_run.wanted) > 590 and role_run.results)
     assert not any(role_run.wanted) and role_run.results[-1].state is CheckState.RESTING
 
 
