@@ -33,10 +33,10 @@ from vical_mocks.tracks import simulate_tracks
 from benchmarks import runner
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate
-from vical_daemon.offline.verify import Answer, CameraCheck, Verifier
 from vical_daemon.results.change_odds import Counts
 from vical_daemon.results.export import rig_from_estimate
 from vical_daemon.results.known import KnownCamera, known_cameras
+from vical_daemon.results.verifier import Answer, CameraCheck, Verifier
 
 WAYS = ("none", "rotation", "none", "position", "none", "time shift", "none", "lens")
 """What has changed, by the seed: every other rig has not."""

@@ -16,6 +16,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 LONGEST_FIRST = (  # as `pytest --durations=0 tests` has them
     "test_demo_command.py",
+    "test_verify_service.py",
     "test_partial_start.py",
     "test_gaps.py",
     "test_web_page.py",
@@ -30,6 +31,7 @@ LONGEST_FIRST = (  # as `pytest --durations=0 tests` has them
     "test_rolling_shutter_correction.py",
     "test_bounded_input.py",
     "test_web_hostile.py",
+    "test_verify_live.py",
     "test_model_selection.py",
     "test_target_free.py",
     "test_held_lens.py",

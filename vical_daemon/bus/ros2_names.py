@@ -61,6 +61,7 @@ def ros2_topic(key: str, namespace: str = "") -> Ros2Topic | None:
         "predicted": f"/{name}/predicted_points",
         "calibration": f"/calibration/{name}",
         "stored": f"/calibration/{name}/stored",
+        "verify": f"/calibration/{name}/verify",
         "pose": f"/calibration/{name}/pose",
         "tf_static": "/tf_static",
         "status": "/diagnostics",

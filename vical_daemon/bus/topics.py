@@ -113,14 +113,15 @@ STORED = _row(
     "stored", "calibration/{name}/stored", messages.CALIBRATION_TYPE, 0, _DATA, _BLOCK,
     recorded=False, keep_last=True,
 )  # fmt: skip
+VERIFY = _row("verify", "calibration/{name}/verify", messages.VERIFY_TYPE, 1, _DATA, _BLOCK, keep_last=True)
 POSE = _row("pose", "calibration/{name}/pose", messages.POSE_TYPE, 5, _DATA, _DROP, keep_last=True)
 TF_STATIC = _row("tf_static", "tf_static", messages.TF_TYPE, 0.2, _DATA, _BLOCK, keep_last=True)
 STATUS = _row("status", "status/{name}", messages.DIAGNOSTICS_TYPE, 1, _DATA, _DROP, keep_last=True)
 COMMAND = _row("command", "command/{name}", messages.STRING_TYPE, 0, _HIGH, _BLOCK)
 
 TOPICS: tuple[Topic, ...] = (
-    IMU, IMAGE, COMPRESSED, CAMERA_INFO, POINTS, TRACKS, PREDICTED, CALIBRATION, STORED, POSE,
-    TF_STATIC, STATUS, COMMAND,
+    IMU, IMAGE, COMPRESSED, CAMERA_INFO, POINTS, TRACKS, PREDICTED, CALIBRATION, STORED, VERIFY,
+    POSE, TF_STATIC, STATUS, COMMAND,
 )  # fmt: skip
 BY_KIND: dict[str, Topic] = {topic.kind: topic for topic in TOPICS}
 

@@ -45,6 +45,7 @@ IRRELEVANT_M, IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 _JOURNAL_NAMES = {
     EventKind.DEVICE_REPLACED: "calibration_restarted",
     EventKind.ESTIMATOR_RESTARTED: "estimator_restarted",
+    EventKind.STORED_HOLDS: "holds",
 }
 
 
@@ -115,6 +116,11 @@ class CalibrationPersistence:
         return list(self._before)
 
     @property
+    def before(self) -> dict[str, StoredCalibration]:
+        """What was stored for these devices at the last call of `priors`, by camera."""
+        return dict(self._before)
+
+    @property
     def devices(self) -> dict[str, str]:
         """Serial numbers of the devices by component; empty while one of them is uncertain."""
         names = self._components()
@@ -129,6 +135,14 @@ class CalibrationPersistence:
         """Write an event to the journal now, and add it to the next estimate."""
         self._journal(event)
         self._announced.append(event)
+
+    def said(self, estimate: CalibrationEstimate, events: list[Event]) -> CalibrationEstimate:
+        """Write events to the journal; return the estimate with them and those announced."""
+        for event in events:
+            self._journal(event)
+        events = [*self._announced, *events]
+        self._announced.clear()
+        return replace(estimate, events=events)
 
     def watch(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
         """Save an estimate that converged, and announce what changed since the stored calibration.
@@ -156,7 +170,8 @@ class CalibrationPersistence:
         fields |= {"value": event.value} if event.value is not None else {}
         fields |= {"sigma": event.sigma} if event.sigma is not None else {}
         name = "bumped" if event.changed else _JOURNAL_NAMES.get(event.kind, "calibration")
-        notify.event(name, event_text(event), level="warning", rig=self._config.rig, **fields)
+        level = "notice" if event.kind is EventKind.STORED_HOLDS else "warning"
+        notify.event(name, event_text(event), level=level, rig=self._config.rig, **fields)
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
         """Store an estimate if it has converged."""

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from vical_daemon.config.model import Config
 from vical_daemon.config.paths import make_private, runtime_directory
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.measurements import CameraPrior
-from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.result import CalibrationEstimate, Status
 from vical_daemon.estimation.wording import event_text
 from vical_daemon.service.health import StatusSender
 from vical_daemon.service.progress import Progress, Restarts
@@ -32,6 +32,7 @@ from vical_daemon.service.wall_clock import WallClock, service_clock
 
 __all__ = ["EstimateRole", "run"]
 
+Until = Callable[[CalibrationEstimate | None, set[str]], bool]
 _log = logging.getLogger(__name__)
 QUEUE_LIMIT = 20_000  # samples: 20 s at 1000 Hz, which may arrive while the estimator starts
 _BACKLOG_S = 1.0  # images sometimes wait this long
@@ -49,6 +50,32 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
     """
     folder = make_private(runtime_directory()) if clock is None else None
     clock = clock or service_clock()
+    if config.mode == "verify":
+        from vical_daemon.calibrate.verify_role import run_verify
+
+        run_verify(config, bus, stop, clock)
+    else:
+        calibrate(config, bus, stop, clock, folder=folder)
+
+
+def calibrate(
+    config: Config,
+    bus: Bus,
+    stop: threading.Event,
+    clock: WallClock,
+    until: Until | None = None,
+    folder: Path | None = None,
+) -> None:
+    """Calibrate until `stop`, or until `until` says that it is enough.
+
+    Args:
+        config: The rig.
+        bus: Where samples come from and estimates go.
+        stop: Ends it.
+        clock: Monotonic to UNIX time.
+        until: Gets the last estimate and the commands that came since; True: enough.
+        folder: Where the running estimator is saved; None: nowhere.
+    """
     queue = SubscriberQueue(bus, input_keys(config), QUEUE_LIMIT)
     persistence = CalibrationPersistence(config, bus, clock)
     priors = persistence.priors()
@@ -84,6 +111,8 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
                 checkpoint.save(role.estimator, persistence.devices)
             if not len(queue) or stop.is_set():
                 break
+        if until is not None and until(role.latest, words):
+            break
     checkpoint.forget()  # after a stop the rig may be touched
     commands.close()
     queue.close()

@@ -19,6 +19,9 @@ WORDS = {  # role and word on the bus
     "accept": ("estimate", "accept"),
     "discard": ("estimate", "discard"),
     "reset": ("estimate", "reset"),
+    "check": ("estimate", "check"),
+    "calibrate": ("estimate", "calibrate"),
+    "verify": ("estimate", "verify"),
     "record-start": ("record", "start"),
     "record-stop": ("record", "stop"),
 }
@@ -29,6 +32,9 @@ _EPILOG = """\
   vical command accept            store the present result as the calibration of these devices
   vical command discard           forget it, and put back what was stored when it began
   vical command reset             forget it and begin anew; the store stays as it is
+  vical command check             with `mode: verify`: check the stored calibration now, without a pause
+  vical command calibrate         with `mode: verify`: calibrate, store the result, and verify it from then on
+  vical command verify            ends such a calibration
   vical command record-start      begin a recording (record-stop ends it)
 
 exit code: 0 done; 1 no answer, or the result was refused; 2 bad usage

@@ -16,10 +16,10 @@ from vical_daemon.cli.options import add_json, add_sensors, add_stretch
 
 if TYPE_CHECKING:
     from vical_daemon.config.priors import Initial
-    from vical_daemon.offline.verify import Verifier
     from vical_daemon.results.change_odds import Counts
     from vical_daemon.results.export import Rig
     from vical_daemon.results.known import KnownCamera
+    from vical_daemon.results.verifier import Verifier
 
 _EPILOG = """\
 examples:
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(finite(document), allow_nan=False))
     else:
-        from vical_daemon.cli.verify_text import describe
+        from vical_daemon.results.verify_text import describe
 
         print(describe(document, Path(args.against).name))
     return {"holds": 0, "changed": EXIT_CHANGED}.get(document["verdict"], EXIT_CANNOT_TELL)
@@ -128,7 +128,7 @@ def _verifier(
     known: dict[str, KnownCamera], cameras: list[str], held: bool, counts: Counts, against: str
 ) -> Verifier:
     """Pair the recording's cameras with those of the calibration."""
-    from vical_daemon.offline.verify import CameraCheck, Verifier
+    from vical_daemon.results.verifier import CameraCheck, Verifier
 
     if len(known) == len(cameras) == 1:
         known = {cameras[0]: next(iter(known.values()))}

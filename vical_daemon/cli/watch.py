@@ -8,6 +8,8 @@ import sys
 import threading
 import time
 from collections import deque
+from contextlib import suppress
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from vical_daemon.cli.errors import CliError
@@ -15,6 +17,7 @@ from vical_daemon.cli.options import add_config, add_json
 
 if TYPE_CHECKING:
     from vical_daemon.bus.interface import Bus, Sample
+    from vical_daemon.bus.messages import VerifyResult
     from vical_daemon.estimation.result import CalibrationEstimate
 
 _REFRESH_S = 0.25
@@ -89,20 +92,21 @@ class View:
         self.estimates: dict[tuple[str, str], CalibrationEstimate] = {}
         self._heard_s: dict[tuple[str, str], float] = {}
         self.health: dict[tuple[str, str], tuple[str, str]] = {}
+        self.verified: dict[tuple[str, str], VerifyResult] = {}
         self._unprinted: deque[tuple[str, str, CalibrationEstimate]] = deque(maxlen=10_000)
 
     def begin(self, bus: Bus) -> None:
         """Ask for the last values first: a late joiner sees the state at once."""
         from vical_daemon.bus import topics
 
-        for topic in (topics.CALIBRATION, topics.STATUS):
+        for topic in (topics.CALIBRATION, topics.STATUS, topics.VERIFY):
             key = topic.pattern.format(rig=self._rig, name="*")
             for sample in bus.latest(key):
                 self.take(sample)
             bus.subscribe(key, self.take)
 
     def take(self, sample: Sample) -> None:
-        """Take a message; others than calibrations and statuses are ignored."""
+        """Take a message; others than calibrations, verifications and statuses are ignored."""
         from vical_daemon.bus import topics
 
         parsed = topics.parse_key(sample.key)
@@ -110,6 +114,9 @@ class View:
             self._on_estimate(parsed.rig, parsed.name, sample)
         elif parsed is not None and parsed.topic is topics.STATUS:
             self._on_status(parsed.rig, sample)
+
+        elif parsed is not None and parsed.topic is topics.VERIFY:
+            self._on_verified(parsed.rig, parsed.name, sample)
 
     def all_converged(self) -> bool:
         """Whether there is a camera and every one has converged, and still says so."""
@@ -161,12 +168,21 @@ class View:
         self._unprinted.append((rig, camera, estimate))
 
     def _print(self, rig: str, camera: str, estimate: CalibrationEstimate) -> None:
+        verified = self.verified.get((rig, camera))
         if self._json:
-            print(json.dumps({"rig": rig, "camera": camera} | estimate.to_json()), flush=True)
+            more = {} if verified is None else {"verify": asdict(verified)}
+            print(json.dumps({"rig": rig, "camera": camera} | estimate.to_json() | more), flush=True)
         else:
             from vical_daemon.cli.live_table import one_line
 
-            print(f"{rig}  {one_line(camera, estimate)}", flush=True)
+            text = one_line(camera, estimate) if verified is None else f"{camera}  {verified.text}"
+            print(f"{rig}  {text}", flush=True)
+
+    def _on_verified(self, rig: str, camera: str, sample: Sample) -> None:
+        from vical_daemon.bus.messages import MessageError, admit_verification
+
+        with suppress(MessageError):
+            self.verified[rig, camera] = admit_verification(sample.payload)
 
     def _on_status(self, rig: str, sample: Sample) -> None:
         from vical_daemon.bus.messages import MessageError, decode_diagnostics

@@ -47,6 +47,8 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
             "calibration.mode",
             "target needs `target: FILE` (`vical target` makes one), or mode: target_free",
         )
+    if config.verify.recalibrate and config.verify.against != "store":
+        yield "verify.recalibrate", "a new calibration goes to the store, so it needs `against: store`"
 
 
 def _check_bus(bus: BusConfig) -> Iterator[tuple[str, str]]:

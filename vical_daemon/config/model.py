@@ -169,6 +169,36 @@ class CalibrationConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class CountsConfig:
+    """The smallest changes since the calibration was stored that count as such."""
+
+    position_m: Annotated[float, Bound(above=0, high=1.0)] = 2e-3
+    rotation_deg: Annotated[float, Bound(above=0, high=10.0)] = 0.2
+    timeshift_s: Annotated[float, Bound(above=0, high=0.1)] = 1e-3
+    focal_share: Annotated[float, Bound(above=0, high=0.5, hint="of the focal length")] = 5e-3
+
+
+@dataclass(frozen=True, slots=True)
+class VerifyConfig:
+    """With `mode: verify`: how the stored calibration is checked.
+
+    Attributes:
+        against: store, or a file: a result of vical, Kalibr's or OpenVINS's camchain; relative to the
+            settings file.
+        cpu_percent: Share of one core that the process may use on average, by pauses between checks.
+        image_rate_hz: Largest number of images per second in which the board is searched during a check.
+        recalibrate: Calibrate where nothing is stored, or what is stored no longer holds; store the result.
+        counts: The smallest changes that count.
+    """
+
+    against: str = "store"
+    cpu_percent: Annotated[float, Bound(above=0, high=100)] = 3.0
+    image_rate_hz: Annotated[float, Bound(low=1, high=1000)] = 10.0
+    recalibrate: bool = False
+    counts: CountsConfig = field(default_factory=CountsConfig)
+
+
+@dataclass(frozen=True, slots=True)
 class BusConfig:
     """How processes connect; nothing listens on a network, loopback included, unless configured here.
 
@@ -285,6 +315,8 @@ class Config:
         imus: By name.
         cameras: By name.
         target: Target file (Kalibr's format); relative to the settings file.
+        mode: calibrate: estimate and store; verify: check from time to time whether the stored calibration
+            still holds.
         ros2: Publish under ROS 2's names, too; None: off.
         path: File this was read from; None: made in memory.
 
@@ -295,7 +327,9 @@ class Config:
     imus: dict[Name, ImuConfig] = field(default_factory=dict)
     cameras: dict[Name, CameraConfig] = field(default_factory=dict)
     target: str | None = None
+    mode: Literal["calibrate", "verify"] = "calibrate"
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    verify: VerifyConfig = field(default_factory=VerifyConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     ros2: Ros2Config | None = None
     record: RecordConfig = field(default_factory=RecordConfig)
@@ -325,6 +359,13 @@ class Config:
         if self.target is None:
             return None
         return (self.path.parent if self.path else Path()) / self.target
+
+    @property
+    def verify_path(self) -> Path | None:
+        """The file that is verified, likewise; None: the store."""
+        if self.verify.against == "store":
+            return None
+        return (self.path.parent if self.path else Path()) / self.verify.against
 
 
 def load(path: Path | str) -> Config:

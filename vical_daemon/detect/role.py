@@ -25,6 +25,7 @@ from vical_daemon.config.model import Config
 from vical_daemon.config.priors import camera_prior
 from vical_daemon.detect.detectors import Detect, make_detector
 from vical_daemon.detect.flow_aid import GyroAid
+from vical_daemon.detect.wanted import WantedImages
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.service import notify
 from vical_daemon.service.health import StatusSender
@@ -70,7 +71,7 @@ class DetectRole:
         self._size: tuple[int, int] | None = None  # of the images of this camera: height, width
         self._other: tuple[tuple[int, int], int] = ((0, 0), 0)  # another size, and how often in a row
         self._problem = ""
-        self._period_ns = 1e9 / config.calibration.detect_rate_hz
+        self.rate_hz = config.calibration.detect_rate_hz  # images per second at most
         self._next_ns = 0.0
         self._images = self._found = self._malformed = self._skipped = self._failures = 0
         self._busy_s = 0.0
@@ -118,13 +119,13 @@ class DetectRole:
         return True
 
     def _due(self, stamp_ns: int) -> bool:
-        """Whether `detect_rate_hz` allows an image so soon after the last one."""
-        ahead_ns = self._next_ns - stamp_ns
-        if 0.5 * self._period_ns < ahead_ns < _SET_BACK_NS:
+        """Whether `rate_hz` allows an image so soon after the last one."""
+        ahead_ns, period_ns = self._next_ns - stamp_ns, 1e9 / self.rate_hz
+        if 0.5 * period_ns < ahead_ns < _SET_BACK_NS:
             return False
         if ahead_ns >= _SET_BACK_NS:  # the clock was set back, or the stamp before was wrong
             self._next_ns = stamp_ns
-        self._next_ns = max(self._next_ns + self._period_ns, stamp_ns)
+        self._next_ns = max(self._next_ns + period_ns, stamp_ns)
         return True
 
     def _failed(self, error: Exception) -> None:
@@ -204,31 +205,70 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
 
 
 class _Worker:
-    """Thread of one camera: takes the newest image, detects, publishes."""
+    """Thread of one camera: takes the newest image, detects, publishes.
+
+    With `mode: verify` it does so only while images are wanted, and has no subscription otherwise.
+    """
 
     def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
         self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
         self._since_s: float | None = None  # start of the current image
-        self._aid = attach_aid(bus, self._role)
-        key = topics.IMAGE.key(config.rig, camera)
-        self.subscription = bus.subscribe(key, depth=QUEUE_DEPTH, newest_wins=True)
+        self._aid: list[Subscription] = []
+        self._key = topics.IMAGE.key(config.rig, camera)
+        self._dropped = 0
+        self._images: Subscription | None = None
+        self._wanted: WantedImages | None = None
+        if config.mode == "verify":
+            self._wanted = WantedImages(bus, topics.VERIFY.key(config.rig, camera))
+        else:
+            self._open()
         self.thread = threading.Thread(target=self._run, name=f"detect/{camera}", daemon=True)
 
     def close(self) -> None:
         """End the subscriptions and wait for the thread."""
-        for subscription in (self.subscription, *self._aid):
-            subscription.close()
+        self._shut()
+        if self._wanted is not None:
+            self._wanted.close()
         self.thread.join(JOIN_S)
 
     def status(self) -> DiagnosticStatus:
-        since_s = self._since_s
+        since_s, images = self._since_s, self._images
         busy_s = 0.0 if since_s is None else time.monotonic() - since_s
-        return self._role.status(self.subscription.dropped, busy_s)
+        return self._role.status(self._dropped + (images.dropped if images else 0), busy_s)
+
+    def _open(self) -> None:
+        self._images = self._bus.subscribe(self._key, depth=QUEUE_DEPTH, newest_wins=True)
+        self._aid = attach_aid(self._bus, self._role)
+
+    def _shut(self) -> None:
+        images, self._images = self._images, None
+        if images is not None:
+            self._dropped += images.dropped
+            images.close()
+        for subscription in self._aid:
+            subscription.close()
+        self._aid = []
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            sample = self.subscription.recv(0.2)
+            if self._wanted is not None and not self._follow(self._wanted):
+                continue
+            images = self._images
+            sample = images.recv(0.2) if images is not None else None
             if sample is not None:
                 self._since_s = time.monotonic()  # stays set if the thread ends or hangs
                 publish(self._bus, self._role.points(sample))
                 self._since_s = None
+
+    def _follow(self, wanted: WantedImages) -> bool:
+        """Open or close the subscription as images are wanted; False: none are, after a short wait."""
+        rate_hz = wanted.rate_hz
+        if rate_hz > 0.0:
+            self._role.rate_hz = rate_hz
+            if self._images is None:
+                self._open()
+            return True
+        if self._images is not None:
+            self._shut()
+        wanted.wait(0.2)
+        return False

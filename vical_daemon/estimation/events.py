@@ -21,6 +21,8 @@ class EventKind(StrEnum):
     CAMERA_MOVED = "camera_moved"
     CAMERA_TURNED = "camera_turned"
     TIMESHIFT_CHANGED = "timeshift_changed"
+    LENS_CHANGED = "lens_changed"
+    STORED_HOLDS = "stored_holds"
     TIMESHIFT_STEPPED = "timeshift_stepped"
     POSE_LOST = "pose_lost"
     CLOCK_DRIFT = "clock_drift"
@@ -115,6 +117,7 @@ _CHANGES = frozenset(
         EventKind.CAMERA_MOVED,
         EventKind.CAMERA_TURNED,
         EventKind.TIMESHIFT_CHANGED,
+        EventKind.LENS_CHANGED,
     }
 )
 
@@ -182,7 +185,8 @@ REFERENCE: dict[EventKind, About] = {
         "The lever arm differs. Value: distance.",
         "m",
         "Once per start, at convergence, if a component differs from the stored calibration by more than 4 "
-        "joint sigma and 2 mm; target-free also with `bumped`.",
+        "joint sigma and 2 mm; target-free also with `bumped`. With `mode: verify`, when a second check "
+        "confirms that the stored calibration no longer holds.",
     ),
     EventKind.CAMERA_TURNED: About(
         "The mounting rotation differs. Value: angle.",
@@ -193,6 +197,17 @@ REFERENCE: dict[EventKind, About] = {
         "The time shift differs. Value: new minus stored.",
         "s",
         "As `camera_moved`: 4 joint sigma and 0.2 ms.",
+    ),
+    EventKind.LENS_CHANGED: About(
+        "The lens differs. Value: how far it projects points from where the stored one does, RMS over the "
+        "image.",
+        "px",
+        "With `mode: verify`, as `camera_moved`.",
+    ),
+    EventKind.STORED_HOLDS: About(
+        "The stored calibration holds. Value: seconds of data that showed it.",
+        "s",
+        "With `mode: verify`, at the first such answer, and at the first one after another answer.",
     ),
     EventKind.TIMESHIFT_STEPPED: About(
         "The time shift jumped; everything else is kept. Value: new minus old.",

@@ -323,6 +323,11 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.CAMERA_MOVED: ("changed: ", _difference("moved by", 1e3, "mm", ".1f")),
     EventKind.CAMERA_TURNED: ("changed: ", _difference("turned by", 180.0 / math.pi, "deg", ".2f")),
     EventKind.TIMESHIFT_CHANGED: ("changed: ", _difference("time shift by", 1e3, "ms", "+.2f")),
+    EventKind.LENS_CHANGED: ("changed: ", _difference("lens by", 1.0, "px", ".2f")),
+    EventKind.STORED_HOLDS: (
+        "",
+        lambda e: f"the stored calibration holds, by {_of(e, 1.0, 's', '.0f')} of data",
+    ),
     EventKind.TIMESHIFT_STEPPED: (
         "",
         lambda e: f"the time shift stepped by {_of(e, 1e3, 'ms', '+.1f')}; all else is kept",

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vical_daemon.offline.errors import InputError
 
 if TYPE_CHECKING:
     from vical_daemon.results.export import Rig
     from vical_daemon.results.known import KnownCamera
-
-_RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recording: 18 hours
 
 
 def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
@@ -23,27 +20,19 @@ def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
         InputError: Nothing there that holds a calibration.
         ExportError: A file that is not of the expected form.
     """
-    from vical_daemon.config.priors import read_initial
-    from vical_daemon.config.strict_yaml import ConfigError
     from vical_daemon.results.export import ExportError
-    from vical_daemon.results.known import known_cameras, known_prior
+    from vical_daemon.results.files import known_without_lens
+    from vical_daemon.results.known import known_cameras
 
     path = Path(source)
     try:
         rig = read_source(source)
         return known_cameras(rig, path.name), rig
     except ExportError as error:
-        if path.suffix not in (".yaml", ".yml"):
-            raise
-        try:
-            priors = read_initial(path).cameras
-        except ConfigError:
+        known = known_without_lens(path)
+        if known is None:
             raise error from None
-    found = {name: known_prior(name, prior, path.name) for name, prior in priors.items()}
-    known = {name: camera for name, camera in found.items() if camera is not None}
-    if not known:
-        raise InputError(f"{source}: no camera with T_cam_imu in it")
-    return known, None
+        return known, None
 
 
 def read_source(source: str) -> Rig:
@@ -51,48 +40,18 @@ def read_source(source: str) -> Rig:
 
     Raises:
         InputError: Nothing there that holds a calibration.
+        ExportError: A file that is not of the expected form.
     """
-    from vical_daemon.results.export import rig_from_json
-    from vical_daemon.results.export.kalibr import read_camchain
+    from vical_daemon.results.files import read_rig
 
     path = Path(source)
     if source == "store" and not path.exists():
         return _from_store()
     if not path.exists():
         raise InputError(f"{source}: no such file")
-    if path.suffix in (".yaml", ".yml"):
-        return read_camchain(path)
     if path.is_dir() or path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
         return _from_log(path)
-    document = _read_json(path)
-    note = f"vical, from {path.name}"
-    if isinstance(document.get("estimate"), dict):  # a file of the store
-        devices = {
-            "imu": document.get("imu_serial"),
-            f"camera/{document.get('camera')}": document.get("camera_serial"),
-        }
-        return rig_from_json(document["estimate"] | {"devices": devices}, note=note)
-    return rig_from_json(document, note=note)
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    """Read a result; of a file with several lines (`vical demo --json`) the last one counts."""
-    from vical_drivers.user_files import read_text
-
-    try:
-        text = read_text(path, _RESULT_LIMIT)
-        document = json.loads(text)
-    except json.JSONDecodeError as error:
-        lines = [line for line in text.splitlines() if line.strip()]
-        try:
-            document = json.loads(lines[-1]) if lines else None
-        except json.JSONDecodeError:
-            raise InputError(f"{path}: not JSON: {error}") from None
-    except (UnicodeDecodeError, RecursionError):
-        raise InputError(f"{path}: not JSON; give the result of `vical calibrate -o`") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: not a result of `vical calibrate --json`")
-    return document
+    return read_rig(path)
 
 
 def _from_log(path: Path) -> Rig:

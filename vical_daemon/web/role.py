@@ -49,7 +49,7 @@ class _Feeds:
         self._always = [
             bus.subscribe(topics.CALIBRATION.key(config.rig, name), state.take) for name in config.cameras
         ]
-        seen = (topics.POINTS, topics.TRACKS, topics.PREDICTED, topics.STORED)
+        seen = (topics.POINTS, topics.TRACKS, topics.PREDICTED, topics.STORED, topics.VERIFY)
         self._always += [
             bus.subscribe(t.key(config.rig, n), state.take) for n in config.cameras for t in seen
         ]

@@ -34,6 +34,9 @@ COMMANDS = {  # name on the page: role and command
     "reset": ("estimate", "reset"),
     "accept": ("estimate", "accept"),
     "discard": ("estimate", "discard"),
+    "calibrate": ("estimate", "calibrate"),
+    "verify": ("estimate", "verify"),
+    "check": ("estimate", "check"),
 }
 _FILES: dict[str, str | Path] = {
     "": "index.html",

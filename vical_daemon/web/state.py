@@ -18,7 +18,9 @@ from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
     MessageError,
+    VerifyResult,
     admit_calibration,
+    admit_verification,
     decode_diagnostics,
 )
 from vical_daemon.estimation.events import Event
@@ -38,6 +40,7 @@ from vical_daemon.results.report.scene import rig as rig_document
 from vical_daemon.service.liveness import FRESH_S
 from vical_daemon.web.camera_watch import CameraWatch
 from vical_daemon.web.meters import known_of_needed
+from vical_daemon.web.verification import verification_words
 
 HISTORY = 1500
 """Rows kept of each camera: 1.6 MB, five minutes of estimates at 5 Hz."""
@@ -101,6 +104,7 @@ class WebState:
         self._watches = dict(watches or {})
         self._targets = targets or ConvergenceTargets()
         self._stored: dict[str, CalibrationMessage] = {}
+        self._verified: dict[str, tuple[float, VerifyResult]] = {}
         self._clock = clock
         self._lock = threading.Lock()
         self._arrived: deque[tuple[float, Sample]] = deque(maxlen=4096)
@@ -173,6 +177,9 @@ class WebState:
         elif parsed.topic is topics.STORED:
             _admit(parsed.name, self._stored)
             self._stored[parsed.name] = admit_calibration(sample.payload)
+        elif parsed.topic is topics.VERIFY:
+            _admit(parsed.name, self._verified)
+            self._verified[parsed.name] = arrived_s, admit_verification(sample.payload)
         elif parsed.topic is topics.STATUS:
             _admit(parsed.name, self._statuses)
             self._statuses[parsed.name] = arrived_s, decode_diagnostics(sample.payload).statuses
@@ -203,6 +210,8 @@ class WebState:
             entry = summary(camera.latest, now_s - camera.arrived_s, fault is not None)
             entry["events"] = [event_document(event) for event in camera.events]
             entry |= self._result(name, camera.latest)
+            if fault is None and not entry["stale"]:
+                entry |= self._verification(name, now_s)
             entry["rows" if whole else "fresh"] = camera.rows if whole else camera.fresh
             cameras[name] = entry
         devices = [
@@ -253,6 +262,13 @@ class WebState:
                 ],
             },
         }
+
+    def _verification(self, name: str, now_s: float) -> dict[str, Any]:
+        """Return what takes the place of the estimator's words while a stored calibration is verified."""
+        arrived_s, result = self._verified.get(name, (-math.inf, None))
+        if result is None or is_stale(now_s - arrived_s):
+            return {}
+        return verification_words(result)
 
     def _sights(self, *, full: bool) -> dict[str, Any]:
         """Return what the page shows of the images of each camera."""

@@ -44,6 +44,7 @@ class Junk:
             "imu": self._imu, "image": self._image, "compressed": self._compressed,
             "camera_info": self._camera_info, "points": self._points, "tracks": self._points,
             "predicted": self._points, "calibration": self._calibration, "stored": self._calibration,
+            "verify": self._verification,
             "pose": self._pose,
             "tf_static": self._transforms, "status": self._status, "command": self._command,
         }  # fmt: skip
@@ -158,6 +159,17 @@ class Junk:
 
     def _calibration(self, now_ns: int, name: str) -> bytes:
         return m.encode_calibration(self._estimate(now_ns), "cam0" if name != "cam1" else name)
+
+    def _verification(self, now_ns: int, name: str) -> bytes:
+        value, sigma, probability, used_s, rate_hz = self._wild(5).tolist()
+        change = m.Change(
+            str(self._rng.choice(["position", "", "x" * 300])), value, sigma, tuple(self._wild(3))
+        )
+        result = m.VerifyResult(
+            self._stamp(now_ns), name, m.CheckState.CHECKING, "changed", self._stamp(now_ns), "\n" * 50, "",
+            probability, used_s, 2**63, (change,) * int(self._rng.integers(0, 9)), ("",), rate_hz,
+        )  # fmt: skip
+        return m.encode_verification(result)
 
     def _pose(self, now_ns: int, name: str) -> bytes:
         with np.errstate(all="ignore"):

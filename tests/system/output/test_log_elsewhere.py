@@ -25,6 +25,8 @@ COUNT = 25
 LENS = [50.0, 50.0, 32.0, 24.0]
 FINE = m.DiagnosticStatus(m.Level.OK, "imu/imu0", "fine")
 
+MOVED = m.Change("position", 3e-3, 4e-4, (1.0, 0.0, 0.0))
+
 
 def payload(topic, k, web_feed):
     """A message of each kind."""
@@ -44,6 +46,9 @@ def payload(topic, k, web_feed):
         "predicted": lambda: m.encode_points(stamp, "cam0", np.arange(6), grid),
         "calibration": lambda: m.encode_calibration(estimate, "cam0"),
         "stored": lambda: m.encode_calibration(estimate, "cam0"),
+        "verify": lambda: m.encode_verification(
+            m.VerifyResult(stamp, "cam0", m.CheckState.RESTING, "changed", stamp, changes=(MOVED,))
+        ),
         "pose": lambda: m.encode_pose(stamp, "imu0", estimate.cameras["cam0"].T_imu_cam),
         "tf_static": lambda: m.encode_transforms([pose]),
         "status": lambda: m.encode_diagnostics(stamp, "imu", [FINE]),

@@ -15,7 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
-from vical_daemon.bus.messages import DiagnosticStatus, Level, encode_calibration, encode_diagnostics
+from vical_daemon.bus.messages import (
+    CheckState,
+    DiagnosticStatus,
+    Level,
+    VerifyResult,
+    encode_calibration,
+    encode_diagnostics,
+    encode_verification,
+)
 from vical_daemon.cli import bus_access, demo_truth, live_table, main, watch
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.results.euler import euler_sigma_deg
@@ -47,6 +55,16 @@ def test_a_late_joiner_gets_the_last_state_at_once(bus: LocalBus, capsys) -> Non
     assert time.monotonic() - begin_s < 2.0
     state = json.loads(capsys.readouterr().out)
     assert (state["rig"], state["camera"], state["status"]) == ("rover", "cam0", "converging")
+
+
+def test_a_verification_is_shown_with_the_calibration_in_use(bus: LocalBus, capsys) -> None:
+    result = VerifyResult(5, "cam0", CheckState.RESTING, "changed", 4, text="store no longer holds: lens")
+    bus.publish(topics.VERIFY.key("rover", "cam0"), encode_verification(result))
+    _publish(bus, "rover", Status.CONVERGED)
+    assert main(["watch", "--once"]) == 0
+    assert capsys.readouterr().out == "rover  cam0  store no longer holds: lens\n"
+    assert main(["watch", "--once", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["verify"]["verdict"] == "changed"
 
 
 def test_nothing_there_is_one_line(bus: LocalBus, capsys) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.messages import Level
 from vical_daemon.config.model import Config, loads
 from vical_daemon.detect import role as detect
+from vical_daemon.detect import wanted
 from vical_daemon.detect.role import DetectRole
 from vical_daemon.service import notify
 
@@ -88,5 +90,42 @@ class TestDetect:
         while worker.status().level is Level.STALE:
             assert time.monotonic() < end_s
             time.sleep(0.01)
+        stop.set()
+        worker.close()
+
+    def test_with_mode_verify_it_works_only_while_images_are_wanted(
+        self, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        stop, bus = threading.Event(), LocalBus()
+        seen: list[int] = []
+        monkeypatch.setattr(detect, "make_detector", lambda *_: lambda picture, t_ns: seen.append(t_ns))
+        monkeypatch.setattr(wanted, "FRESH_S", 0.5)
+        worker = detect._Worker(replace(config, mode="verify"), "cam0", bus, stop)
+        worker.thread.start()
+        key, count = topics.VERIFY.key("rover", "cam0"), 0
+
+        def send(seconds: float, rate_hz: float | None) -> int:
+            """Send images, 20 per second of their stamps, each after a wish; return how many were used."""
+            nonlocal count
+            before, end_s = len(seen), time.monotonic() + seconds
+            while time.monotonic() < end_s:
+                if rate_hz is not None:
+                    result = m.VerifyResult(1, "cam0", m.CheckState.CHECKING, image_rate_hz=rate_hz)
+                    bus.publish(key, m.encode_verification(result))
+                bus.publish(IMAGE, image(NOW + count * 50 * MS).payload)
+                count += 1
+                time.sleep(0.02)
+            return len(seen) - before
+
+        assert send(0.3, None) == 0
+        assert send(2.0, 10.0) > 0
+        gaps = np.diff(seen)
+        assert gaps.mean() > 90 * MS  # about 10 of 20 per second
+        send(0.3, 0.0)
+        assert send(0.3, 0.0) == 0
+        bus.publish(key, b"\x00\x01\x00\x00junk")
+        assert send(2.0, 10.0) > 0
+        send(0.7, None)  # whoever asked has gone
+        assert send(0.3, None) == 0
         stop.set()
         worker.close()

@@ -11,7 +11,16 @@ import pytest
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus, Sample
-from vical_daemon.bus.messages import Level, decode_calibration, encode_calibration, encode_diagnostics
+from vical_daemon.bus.messages import (
+    Change,
+    CheckState,
+    Level,
+    VerifyResult,
+    decode_calibration,
+    encode_calibration,
+    encode_diagnostics,
+    encode_verification,
+)
 from vical_daemon.config.model import CameraConfig, Config, RecordConfig
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.guidance import AXES, Block, Guidance, Lack, Verb, WeakDirection
@@ -375,6 +384,23 @@ def test_broken_images_are_passed_over(web_feed):
     view.take(Sample(topics.IMAGE.key(web_feed.RIG, "other"), b"", 0))
     sight = view.next()
     assert sight is None or (picture_event(sight) is None and drawn_jpeg(sight) is None)
+
+
+def test_a_verification_takes_the_place_of_the_estimators_words(bus, state, web_feed):
+    def shown(**fields):
+        result = VerifyResult(1, "cam0", CheckState.RESTING, **fields)
+        bus.publish(topics.VERIFY.key(web_feed.RIG, "cam0"), encode_verification(result))
+        web_feed.publish_estimate(bus, web_feed.estimate(10.0, np.random.default_rng(2)))
+        return state.tick()["cameras"]["cam0"]
+
+    changed = shown(verdict="changed", text="store no longer holds", changes=(Change("lens", 4.0, 1.0),))
+    assert changed["status"] == "changed" and changed["headline"].endswith("no longer holds.")
+    assert changed["reason"] == "store no longer holds" and changed["verify"]["changes"][0]["what"] == "lens"
+    unsure = shown(missing_motion=("turn about x",))
+    assert (unsure["status"], unsure["guidance"]) == ("verifying", "turn about x")
+    before = state.malformed
+    assert shown(seconds_used=float("nan"))["status"] == "verifying"  # the last good one
+    assert state.malformed == before + 1
 
 
 def test_the_stored_calibration_stands_beside_the_present_one(bus, state, web_feed):

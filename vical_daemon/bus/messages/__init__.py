@@ -12,6 +12,7 @@ from vical_daemon.bus.messages.admission import (
     admit_imu,
     admit_points,
     admit_stamp_sigma_s,
+    admit_verification,
 )
 from vical_daemon.bus.messages.calibration import (
     CALIBRATION_TYPE,
@@ -66,6 +67,14 @@ from vical_daemon.bus.messages.poses import (
     encode_transforms,
 )
 from vical_daemon.bus.messages.schemas import ros2_schema
+from vical_daemon.bus.messages.verification import (
+    VERIFY_TYPE,
+    Change,
+    CheckState,
+    VerifyResult,
+    decode_verification,
+    encode_verification,
+)
 
 __all__ = [
     "CALIBRATION_TYPE",
@@ -79,8 +88,11 @@ __all__ = [
     "STRING_TYPE",
     "TF_TYPE",
     "TRACKS_TYPE",
+    "VERIFY_TYPE",
     "CalibrationMessage",
     "CameraInfoMessage",
+    "Change",
+    "CheckState",
     "CompressedImageMessage",
     "DiagnosticStatus",
     "DiagnosticsMessage",
@@ -92,11 +104,13 @@ __all__ = [
     "PointsMessage",
     "PoseMessage",
     "Transform",
+    "VerifyResult",
     "admit_calibration",
     "admit_image",
     "admit_imu",
     "admit_points",
     "admit_stamp_sigma_s",
+    "admit_verification",
     "check_message",
     "decode_calibration",
     "decode_camera_info",
@@ -108,6 +122,7 @@ __all__ = [
     "decode_pose",
     "decode_string",
     "decode_transforms",
+    "decode_verification",
     "encode_calibration",
     "encode_camera_info",
     "encode_compressed_image",
@@ -118,6 +133,7 @@ __all__ = [
     "encode_pose",
     "encode_string",
     "encode_transforms",
+    "encode_verification",
     "imu_encoder",
     "merge_calibrations",
     "ros2_schema",

@@ -14,7 +14,11 @@ from vical_daemon.bus.messages.cdr import MessageError
 from vical_daemon.bus.messages.image import ImageMessage, decode_image
 from vical_daemon.bus.messages.imu import ImuMessage, decode_imu
 from vical_daemon.bus.messages.points import PointsMessage, decode_points
+from vical_daemon.bus.messages.verification import VerifyResult, decode_verification
 from vical_daemon.estimation import plausible
+
+FASTEST_HZ = 1000.0
+"""Images per second: the bound of `calibration.detect_rate_hz`."""
 
 
 class ImplausibleError(MessageError):
@@ -67,6 +71,22 @@ def admit_calibration(data: bytes) -> CalibrationMessage:
     message = decode_calibration(data)
     known = message.camera_estimate
     _refuse("" if known is None else plausible.camera_problem(known))
+    return message
+
+
+def admit_verification(data: bytes) -> VerifyResult:
+    """Decode a vical_msgs/VerifyResult and check its values.
+
+    Raises:
+        MessageError: Not such a message.
+        ImplausibleError: A number that is none, or more images than any camera gives.
+    """
+    message = decode_verification(data)
+    numbers = [x for c in message.changes for x in (c.value, c.sigma, *c.axis)]
+    if not all(math.isfinite(x) for x in (message.seconds_used, *numbers)):
+        _refuse("a value is not finite")
+    if not 0.0 <= message.image_rate_hz <= FASTEST_HZ:
+        _refuse(f"{message.image_rate_hz:g} images per second")
     return message
 
 

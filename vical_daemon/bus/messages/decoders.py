@@ -22,6 +22,7 @@ from vical_daemon.bus.messages.image import (
 from vical_daemon.bus.messages.imu import IMU_TYPE, decode_imu
 from vical_daemon.bus.messages.points import POINTS_TYPE, TRACKS_TYPE, decode_points
 from vical_daemon.bus.messages.poses import POSE_TYPE, TF_TYPE, decode_pose, decode_transforms
+from vical_daemon.bus.messages.verification import VERIFY_TYPE, decode_verification
 
 DECODERS: dict[str, Callable[[bytes], object]] = {
     CALIBRATION_TYPE: decode_calibration,
@@ -35,6 +36,7 @@ DECODERS: dict[str, Callable[[bytes], object]] = {
     STRING_TYPE: decode_string,
     TF_TYPE: decode_transforms,
     TRACKS_TYPE: decode_points,
+    VERIFY_TYPE: decode_verification,
 }
 
 

@@ -78,6 +78,28 @@ float64 sigma                    # m, rad or s
 float64 limit                    # above which sigma it counts as unknown
 vical_msgs/Guidance guidance     # the motion that would reveal it
 """,
+    "vical_msgs/msg/Change": """\
+# What has changed since a calibration was stored
+string block                     # position rotation timeshift lens
+float64 value                    # m, rad, s, or px RMS over the image
+float64 sigma
+float64[] axis                   # unit vector: position in the imu frame, rotation in the camera frame
+""",
+    "vical_msgs/msg/VerifyResult": """\
+# Whether a stored calibration of one camera still holds
+std_msgs/Header header           # stamp: newest data looked at; frame_id: camera
+string state                     # resting checking calibrating unable
+string verdict                   # holds changed cannot_tell: the last answer
+builtin_interfaces/Time answered # when it was given; 0: no answer yet
+string against                   # what is checked: store, or a file
+string text                      # all of this in one line
+float64 probability_changed      # from the check that is going on; not a number: none yet
+float64 seconds_used             # data in it
+uint64 checks                    # answers so far
+vical_msgs/Change[] changes      # of the last answer, where it is `changed`
+string[] missing_motion          # what would help the check that is going on
+float64 image_rate_hz            # what the detector is asked for now; 0: nothing
+""",
     "vical_msgs/msg/CalibrationEstimate": """\
 # The complete estimate of one camera at one moment
 std_msgs/Header header           # stamp: newest data used; frame_id: camera

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -453,3 +454,42 @@ def test_imu_that_is_not_finite_is_refused():
         m.encode_imu(0, "imu0", (1.0, 2.0), (0.0, 0.0, 0.0))
     with pytest.raises(m.MessageError):
         m.encode_imu(2**80, "imu0", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
+
+
+def test_verify_result_is_what_rosbags_writes(rng):
+    axis = rng.standard_normal(3).tolist()
+    change = m.Change("rotation", 3.5e-3, 2e-4, tuple(axis))
+    result = m.VerifyResult(
+        STAMP_NS, "cam0", m.CheckState.CHECKING, "changed", STAMP_NS - 5, "store", "gedreht: 0,2°",
+        None, 7.0, 3, (change, m.Change("timeshift", -1e-3, 1e-4)), ("turn about x",), 10.0,
+    )  # fmt: skip
+    answered = STAMP_NS - 5
+    expected = serialised(
+        ros(
+            m.VERIFY_TYPE,
+            header=header("cam0"),
+            state="checking",
+            verdict="changed",
+            answered=ros("builtin_interfaces/msg/Time", sec=answered // 10**9, nanosec=answered % 10**9),
+            against="store",
+            text="gedreht: 0,2°",
+            probability_changed=float("nan"),
+            seconds_used=7.0,
+            checks=3,
+            changes=[
+                ros("vical_msgs/msg/Change", block="rotation", value=3.5e-3, sigma=2e-4, axis=np.array(axis)),
+                ros("vical_msgs/msg/Change", block="timeshift", value=-1e-3, sigma=1e-4, axis=np.zeros(0)),
+            ],
+            missing_motion=["turn about x"],
+            image_rate_hz=10.0,
+        ),
+        m.VERIFY_TYPE,
+    )
+    encoded = m.encode_verification(result)
+    assert encoded == expected
+    assert m.decode_verification(encoded) == result
+    for wrong in (replace(result, verdict="maybe"), replace(result, answered_ns=2**63)):
+        with pytest.raises(m.MessageError):
+            m.encode_verification(wrong)
+    with pytest.raises(m.MessageError, match="does not exist"):
+        m.decode_verification(encoded.replace(b"checking", b"chocking"))

@@ -15,9 +15,9 @@ from vical_daemon.estimation.result import (
     PoseEstimate,
     Status,
 )
-from vical_daemon.offline.verify import Answer, CameraCheck, Verifier
 from vical_daemon.results.export import rig_from_estimate
 from vical_daemon.results.known import known_cameras
+from vical_daemon.results.verifier import Answer, CameraCheck, Verifier
 
 LENS = [458.0, 457.0, 367.0, 248.0]
 SIGMA = np.array([2e-4] * 3 + [2e-4] * 3 + [5e-5] + [0.2] * 4 + [1e-3] * 4)

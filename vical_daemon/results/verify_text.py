@@ -17,7 +17,7 @@ def describe(document: dict[str, Any], against: str) -> str:
         lines += ["", f"{name}: {camera['verdict']}, after {camera['seconds_used']:.0f} s of data"]
         if camera["reason"]:
             lines.append(f"  {camera['reason']}")
-        lines += [f"  {_change(change)}" for change in camera["changes"]]
+        lines += [f"  {change_text(change)}" for change in camera["changes"]]
         lines += [f"  {_block(block, row)}" for block, row in camera["blocks"].items()]
         lines += [f"  note: {note}" for note in camera["assumed"]]
     if document["missing_motion"]:
@@ -36,7 +36,8 @@ def _headline(document: dict[str, Any], against: str) -> str:
     return f"cannot tell whether {against} holds{chance}"
 
 
-def _change(change: dict[str, Any]) -> str:
+def change_text(change: dict[str, Any]) -> str:
+    """Say what has changed, by how much, and along which way."""
     scale, unit = _SCALE[change["unit"]]
     value, sigma = scale * change["value"], scale * change["sigma"]
     axis = change.get("axis")

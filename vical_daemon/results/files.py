@@ -1,0 +1,91 @@
+"""Reads a calibration from a file: a result of ours, a file of the store, Kalibr's or OpenVINS's camchain."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from vical_drivers.user_files import read_text
+
+from vical_daemon.config.priors import read_initial
+from vical_daemon.config.strict_yaml import ConfigError
+from vical_daemon.results.export import ExportError, Rig, rig_from_json
+from vical_daemon.results.export.kalibr import read_camchain
+from vical_daemon.results.known import KnownCamera, known_cameras, known_prior
+
+_RESULT_LIMIT = 2**25  # bytes; a result takes 0.5 kB for each second of recording: 18 hours
+
+
+def read_rig(path: Path) -> Rig:
+    """Read the rig that a file describes.
+
+    Raises:
+        ExportError: There is none in it; one line.
+    """
+    if not path.exists():
+        raise ExportError(f"{path}: no such file")
+    if path.suffix in (".yaml", ".yml"):
+        return read_camchain(path)
+    document = _read_json(path)
+    note = f"vical, from {path.name}"
+    if isinstance(document.get("estimate"), dict):  # a file of the store
+        devices = {
+            "imu": document.get("imu_serial"),
+            f"camera/{document.get('camera')}": document.get("camera_serial"),
+        }
+        return rig_from_json(document["estimate"] | {"devices": devices}, note=note)
+    return rig_from_json(document, note=note)
+
+
+def read_known_file(path: Path) -> tuple[dict[str, KnownCamera], Rig | None]:
+    """Read what a file claims about each camera; a Kalibr file may lack the lens (then there is no rig).
+
+    Raises:
+        ExportError: No calibration in it; one line.
+    """
+    try:
+        rig = read_rig(path)
+        return known_cameras(rig, path.name), rig
+    except ExportError as error:
+        known = known_without_lens(path)
+        if known is None:
+            raise error from None
+        return known, None
+
+
+def known_without_lens(path: Path) -> dict[str, KnownCamera] | None:
+    """Read a Kalibr file that may lack the lens; None if it is none.
+
+    Raises:
+        ExportError: It is one, without a mounting.
+    """
+    if path.suffix not in (".yaml", ".yml"):
+        return None
+    try:
+        priors = read_initial(path).cameras
+    except ConfigError:
+        return None
+    found = {name: known_prior(name, prior, path.name) for name, prior in priors.items()}
+    known = {name: camera for name, camera in found.items() if camera is not None}
+    if not known:
+        raise ExportError(f"{path}: no camera with T_cam_imu in it")
+    return known
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Read a result; of a file with several lines (`vical demo --json`) the last one counts."""
+    try:
+        text = read_text(path, _RESULT_LIMIT)
+        document = json.loads(text)
+    except json.JSONDecodeError as error:
+        lines = [line for line in text.splitlines() if line.strip()]
+        try:
+            document = json.loads(lines[-1]) if lines else None
+        except json.JSONDecodeError:
+            raise ExportError(f"{path}: not JSON: {error}") from None
+    except (UnicodeDecodeError, RecursionError):
+        raise ExportError(f"{path}: not JSON; give the result of `vical calibrate -o`") from None
+    if not isinstance(document, dict):
+        raise ExportError(f"{path}: not a result of `vical calibrate --json`")
+    return document
