@@ -91,13 +91,10 @@ def calibrate(
         words = _commands(commands)
         if "accept" in words and persistence.accept(role.latest):
             publish(bus, persistence.stored_messages())
-        if "discard" in words:
+        if words & {"discard", "reset"}:
+            _log.info("calibrating anew by command")
             checkpoint.forget()
-            priors = persistence.discard()
-            role.reset(make_estimator(config, priors), make_watch(config))
-        if "reset" in words:
-            _log.info("calibration reset by command")
-            checkpoint.forget()
+            priors = persistence.discard() if "discard" in words else priors
             role.reset(make_estimator(config, priors), make_watch(config))
         if persistence.replaced:
             checkpoint.forget()
