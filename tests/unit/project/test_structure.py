@@ -1,6 +1,7 @@
 """The limits of CONTRIBUTING.md: lengths of files and functions, a root of three modules, no cycle."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -10,16 +11,21 @@ from benchmarks.structure import Sources, cycles, functions, import_edges, inlin
 ROOT = Path(__file__).parents[3]
 
 
+@cache
+def sources_of(folder):
+    return Sources(ROOT / folder)
+
+
 @pytest.mark.parametrize("folder", ["vical_daemon", "drivers", "mocks"])
 def test_no_file_exceeds_500_lines_and_no_function_60(folder):
-    sources = Sources(ROOT / folder)
+    sources = sources_of(folder)
     assert len(sources.trees) > 40
     assert {str(path): n for path, n in sources.lines.items() if n > 500} == {}
     assert {name: n for n, name in functions(sources) if n > 60} == {}
 
 
 def test_the_root_has_three_modules_and_the_parts_no_cycle():
-    sources = Sources(ROOT / "vical_daemon")
+    sources = sources_of("vical_daemon")
     assert sorted(p.name for p in sources.root.glob("*.py")) == ["__init__.py", "__main__.py", "client.py"]
     edges = import_edges(sources)
     assert ("calibrate", "estimation") in edges
