@@ -40,9 +40,10 @@ def _halves() -> tuple[list[Any], Any]:
 
 
 def euroc(mode: str) -> runner.Result:
-    """Disagreement of the halves of the real recording; `mode`: fixed, free, or tracks (no board)."""
+    """Disagreement of the halves of the real recording; `mode`: lens fixed, free, or tracks: free, and
+    no board."""
     halves, points = _halves()
-    fix = frozenset() if mode == "free" else frozenset({"intrinsics"})
+    fix = frozenset({"intrinsics"}) if mode == "fixed" else frozenset[str]()
     options = CalibrationOptions(fix=fix, imu_noise=euroc_halves.NOISE, target_free=mode == "tracks")
     if mode == "tracks":
         a, b = (_tracks(h, options) for h in halves)

@@ -19,7 +19,7 @@ import numpy as np
 
 from vical_daemon.estimation import calibrator, target_free
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.filter import calibration_filter, image_intake, image_update
+from vical_daemon.estimation.filter import image_intake, image_update
 from vical_daemon.estimation.filter import snapshot as board_snapshot
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import ImageIntake
@@ -40,7 +40,7 @@ from vical_daemon.estimation.smoother.carry import DRIFT
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.judge import TargetFreeStatus
-from vical_daemon.estimation.status import change_watch, status_evaluator
+from vical_daemon.estimation.status import change_watch
 from vical_daemon.estimation.status.drift_watch import DriftWatch
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
@@ -49,6 +49,10 @@ from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 SMALL, WRONG, MOVED = "sigmas too small", "rig or data wrong", "the delay moved"
 _NEVER = 10**9
+_STEPS = ("nothing", "5 ms", "20 ms", "0.5 deg", "2 deg", "10 mm", "2 deg, 10 mm, 5 ms")
+_DRIFTS = "clock drifts by 100 ppm from then on"
+_JUNK = ("nothing", "30 % junk corners for 3 s", "all corners junk for 1 s", "2 deg")
+_KEPT = ("2 deg", "2 deg, 10 mm, 5 ms", "bump in a gap of 5 s")
 _HARDLY = 1e-4  # of a prior sigma: the state exists and stays where it is
 
 
@@ -78,6 +82,7 @@ class Mechanism:
         changes: Makes the patch.
         free: It belongs to calibration without a target.
         faults: Cases of `ablation_data.FAULTS` that it was made for.
+        disturbances: Of `ablation_disturbances.DISTURBANCES`, those that concern it.
     """
 
     family: str
@@ -85,6 +90,7 @@ class Mechanism:
     changes: Callable[[], Sequence[tuple[Any, ...]]]
     free: bool = False
     faults: tuple[str, ...] = ()
+    disturbances: tuple[str, ...] = ()
 
 
 @contextmanager
@@ -206,7 +212,11 @@ def _agreed() -> list[tuple[Any, ...]]:
 def _compared() -> list[tuple[Any, ...]]:
     weighed = TargetFreeDoubts.weighed
     return [
-        (TargetFreeDoubts, "weighed", lambda self, carry, factor, _compared: weighed(self, carry, factor, True))
+        (
+            TargetFreeDoubts,
+            "weighed",
+            lambda self, carry, factor, _compared: weighed(self, carry, factor, True),
+        )
     ]
 
 
@@ -221,13 +231,18 @@ def _both_blocks(*_args: Any) -> tuple[int, ...]:
 BOARD: dict[str, Mechanism] = {
     # ------------------------------------------------------------------ the delay moved
     "clock drift": Mechanism(
-        MOVED, "a state for the drift of the time shift", _no_drift, faults=("skew 100 ppm", "drift 20 ppm")
+        MOVED,
+        "a state for the drift of the time shift",
+        _no_drift,
+        faults=("skew 100 ppm", "drift 20 ppm"),
+        disturbances=("nothing", _DRIFTS, "5 ms"),
     ),
     "clock drift: mixture": Mechanism(
         MOVED,
         "no drift and drift as two hypotheses; without: always a drift",
         _always_drift,
         faults=("skew 100 ppm", "drift 20 ppm"),
+        disturbances=("nothing", _DRIFTS),
     ),
     "clock drift: driver's sigma": Mechanism(
         MOVED,
@@ -239,21 +254,25 @@ BOARD: dict[str, Mechanism] = {
         "a delay that was constant begins to move",
         lambda: [(DriftWatch, "drifts", _is(False))],
         faults=("drift 20 ppm",),
+        disturbances=("nothing", _DRIFTS, "5 ms", "imu stamps +3 ms"),
     ),
     "step of the delay found": Mechanism(
         MOVED,
         "images that do not fit are tried with another delay, all else kept",
         lambda: [(Calibrator, "_shift_stepped", _is(False))],
+        disturbances=("5 ms", "20 ms", "camera clock +0.5 s", "imu clock +0.5 s", "2 deg, 10 mm, 5 ms"),
     ),
     "camera clock set": Mechanism(
         MOVED,
         "the order of arrival shows steps of seconds",
         lambda: [(ImageIntake, "_in_step", _is(True))],
+        disturbances=("camera clock +0.5 s", "camera clock +1 h", "imu clock -1 h"),
     ),
     "imu stamps remapped": Mechanism(
         MOVED,
         "steps of even imu stamps are taken off (StampSteps)",
         lambda: [(StampSteps, "even", lambda _self, t_s: t_s)],
+        disturbances=("imu stamps +3 ms",),
     ),
     # ------------------------------------------------------------------ rig or data wrong
     "gate of corners": Mechanism(
@@ -261,61 +280,75 @@ BOARD: dict[str, Mechanism] = {
         "corners far from where they are expected",
         lambda: [(image_update, "_CORNER_GATE", np.inf)],
         faults=("5 % outliers, 30 % half-hidden",),
+        disturbances=_JUNK,
     ),
     "gate of residuals": Mechanism(
         WRONG,
         "corners that do not fit after the correction",
         lambda: [(image_update, "_RESIDUAL_GATE", np.inf)],
         faults=("5 % outliers, 30 % half-hidden",),
+        disturbances=_JUNK,
     ),
     "gate of images": Mechanism(
         WRONG,
         "whole images far from where they are expected",
         lambda: [(CalibrationFilter, "_surprising", _is(False))],
+        disturbances=(*_STEPS, *_JUNK[1:3]),
     ),
     "gate of images: level": Mechanism(
         WRONG,
         "the limit of that gate follows the usual level (nis_level)",
         lambda: [(CalibrationFilter, "nis_level", _held_at(1.0))],
+        disturbances=(*_STEPS, *_JUNK[1:3]),
     ),
     "refused images counted": Mechanism(
         WRONG,
         "ten refused in a row: pose anew, then calibration anew",
         lambda: [(change_watch, "_REFUSED_POSE", _NEVER), (change_watch, "_REFUSED_CHANGED", _NEVER)],
+        disturbances=(*_STEPS, "bump in a gap of 5 s"),
     ),
     "CUSUM of innovations": Mechanism(
         WRONG,
         "innovations that are larger than usual for some images",
         lambda: [(Consistency, "alarmed", property(_is(False)))],
+        disturbances=_STEPS,
     ),
     "filter of before a change": Mechanism(
         WRONG,
         "what is kept over a change is the filter of 3 s ago",
         lambda: [(RecentPast, "filter", _same_filter)],
+        disturbances=(*_KEPT, "20 ms"),
     ),
     "kept over a change": Mechanism(
         WRONG,
         "lens, imu, target and noise stay known when the mounting has changed",
         lambda: [_first(Calibrator, "_restart", _put(_kept_until_s=np.inf))],
+        disturbances=_KEPT,
     ),
     "kept, until proven": Mechanism(
         WRONG,
         "what was kept is given up if images contradict it within 10 s",
         lambda: [(calibrator, "_PROVEN_S", 0.0)],
+        disturbances=_KEPT,
     ),
     "plausible state": Mechanism(
-        WRONG, "a state no rig can have: start anew", lambda: [(CalibrationFilter, "plausible", _is(True))]
+        WRONG,
+        "a state no rig can have: start anew",
+        lambda: [(CalibrationFilter, "plausible", _is(True))],
+        disturbances=_STEPS,
     ),
     "status: refused or large innovations": Mechanism(
         WRONG,
         "inconsistent while a third is refused, or innovations four times too large",
         lambda: [(StatusEvaluator, "_trouble", _is(""))],
+        disturbances=(*_JUNK, "gyro clips"),
     ),
     "held-back check": Mechanism(
         WRONG,
         "a copy of the filter predicts an image by the imu alone",
         lambda: [(Calibrator, "_ask_held_back", _is(None)), (StatusEvaluator, "_held_back_fine", _is(True))],
         faults=("imu noise told 10 times too small",),
+        disturbances=("nothing", "2 deg"),
     ),
     "steady status": Mechanism(
         WRONG,
@@ -324,22 +357,38 @@ BOARD: dict[str, Mechanism] = {
             (SteadyStatus, "follow", _unsteady),
             (SteadyStatus, "counted", lambda _self, weak: weak),
         ],
+        disturbances=("nothing", "30 % junk corners for 3 s"),
     ),
     "status: what may be off": Mechanism(
         WRONG,
         "not converged while data speak for a drift, an imu or a target that is off",
         lambda: [(Calibrator, "_in_doubt", _is(""))],
         faults=("imu 0.3 % off", "crooked board", "drift 20 ppm"),
+        disturbances=("nothing", _DRIFTS),
     ),
     "imu clipped": Mechanism(
-        WRONG, "readings at the end of the range", lambda: [(RangeLimits, "clipped", _is(False))]
+        WRONG,
+        "readings at the end of the range",
+        lambda: [(RangeLimits, "clipped", _is(False))],
+        disturbances=("gyro clips",),
     ),
-    "imu spikes": Mechanism(WRONG, "single readings that are wrong", lambda: [(SpikeFilter, "sift", _sift)]),
+    "imu spikes": Mechanism(
+        WRONG,
+        "single readings that are wrong",
+        lambda: [(SpikeFilter, "sift", _sift)],
+        disturbances=("spikes of the gyro",),
+    ),
     "imu repeated": Mechanism(
-        WRONG, "a device that hangs repeats its reading", lambda: [(ImuIntake, "_last", _held_at(()), True)]
+        WRONG,
+        "a device that hangs repeats its reading",
+        lambda: [(ImuIntake, "_last", _held_at(()), True)],
+        disturbances=("imu frozen for 1 s",),
     ),
     "images repeated": Mechanism(
-        WRONG, "a camera that hangs repeats its image", lambda: [(image_intake, "_same", _is(False))]
+        WRONG,
+        "a camera that hangs repeats its image",
+        lambda: [(image_intake, "_same", _is(False))],
+        disturbances=("camera frozen for 3 s",),
     ),
     # ------------------------------------------------------------------ sigmas too small
     "corner noise measured": Mechanism(
@@ -357,7 +406,7 @@ BOARD: dict[str, Mechanism] = {
         SMALL,
         "innovations that last for images: variances times the long-run ratio",
         lambda: [_then(Consistency, "_remember", _put(factor=1.0))],
-        faults=("lens model misses", "crooked board, shape held"),
+        faults=("lens model misses",),
     ),
     "lens agreement": Mechanism(
         SMALL,
@@ -459,24 +508,28 @@ FREE: dict[str, Mechanism] = {
         lambda: [_then(TargetFreeCalibrator, "__init__", _no_free_drift)],
         free=True,
         faults=("free: skew 100 ppm",),
+        disturbances=("nothing", _DRIFTS),
     ),
     "free: walk of the delay": Mechanism(
         MOVED,
         "the time shift may wander from window to window",
         lambda: [(handover, "_SHIFT_WALK", 0.0)],
         free=True,
+        disturbances=("nothing", _DRIFTS),
     ),
     "free: lasting jitter": Mechanism(
         MOVED,
         "late stamps that follow each other: the clock stepped",
         lambda: [(StampOffsets, "lasts", _is(False))],
         free=True,
+        disturbances=("5 ms", "20 ms", "camera clock +0.5 s"),
     ),
     "free: what has changed": Mechanism(
         MOVED,
         "mounting and clock tested apart; without: both are new",
         lambda: [(target_free, "changed_blocks", _both_blocks)],
         free=True,
+        disturbances=("5 ms", "20 ms", "2 deg"),
     ),
     "free: windows fit": Mechanism(
         WRONG,
@@ -488,24 +541,31 @@ FREE: dict[str, Mechanism] = {
         ],
         free=True,
         faults=("free: 3 % outliers",),
+        disturbances=("20 ms", "2 deg", "30 % junk corners for 3 s"),
     ),
     "free: windows fit, links": Mechanism(
         WRONG, "only the links", lambda: [(judge, "_MOST_INERTIAL", np.inf)], free=True
     ),
     "free: windows agree": Mechanism(
-        WRONG, "a window that contradicts what is known is given up", _agreed, free=True
+        WRONG,
+        "a window that contradicts what is known is given up",
+        _agreed,
+        free=True,
+        disturbances=("5 ms", "0.5 deg", "10 mm"),
     ),
     "free: small changes": Mechanism(
         WRONG,
         "where the model fits poorly, a small contradiction is no change",
         lambda: [(judge, "_matters", _is(True))],
         free=True,
+        disturbances=("nothing", "5 ms"),
     ),
     "free: tolerant at first": Mechanism(
         WRONG,
         "fifty times the limit in the first four windows",
         lambda: [(judge, "_LEARNING", 0)],
         free=True,
+        disturbances=("nothing",),
     ),
     "free: outliers refused": Mechanism(
         WRONG,

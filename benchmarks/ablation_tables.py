@@ -34,7 +34,11 @@ def print_tables(rows: list[dict[str, Any]], nothing: str) -> None:
 
 
 def _euroc(mechanisms: dict[str, Rows], nothing: str) -> None:
-    print("| without | " + " | ".join(f"{m}: mm, us, largest z (lens z)" for m in ("fixed", "free", "tracks")) + " |")
+    print(
+        "| without | "
+        + " | ".join(f"{m}: mm, us, largest z (lens z)" for m in ("fixed", "free", "tracks"))
+        + " |"
+    )
     print("|---|---|---|---|")
     for name in [nothing, *(m for m in mechanisms if m != nothing)]:
         cells = []
