@@ -146,7 +146,7 @@ def write(
 ) -> None:
     """Print the result and write it where it was asked for; `more`: text that goes before, for people."""
     text = json.dumps(finite(result), allow_nan=False)
-    if args.output:
+    if args.output and result["cameras"]:  # a failure must not replace an earlier result
         Path(args.output).write_text(text + "\n", encoding="utf-8")
     if args.json:
         print(text)
@@ -171,9 +171,9 @@ def conclude(
         from vical_daemon.offline.input_diagnosis import diagnose_input
 
         mistake = diagnose_input(job)
-        if mistake:
-            raise CliError(f"no calibration: {mistake}")
-        raise CliError(f"no calibration: {status}: {why or 'too little data'} ({suspects(job)})")
+        why = mistake or f"{status}: {why or 'too little data'} ({suspects(job)})"
+        unwritten = "" if result["cameras"] or not args.output else f"; {args.output} was not written"
+        raise CliError(f"no calibration: {why}{unwritten}")
     if status == "converged":
         return 0
     warn(f"{status}: {why}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import grp
 import json
 import os
 import platform
@@ -11,6 +10,8 @@ import resource
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+from vical_drivers.access import how_to_open
 
 from vical_daemon.cli.check import Finding, document, print_line
 from vical_daemon.cli.errors import CliError
@@ -105,11 +106,7 @@ def _devices(folder: Path, may_use: Callable[[Path], bool]) -> Iterator[Finding]
     for path in found:
         problem = ""
         if not may_use(path):
-            try:
-                group = grp.getgrgid(path.stat().st_gid).gr_name
-            except (KeyError, OSError):
-                group = "?"
-            problem = f"{path}: not yours to use: sudo usermod -aG {group} $USER, then log in again"
+            problem = f"{path}: not yours to use: {how_to_open(path)}"
         yield Finding("device", str(path), problem)
     if not found:
         yield Finding("device", "neither serial port nor camera is plugged in")

@@ -51,7 +51,7 @@ def direction_sigma(weak: WeakDirection) -> str:
         Block.ROTATION: f"{math.degrees(weak.sigma):.2f} deg",
         Block.TIMESHIFT: f"{1e3 * weak.sigma:.2f} ms",
     }[weak.block]
-    return f"{direction_name(weak)}: +-{figure}"
+    return f"{direction_name(weak)}: ±{figure}"
 
 
 def direction_warning(weak: WeakDirection) -> str:
@@ -262,13 +262,13 @@ def _of(event: Event, factor: float, unit: str, form: str) -> str:
     value = format(factor * (math.nan if event.value is None else event.value), form)
     if event.sigma is None:
         return f"{value} {unit}"
-    return f"{value} +- {format(factor * event.sigma, form.replace('+', ''))} {unit}"
+    return f"{value} ± {format(factor * event.sigma, form.replace('+', ''))} {unit}"
 
 
 def _size(event: Event, factor: float, unit: str, form: str) -> str:
     """The same without the sign."""
     value = format(factor * abs(math.nan if event.value is None else event.value), form)
-    return f"{value} {unit}" if event.sigma is None else f"{value} +- {factor * event.sigma:{form}} {unit}"
+    return f"{value} {unit}" if event.sigma is None else f"{value} ± {factor * event.sigma:{form}} {unit}"
 
 
 def _target_size(event: Event) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import grp
 import logging
 import os
 import select
@@ -21,6 +20,7 @@ from typing import Protocol
 
 import serial
 
+from vical_drivers.access import how_to_open
 from vical_drivers.errors import (
     DeviceBusyError,
     DeviceLostError,
@@ -239,11 +239,7 @@ def _explain(path: str, error: Exception) -> DriverError:
     code = getattr(error, "errno", None)
     text = str(error)
     if code in (errno.EACCES, errno.EPERM):
-        group = _group_of(path)
-        return DevicePermissionError(
-            f"{path}: permission denied; add yourself to group {group}: sudo usermod -aG {group} $USER, "
-            "then log in again"
-        )
+        return DevicePermissionError(f"{path}: permission denied; {how_to_open(path, 'dialout')}")
     if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
         return DeviceBusyError(f"{path}: another process has it open; find it with: fuser -v {path}")
     if code == errno.ENOENT or not Path(path).exists():
@@ -253,13 +249,6 @@ def _explain(path: str, error: Exception) -> DriverError:
     if isinstance(error, ValueError):
         return DeviceNotFoundError(f"{path}: the port does not take these settings ({error})")
     return DeviceNotFoundError(f"{path}: this is no serial port; `vical devices` lists those that exist")
-
-
-def _group_of(path: str) -> str:
-    try:
-        return grp.getgrgid(Path(path).stat().st_gid).gr_name
-    except (OSError, KeyError):
-        return "dialout"
 
 
 class ArrivalLog:

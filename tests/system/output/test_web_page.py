@@ -287,7 +287,7 @@ def test_what_stands_above_the_fold(served, web_feed, browser, tmp_path, scene):
     """In windows of two widths, light and dark: one browser opens the page in each."""
     keep, bus, rng = shots() or tmp_path, served.bus, np.random.default_rng(0)
     status = Status.CONVERGED if scene in ("converged", "edges") else Status.CONVERGING
-    reason = "lever arm along the optical axis: +-12.0 mm" if status is Status.CONVERGING else ""
+    reason = "lever arm along the optical axis: ±12.0 mm" if status is Status.CONVERGING else ""
     event = Event(EventKind.STAMP_JITTER, "cam0", 1.2e-3, t_s=12.0)
     for k in range(1, 150):
         events = [event] if k == 60 else []

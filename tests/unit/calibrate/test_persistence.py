@@ -161,8 +161,8 @@ def test_a_changed_mounting_is_announced_once(config: Config) -> None:
     persistence.priors()
     first = persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03), turn_deg=1.0)))
     assert [event_text(e) for e in first.events] == [
-        "changed: cam0: moved by 10.0 +- 0.1 mm since the stored calibration",
-        "changed: cam0: turned by 1.00 +- 0.01 deg since the stored calibration",
+        "changed: cam0: moved by 10.0 ± 0.1 mm since the stored calibration",
+        "changed: cam0: turned by 1.00 ± 0.01 deg since the stored calibration",
     ]
     assert persistence.watch(_estimate(_camera(p_m=(0.09, 0.02, -0.03)))).events == []
 

@@ -250,6 +250,14 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
     assert words in err.splitlines()[-1] and err.splitlines()[-1].startswith("vical: error: ")
 
 
+def test_a_failure_keeps_an_earlier_result(copy: Path, capsys) -> None:
+    earlier = copy / "result.json"
+    earlier.write_text("of yesterday", encoding="utf-8")
+    assert main([*_spoil_target_size(copy), "-o", str(earlier)]) == 1
+    assert f"{earlier} was not written" in capsys.readouterr().err.splitlines()[-1]
+    assert earlier.read_text(encoding="utf-8") == "of yesterday"
+
+
 def test_a_slipped_decimal_point_is_reported_and_the_answer_is_right(copy: Path, capsys) -> None:
     plain = _calibrate(copy, capsys)["cameras"]["cam0"]["T_imu_cam"]
     assert main([*_with_tag_size(copy, 0.88), "--json", "--accept", "converging"]) == 0

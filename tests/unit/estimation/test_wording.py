@@ -29,7 +29,7 @@ def test_every_kind_is_explained_and_has_one_line(kind):
         event = Event(kind, "cam0", value, sigma, said="text")
         line = event_text(event)
         assert "cam0: " in line and "\n" not in line
-        assert (value is None or sigma is None or not about.unit) or "+- " in line
+        assert (value is None or sigma is None or not about.unit) or "± " in line
         assert ("nan" in line) <= bool(about.unit and value is None), line
         assert json.loads(json.dumps(event_document(event)))["text"] == line
 
@@ -53,7 +53,7 @@ def test_every_cause_has_a_text(cause):
         (
             Event(EventKind.CLOCK_DRIFT, "cam0", -5e-5, 1e-6),
             "cam0: the time shift drifts: the clocks of camera and imu run at different rates, "
-            "by -50.0 +- 1.0 us a second; it is now estimated too",
+            "by -50.0 ± 1.0 us a second; it is now estimated too",
         ),
         (
             Event(EventKind.TARGET_SIZE, value=-0.03),
@@ -93,9 +93,9 @@ def test_every_guidance_has_a_text_without_numbers_that_are_not_known(verb, lack
 @pytest.mark.parametrize(
     ("block", "sigma", "said"),
     [
-        (Block.LEVER_ARM, 0.0123, "lever arm along the optical axis: +-12.3 mm"),
-        (Block.ROTATION, math.radians(0.5), "rotation about the optical axis: +-0.50 deg"),
-        (Block.TIMESHIFT, 1.5e-3, "time shift: +-1.50 ms"),
+        (Block.LEVER_ARM, 0.0123, "lever arm along the optical axis: ±12.3 mm"),
+        (Block.ROTATION, math.radians(0.5), "rotation about the optical axis: ±0.50 deg"),
+        (Block.TIMESHIFT, 1.5e-3, "time shift: ±1.50 ms"),
     ],
 )
 def test_a_weak_direction_is_named_with_its_figure_and_its_cure(block, sigma, said):

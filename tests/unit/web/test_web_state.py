@@ -203,7 +203,7 @@ def test_the_picture_shows_what_the_guidance_asks_for(bus, state, web_feed, aske
 
 
 def test_every_status_has_a_short_headline_and_the_reason_below_it(bus, state, web_feed):
-    reason = "the motion does not show: lever arm along the optical axis: +-300.0 mm"
+    reason = "the motion does not show: lever arm along the optical axis: ±300.0 mm"
     for status in Status:
         estimate = web_feed.estimate(1.0, np.random.default_rng(0), status, reason=reason)
         web_feed.publish_estimate(bus, estimate)

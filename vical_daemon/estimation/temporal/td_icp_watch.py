@@ -62,8 +62,8 @@ class DelayVerdict:
             return ""
         own, sigma = 1e3 * self.report.timeshift_s, 1e3 * self.report.timeshift_sigma_s
         return (
-            f"rotations alone give a time shift of {own:+.2f} +- {sigma:.2f} ms, the filter "
-            f"{1e3 * self.filter_s:+.2f} +- {1e3 * self.filter_sigma_s:.2f} ms, in {self.against} windows: "
+            f"rotations alone give a time shift of {own:+.2f} ± {sigma:.2f} ms, the filter "
+            f"{1e3 * self.filter_s:+.2f} ± {1e3 * self.filter_sigma_s:.2f} ms, in {self.against} windows: "
             "do the stamps of camera and imu drift or jump?"
         )
 

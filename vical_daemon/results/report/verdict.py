@@ -66,7 +66,8 @@ def verdict(result: Mapping[str, Any]) -> Verdict:
         (f"{name}: " if several else "") + main_cause(camera, lens_held=name in held)
         for name, camera in cameras.items()
     ]
-    return Verdict(word, known, warnings + causes)
+    begun = [line if line.split(":")[0] in cameras else line[:1].upper() + line[1:] for line in warnings]
+    return Verdict(word, known, begun + causes)
 
 
 def _known(camera: Mapping[str, Any]) -> str:

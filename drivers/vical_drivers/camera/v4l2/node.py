@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import grp
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from vical_drivers.access import how_to_open
 from vical_drivers.camera.v4l2 import abi
 from vical_drivers.camera.v4l2.kernel import Kernel, Mapping
 from vical_drivers.errors import (
@@ -79,10 +79,7 @@ def translate(error: OSError, path: str, doing: str) -> DriverError:
     """Return the driver error for a failed system call: what, where, what to try."""
     code = error.errno
     if code in (errno.EACCES, errno.EPERM):
-        return DevicePermissionError(
-            f"{path}: no permission to {doing}; the device belongs to group {_group_of(path)!r}: "
-            f"sudo usermod -aG {_group_of(path)} $USER, then log in again"
-        )
+        return DevicePermissionError(f"{path}: no permission to {doing}; {how_to_open(path, 'video')}")
     if code == errno.ENOENT:
         return DeviceNotFoundError(f"{path}: no such device; `vical camera list` shows what is there")
     if code == errno.EBUSY:
@@ -100,13 +97,6 @@ def translate(error: OSError, path: str, doing: str) -> DriverError:
     if code == errno.ENOSPC:
         return DeviceRefusedError(f"{path}: not enough USB bandwidth to {doing}; use MJPG or another port")
     return DeviceRefusedError(f"{path}: cannot {doing}: {os.strerror(code or 0)}")
-
-
-def _group_of(path: str) -> str:
-    try:
-        return grp.getgrgid(Path(path).stat().st_gid).gr_name
-    except (OSError, KeyError):
-        return "video"
 
 
 def _holders(path: str) -> str:

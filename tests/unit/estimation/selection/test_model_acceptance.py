@@ -31,7 +31,7 @@ def test_an_imu_announced_gives_the_answer_of_a_wide_prior():
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(imu_entries(f.state), x[entries], atol=1e-8)
     value, sigma = surest(x, P, entries)
-    assert f"scale or alignment of the imu is off, by {1e2 * value:.2f} +- {1e2 * sigma:.2f} %" in event_text(
+    assert f"scale or alignment of the imu is off, by {1e2 * value:.2f} ± {1e2 * sigma:.2f} %" in event_text(
         told[IMU]
     )
 
@@ -45,7 +45,7 @@ def test_a_target_announced_is_left_as_it_was_found(factor):
     assert off(f, TARGET) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-9, atol=1e-15)
     value, sigma = surest(x, P, dense.where[TARGET])
-    assert f"by {1e3 * value:.2f} +- {1e3 * np.sqrt(factor) * sigma:.2f} mm at its edges" in event_text(
+    assert f"by {1e3 * value:.2f} ± {1e3 * np.sqrt(factor) * sigma:.2f} mm at its edges" in event_text(
         told[TARGET]
     )
     # what stretches had said of the lens was said with the target as stated
@@ -71,7 +71,7 @@ def test_a_lag_is_announced_once_it_is_measured_how_well_images_fit(lag, told):
     events = ModelAcceptance().look(f)
     assert list(events) == [LAG]
     value, sigma = surest(x, P, dense.where[LAG])
-    assert f"is {1e3 * value:.2f} +- {1e3 * sigma:.2f} ms {told} the gyro" in event_text(events[LAG])
+    assert f"is {1e3 * value:.2f} ± {1e3 * sigma:.2f} ms {told} the gyro" in event_text(events[LAG])
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-9, atol=1e-15)
     assert off(f, LAG) == pytest.approx(1.0, abs=1e-12)
 
@@ -88,6 +88,6 @@ def test_a_size_announced_gives_the_answer_of_a_wide_prior(size, told):
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-6, atol=1e-12)
     assert f.state.target_scale - 1.0 == pytest.approx(x[where][0], abs=1e-8)
     value, sigma = surest(x, P, where)
-    assert f"the target is {1e2 * value:.2f} +- {1e2 * sigma:.2f} % {told} than stated" in event_text(
+    assert f"the target is {1e2 * value:.2f} ± {1e2 * sigma:.2f} % {told} than stated" in event_text(
         events[SIZE]
     )

@@ -275,7 +275,7 @@ def test_guidance_of_a_running_calibration_is_worst_first_and_speaks_of_the_moti
         "lever arm along the optical axis",
         "rotation about the image's x axis",
     ]
-    assert found[0].excess == pytest.approx(10.0) and direction_sigma(found[0]).endswith("+-50.0 mm")
+    assert found[0].excess == pytest.approx(10.0) and direction_sigma(found[0]).endswith("±50.0 mm")
     assert (
         guidance_text(found[0].guidance)
         == "so far it turned about the optical axis only; rotate about another axis"

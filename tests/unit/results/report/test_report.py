@@ -260,7 +260,7 @@ def test_the_verdict_says_how_well_and_what_helps(result):
         {"kind": "fixed_lens", "camera": "cam0", "t_s": 9.0, "text": "the fixed lens is off: free it"},
     ]
     said = verdict(result)
-    assert (said.word, said.advice[0]) == ("Converged, with reservations.", "the fixed lens is off: free it")
+    assert (said.word, said.advice[0]) == ("Converged, with reservations.", "The fixed lens is off: free it")
     assert "comes from the lens: leave it free" in said.advice[-1]
     assert not any("without images" in line for line in said.advice)
     for status, word in (
