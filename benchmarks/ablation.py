@@ -1,12 +1,12 @@
-"""Which mechanisms of the estimation earn their place: each is taken away in turn, on real and simulated data.
+"""Which mechanisms of the estimation earn their place: each is taken away in turn.
 
     python -m benchmarks ablation                              all data, all mechanisms (hours)
     python -m benchmarks ablation --data euroc,rigs            some data
     python -m benchmarks ablation --only "noise scale"         some mechanisms (may be repeated)
     python -m benchmarks ablation --table                      the tables of what has been run
 
-Nothing in the product knows of it: `ablation_mechanisms` patches the estimation while the study runs. It can be
-interrupted; what has been run is in the folder --out.
+Nothing in the product knows of it: `ablation_patches` changes the estimation while the study runs. It can
+be interrupted; what has been run is in the folder --out.
 """
 
 from __future__ import annotations
@@ -23,11 +23,14 @@ import numpy as np
 
 from benchmarks import ablation_data as data
 from benchmarks import runner
+from benchmarks.ablation_board import BOARD
 from benchmarks.ablation_disturbances import DISTURBANCES, disturbed
-from benchmarks.ablation_mechanisms import BOARD, FREE, MECHANISMS, without
+from benchmarks.ablation_free import FREE
+from benchmarks.ablation_patches import without
 from benchmarks.ablation_tables import print_tables
 
 NOTHING = "nothing (as it is)"
+MECHANISMS = BOARD | FREE
 Trial = tuple[str, str, int, "partial[runner.Result]"]
 """Data, case, seed, and what runs it."""
 _EUROC = {"fixed": 0, "free": 0, "tracks": 0}
@@ -82,7 +85,10 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--only", action="append", help="only this mechanism (may be repeated)")
     parser.add_argument("--table", action="store_true", help="run nothing")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/raw"))
+    parser.add_argument("--keep-old", action="store_true", help="accept stored results of other code")
     args = parser.parse_args(argv)
+    code = runner.fingerprint("vical_daemon/estimation", "mocks/vical_mocks")
+    accepted = None if args.keep_old else code
     unknown = (set(args.data.split(",")) - set(DATA)) | (set(args.only or ()) - set(MECHANISMS))
     if unknown:
         parser.error(f"not known: {', '.join(sorted(unknown))}; mechanisms: {', '.join(MECHANISMS)}")
@@ -91,14 +97,14 @@ def main(argv: list[str]) -> int:
         if "euroc" in args.data and not data.euroc_halves.FOLDER.is_dir():
             print(f"no recording at {data.euroc_halves.FOLDER}: leave euroc out with --data", file=sys.stderr)
             return 1
-        _run(store, args.data.split(","), [NOTHING, *(args.only or [*BOARD, *FREE])])
-    print_tables(_stored(store), NOTHING)
+        _run(store, args.data.split(","), [NOTHING, *(args.only or MECHANISMS)], code, accepted)
+    print_tables(_stored(store, accepted), NOTHING)
     return 0
 
 
-def _run(store: Path, wanted: list[str], names: list[str]) -> None:
+def _run(store: Path, wanted: list[str], names: list[str], code: str, accepted: str | None) -> None:
     store.parent.mkdir(parents=True, exist_ok=True)
-    done = {(r["mechanism"], r["data"], r["case"], r["seed"]) for r in _stored(store)}
+    done = {(r["mechanism"], r["data"], r["case"], r["seed"]) for r in _stored(store, accepted)}
     with store.open("a", encoding="utf-8") as file:
         for kind in wanted:
             for name in names:
@@ -107,7 +113,7 @@ def _run(store: Path, wanted: list[str], names: list[str]) -> None:
                     for which, case, seed, run in trials({kind}, name):
                         if (name, which, case, seed) in done:
                             continue
-                        row = {"mechanism": name, "data": which, "case": case, "seed": seed}
+                        row = {"mechanism": name, "data": which, "case": case, "seed": seed, "code": code}
                         try:
                             row["result"] = run()
                         except (np.linalg.LinAlgError, ValueError, AssertionError, OverflowError) as error:
@@ -117,7 +123,8 @@ def _run(store: Path, wanted: list[str], names: list[str]) -> None:
                 print(f"{kind}, without {name}: {time.process_time() - begin:.0f} s", file=sys.stderr)
 
 
-def _stored(store: Path) -> list[runner.Result]:
+def _stored(store: Path, code: str | None) -> list[runner.Result]:
+    """Results made by this code; None: by any."""
     if not store.exists():
         return []
     rows = []
@@ -126,4 +133,4 @@ def _stored(store: Path) -> list[runner.Result]:
             rows.append(json.loads(line))
         except json.JSONDecodeError:  # the last line of an interrupted run
             continue
-    return rows
+    return [row for row in rows if code in (None, row.get("code"))]

@@ -1,4 +1,4 @@
-"""What `benchmarks ablation` runs the estimation on: real halves, random rigs, rigs with one fault, disturbances.
+"""What `benchmarks ablation` runs the estimation on: real halves, random rigs, rigs with one fault.
 
 Every function takes a seed and gives what is needed to compare two versions of the estimation on it.
 """

@@ -1,6 +1,6 @@
 """Disturbances for `benchmarks ablation`: a rig or its data change while it is followed. Is the cause found?
 
-All disturbances of a seed are the same until `AT_S`: that part is followed once, and each goes on from a copy.
+All disturbances of a seed are the same until `AT_S`: that part is followed once, each goes on from a copy.
 """
 
 from __future__ import annotations
@@ -196,6 +196,7 @@ def _recording(
 @lru_cache(maxsize=4)
 def _before(ablated: str, target_free: bool, seed: int) -> bytes:
     """The calibrator just before `AT_S`, and what it had announced; one for each mechanism taken away."""
+    del ablated  # only part of the key
     run = _recording(None, False, target_free, seed)
     options = CalibrationOptions(target_free=target_free, imu_noise=imu_noise(run))
     prior = camera_prior(run, seed, StartErrors(), exact_lens=False)
