@@ -22,9 +22,9 @@ import numpy as np
 from vical_drivers.microstrain.device import MicrostrainImu, open_imu
 from vical_drivers.samples import ImuSample
 
-from vical_daemon import config as config_module
 from vical_daemon.acquire import imu as imu_role
 from vical_daemon.bus.interface import LocalBus, Sample
+from vical_daemon.config import model as config_module
 from vical_daemon.service.wall_clock import WallClock
 
 KEY = "vical/bench/imu/imu0"

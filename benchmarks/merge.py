@@ -25,7 +25,7 @@ from vical_mocks.rotations import exp_so3
 from benchmarks.recordings import SHIFT_S, another, compare
 from vical_daemon.config.priors import read_initial
 from vical_daemon.logs import open_recording
-from vical_daemon.offline.calibrate import Job, add_recordings, make_job
+from vical_daemon.offline.calibration_job import Job, add_recordings, make_job
 from vical_daemon.offline.merge import MergeOutcome, merge
 
 BUMP_RAD, BUMP_M = np.deg2rad(0.5), 5e-3

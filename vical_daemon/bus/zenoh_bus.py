@@ -87,23 +87,29 @@ def open_bus(
     if tcp_port:
         local.append(f"tcp/127.0.0.1:{tcp_port}")
     config: dict[str, Any] = base_config(router=mode == "router")
-    if mode == "router":
-        if socket:
-            free_socket(Path(socket))
-        config |= {"mode": "router", "listen": {"endpoints": [*local, *listen]}}
-        config["connect"] = {"endpoints": list(connect), "timeout_ms": -1, "exit_on_failure": False, **RETRY}
-    else:
-        endpoints = list(connect) or local[:1]
-        if not endpoints:
-            raise BusError("no router to connect to: give a socket or an endpoint like tcp/127.0.0.1:7447")
-        config |= {"mode": "client", "connect": {"endpoints": endpoints, "timeout_ms": 0, **RETRY}}
+    config |= {"mode": mode, **_endpoints(mode, local, listen, connect)}
     add_security(config, tls_ca, tls_certificate, tls_key, password_file, user, password)
     if mode == "client":
         return ZenohBus(open_session(config), is_router=False)
+    if socket:
+        free_socket(Path(socket))
     if tcp_port or listen or connect:
         config["access_control"] = access_rules(commanders, publishers)
     with closed_to_others():
         return ZenohBus(open_session(config), is_router=True)
+
+
+def _endpoints(
+    mode: str, local: Sequence[str], listen: Sequence[str], connect: Sequence[str]
+) -> dict[str, Any]:
+    """Where a router listens and what it connects to, or the router that a client connects to."""
+    if mode == "router":
+        routers = {"endpoints": list(connect), "timeout_ms": -1, "exit_on_failure": False, **RETRY}
+        return {"listen": {"endpoints": [*local, *listen]}, "connect": routers}
+    endpoints = list(connect) or local[:1]
+    if not endpoints:
+        raise BusError("no router to connect to: give a socket or an endpoint like tcp/127.0.0.1:7447")
+    return {"connect": {"endpoints": endpoints, "timeout_ms": 0, **RETRY}}
 
 
 class _KeyPublisher:

@@ -98,14 +98,14 @@ def _host(config: Config) -> ZenohBus:
 
 
 def _wait_for_router(config: Config, stop: threading.Event) -> ZenohBus | None:
-    path, begin_s, told = socket_path(config.bus), time.monotonic(), False
+    path, begin_s, reported = socket_path(config.bus), time.monotonic(), False
     while not stop.is_set():
         try:
             return open_bus(mode="client", socket=path, **_credentials(config.bus))
         except BusError as error:
-            if not told and time.monotonic() - begin_s > _QUIET_S:  # the host may start beside us
+            if not reported and time.monotonic() - begin_s > _QUIET_S:  # the host may start beside us
                 _log.info("waiting for the bus: %s", error)
-                told = True
+                reported = True
         notify.ready("waiting for the bus")  # or systemd takes a late router for our failure
         notify.watchdog()
         stop.wait(_RETRY_S)

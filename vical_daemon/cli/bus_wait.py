@@ -29,15 +29,15 @@ def wait_for_bus(
     Raises:
         BusError: Nobody came, or the bus cannot be used for another reason.
     """
-    told = False
+    reported = False
     while not stop.is_set():
         try:
             return bus_access.open_client(config_path, endpoint)
         except BusError as error:
             if _NOBODY not in str(error) or time.monotonic() >= end_s:
                 raise
-            if not told and not quiet:
+            if not reported and not quiet:
                 print(f"vical: waiting: {error}", file=sys.stderr)
-            told = True
+            reported = True
         stop.wait(min(_RETRY_S, max(0.0, end_s - time.monotonic())))
     return None

@@ -16,7 +16,8 @@ from vical_daemon.cli.options import add_json, add_sensors, add_stretch, suggest
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.result import CalibrationEstimate
-    from vical_daemon.offline.calibrate import Job, Outcome
+    from vical_daemon.offline.calibrate import Outcome
+    from vical_daemon.offline.calibration_job import Job
 
 FIX = ("intrinsics", "timeshift", "extrinsics")
 ESTIMATE = ("imu_intrinsics", "readout", "target_scale", "target_shape")
@@ -115,7 +116,7 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
     from vical_daemon.config.priors import Initial, read_initial
     from vical_daemon.logs import open_recording
-    from vical_daemon.offline import calibrate
+    from vical_daemon.offline.calibration_job import add_recordings, make_job
 
     initial = read_initial(args.initial) if args.initial else Initial()
     if args.target:
@@ -125,7 +126,7 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
     recordings = [open_recording(p, cameras=[args.camera] if args.camera else ()) for p in args.inputs]
     for warning in (text for recording in recordings for text in recording.warnings):
         warn(warning)
-    job = calibrate.make_job(
+    job = make_job(
         recordings[0],
         initial,
         target=args.target,
@@ -136,7 +137,7 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
         skip_s=args.skip,
         seconds=args.seconds,
     )
-    calibrate.add_recordings(job, recordings[1:], args.imu)
+    add_recordings(job, recordings[1:], args.imu)
     job.common_clock = args.clock == CLOCKS[0]
     return job, accepted
 
@@ -167,7 +168,7 @@ def conclude(
         _report(args, job, outcome, result)
     status, why = result["status"], result["reason"] or result["guidance"]
     if status in _UNUSABLE or not result["cameras"]:
-        from vical_daemon.offline.calibrate import suspects
+        from vical_daemon.offline.calibration_job import suspects
         from vical_daemon.offline.input_diagnosis import diagnose_input
 
         mistake = diagnose_input(job)

@@ -73,7 +73,7 @@ def _camera_lines(camera: dict[str, Any]) -> list[str]:
 
 
 def _readout_lines(camera: dict[str, Any]) -> list[str]:
-    """The readout of a rolling shutter, told or found."""
+    """The readout of a rolling shutter, given or found."""
     readout_s, sigma_s = camera.get("readout_s", 0.0), camera.get("readout_sigma_s", 0.0)
     if not (readout_s or sigma_s):
         return []

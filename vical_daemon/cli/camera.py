@@ -79,6 +79,26 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
         default="mono8",
         help="encoding of the frames (default mono8)",
     )
+    _add_exposure(parser)
+    parser.add_argument("--gain", type=float, default=None, help="in the camera's own unit")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="set another control; may be repeated",
+    )
+    _add_shutter(parser)
+    parser.add_argument(
+        "--buffers",
+        type=int,
+        default=None,
+        metavar="N",
+        help="number of kernel buffers (default: the driver's)",
+    )
+
+
+def _add_exposure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--exposure",
         type=float,
@@ -93,14 +113,9 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="exposure time of a camera that does not report it, s",
     )
-    parser.add_argument("--gain", type=float, default=None, help="in the camera's own unit")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="set another control; may be repeated",
-    )
+
+
+def _add_shutter(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--readout",
         type=float,
@@ -114,13 +129,6 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "raw", "soe", "eof", "first-packet", "shutter-closed"),
         default="auto",
         help="what the driver's stamp marks, if the driver reports it wrongly (default auto)",
-    )
-    parser.add_argument(
-        "--buffers",
-        type=int,
-        default=None,
-        metavar="N",
-        help="number of kernel buffers (default: the driver's)",
     )
 
 

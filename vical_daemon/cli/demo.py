@@ -1,4 +1,4 @@
-"""`vical demo`: the whole system without hardware, truth beside the estimate at the end."""
+"""`vical demo`: the whole system without hardware, with a comparison to the truth at the end."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def _print_text(result: dict[str, Any], table: str) -> None:
         "The time shift between the stamps, which a calibration finds, contains that; its error/sigma below\n"
         "allows for the ±."
     )
-    print(f"\n{CAMERA} in the imu frame, beside the truth\n{table}")
+    print(f"\n{CAMERA} in the imu frame, compared with the truth\n{table}")
 
 
 def _say(text: str) -> None:

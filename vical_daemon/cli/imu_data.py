@@ -15,7 +15,7 @@ from vical_drivers.user_files import read_text
 from vical_daemon.cli.errors import EXIT_USAGE, CliError
 from vical_daemon.cli.imu_options import COLUMNS
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.asl import TABLE_LIMIT
+from vical_daemon.logs.asl_tables import TABLE_LIMIT
 
 MOVED_RPS, MOVED_MPS2 = 9e-3, 0.2  # 0.5 deg/s; twenty mg
 _LIVELY = 5.0  # scatter of the gyro within a second over that of the quietest ones

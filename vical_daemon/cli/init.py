@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 examples:
-  vical init                        what is plugged in; uses a target file that lies beside the config
+  vical init                        what is plugged in; uses a target file that lies next to the config
   vical init --target aprilgrid     also makes board.pdf to print, and target.yaml
   vical init --emulated             no hardware: an emulated IMU and a rendered camera
 

@@ -49,7 +49,7 @@ _EXPOSURE = """\
     # exposure_s: 0.005          # now: {exposure}; short is good: blur shifts corners
 """
 _NO_EXPOSURE = """\
-    assume_exposure_s: {guess}      # a guess, the camera does not tell; half its error is in the time shift
+    assume_exposure_s: {guess}      # a guess: not reported; half its error is in the time shift
 """
 _NO_CAMERA = """\
   # cam0:                        # none was found: plug it in, then vical init --force
@@ -97,7 +97,7 @@ class FoundCamera:
         serial_number: Or what stands for it.
         size: width, height, px.
         rate_hz: Frames a second.
-        exposure: As the camera tells it, s; "unknown": it does not; "": it could not be asked.
+        exposure: As the camera reports it, s; "unknown": it does not; "": it could not be asked.
         offers: Formats and sizes it has.
         problem: Why it could not be asked; empty: it could.
     """

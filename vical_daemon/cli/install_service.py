@@ -106,7 +106,7 @@ def templates() -> Path:
     for folder in (package / "service_files", package.parent / "systemd"):
         if (folder / "vical.target").is_file():
             return folder
-    raise CliError(f"the unit files are not in this installation (looked beside {package})")
+    raise CliError(f"the unit files are not in this installation (looked next to {package})")
 
 
 def render(name: str, program: Path, interpreter: Path | None = None) -> str:

@@ -12,7 +12,7 @@ from vical_daemon.cli.errors import EXIT_NOT_CONVERGED, EXIT_USAGE, CliError
 from vical_daemon.cli.options import warn
 
 if TYPE_CHECKING:
-    from vical_daemon.offline.calibrate import Job
+    from vical_daemon.offline.calibration_job import Job
     from vical_daemon.offline.merge import MergeOutcome
 
 DISAGREEING = "disagreeing"

@@ -97,7 +97,7 @@ class RoleThreads:
             except Exception as error:
                 self.errors[role] = error
                 self.failed.set()
-                if describe_known(error) is None:  # a bug; what was foreseen is told in one line
+                if describe_known(error) is None:  # a bug; a known error is reported in one line
                     _log.exception("role %s failed", role)
 
         thread = self._threads[role] = threading.Thread(target=guarded, name=f"role {role}", daemon=True)

@@ -86,7 +86,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.skip >= 0 or not (args.seconds is None or args.seconds > 0):
         raise CliError("--skip must not be negative, --seconds must be above 0", EXIT_USAGE)
     from vical_daemon.logs import open_recording
-    from vical_daemon.offline.calibrate import make_job, run_job
+    from vical_daemon.offline.calibrate import run_job
+    from vical_daemon.offline.calibration_job import make_job
     from vical_daemon.offline.sources import read_known
 
     known, rig = read_known(args.against)

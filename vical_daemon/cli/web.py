@@ -94,12 +94,12 @@ def _discover(bus: Bus, stop: threading.Event) -> Config | None:
     from vical_daemon.config.model import CameraConfig, Config, ImuConfig
 
     parsed: list[topics.ParsedKey] = []
-    told = False
+    reported = False
     while not parsed and not stop.is_set():
         found = [topics.parse_key(sample.key) for sample in bus.latest(f"{topics.ROOT}/**", 2.0)]
         parsed = [entry for entry in found if entry is not None]
-        if not parsed and not told:
-            told = True
+        if not parsed and not reported:
+            reported = True
             print(
                 "vical: waiting: nothing on the bus yet; is `vical run` (vical.target) up?", file=sys.stderr
             )

@@ -14,18 +14,14 @@ import numpy as np
 from vical_daemon.estimation.events import ROLLING, Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.frame_queue import FrameQueue
-from vical_daemon.estimation.filter.image_intake import (
-    ImageIntake,
-    by_present_stamps,
-    trace_by_present_stamps,
-)
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
+from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.init.board_window import Frames
-from vical_daemon.estimation.init.initializer import LATE_S, Initializer
-from vical_daemon.estimation.init.motion_restart import WIDE_RAD, WIDE_SHARE, MotionRestart, distance_m
+from vical_daemon.estimation.init.initializer import LATE_S, Attempt, Initializer
+from vical_daemon.estimation.init.motion_restart import MotionRestart, motion_is_lost
 from vical_daemon.estimation.init.recording_start import RecordingStart
+from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -33,9 +29,7 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.model.held_lens import FixedLens
-from vical_daemon.estimation.model.state import ATTITUDE, POSITION, Layout, make_layout
-from vical_daemon.estimation.plausible import stamp_sigma_problem, usable_points
+from vical_daemon.estimation.plausible import usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.selection import model_selection as hypotheses
@@ -52,9 +46,7 @@ _STEPPED_LEAST_S = 1e-3
 _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
-_BLIND_S = 0.5  # without a usable image the motion is worth a look
-_ALWAYS = {hypotheses.IMU, hypotheses.LAG, hypotheses.SIZE}  # are states, see `hypotheses`
-_MOST_SURPRISES = 4  # in one start: shutters that roll, targets that are not as large as stated
+_MOST_CHANGES = 4  # of the rig's model in one start: rolling shutters, targets of another size
 
 
 class Calibrator:
@@ -75,17 +67,10 @@ class Calibrator:
         if target_points_m is None:
             raise ValueError("target-free calibration needs TargetFreeCalibrator")
         self.options = options
-        self.priors = dict(cameras)
-        self.target = np.asarray(target_points_m, dtype=np.float64)
-        self._states = options.estimate | _ALWAYS
-        self._held = self._held_lenses()
-        if "intrinsics" not in options.fix or self._held:  # else what is missed may as well be the lens
-            self._states |= {hypotheses.TARGET}
-        self.layout = self._lay_out()
-        self.judge = StatusEvaluator(options, self.layout)
+        self.rig = RigModel(options, cameras, np.asarray(target_points_m, dtype=np.float64))
+        self.judge = StatusEvaluator(options, self.rig.layout)
         self.filter: CalibrationFilter | None = None
-        self._imu = ImuIntake()
-        self._images = ImageIntake()
+        self._intake = SensorIntake()
         self._pending = FrameQueue(list(cameras))
         self._starting = self._new_starting()
         self.watch = ChangeWatch()
@@ -95,78 +80,55 @@ class Calibrator:
         self._held_back = HoldoutCheck()
         self._beyond_doubt = ModelAcceptance()
         self._past = RecentPast()
-        self._offsets_s: dict[str, float] = {}  # by camera: what was added to its stamps so far
-        self._stamp_sigma_s = 0.0
         # A step of the time shift, until images confirm it: when to announce it, camera, shift before, s.
         self._unproven: tuple[float, str, float] | None = None
         self._kept_until_s = -np.inf  # until then, what was kept over a change is not proven
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._reports: list[FrameReport] = []  # of the images of a start
-        self._size = 1.0  # of the target over the stated one, where it is by far not that
-
-    def _lay_out(self) -> Layout:
-        models = {name: prior.distortion_model for name, prior in self.priors.items()}
-        return make_layout(
-            models, fix=self.options.fix, estimate=self._states, target_m=self.target, held=self._held
-        )
-
-    def _held_lenses(self) -> dict[str, FixedLens]:
-        """Lenses whose errors matter to something that is estimated, by camera."""
-        fix = self.options.fix
-        if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
-            return {}
-        lenses = {name: FixedLens.of(prior) for name, prior in self.priors.items()}
-        return {name: lens for name, lens in lenses.items() if lens is not None}
 
     def _new_starting(self, off: Collection[str] = ()) -> Initializer:
         """For a rig of which it is known what is not as stated."""
         options = replace(self.options, estimate=self.options.estimate | set(off))
-        return Initializer(options, self.layout, self.target, self._step)
+        return Initializer(options, self.rig.layout, self.rig.target, self._step)
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
         """Take how well the imu's driver knows its device's clock now, one sigma, s; nonsense is ignored."""
-        if stamp_sigma_problem(sigma_s):
-            return
-        self._stamp_sigma_s = sigma_s
-        if self.filter is not None:
+        if self._intake.stamps_known_to(sigma_s) and self.filter is not None:
             self.filter.stamp_sigma_s = sigma_s
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
-        for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
+        for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
             self.judge.saw_imu(*reading)
-        self.judge.announce_all(self._imu.news())
+        self.judge.announce_all(self._intake.imu_news())
 
     @property
     def _buffer(self) -> ImuBuffer | None:
-        return self._imu.buffer
+        return self._intake.buffer
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the points of one image; those of unknown cameras or off the board are only counted."""
-        ok = usable_points(frame) & (frame.ids < len(self.target))
+        ok = usable_points(frame) & (frame.ids < len(self.rig.target))
         nonsense = len(ok) > 0 and not ok.any()  # its stamp is worth no more than its points
-        if frame.camera not in self.priors or self._buffer is None or self._imu.between or nonsense:
-            self.judge.frames_ignored += 1
+        if frame.camera not in self.rig.priors or not self._intake.takes_images or nonsense:
+            self._intake.images_ignored += 1
             return
         if not ok.all():
             sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
-        stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
-        t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
-        self._imu.saw_image(self._images.ahead_s(frame.camera))
-        self.judge.announce_all(self._images.news())
+        t_cam_s = self._intake.take_image(frame)
+        self.judge.announce_all(self._intake.image_news())
         if t_cam_s is None:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return
-        if self._images.offset_s(frame.camera) != self._offsets_s.get(frame.camera, 0.0):
+        if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
         self.judge.saw_points(t_cam_s, len(frame.ids))
         self._pending.push(t_cam_s, frame)
 
     def _clock_was_set(self, camera: str) -> None:
         """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
-        self._offsets_s[camera] = self._images.offset_s(camera)
         if self.filter is not None:
             self._lose_motion()
             self._seek_shift.add(camera)
@@ -180,7 +142,7 @@ class Calibrator:
     @property
     def left_out(self) -> dict[str, int]:
         """Readings and images that were not used, by cause."""
-        return {**self._imu.left_out, "images_ignored": self.judge.frames_ignored}
+        return self._intake.left_out
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
@@ -204,29 +166,39 @@ class Calibrator:
         assert self._buffer is not None
         if self.filter is None:
             self._starting.take(self._pending.take_all())
-            self._buffer.cut(self._imu.gap_end_s)  # a start needs motion in one piece
+            self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
             self._buffer.trim(self._starting.oldest_s - _KEEP_S)
         if not (at_end or self._starting.due(self._buffer.newest_s)):
             return
-        found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
-        for _ in range(_MOST_SURPRISES):
+        found = self._attempt(self._buffer)
+        if found.filter is None:
+            if self.filter is None:
+                self.judge.waiting(found.reason, found.motion_missing)
+            return
+        if self.rig.size != 1.0:
+            event = Event(EventKind.TARGET_SIZE, value=self.rig.size - 1.0)
+            self.judge.announce(event, once=hypotheses.SIZE)
+        self._begin(found.filter, found)
+
+    def _attempt(self, buffer: ImuBuffer) -> Attempt:
+        """Try to start; where the data contradict the model of the rig, change that and try again."""
+        may_be_partial = self.filter is None
+        found = self._starting.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+        for _ in range(_MOST_CHANGES):
             if found.rolling is not None:
                 self._estimate_readout(*found.rolling)
             elif found.size is not None:
                 self._resize(found.size)
             else:
                 break
-            found = self._starting.attempt(self._buffer, self.priors, may_be_partial=self.filter is None)
-        if found.filter is None:
-            if self.filter is None:
-                self.judge.waiting(found.reason, found.motion_missing)
-            return
-        if self._size != 1.0:
-            self.judge.announce(Event(EventKind.TARGET_SIZE, value=self._size - 1.0), once=hypotheses.SIZE)
+            found = self._starting.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+        return found
+
+    def _begin(self, f: LinearisedFilter, found: Attempt) -> None:
+        """Go on from a start: use its images, and then the stream."""
         later = self._pending.take_all()
-        f = found.filter
-        f.began_s, f.stamp_sigma_s = f.state.t_s, self._stamp_sigma_s
-        if self._stale is not None and self._stale.layout is self.layout:
+        f.began_s, f.stamp_sigma_s = f.state.t_s, self._intake.stamp_sigma_s
+        if self._stale is not None and self._stale.layout is self.rig.layout:
             f.keep_from(self._stale)
             self._kept_until_s = f.state.t_s + _PROVEN_S
         self._stale = None
@@ -247,33 +219,29 @@ class Calibrator:
                 return frames[k:]
             report = self._step(f, frame, t_cam_s)
             if report is None:
-                self.judge.frames_ignored += 1
+                self._intake.images_ignored += 1
                 continue
             if f.unshown is not None:
                 self._starting.take([(t_cam_s, frame)])
                 f.unshown.follow(f)
-            self._used_ns[frame.camera] = frame.t_cam_ns
             now = f.plain()
             self._ask_held_back(now, frame, t_cam_s)
-            self._past.saw(now, report, frame, t_cam_s)
-            self.judge.saw_frame(report, now)
+            self._note(now, report, frame, t_cam_s)
             self._reports.append(report)
         return []
 
     def _estimate_readout(self, camera: str, axis: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
-        self._states |= {"readout"}
-        self.priors[camera] = replace(self.priors[camera], readout_axis=axis)
-        self.layout = self.judge.layout = self._lay_out()
-        self._starting.go_on_with(self.layout, self.target)
+        self.rig.estimate_readout(camera, axis)
+        self.judge.layout = self.rig.layout
+        self._starting.go_on_with(self.rig.layout, self.rig.target)
         self.judge.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
         """The target is by far not as large as stated: go on with one that is; its size is asked for."""
-        self.target = self.target * size
-        self.layout = self.judge.layout = self._lay_out()
-        self._starting.go_on_with(self.layout, self.target, {hypotheses.SIZE})
-        self._size *= size
+        self.rig.resize(size)
+        self.judge.layout = self.rig.layout
+        self._starting.go_on_with(self.rig.layout, self.rig.target, {hypotheses.SIZE})
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
@@ -283,7 +251,7 @@ class Calibrator:
             item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
             if item is None:
                 break
-            if self._lost is None and self._must_restart(*item):
+            if self._lost is None and motion_is_lost(self.filter, self._buffer, item[1].camera, item[0]):
                 self._lose_motion()
             if self._lost is None:
                 reports += self._one(item[1], item[0])
@@ -291,31 +259,9 @@ class Calibrator:
                 reports += self._find_motion(self._lost, item[1], item[0])
         return reports
 
-    def _must_restart(self, t_cam_s: float, frame: PointsFrame) -> bool:
-        """Whether the motion at an image cannot be had from the one before: readings miss, or drift far.
-
-        Far is where the pose from the image itself would be as good.
-        """
-        f = self.filter
-        assert f is not None
-        assert self._buffer is not None
-        camera = f.state.cameras[frame.camera]
-        if self._buffer.gap_within(f.state.t_s, t_cam_s + camera.timeshift_s):
-            return True
-        if t_cam_s + camera.timeshift_s < f.state.t_s + _BLIND_S:
-            return False
-        ahead = f.copy()
-        segment = self._buffer.segment(f.state.t_s, t_cam_s + camera.timeshift_s)
-        if segment is None:
-            return False
-        ahead.predict(segment)
-        sigmas = ahead.sigmas()
-        away_m = distance_m(ahead.state.p_world_imu)
-        return bool(sigmas[ATTITUDE].max() > WIDE_RAD or sigmas[POSITION].max() > WIDE_SHARE * away_m)
-
     def _lose_motion(self) -> None:
         """Forget where the rig is, not its calibration; images to come will show it."""
-        self._lost, self._held_back = MotionRestart(self.target, self._used_ns), HoldoutCheck()
+        self._lost, self._held_back = MotionRestart(self.rig.target, self._used_ns), HoldoutCheck()
 
     def _find_motion(self, lost: MotionRestart, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
         """Take the motion anew as soon as images show it, and follow those it was taken from."""
@@ -328,7 +274,7 @@ class Calibrator:
                 return []
             lost = self._seek(f, lost, frame.camera)
         self._buffer.trim((lost.frames[0][0] if lost.frames else t_cam_s) - _KEEP_S)
-        motion = lost.motion(f.state, self.layout, f.sigmas(), self._buffer)
+        motion = lost.motion(f.state, self.rig.layout, f.sigmas(), self._buffer)
         if motion is None:
             return []
         self._lost = None
@@ -348,7 +294,7 @@ class Calibrator:
         f.predict(segment)  # of no length at the first image: that one, too, must know how the rig turns
         if len(frame.ids) < 4:
             return None
-        return f.update(f.image(frame, t_cam_s, self.target[frame.ids]))
+        return f.update(f.image(frame, t_cam_s, self.rig.target[frame.ids]))
 
     def _one(self, frame: PointsFrame, t_cam_s: float) -> list[FrameReport]:
         """Follow one image of the stream; its verdict, or none where it could not be used."""
@@ -358,7 +304,7 @@ class Calibrator:
         assert self._buffer is not None
         report = self._step(f, frame, t_cam_s)
         if report is None:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return []
         if f.unshown is not None:
             self._starting.take([(t_cam_s, frame)])
@@ -370,9 +316,7 @@ class Calibrator:
             self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
             self._restart(f)
             return [report]
-        self._used_ns[frame.camera] = frame.t_cam_ns
-        self._past.saw(f, report, frame, t_cam_s)
-        self.judge.saw_frame(report, f)
+        self._note(f, report, frame, t_cam_s)
         if self._unproven is not None and f.state.t_s > self._unproven[0]:
             self._announce_step(f, *self._unproven[1:])
             self._unproven = None
@@ -381,10 +325,16 @@ class Calibrator:
         self._act(self.watch.look(report, f), frame)
         return [report]
 
+    def _note(self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float) -> None:
+        """Take an image and its verdict into what is remembered and reported."""
+        self._used_ns[frame.camera] = frame.t_cam_ns
+        self._past.saw(f, report, frame, t_cam_s)
+        self.judge.saw_frame(report, f)
+
     def _ask_held_back(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """Judge how well an image was predicted that the held-back copy of the filter has not used."""
         assert self._buffer is not None
-        ratio = self._held_back.follow(f, frame, t_cam_s, self.target, self._buffer)
+        ratio = self._held_back.follow(f, frame, t_cam_s, self.rig.target, self._buffer)
         if ratio is not None:
             self.judge.held_back(ratio, f.consistency[frame.camera].scale)
 
@@ -412,10 +362,10 @@ class Calibrator:
         its lens, until the misfit is no longer one of the time shift alone.
         """
         assert self._buffer is not None
-        if self.layout.cameras[camera].timeshift is None or f.unshown is not None:
+        if self.rig.layout.cameras[camera].timeshift is None or f.unshown is not None:
             return False
         before = self._past.filter(f)
-        fit = self._past.find_shift(before, camera, self._buffer, self.target)
+        fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
             return False
         self.filter = before
@@ -430,7 +380,7 @@ class Calibrator:
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
         """Take a time shift as found anew, all else as it is known; the step, s."""
-        index, known = self.layout.cameras[camera].timeshift, f.state.cameras[camera]
+        index, known = self.rig.layout.cameras[camera].timeshift, f.state.cameras[camera]
         assert index is not None
         step_s = fit.timeshift_s - known.timeshift_s
         known.timeshift_s = fit.timeshift_s
@@ -450,14 +400,8 @@ class Calibrator:
             return
         before = self._past.filter(f)
         sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
-        for name, camera in sound.state.cameras.items() if sound else ():
-            if not self.layout.lens_free(name):
-                continue
-            self.priors[name] = replace(
-                self.priors[name],
-                intrinsics=tuple(camera.intrinsics.tolist()),
-                distortion=tuple(camera.distortion.tolist()),
-            )
+        if sound is not None:
+            self.rig.start_from_lenses_of(sound.state)
         self._unproven = None
         self.judge.changed(self.watch.why)
         self._stale, self.filter = sound, None
@@ -470,11 +414,11 @@ class Calibrator:
         if isinstance(lost, RecordingStart):  # the gyro's bias is that of another recording
             f.state.gyro_bias = lost.gyro_bias(f.state, self._buffer)
         own = [x for x in lost.frames if x[1].camera == camera]
-        fit = self._past.shift_of(own, f, self._buffer, self.target)
+        fit = self._past.shift_of(own, f, self._buffer, self.rig.target)
         if fit is None:
             return lost
         self._set_shift(f, camera, fit)
-        self._lost = again = type(lost)(self.target, self._used_ns)
+        self._lost = again = type(lost)(self.rig.target, self._used_ns)
         for t_cam_s, frame in lost.frames:
             again.take(frame, t_cam_s, f.state, self._buffer)
         return again
@@ -496,14 +440,14 @@ class Calibrator:
         if not self.can_go_on:
             self.filter = None
         f = self.filter
-        for name, where in self.layout.cameras.items():
+        cameras = self.rig.layout.cameras
+        for name, where in cameras.items():
             if f is not None:
-                f.state.cameras[name].timeshift_s += self._offset_s(name)
+                f.state.cameras[name].timeshift_s += self._intake.offset_s(name)
             if f is not None and where.timeshift is not None:  # drivers find the clock once more
-                f.reopen(where.timeshift, abs(self._imu.stepped_s))
-        self._imu.next_recording()
-        self._images, self._offsets_s = ImageIntake(), {}
-        self._pending = FrameQueue(list(self.priors))
+                f.reopen(where.timeshift, abs(self._intake.imu_stepped_s))
+        self._intake.next_recording()
+        self._pending = FrameQueue(list(self.rig.priors))
         self._past, self._unproven = RecentPast(), None
         self._used_ns.clear()
         self._seek_shift.clear()
@@ -511,33 +455,27 @@ class Calibrator:
         self._held_back, self._lost = HoldoutCheck(), None
         if f is not None:
             self.watch.shift_reopened()
-            self._lost = RecordingStart(self.target, {})
+            self._lost = RecordingStart(self.rig.target, {})
             self._seek_shift |= f.drifting  # who knows how far, in the time between
             if not common_clock:
-                self._seek_shift |= {n for n, c in self.layout.cameras.items() if c.timeshift is not None}
+                self._seek_shift |= {n for n, c in cameras.items() if c.timeshift is not None}
 
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
         self.judge.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
-        offsets = {name: self._offset_s(name) for name in self.priors}
-        estimate = self.judge.estimate(self.filter, self._stale)
-        return by_present_stamps(estimate, offsets, self._stamp_sigma_s)
-
-    def _offset_s(self, camera: str) -> float:
-        """Time shift by the stamps as they come now, minus that of the filter, s."""
-        return self._imu.shift_s + self._images.offset_s(camera)
+        return self._intake.by_present_stamps(self.judge.estimate(self.filter, self._stale))
 
     def _in_doubt(self, f: CalibrationFilter) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
-        if self.watch.doubtful or any(clock_drift.in_doubt(f, name) for name in self.priors):
+        if self.watch.doubtful or any(clock_drift.in_doubt(f, name) for name in self.rig.priors):
             return clock_drift.CLOCKS_IN_DOUBT
         converged = self.judge.status == Status.CONVERGED
         return hypotheses.IN_DOUBT.get(hypotheses.in_doubt(f, converged=converged), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
-        return trace_by_present_stamps(self.judge.trace(camera), self._offset_s(camera))
+        return self._intake.trace_by_present_stamps(self.judge.trace(camera), camera)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return how well the IMU alone predicted images before they were used, oldest first."""

@@ -9,24 +9,17 @@ window's own data moved the calibration, against how far they may, says whether 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.events import Cause
-from vical_daemon.estimation.filter.image_intake import (
-    ImageIntake,
-    by_present_stamps,
-    trace_by_present_stamps,
-)
+from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.filter.unobservable_directions import has_turned
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.plausible import stamp_sigma_problem
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.carry import (
@@ -38,15 +31,10 @@ from vical_daemon.estimation.smoother.carry import (
     calibration_difference,
 )
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.handover import (
-    initial_prior,
-    next_window,
-    of_another_recording,
-    with_process_noise,
-)
+from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
+from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 from vical_daemon.estimation.smoother.reports import window_reports
-from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
 from vical_daemon.estimation.smoother.starter import Starter
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
@@ -59,17 +47,9 @@ _MIN_PARALLAX_DEG = 0.4
 _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
-_STEPS_GROW, _STEPS_START = 12, 30
+_STEPS_GROW = 12
 _PATIENCE_S = 15.0  # in which a changed mounting or clock is looked for; then anything may have changed
 _MORE_JITTER = 2.0  # times that of the stamps before: no chance in windows of 30 images and more
-_DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
-
-
-class _Begun(NamedTuple):
-    """A window that has been started."""
-
-    bundle: Bundle
-    fit: Fit
 
 
 class TargetFreeCalibrator:
@@ -91,24 +71,22 @@ class TargetFreeCalibrator:
         for block in sorted({"target_scale", "target_shape"} & options.estimate):
             raise ValueError(f"without a target there is no {block} to estimate")
         self.options = options
-        self.camera, self.prior = next(iter(cameras.items()))
+        self.camera, prior = next(iter(cameras.items()))
         self.active = np.ones(FULL, dtype=bool)
         self.active[:6] = "extrinsics" not in options.fix
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         self.active[LENS] = "intrinsics" not in options.fix
-        rolling = "readout" in options.estimate or self.prior.readout_s != 0.0
+        rolling = "readout" in options.estimate or prior.readout_s != 0.0
         self.judge = TargetFreeStatus(options, self.camera, self.active, rolling=rolling)
-        self.starter = Starter(options, self.prior)
+        self._first = FirstWindow(options, prior, self.active, self.judge)
         self.window: Window | None = None
         self.carry: MarginalPrior | None = None  # before the window
         self.latest: MarginalPrior | None = None  # after its last adjustment
         self._closed = 0
-        self._noise = (options.corner_sigma_px, 1.0, 0.0)  # px, how long errors last, jitter of stamps in s
-        self._imu = ImuIntake()
-        self._images = ImageIntake()
+        self._noise = Noise(options.corner_sigma_px)
+        self._intake = SensorIntake()
         self._pending: list[Stamped] = []
         self._fitted_s = -np.inf  # stamp of the last image that fitted
-        self._set_by_s = 0.0  # added to the camera's stamps so far
         self._confirmed = False  # a second window contradicts what was known
         self._seek_shift = False  # the time shift is to be found again, and its step has been reported
         self._newest_s = -np.inf  # stamp of the last image, used or not
@@ -120,35 +98,37 @@ class TargetFreeCalibrator:
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
         """Take how well the imu's driver knows its device's clock now, one sigma, s; nonsense is ignored."""
-        if stamp_sigma_problem(sigma_s):
-            return
-        self.judge.doubts.stamp_sigma_s = sigma_s
+        if self._intake.stamps_known_to(sigma_s):
+            self.judge.doubts.stamp_sigma_s = sigma_s
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
-        for reading in self._imu.take(t_imu_ns, gyro_rps, specific_force_mps2):
+        for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
             self.judge.saw_imu(reading.t_imu_ns, reading.gyro_rps)
-        self.judge.announce_all(self._imu.news())
+        self.judge.announce_all(self._intake.imu_news())
+
+    @property
+    def starter(self) -> Starter:
+        """What tries to start."""
+        return self._first.starter
 
     @property
     def _buffer(self) -> ImuBuffer | None:
-        return self._imu.buffer
+        return self._intake.buffer
 
     def add_points(self, frame: PointsFrame) -> None:
         """Take the tracks of one image; those of other cameras, or out of order, are only counted."""
         count, frame = len(frame.ids), cleaned(frame)
         nonsense = count > 0 and not len(frame.ids)  # its stamp is worth no more than its tracks
-        if frame.camera != self.camera or self._buffer is None or self._imu.between or nonsense:
-            self.judge.frames_ignored += 1
+        if frame.camera != self.camera or not self._intake.takes_images or nonsense:
+            self._intake.images_ignored += 1
             return
-        stamp_s = (frame.t_cam_ns - self._imu.base_ns) * 1e-9
-        t_cam_s = self._images.take(frame, stamp_s, self._buffer.newest_s)
-        self._imu.saw_image(self._images.ahead_s(frame.camera))
-        self.judge.announce_all(self._images.news())
+        t_cam_s = self._intake.take_image(frame)
+        self.judge.announce_all(self._intake.image_news())
         if t_cam_s is None or t_cam_s <= self._newest_s:
-            self.judge.frames_ignored += 1
+            self._intake.images_ignored += 1
             return
-        if self._images.offset_s(frame.camera) != self._set_by_s:
+        if self._intake.clock_was_set(frame.camera):
             self._clock_was_set()
         self._newest_s = t_cam_s
         if not self._thinning.takes(t_cam_s):
@@ -159,7 +139,6 @@ class TargetFreeCalibrator:
 
     def _clock_was_set(self) -> None:
         """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
-        self._set_by_s = self._images.offset_s(self.camera)
         self._pending.clear()
         if self.latest is not None:
             self._lost(Cause.CLOCK_SET, keep=True)
@@ -174,7 +153,7 @@ class TargetFreeCalibrator:
     @property
     def left_out(self) -> dict[str, int]:
         """Readings and images that were not used, by cause."""
-        return {**self._imu.left_out, "images_ignored": self.judge.frames_ignored}
+        return self._intake.left_out
 
     # ------------------------------------------------------------------ work
     def process(self) -> list[FrameReport]:
@@ -230,19 +209,12 @@ class TargetFreeCalibrator:
         assert self._buffer is not None
         end = self._buffer.newest_s - _LATE_S
         known = self.latest
-        self._buffer.cut(self._imu.gap_end_s)  # a start needs motion in one piece
+        self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
         hint = None if self._anew else known
         frames = self.starter.stretch(self._buffer, self._pending, end, hint, last=flush)
         if frames is None:
             return False
-        begun: _Begun | str
-        if isinstance(frames, str):
-            begun = frames
-        elif known is None:
-            begun = self._begin(frames, None)
-        else:
-            before = self._of_another(frames, known) if self._anew else known
-            begun = before if isinstance(before, str) else self._go_on(frames, before)
+        begun = frames if isinstance(frames, str) else self._begin(self._buffer, frames, known)
         if isinstance(begun, str):
             self.judge.waiting(begun, self.starter.motion_missing)
             return False
@@ -250,7 +222,7 @@ class TargetFreeCalibrator:
         self._fitted_s = last = window.frames[-1][0]
         self._pending = [x for x in self._pending if x[0] > last]
         self.window, self.carry, self.latest = window, begun.bundle.carry, fit.carry
-        self._noise = (fit.sigma_px, fit.spread, fit.jitter_s)
+        self._noise = Noise.of(fit)
         self._anew = False
         self.judge.held = self.starter.held
         self.judge.started(window.frames[0][0])
@@ -259,80 +231,35 @@ class TargetFreeCalibrator:
             self._close(fit, begun.bundle)
         return True
 
-    def _begin(self, frames: list[Stamped], known: MarginalPrior | None) -> _Begun | str:
-        """Start a window from a stretch, with the calibration of before where there is one; or why not."""
-        assert self._buffer is not None
-        window = self.starter.window(self._buffer, frames, known)
-        if isinstance(window, str):
-            return window
-        return self._adjusted(window, known) or _DOES_NOT_FIT
+    def _begin(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None) -> Begun | str:
+        """Start a window from a stretch: the first of all, of another recording, or after a pause."""
+        if known is None:
+            return self._first.begin(buffer, frames, None, self._noise)
+        if self._anew:
+            found = self._first.of_another(buffer, frames, known, self._stepped_s)
+            return found if isinstance(found, str) else self._go_on(buffer, frames, found)
+        return self._go_on(buffer, frames, known)
 
-    def _of_another(self, frames: list[Stamped], known: MarginalPrior) -> MarginalPrior | str:
-        """What was known, with the biases by the first images of another recording; or why there are none."""
-        assert self._buffer is not None
-        window = self.starter.window(self._buffer, frames, None)
-        if isinstance(window, str):
-            return window
-        if self.starter.held is not None:
-            self.starter.held = None
-            return "the rig turns about one axis only so far: turn it about a second one"
-        return of_another_recording(known, window, self._stepped_s)
-
-    def _adjusted(
-        self, window: Window, known: MarginalPrior | None, reopened: Collection[int] = ()
-    ) -> _Begun | None:
-        """Adjust a first window with what is known but for some errors; None where it does not fit."""
-        bundle, carry, fit = self._solved(window, known, reopened)
-        if known is None and self._axis_open and fit is not None and shows_columns(bundle, fit):
-            by_columns = self._solved(read_by_columns(window), known, reopened)
-            if by_columns[2] is not None and by_columns[2].sigma_px < fit.sigma_px:
-                bundle, carry, fit = by_columns
-        if fit is None or not (fit.settled and self.judge.fits(fit, first=True)):
-            return None
-        if known is not None and not self.judge.agrees(fit, carry, complete=False):
-            return None
-        if known is None and self._axis_open:
-            axis = bundle.window.camera.readout_axis
-            self.prior = self.starter.prior = replace(self.prior, readout_axis=axis)
-        return _Begun(bundle, fit)
-
-    def _solved(
-        self, window: Window, known: MarginalPrior | None, reopened: Collection[int]
-    ) -> tuple[Bundle, MarginalPrior, Fit | None]:
-        """Adjust a window with what is known but for some errors."""
-        assert self._buffer is not None
-        carry = initial_prior(
-            window, known, self.active, self.starter.held, self.judge.doubts.imu_sigma, reopened
-        )
-        bundle = Bundle(window, carry, *self._noise)
-        return bundle, carry, bundle.solve(self._buffer, _STEPS_START)
-
-    @property
-    def _axis_open(self) -> bool:
-        """Whether nothing was said, or found, of what a rolling shutter would read one after the other."""
-        return not (self.prior.readout_axis or self.prior.readout_s)
-
-    def _go_on(self, frames: list[Stamped], known: MarginalPrior) -> _Begun | str:
+    def _go_on(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior) -> Begun | str:
         """Start a window after a pause; where it contradicts what was known, find what has changed."""
-        assert self._buffer is not None
         surely = self._seek_shift or self._confirmed
-        begun = _DOES_NOT_FIT if surely else self._begin(frames, known)
-        if isinstance(begun, _Begun):
+        begun = DOES_NOT_FIT if surely else self._first.begin(buffer, frames, known, self._noise)
+        if isinstance(begun, Begun):
             return begun
-        if begun is _DOES_NOT_FIT:
+        if begun is DOES_NOT_FIT:
             self.judge.contradicted(frames[-1][0] - frames[0][0])
         if self.judge.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
-            held, anew = self.starter.held, self._begin(frames, None)
-            if isinstance(anew, _Begun):
+            held, anew = self.starter.held, self._first.begin(buffer, frames, None, self._noise)
+            if isinstance(anew, Begun):
                 self._closed, self._confirmed, self._seek_shift = 0, False, False
                 self.judge.changed()
             else:
                 self.starter.held = held
             return anew
-        window = self.starter.window_anew(self._buffer, frames, known)
+        window = self.starter.window_anew(buffer, frames, known)
         if isinstance(window, str):
             return begun
-        free = self._adjusted(window, known, BOTH)
+        free = self._first.adjusted(buffer, window, known, self._noise, BOTH)
         if free is None:
             return begun
         known = known.at(window.frames[0][0])
@@ -350,7 +277,7 @@ class TargetFreeCalibrator:
         if MOUNTING[0] in reopened and not self.judge.proven:
             self._forget(known)
             return begun
-        ended = self._adjusted(window, known, reopened)
+        ended = self._first.adjusted(buffer, window, known, self._noise, reopened)
         if ended is None:
             return begun
         change = calibration_difference(window, known)
@@ -394,17 +321,17 @@ class TargetFreeCalibrator:
         if self._closed and not self._agrees(fit, self.carry, complete=_full(window)):
             self._lost(Cause.WINDOW_CONTRADICTED, against_s=against_s)
             return
-        self.latest, self._noise = fit.carry, (fit.sigma_px, fit.spread, fit.jitter_s)
+        self.latest, self._noise = fit.carry, Noise.of(fit)
         self._fitted_s = window.frames[-1][0]
         self.judge.saw_fit(fit, self._fitted_s + window.shift_s)
         if _full(window):
             self._close(fit, bundle)
 
     def _agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
-        """Whether a window agrees with what was known of calibration and stamps, as far as it tells."""
+        """Whether a window agrees with what was known of calibration and stamps, as far as it shows that."""
         if fit.parallax_deg < _MIN_PARALLAX_DEG:
             return True
-        stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise[2]
+        stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise.jitter_s
         return self.judge.agrees(fit, carry, complete=complete) and not stepped
 
     def _close(self, fit: Fit, bundle: Bundle) -> None:
@@ -426,15 +353,7 @@ class TargetFreeCalibrator:
 
     def _forget(self, known: MarginalPrior) -> None:
         """What was kept over a change contradicts the images, too: start over, with the lens as a guess."""
-        lens = known.camera
-        self.prior = replace(
-            self.prior,
-            intrinsics=tuple(lens.intrinsics.tolist()),
-            distortion=tuple(lens.distortion.tolist()),
-            T_imu_cam=None if self.active[0] else self.prior.T_imu_cam,
-            readout_s=lens.readout_s,
-        )
-        self.starter = Starter(self.options, self.prior)
+        self._first.guess_from(known)
         self.latest = None
         self._closed, self._confirmed = 0, False
         self.judge.changed()
@@ -488,14 +407,14 @@ class TargetFreeCalibrator:
             self.window = self.carry = self.latest = None
             self._closed = 0
         if self.latest is not None:
-            camera = self.latest.camera
-            self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + self._offset_s)
+            camera, offset_s = self.latest.camera, self._intake.offset_s(self.camera)
+            self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + offset_s)
         self._anew = self.latest is not None
         self.starter.again()
         self.judge.next_recording()
-        self._stepped_s = abs(self._imu.stepped_s)
-        self._imu.next_recording()
-        self._images, self._pending, self._set_by_s = ImageIntake(), [], 0.0
+        self._stepped_s = abs(self._intake.imu_stepped_s)
+        self._intake.next_recording()
+        self._pending = []
         self._newest_s = self._fitted_s = -np.inf
         self._confirmed, self._seek_shift = False, self._anew and not common_clock
 
@@ -507,12 +426,7 @@ class TargetFreeCalibrator:
         if known is not None and self._buffer is not None:
             known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
         estimate = self.judge.estimate(known, running=self.window is not None, gravity=gravity)
-        return by_present_stamps(estimate, {self.camera: self._offset_s}, self.judge.doubts.stamp_sigma_s)
-
-    @property
-    def _offset_s(self) -> float:
-        """Time shift by the stamps as they come now, minus that of the windows, s."""
-        return self._imu.shift_s + self._images.offset_s(self.camera)
+        return self._intake.by_present_stamps(estimate)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return nothing: there is no such check without a target."""
@@ -522,7 +436,7 @@ class TargetFreeCalibrator:
         """Return how the calibration developed."""
         if camera != self.camera:
             return []
-        return trace_by_present_stamps(self.judge.trace(), self._offset_s)
+        return self._intake.trace_by_present_stamps(self.judge.trace(), camera)
 
 
 def _full(window: Window) -> bool:

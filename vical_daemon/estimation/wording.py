@@ -13,7 +13,7 @@ from typing import Any
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, Verb, WeakDirection
 
-_ALONG = 0.85
+ALONG = 0.85
 """Cosine above which a direction is called by the name of an axis: within 32 deg."""
 _BESIDE = 0.3
 """Least share of a second axis in a direction that is called a line between two."""
@@ -27,9 +27,9 @@ def axis_name(axis_cam: Sequence[float]) -> str:
     length = math.sqrt(sum(a * a for a in axis_cam))
     size = [abs(a) / length for a in axis_cam]
     order = sorted(range(3), key=lambda i: -size[i])
-    if size[order[0]] > _ALONG:
+    if size[order[0]] > ALONG:
         return _AXIS_NAMES[AXES[order[0]]]
-    if size[order[0]] ** 2 + size[order[1]] ** 2 > _ALONG**2 and size[order[1]] > _BESIDE:
+    if size[order[0]] ** 2 + size[order[1]] ** 2 > ALONG**2 and size[order[1]] > _BESIDE:
         first, second = (("x", "y", "optical")[i] for i in sorted(order[:2]))
         return f"a line between the camera's {first} and {second} axes"
     return "a line oblique to all axes of the camera"

@@ -14,7 +14,7 @@ import numpy as np
 from vical_drivers.user_files import read_file
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.logs.asl import TABLE_LIMIT
+from vical_daemon.logs.asl_tables import TABLE_LIMIT
 from vical_daemon.logs.model import RecordingError
 from vical_daemon.logs.stamps import (
     UNIT_WORDS,

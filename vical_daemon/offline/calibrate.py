@@ -6,7 +6,7 @@ Everything happens in one thread and in the order of the stamps, so two runs are
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +15,10 @@ from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.outgoing import publish
 from vical_daemon.calibrate.estimators import make_estimator
 from vical_daemon.calibrate.worker import EstimateRole
-from vical_daemon.config.cross_checks import NEEDS_TARGET
-from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
-from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.events import Event
-from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB
-from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.estimation.result import CalibrationEstimate
-from vical_daemon.logs import Recording, Stream
 from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
-from vical_daemon.offline.errors import InputError, OptionError
+from vical_daemon.offline.calibration_job import Job, input_key, keys_of, noise_of, points_key
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.model.frame_report import FrameReport
@@ -32,59 +26,6 @@ if TYPE_CHECKING:
 Progress = Callable[[float, CalibrationEstimate | None], None]
 PUBLISH_EVERY_S = 1.0  # of the data: often enough for a progress bar
 _APART_NS = 10_000_000_000  # between one recording and the next: more than any gap that is bridged
-
-
-@dataclass(slots=True)
-class Job:
-    """What to calibrate.
-
-    Attributes:
-        recording: The data.
-        imu: Stream of the IMU.
-        cameras: Stream of each camera.
-        config: The rig, as the roles want it.
-        priors: What is known about each camera.
-        skip_s: Seconds of the recording that are left out at its beginning.
-        seconds: How many are used then; None: all.
-        others: Further recordings of the same rig, in the order in which they are used.
-        common_clock: The time shift is the same in all recordings.
-    """
-
-    recording: Recording
-    imu: Stream
-    cameras: dict[str, Stream]
-    config: Config
-    priors: dict[str, CameraPrior]
-    skip_s: float = 0.0
-    seconds: float | None = None
-    others: list[Job] = field(default_factory=list)
-    common_clock: bool = True
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds of the recording that are used."""
-        left_s = self.recording.duration_s - self.skip_s
-        return left_s if self.seconds is None else min(self.seconds, left_s)
-
-    @property
-    def begin_ns(self) -> int:
-        """Stamp from which on it is used."""
-        return self.recording.begin_ns + round(self.skip_s * 1e9)
-
-    @property
-    def parts(self) -> list[Job]:
-        """This recording and the others."""
-        return [self, *self.others]
-
-    def messages(self) -> Iterator[tuple[str, bytes]]:
-        """Yield (key, payload) of the streams and the part of the recording that are used."""
-        begin_ns = self.begin_ns
-        end_ns = begin_ns + round(self.duration_s * 1e9)
-        statuses = [topics.STATUS.key(self.recording.rig, "imu")]  # they say how well stamps are known
-        for key, payload in self.recording.messages([self.imu, *self.cameras.values()], statuses):
-            stamp_ns = stamp_of(payload)
-            if stamp_ns is not None and begin_ns <= stamp_ns <= end_ns:
-                yield key, payload
 
 
 @dataclass(slots=True)
@@ -134,107 +75,6 @@ class Outcome:
     held_out: list[dict[str, float]] = field(default_factory=list)
 
 
-def make_job(
-    recording: Recording,
-    initial: Initial,
-    *,
-    target: str | None,
-    camera: str | None = None,
-    imu: str | None = None,
-    fix: Sequence[str] = (),
-    estimate: Sequence[str] = (),
-    skip_s: float = 0.0,
-    seconds: float | None = None,
-) -> Job:
-    """Choose streams and put what is known into the form of a config.
-
-    Args:
-        recording: The data.
-        initial: What `--initial` says.
-        target: Target file; None: target-free.
-        camera: Only this one; None: all.
-        imu: Which; None: the only one.
-        fix: See `CalibrationOptions`.
-        estimate: See `CalibrationOptions`.
-        skip_s: See `Job`.
-        seconds: See `Job`.
-
-    Raises:
-        InputError: No such stream, or something needed is not known.
-    """
-    if skip_s >= recording.duration_s:
-        raise OptionError(f"--skip {skip_s:g}: {recording.path} is only {recording.duration_s:.1f} s long")
-    imu_stream = _choose("imu", recording.imus, imu)
-    chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
-    if not chosen:
-        raise InputError(
-            f"{recording.path} holds no camera, neither images nor points; `vical info` shows what is in it"
-        )
-    priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
-    if target is None and any(p.distortion_model == PLUMB_BOB for p in priors.values()):
-        raise InputError(f"--initial: {NEEDS_TARGET}")
-    config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
-    config = replace(
-        config,
-        target=target,
-        calibration=CalibrationConfig(
-            mode="target" if target else "target_free",
-            fix=tuple(fix),  # type: ignore[arg-type]
-            estimate=tuple(estimate),  # type: ignore[arg-type]
-        ),
-    )
-    return Job(recording, imu_stream, chosen, config, priors, skip_s, seconds)
-
-
-def add_recordings(job: Job, recordings: Sequence[Recording], imu: str | None = None) -> None:
-    """Add further recordings of the same rig to a job.
-
-    Args:
-        job: Of the first; its part of the recording is that of each.
-        recordings: Further ones, in order.
-        imu: Which; None: the only one.
-
-    Raises:
-        InputError: A recording is not of the same cameras, or too short.
-    """
-    for recording in recordings:
-        if job.skip_s >= recording.duration_s:
-            length = f"{recording.path} is only {recording.duration_s:.1f} s long"
-            raise OptionError(f"--skip {job.skip_s:g}: {length}")
-        cameras = _same_cameras(job, recording)
-        for name, stream in cameras.items():
-            size = job.priors[name].resolution
-            if stream.resolution not in (None, size):
-                given, found = ("{} x {}".format(*r) for r in (size, stream.resolution))
-                raise InputError(f"{recording.path}: {name} has images of {found}, those before of {given}")
-        imu_stream = _choose("imu", recording.imus, imu)
-        part = Job(recording, imu_stream, cameras, job.config, job.priors, job.skip_s, job.seconds)
-        job.others.append(part)
-
-
-def _same_cameras(job: Job, recording: Recording) -> dict[str, Stream]:
-    """Streams of the job's cameras in another recording; a single one may have another name there."""
-    found = recording.cameras
-    if len(job.cameras) == len(found) == 1:
-        return dict(zip(job.cameras, found.values(), strict=True))
-    cameras = {name: found[name] for name in job.cameras if name in found}
-    if not cameras:
-        there, here = ", ".join(found) or "none", ", ".join(job.cameras)
-        raise InputError(f"{recording.path} has the cameras {there}, and {job.recording.path} has {here}")
-    return cameras
-
-
-def _config(rig: str, imu: Stream, priors: dict[str, CameraPrior], noise: ImuNoise) -> Config:
-    """Describe the devices of a recording as a config does."""
-    densities = NoiseConfig(noise.gyro_density, noise.gyro_walk, noise.accel_density, noise.accel_walk)
-    rate_hz = min(max(imu.rate_hz, 1.0), 1000.0)
-    return Config(
-        rig=rig,
-        imus={imu.name: ImuConfig(port="recording", rate_hz=rate_hz, noise=densities)},
-        cameras={name: CameraConfig(uri="recording", size=p.resolution) for name, p in priors.items()},
-    )
-
-
 def run_job(
     job: Job,
     progress: Progress,
@@ -253,53 +93,82 @@ def run_job(
         enough: Called with each estimate, once a second of data; True: the rest is not needed.
     """
     frames: list[FrameReport] = []
-    bus = LocalBus()
-    estimator = make_estimator(job.config, job.priors)
-    keep = frames.extend if keep_frames else None
-    events: list[Event] = []
-
-    stop = False
-
-    def listen(estimate: CalibrationEstimate) -> CalibrationEstimate:
-        nonlocal stop
-        events.extend(estimate.events)
-        stop = stop or (enough is not None and enough(estimate))
-        return estimate
-
-    role = EstimateRole(job.config, estimator, PUBLISH_EVERY_S, inspect=listen, keep=keep)
-    status_key = topics.STATUS.key(job.config.rig, "imu")
-    for key in (job.imu.key, status_key, *(_points_key(job, name) for name in job.cameras)):
-        bus.subscribe(key, role.take)
-    _attach_detectors(bus, job)
+    player = _Player(job, progress, frames.extend if keep_frames else None, enough)
     parts = job.parts if only is None else [job.parts[k] for k in only]
-    total = sum(_expected(part) for part in parts)
-    t_shown_s, done = time.monotonic(), 0
-
-    def play(part: Job, later_ns: int) -> None:
-        nonlocal t_shown_s, done
-        keys = _keys(job, part)
-        stamp_sigma_s = part.recording.stamp_sigma_s.get(part.imu.name)
-        if stamp_sigma_s is not None:
-            estimator.stamps_known_to(stamp_sigma_s)
-        for key, payload in part.messages():
-            if stop:
-                break
-            key = keys[key]
-            bus.publish(key, _later(payload, later_ns) if later_ns else payload)
-            done += 1
-            if key != job.imu.key:
-                publish(bus, role.step())
-                if time.monotonic() - t_shown_s > 0.1:
-                    t_shown_s = time.monotonic()
-                    progress(min(done / total, 1.0), role.latest)
-        publish(bus, role.finish())
-
-    inputs = _play_all(parts, role, play, common_clock=job.common_clock)
+    player.expected = sum(_expected(part) for part in parts)
+    role, estimator = player.role, player.estimator
+    inputs = _play_all(parts, role, player.play, common_clock=job.common_clock)
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
     checks = [asdict(check) for check in estimator.held_out()]
     used = inputs if len(parts) > 1 else []
-    return Outcome(replace(role.latest, events=events), traces, frames, used, checks)
+    return Outcome(replace(role.latest, events=player.events), traces, frames, used, checks)
+
+
+class _Player:
+    """The roles detect and estimate on a bus of their own, and what is published to them.
+
+    Args:
+        job: What to calibrate.
+        progress: See `run_job`.
+        keep: Takes the verdicts on frames; None: they are not wanted.
+        enough: See `run_job`.
+
+    Attributes:
+        role: Estimates.
+        estimator: Its estimator.
+        events: What it announced so far.
+        expected: About how many messages are played in all.
+    """
+
+    def __init__(
+        self,
+        job: Job,
+        progress: Progress,
+        keep: Callable[[Sequence[FrameReport]], None] | None,
+        enough: Callable[[CalibrationEstimate], bool] | None,
+    ) -> None:
+        self._job, self._progress, self._enough = job, progress, enough
+        self._bus = LocalBus()
+        self.estimator = make_estimator(job.config, job.priors)
+        self.role = EstimateRole(
+            job.config, self.estimator, PUBLISH_EVERY_S, inspect=self._inspect, keep=keep
+        )
+        self.events: list[Event] = []
+        self.expected = 0.0
+        self._stop, self._done, self._shown_s = False, 0, time.monotonic()
+        status_key = topics.STATUS.key(job.config.rig, "imu")
+        for key in (job.imu.key, status_key, *(points_key(job, name) for name in job.cameras)):
+            self._bus.subscribe(key, self.role.take)
+        _attach_detectors(self._bus, job)
+
+    def _inspect(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
+        self.events.extend(estimate.events)
+        self._stop = self._stop or (self._enough is not None and self._enough(estimate))
+        return estimate
+
+    def play(self, part: Job, later_ns: int) -> None:
+        """Publish one recording, its stamps moved by `later_ns`."""
+        keys = keys_of(self._job, part)
+        stamp_sigma_s = part.recording.stamp_sigma_s.get(part.imu.name)
+        if stamp_sigma_s is not None:
+            self.estimator.stamps_known_to(stamp_sigma_s)
+        for key, payload in part.messages():
+            if self._stop:
+                break
+            key = keys[key]
+            self._bus.publish(key, _later(payload, later_ns) if later_ns else payload)
+            self._done += 1
+            if key != self._job.imu.key:
+                publish(self._bus, self.role.step())
+                self._show()
+        publish(self._bus, self.role.finish())
+
+    def _show(self) -> None:
+        """Report the progress, ten times a second at most."""
+        if time.monotonic() - self._shown_s > 0.1:
+            self._shown_s = time.monotonic()
+            self._progress(min(self._done / self.expected, 1.0), self.role.latest)
 
 
 def _play_all(
@@ -343,22 +212,6 @@ def _expected(part: Job) -> float:
     return count * part.duration_s / max(part.recording.duration_s, 1e-9)
 
 
-def _keys(job: Job, part: Job) -> dict[str, str]:
-    """Keys of a recording and those of the job that they mean."""
-    there, here = (topics.STATUS.key(x.recording.rig, "imu") for x in (part, job))
-    keys = {part.imu.key: job.imu.key, there: here}
-    if part is job:
-        return keys | {stream.key: stream.key for stream in part.cameras.values()}
-    return keys | {stream.key: _input_key(job, name, stream) for name, stream in part.cameras.items()}
-
-
-def _input_key(job: Job, name: str, stream: Stream) -> str:
-    """Where the messages of a camera's stream go."""
-    if stream.kind in ("points", "tracks"):
-        return _points_key(job, name)
-    return topics.BY_KIND[stream.kind].key(job.config.rig, name)
-
-
 def _later(payload: bytes, later_ns: int) -> bytes:
     stamp_ns = stamp_of(payload)
     return payload if stamp_ns is None else with_stamp(payload, stamp_ns + later_ns)
@@ -376,7 +229,7 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     for name, camera in result["cameras"].items():
         camera["resolution"] = list(job.priors[name].resolution)
     if result["imu"] is not None:
-        result["imu"] |= {"name": job.imu.name, "noise": asdict(_noise_of(job))}
+        result["imu"] |= {"name": job.imu.name, "noise": asdict(noise_of(job))}
     result["warnings"] = [text for part in job.parts for text in part.recording.warnings]
     first = next(iter(job.cameras))
     result["trace"] = outcome.traces[first]
@@ -410,22 +263,13 @@ def images_at(job: Job, camera: str, stamps_ns: Sequence[int]) -> dict[int, byte
     return found
 
 
-def suspects(job: Job) -> str:
-    """Name what to check when the motion is not to blame: wrong input looks like poor motion."""
-    spans = ", ".join(f"{name} {stream.duration_s:.1f} s" for name, stream in job.cameras.items())
-    things = ["the lens in --initial", f"the stamps (imu {job.imu.duration_s:.1f} s, {spans})"]
-    if job.config.target:
-        things.insert(0, f"the sizes in {job.config.target}")
-    return f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}"
-
-
 def _attach_detectors(bus: LocalBus, job: Job) -> None:
     """Give a detector to each camera that comes as images; its points go back on the same bus."""
     images: dict[str, set[str]] = {}
     for part in job.parts:
         for name, stream in part.cameras.items():
             if stream.kind in ("image", "compressed"):
-                images.setdefault(name, set()).add(_input_key(job, name, stream))
+                images.setdefault(name, set()).add(input_key(job, name, stream))
     if not images:
         return
     from vical_daemon.detect.role import DetectRole, attach_aid
@@ -439,58 +283,3 @@ def _attach_detectors(bus: LocalBus, job: Job) -> None:
 
         for key in keys:
             bus.subscribe(key, on_image)
-
-
-def _points_key(job: Job, camera: str) -> str:
-    stream = job.cameras[camera]
-    if stream.kind in ("points", "tracks"):
-        return stream.key
-    free = job.config.calibration.mode == "target_free"
-    return (topics.TRACKS if free else topics.POINTS).key(job.config.rig, camera)
-
-
-def _choose(what: str, streams: dict[str, Stream], name: str | None) -> Stream:
-    if name is None:
-        if len(streams) == 1:
-            return next(iter(streams.values()))
-        known = ", ".join(streams) or "none"
-        raise OptionError(f"the recording has {len(streams)} {what}s ({known}); say which with --{what}")
-    if name not in streams:
-        raise InputError(
-            f"there is no {what} {name!r} in the recording (known: {', '.join(streams) or 'none'})"
-        )
-    return streams[name]
-
-
-def _prior(name: str, stream: Stream, initial: Initial, fix: Sequence[str]) -> CameraPrior:
-    """Return the prior of one camera; a single camera of another name in the file is meant for it."""
-    cameras = initial.cameras
-    prior = cameras.get(name)
-    if prior is None and len(cameras) == 1:
-        prior = next(iter(cameras.values()))
-    prior = prior or CameraPrior(resolution=(0, 0))
-    if prior.resolution == (0, 0):
-        if stream.resolution is None:
-            raise OptionError(
-                f"{name}: the image size is neither in the recording nor in --initial; "
-                f"give a file with `{name}: {{resolution: [width, height]}}`"
-            )
-        prior = replace(prior, resolution=stream.resolution)
-    elif stream.resolution is not None and stream.resolution != prior.resolution:
-        given_size, size = ("{} x {}".format(*r) for r in (prior.resolution, stream.resolution))
-        raise InputError(f"{name}: --initial is for images of {given_size}, the recording's are {size}")
-    given = {
-        "intrinsics": prior.intrinsics,
-        "extrinsics": prior.T_imu_cam,
-        "timeshift": prior.timeshift_cam_imu_s,
-    }
-    for what in fix:
-        if given[what] is None:
-            raise OptionError(f"--fix {what}: --initial does not give it for {name}")
-    return prior
-
-
-def _noise_of(job: Job) -> ImuNoise:
-    imu = job.config.imus[job.imu.name]
-    n = imu.noise
-    return ImuNoise(n.gyro_density, n.gyro_walk, n.accel_density, n.accel_walk, imu.rate_hz)

@@ -14,7 +14,8 @@ from typing import Any
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.result import CameraEstimate, Status
 from vical_daemon.estimation.tools.agreement import Agreement, Difference, agreements, calibrations
-from vical_daemon.offline.calibrate import Job, Outcome, Progress, document, run_job
+from vical_daemon.offline.calibrate import Outcome, Progress, document, run_job
+from vical_daemon.offline.calibration_job import Job
 
 AGREES, DISAGREES, CANNOT_TELL = "agrees", "disagrees", "cannot tell"
 _NO_RESULT = (Status.WAITING, Status.INITIALISING, Status.INCONSISTENT)

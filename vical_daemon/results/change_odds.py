@@ -14,9 +14,10 @@ from itertools import combinations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.significance import CALIBRATIONS_DISAGREE
 from vical_daemon.results.known import BLOCKS
 
-FALSE_ALARM = 1e-3
+FALSE_ALARM = CALIBRATIONS_DISAGREE
 """Bound of the probability to say `changed` of a calibration that holds."""
 MISSED = 1e-2
 """Bound of the probability to say `holds` of a calibration of which one block has changed by what counts."""

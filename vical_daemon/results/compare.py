@@ -9,10 +9,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from vical_daemon.estimation.measurements import IntArray
+from vical_daemon.estimation.significance import CALIBRATIONS_DISAGREE
 from vical_daemon.results.difference import Difference
 from vical_daemon.results.known import BLOCKS
 
-FALSE_ALARM = 1e-3
+FALSE_ALARM = CALIBRATIONS_DISAGREE
 """Probability of `changed` for two calibrations of the same rig, if their sigmas are right."""
 
 

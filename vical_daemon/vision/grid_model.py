@@ -123,7 +123,8 @@ def outliers(
     middle = np.maximum(count - 1, 0) // 2
     usual = around[:, np.arange(len(valid)), middle]
     usual = np.where(count >= 2, usual, 0.0)
-    odd = np.hypot(*np.where(valid, residual - usual, 0.0))
+    with np.errstate(invalid="ignore"):  # where the model predicts a point and its neighbours at infinity
+        odd = np.hypot(*np.where(valid, residual - usual, 0.0))
     limit = max(floor_px, 6 * median(odd[valid]))
     return np.asarray(valid & ~(odd < limit))
 

@@ -145,7 +145,7 @@ class MicrostrainImu(Closing):
         if known is None or (info.serial_number, info.model) == (known.serial_number, known.model):
             return
         if known.serial_number and not info.serial_number:
-            raise DeviceTimeoutError(f"{self._path}: the device does not tell its serial number")
+            raise DeviceTimeoutError(f"{self._path}: the device does not report its serial number")
         if info.serial_number == known.serial_number:
             return
         self._closed = True

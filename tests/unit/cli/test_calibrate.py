@@ -19,6 +19,7 @@ from vical_daemon.logs import open_recording
 from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline import calibrate
+from vical_daemon.offline.calibration_job import make_job
 
 G = 9.80665
 
@@ -88,7 +89,7 @@ def test_what_the_driver_said_of_its_stamps_counts_as_it_does_live(shortest: Pat
 
 @pytest.fixture(scope="session")
 def outcome(shortest: Path) -> calibrate.Outcome:
-    job = calibrate.make_job(
+    job = make_job(
         open_recording(shortest),
         read_initial(shortest / "initial.yaml"),
         target=str(shortest / "target.yaml"),
@@ -206,11 +207,6 @@ def _with_tag_size(folder: Path, size_m: float) -> list[str]:
     return _arguments(folder)
 
 
-def _spoil_target_size(folder: Path) -> list[str]:
-    """Twenty times too large: nothing in the images shows it, only the accelerometer."""
-    return _with_tag_size(folder, 2.0)
-
-
 def _spoil_no_initial(folder: Path) -> list[str]:
     return _arguments(folder, "--initial", str(folder / "nowhere.yaml"))
 
@@ -228,7 +224,6 @@ def _spoil_report(folder: Path) -> list[str]:
         (_spoil_g, 1, "looks like g"),
         (_spoil_camera_rate, 1, "cam0"),
         (_spoil_target_key, 1, "tagSize"),
-        (_spoil_target_size, 1, "check the sizes in "),
         (_spoil_no_initial, 2, "no such file"),
         (_spoil_initial, 2, "did you mean intrinsics"),
         (_spoil_nothing_fixed, 2, "does not give it"),
@@ -250,11 +245,15 @@ def test_bad_input_is_one_line(copy: Path, capsys, spoil, code: int, words: str)
     assert words in err.splitlines()[-1] and err.splitlines()[-1].startswith("vical: error: ")
 
 
-def test_a_failure_keeps_an_earlier_result(copy: Path, capsys) -> None:
+def test_a_failure_is_one_line_and_keeps_an_earlier_result(copy: Path, capsys) -> None:
+    """A board twenty times too large: nothing in the images shows it, only the accelerometer."""
     earlier = copy / "result.json"
     earlier.write_text("of yesterday", encoding="utf-8")
-    assert main([*_spoil_target_size(copy), "-o", str(earlier)]) == 1
-    assert f"{earlier} was not written" in capsys.readouterr().err.splitlines()[-1]
+    assert main([*_with_tag_size(copy, 2.0), "-o", str(earlier)]) == 1
+    out, err = capsys.readouterr()
+    last = err.splitlines()[-1]
+    assert out == "" and "Traceback" not in err and last.startswith("vical: error: ")
+    assert "check the sizes in " in last and f"{earlier} was not written" in last
     assert earlier.read_text(encoding="utf-8") == "of yesterday"
 
 

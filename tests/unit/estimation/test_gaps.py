@@ -221,7 +221,7 @@ def test_the_motion_found_anew_is_the_true_one(run, so_far):
     for x in frames:
         t_cam_s = (x.t_cam_ns - int(run.t_imu_ns[0])) * 1e-9
         restart.take(PointsFrame("cam0", x.t_cam_ns, x.ids, x.uv_px), t_cam_s, f.state, c._buffer)
-    motion = restart.motion(f.state, c.layout, f.sigmas(), c._buffer)
+    motion = restart.motion(f.state, c.rig.layout, f.sigmas(), c._buffer)
     tau = np.array([motion.t_s + base_s])
     truth = run.rig.trajectory
     turn = np.arccos(np.clip((np.trace(truth.R_world_imu(tau)[0].T @ motion.R_world_imu) - 1) / 2, -1, 1))

@@ -14,6 +14,7 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline import calibrate
+from vical_daemon.offline.calibration_job import make_job
 
 
 def test_all_that_was_announced_on_the_way_is_told_at_the_end(
@@ -34,7 +35,7 @@ def test_all_that_was_announced_on_the_way_is_told_at_the_end(
 
     make = calibrate.make_estimator
     monkeypatch.setattr(calibrate, "make_estimator", lambda *a: Announcer(make(*a)))
-    job = calibrate.make_job(
+    job = make_job(
         open_recording(shortest),
         read_initial(shortest / "initial.yaml"),
         target=str(shortest / "target.yaml"),
@@ -76,9 +77,7 @@ def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
     make = calibrate.make_estimator
     monkeypatch.setattr(calibrate, "make_estimator", lambda *a: Listener(make(*a)))
     recording = open_recording(short)
-    job = calibrate.make_job(
-        recording, read_initial(short / "initial.yaml"), target=str(short / "target.yaml")
-    )
+    job = make_job(recording, read_initial(short / "initial.yaml"), target=str(short / "target.yaml"))
     calibrate.run_job(job, lambda share, estimate: None)
     samples = recording.imu_arrays("imu0")
     expected = [
@@ -93,7 +92,7 @@ def test_the_roles_add_nothing_to_what_the_estimator_is_fed(
 
 def test_only_the_part_that_was_asked_for_is_used(short: Path) -> None:
     recording = open_recording(short)
-    job = calibrate.make_job(
+    job = make_job(
         recording,
         read_initial(short / "initial.yaml"),
         target=str(short / "target.yaml"),

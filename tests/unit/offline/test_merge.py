@@ -87,8 +87,8 @@ def test_of_two_that_disagree_nothing_is_merged(folders, capsys, tmp_path, monke
     code, result, err = _merge(capsys, folders, "monday", "wednesday", more=("-o", str(tmp_path / "r.json")))
     assert code == 3
     assert result["status"] == "inconsistent" and result["cameras"] == {}
-    assert json.loads((tmp_path / "r.json").read_text())["disagreeing"] == result["disagreeing"]
-    assert "too few to tell" in err
+    assert result["disagreeing"]
+    assert "too few to tell" in err and not (tmp_path / "r.json").exists()
 
 
 def _nothing() -> CalibrationEstimate:

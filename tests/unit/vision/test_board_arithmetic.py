@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.vision.aprilgrid import PASSES, _passes
-from vical_daemon.vision.grid_model import _project, _project_with_jacobian
+from vical_daemon.vision.grid_model import _project, _project_with_jacobian, outliers
 from vical_daemon.vision.layout import BoardLayout
 from vical_daemon.vision.saddle import SaddleImage, pixel_noise
 from vical_daemon.vision.tag_code import bit_centres, bit_places
@@ -74,3 +74,11 @@ def test_every_pass_has_its_turn_while_there_is_no_board():
         later = [_passes(width, misses) for misses in range(1, len(PASSES) + 1)]
         assert {passes[-1] for passes in later} == set(PASSES)
         assert all(passes[:-1] == first[: -len(PASSES)] for passes in later)
+
+
+def test_points_that_a_model_predicts_at_infinity_do_not_belong():
+    layout = BoardLayout.of(Checkerboard(5, 4, 0.1, 0.1))
+    residual = np.random.default_rng(1).normal(0.0, 0.05, (len(layout.xy_m), 2))
+    far = layout.xy_m[:, 0] < 0.25  # most of the board: so far are most of their neighbours, too
+    residual[far] = np.inf
+    assert outliers(residual, np.ones(len(residual), bool), layout.neighbours)[far].all()

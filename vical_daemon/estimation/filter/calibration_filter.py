@@ -55,6 +55,7 @@ from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_way
 
 _EYE = np.eye(3)
 _TINY = 1e-30 * np.eye(9)  # noise densities may be told as zero
+_TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
 
@@ -140,10 +141,11 @@ class CalibrationFilter:
         A = self.S.copy()
         A[:9, :d] = moved.linear
         self._drift_shifts(A, moved.seconds)
-        noise = np.zeros((n, c + 9))
+        walks = self._random_walk(moved.seconds)
+        noise = np.zeros((n, c + 9 + walks.shape[1]))
         noise[:9, :c] = moved.curved
-        noise[:9, c:] = unscented.root(Q)
-        noise = np.concatenate([noise, self._random_walk(moved.seconds)], axis=1)
+        noise[:9, c : c + 9] = unscented.root(Q)
+        noise[:, c + 9 :] = walks
         self.S = unscented.lower_root_grown(A, noise, d)
 
     # ------------------------------------------------------------------ update
@@ -265,13 +267,10 @@ class CalibrationFilter:
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
         turned = [ATTITUDE] + [c.rotation for c in self.layout.cameras.values() if c.rotation is not None]
-        if max(float(np.abs(dx[s]).max()) for s in turned) > 1e-4:
-            for s in turned:
-                half = 0.5 * dx[s]
-                J = np.eye(3) + np.array(
-                    [[0, half[2], -half[1]], [-half[2], 0, half[0]], [half[1], -half[0], 0]]
-                )
-                unscented.turn_rows(S, s, J)
+        for s in turned:
+            x, y, z = (0.5 * dx[s]).tolist()
+            if max(abs(x), abs(y), abs(z)) > _TURNED_RAD:
+                unscented.turn_rows(S, s, np.array([[1.0, z, -y], [-z, 1.0, x], [y, -x, 1.0]]))
         self.S = S
         self.state = retract(self.state, self.layout, dx)
 
@@ -394,14 +393,19 @@ class CalibrationFilter:
         for consistency in self.consistency.values():
             consistency.settle()
 
-    def copy(self) -> CalibrationFilter:
-        """A filter that can be run ahead of this one; what is measured about the noise stays shared."""
+    def copy(self, earlier: CalibrationFilter | None = None) -> CalibrationFilter:
+        """A filter that can be run ahead of this one; what is measured about the noise stays shared.
+
+        Args:
+            earlier: A copy that was run as far ahead before: the same derivatives will do as long as its
+                sigmas were as large.
+        """
         return replace(
             self,
             state=deepcopy(self.state),
             S=self.S.copy(),
-            _motion_straight=LinearityMonitor(),
-            _view_straight={},
+            _motion_straight=LinearityMonitor() if earlier is None else earlier._motion_straight,
+            _view_straight={} if earlier is None else earlier._view_straight,
         )
 
     @property

@@ -7,18 +7,22 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import chdtri
 
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.significance import (
+    CORNER_REFUSED,
+    IMAGE_REFUSED,
+    RESIDUAL_REFUSED,
+    chi_square_limit,
+)
 
 _ITERATIONS = 5
 _LEAST = 4  # points for a correction
 _CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
-_CORNER_GATE = float(chdtri(2, 1e-4))
-_RESIDUAL_GATE = float(chdtri(2, 2e-5))
-_FRAME_GATE_P = 1e-9
+_CORNER_GATE = chi_square_limit(2, CORNER_REFUSED)
+_RESIDUAL_GATE = chi_square_limit(2, RESIDUAL_REFUSED)
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
 Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
@@ -27,7 +31,7 @@ Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread 
 @lru_cache(maxsize=256)
 def frame_limit(dof: int) -> float:
     """Chi-square limit of a whole frame (scipy takes half a millisecond for it)."""
-    return float(chdtri(dof, _FRAME_GATE_P))
+    return chi_square_limit(dof, IMAGE_REFUSED)
 
 
 @dataclass(slots=True)
@@ -45,6 +49,7 @@ class ImageFit:
         left: Whitened residuals after the correction, shape (n, 2).
         ways: The ways of the kept rows, whitened and compressed: sums over the rows stay, shape (m, k).
         r: Their innovation, shape (m,).
+        rows: Ways and innovation of the kept rows, whitened, where the fit is linearised; (2n, k), (2n,).
     """
 
     S: FloatArray
@@ -57,6 +62,7 @@ class ImageFit:
     left: FloatArray
     ways: FloatArray
     r: FloatArray
+    rows: tuple[FloatArray, FloatArray]
 
 
 def rows_of(keep: BoolArray) -> BoolArray | slice:
@@ -73,9 +79,7 @@ def whitened(image: Image, lin: Linear, keep: BoolArray) -> tuple[FloatArray, Fl
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-    moves = lin.moves
-    size = len(moves)
-    moved = lin.ways @ (unscented.lower_root(moves) if moves.shape[1] > size else moves)
+    moved = lin.ways @ lin.moves
     var = np.einsum("ij,ij->i", moved, moved)
     if lin.curved.size:
         var += np.einsum("ij,ij->i", lin.curved, lin.curved)
@@ -127,6 +131,23 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
     return fit
 
 
+def _moved(solution: FloatArray, spread: FloatArray, shared: FloatArray) -> FloatArray:
+    """How far a solution moves the image in each way, shape (k,), and what it leaves to the curvature."""
+    n = spread.shape[1]
+    if len(solution) == n:
+        return np.asarray(spread @ solution)
+    m = n + shared.shape[1]
+    return np.concatenate([spread @ solution[:n] + shared @ solution[n:m], solution[m:]])
+
+
+def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
+    """Sum of squares and number of the rows that no state moves."""
+    alone = np.einsum("ij,ij->i", rows, rows) < _ALONE
+    count = int(np.count_nonzero(alone))
+    left = r[alone] if count else r[:0]
+    return float(left @ left), count
+
+
 def _correct(
     prior: FloatArray, spread: FloatArray, r: FloatArray, lin: Linear, weight: FloatArray, keep: BoolArray
 ) -> ImageFit:
@@ -139,19 +160,18 @@ def _correct(
             ways = np.concatenate([ways, curved], axis=1)
     for _ in range(3):
         rows = rows_of(keep)
-        R, r_small, rest, dof_rest = unscented.compress(ways[rows], r[rows])
+        kept, r_kept = ways[rows], r[rows]
+        R, r_small, rest, dof_rest = unscented.compress(kept, r_kept)
         small = np.concatenate([R[:, :k] @ spread, R[:, :k] @ lin.shared, R[:, k:]], axis=1)
         c = unscented.correct(prior, small, r_small)
-        e, shared, bent = np.split(c.solution, np.cumsum([len(prior), lin.shared.shape[1]]))
-        left = (r - ways @ np.concatenate([spread @ e + lin.shared @ shared, bent])).reshape(-1, 2)
-        bad = keep & ((left**2).sum(axis=1) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
+        moved = _moved(c.solution, spread, lin.shared)
+        left = (r - ways @ moved).reshape(-1, 2)
+        bad = keep & (np.einsum("ij,ij->i", left, left) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
         if not bad.any() or (keep & ~bad).sum() < _LEAST:
             break
         keep = keep & ~bad
     # Rows that no state moves are residuals like the rest, and say nothing about whether the innovations fit.
-    alone = np.einsum("ij,ij->i", small, small) < _ALONE if dof_rest else np.zeros(len(r_small), bool)
-    apart = float((r_small[alone] ** 2).sum())
-    count = int(alone.sum())
+    apart, count = _unmoved(small, r_small) if dof_rest else (0.0, 0)
     return ImageFit(
         c.S,
         c.dx,
@@ -163,4 +183,5 @@ def _correct(
         left,
         R[:, :k],
         r_small,
+        (kept[:, :k], r_kept),
     )

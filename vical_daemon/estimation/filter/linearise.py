@@ -79,11 +79,15 @@ class Linear:
     curved: FloatArray
     valid: BoolArray
     shared: FloatArray
+    _moves: FloatArray | None = None
 
     @property
     def moves(self) -> FloatArray:
-        """What moves the image beside the corners' own noise: states and what corners share, (k, c + r)."""
-        return np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
+        """Square root of how far states and what corners share move the image, (k, at most k); made once."""
+        if self._moves is None:
+            both = np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
+            self._moves = unscented.lower_root(both) if both.shape[1] > len(both) else both
+        return self._moves
 
 
 def project_errors(
@@ -189,23 +193,22 @@ def view_derivatives(
     x_cam = (arm @ R - cam.p_imu_cam) @ cam.R_imu_cam
     with np.errstate(all="ignore"):
         uv, J, J_lens = project_jacobians(x_cam, cam.intrinsics, cam.distortion, cam.distortion_model)
-    J = J.reshape(-1, 3)
     by_error = _pose_by_error(state, layout, rates, image.camera, ahead_s, turn)
-    ways = np.empty((len(J), len(by_error)))
-    ways[:, :3] = cross(J, np.repeat(x_cam, 2, axis=0))  # j' (x x phi) = (j x x)' phi
-    ways[:, 3:6] = -J
+    ways = np.empty((2 * len(J), len(by_error)))
+    ways[:, :3] = cross(J, x_cam[:, None]).reshape(-1, 3)  # j' (x x phi) = (j x x)' phi
+    np.negative(J.reshape(-1, 3), out=ways[:, 3:6])
     if where.intrinsics is not None and where.distortion is not None:
         n = J_lens.shape[-1]
         ways[:, 6 : 6 + n] = J_lens.reshape(-1, n)
-        by_error[6 : 6 + n, where.intrinsics.start : where.distortion.stop] = np.eye(n)
+        by_error[6 : 6 + n, where.intrinsics.start : where.distortion.stop] = unscented.unit(n)
     at = len(by_error) - MODES * (layout.target_shape is not None)
-    by_point = (J @ (R @ cam.R_imu_cam).T).reshape(-1, 2, 3)  # moved in the world
+    by_point = (J.reshape(-1, 3) @ (R @ cam.R_imu_cam).T).reshape(-1, 2, 3)  # moved in the world
     if layout.target_scale is not None:
         ways[:, at - 1] = np.matmul(by_point, image.points[:, :, None]).ravel()
         by_error[at - 1, layout.target_scale] = 1.0
     if fields is not None:
         ways[:, at:] = np.matmul(by_point, fields).reshape(-1, MODES)
-        by_error[at:, layout.target_shape] = np.eye(MODES)
+        by_error[at:, layout.target_shape] = unscented.unit(MODES)
     return uv, ways, by_error
 
 
@@ -228,7 +231,7 @@ def _pose_by_error(
     out[3:6, POSITION], out[3:6, VELOCITY] = from_world, ahead_s * from_world
     if where.position is not None and where.rotation is not None:
         out[3:6, where.position] = to_cam
-        out[0:3, where.rotation] = np.eye(3)
+        out[0:3, where.rotation] = unscented.unit(3)
     if where.timeshift is not None:
         out[0:3, where.timeshift] = to_cam @ rates.omega
         speed = state.v_world_imu + ahead_s * rates.accel

@@ -1,4 +1,4 @@
-"""What an image says about the noise and the model, beside the state: taken before the image is used."""
+"""Updates of the noise models and of the lens check from an image, before the image corrects the state."""
 
 from __future__ import annotations
 
@@ -26,31 +26,32 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
         fit: Its correction, not yet accepted.
     """
     where = f.layout.cameras[image.camera]
+    # a fit far from straight is linearised elsewhere
+    rows = whitened(image, lin, fit.keep) if lin.curved.size else fit.rows
     shared, agreement = f.shared.get(image.camera), f.agreement.get(image.camera)
     if shared is not None:
-        # a fit far from straight is linearised elsewhere
-        ways, innovation = whitened(image, lin, fit.keep) if lin.curved.size else (fit.ways, fit.r)
+        ways, innovation = rows if lin.curved.size else (fit.ways, fit.r)
         level = f.consistency[image.camera].level
         by_shared = ways @ (lin.by_error @ shared_ways(f.state, f.layout, image.camera))
         shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
     if where.intrinsics is not None and where.distortion is not None and agreement is not None:
         by_lens = lin.by_error[:, where.intrinsics.start : where.distortion.stop]
-        _ask_lens(f, agreement, image, lin, fit, by_lens)
+        _ask_lens(f, agreement, image.camera, lin, rows, by_lens)
 
 
 def _ask_lens(
     f: CalibrationFilter,
     agreement: LensAgreement,
-    image: Image,
+    name: str,
     lin: Linear,
-    fit: ImageFit,
+    rows: tuple[FloatArray, FloatArray],
     by_lens: FloatArray,
 ) -> None:
     """What an image would have the lens be: with the target as stated until it is known not to be."""
-    ways, innovation = whitened(image, lin, fit.keep)
+    ways, innovation = rows
     shape = f.layout.target_shape
     if shape is not None and "target_shape" not in f.off:
         innovation = innovation + ways @ (lin.by_error[:, shape] @ f.mean.target_shape)
-    camera = f.mean.cameras[image.camera]
+    camera = f.mean.cameras[name]
     values = np.concatenate([camera.intrinsics, camera.distortion])
     agreement.learn(f.state.t_s, innovation, ways @ lin.by_error[:, :6], ways @ by_lens, values)

@@ -88,9 +88,10 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
     R, g = state.R_world_imu, state.gravity
     errors = influence(R, relative)
     F = np.zeros((9, len(S)))
-    tilt = -so3.hat(g) @ state.tilt
+    hats = so3.hat(np.array([dp, dv, g]))
+    tilt = -hats[2] @ state.tilt
     F[ATTITUDE, ATTITUDE] = dR.T
-    F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ so3.hat(dp), -R @ so3.hat(dv)
+    F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ hats[:2]
     F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = _EYE
     F[POSITION, VELOCITY] = T * _EYE
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS, CameraSlices
 from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
-from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 
 _ROUNDING = 1e-9  # of the sigma of a lens that is off: less is arithmetic
 
@@ -27,31 +27,17 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
     spread = float(np.sqrt(f.consistency[name].factor))
     sigma = spread * f.sigmas()
     lens_sigma = _lens_sigmas(f, name, spread)
-    q = so3.quat_from_matrix(camera.R_imu_cam)
-    pose = spread**2 * pose_covariance(f, where)
-    shift_sigma = _timeshift_sigma(f, sigma, where)
-    return CameraEstimate(
-        PoseEstimate(
-            camera.p_imu_cam.tolist(),
-            q.tolist(),
-            pose.tolist(),
-        ),
-        float(camera.timeshift_s),
-        shift_sigma,
-        lens[:4].tolist(),
-        lens_sigma[:4].tolist(),
-        camera.distortion_model,
-        lens[4:].tolist(),
-        lens_sigma[4:].tolist(),
-        float(reprojection_rms_px),
-        float(f.corner_noise[name].sigma_px),
-        [],
-        float(camera.readout_s),
-        float(sigma[where.readout]) if where.readout is not None else 0.0,
-        [int(size) for size in camera.resolution],
-        camera.readout_axis,
-        stamp_jitter_s=float(f.shared[name].jitter_s) if name in f.shared else 0.0,
-        calibration_covariance=_calibration_covariance(f, name, spread, lens_sigma).tolist(),
+    return camera_snapshot(
+        camera,
+        pose=spread**2 * pose_covariance(f, where),
+        timeshift_sigma_s=_timeshift_sigma(f, sigma, where),
+        lens=lens,
+        lens_sigma=lens_sigma,
+        readout_sigma_s=float(sigma[where.readout]) if where.readout is not None else 0.0,
+        rms_px=reprojection_rms_px,
+        sigma_px=f.corner_noise[name].sigma_px,
+        joint=_calibration_covariance(f, name, spread, lens_sigma),
+        jitter_s=f.shared[name].jitter_s if name in f.shared else 0.0,
     )
 
 
@@ -110,14 +96,11 @@ def _timeshift_sigma(f: CalibrationFilter, sigma: FloatArray, where: CameraSlice
 
 def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
     """Biases and, where asked for, the matrices."""
-    sigma = f.sigmas()
-    return ImuEstimate(
-        f.state.gyro_bias.tolist(),
-        f.state.accel_bias.tolist(),
-        sigma[GYRO_BIAS].tolist(),
-        sigma[ACCEL_BIAS].tolist(),
-        f.state.gyro_matrix.tolist() if matrices else [],
-        f.state.accel_matrix.tolist() if matrices else [],
+    sigma, state = f.sigmas(), f.state
+    return imu_snapshot(
+        np.concatenate([state.gyro_bias, state.accel_bias]),
+        np.concatenate([sigma[GYRO_BIAS], sigma[ACCEL_BIAS]]),
+        (state.gyro_matrix, state.accel_matrix) if matrices else (),
     )
 
 

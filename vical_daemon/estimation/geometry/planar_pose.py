@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -100,7 +101,7 @@ def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
     Args:
         far: Distance of each point from its place, shape (n,).
     """
-    sigma = np.median(far) / 1.1774  # the median of a Rayleigh distribution
+    sigma = np.median(far) / MEDIAN_RAYLEIGH
     return np.asarray(far <= 6.0 * sigma)
 
 

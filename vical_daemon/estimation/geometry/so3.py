@@ -40,17 +40,9 @@ def hat(v: FloatArray) -> FloatArray:
 
 def _polynomial(alpha: FloatArray, beta: FloatArray, gamma: FloatArray, v: FloatArray) -> FloatArray:
     """Return `alpha I + beta hat(v) + gamma v v'`, the form of all functions of hat(v)."""
-    out = (gamma[..., None] * v)[..., :, None] * v[..., None, :]
-    bv = beta[..., None] * v
-    out[..., 0, 0] += alpha
-    out[..., 1, 1] += alpha
-    out[..., 2, 2] += alpha
-    out[..., 2, 1] += bv[..., 0]
-    out[..., 1, 2] -= bv[..., 0]
-    out[..., 0, 2] += bv[..., 1]
-    out[..., 2, 0] -= bv[..., 1]
-    out[..., 1, 0] += bv[..., 2]
-    out[..., 0, 1] -= bv[..., 2]
+    out = ((beta[..., None] * v) @ _SKEW).reshape(*v.shape, 3)
+    out += (gamma[..., None] * v)[..., :, None] * v[..., None, :]
+    out.reshape(*v.shape[:-1], 9)[..., ::4] += alpha[..., None]
     return out
 
 

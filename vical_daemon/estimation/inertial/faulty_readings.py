@@ -47,18 +47,21 @@ class RangeLimits:
 
     def __init__(self) -> None:
         self._extreme = [1e-9] * 12
+        self._near = [_NEAR * 1e-9] * 12
         self._at = [0] * 12
         self._values: list[dict[float, int]] = [{} for _ in range(12)]
         self._clips = [False] * 12
 
     def clipped(self, six: Six) -> bool:
         """Whether a channel of a reading (rad/s, m/s^2) is at the end of its range."""
-        both = [*six, *[-x for x in six]]
+        a, b, c, d, e, f = six
+        both = (a, b, c, d, e, f, -a, -b, -c, -d, -e, -f)
         extreme = self._extreme
-        for i, value in enumerate(both):
-            if value > _NEAR * extreme[i]:
+        for i, (value, near) in enumerate(zip(both, self._near, strict=True)):
+            if value > near:
                 self._follow(i, value)
-        return any(self._clips) and any(
+                self._near[i] = _NEAR * extreme[i]
+        return True in self._clips and any(
             both[i] == extreme[i] and extreme[i] in self._ends(channels)
             for channels in _CHANNELS
             for i in channels
@@ -126,19 +129,20 @@ class SpikeFilter(Generic[T]):
             self._note(six, self._missed(six))
             return [held_item, item]
         missed = self._missed(six)
-        gyro_off, accel_off = (
-            size > max(_SPIKE * usual, harmful)
-            for size, usual, harmful in zip(missed, self._largest, _HARMFUL, strict=True)
-        )
-        if len(self._first) >= _LEARN and gyro_off != accel_off:
-            self.held = six, item
-            return []
+        if len(self._first) >= _LEARN:
+            (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
+            gyro_off = gyro > _HARMFUL[0] and gyro > _SPIKE * usual_gyro
+            if gyro_off != (accel > _HARMFUL[1] and accel > _SPIKE * usual_accel):
+                self.held = six, item
+                return []
         self._note(six, missed)
         return [item]
 
     def _missed(self, six: Six) -> tuple[float, float]:
         """Errors of the prediction: gyro rad/s, accelerometer m/s^2."""
-        return _apart(six, [2.0 * x - y for x, y in zip(self._last, self._before, strict=True)])
+        a, b, c, d, e, f = self._last
+        p, q, r, s, t, u = self._before
+        return _apart(six, (2.0 * a - p, 2.0 * b - q, 2.0 * c - r, 2.0 * d - s, 2.0 * e - t, 2.0 * f - u))
 
     def _note(self, six: Six, missed: tuple[float, float]) -> None:
         if self._count >= 2:
@@ -146,9 +150,10 @@ class SpikeFilter(Generic[T]):
                 self._first.append(missed)
                 self._largest = (2.0 * np.median(self._first, axis=0)).tolist()
             else:  # one that was not noticed at most doubles it
+                (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
                 self._largest = [
-                    max(min(size, 2.0 * usual), _FADES * usual)
-                    for size, usual in zip(missed, self._largest, strict=True)
+                    max(min(gyro, 2.0 * usual_gyro), _FADES * usual_gyro),
+                    max(min(accel, 2.0 * usual_accel), _FADES * usual_accel),
                 ]
         self._before, self._last = self._last, six
         self._count += 1
@@ -156,5 +161,4 @@ class SpikeFilter(Generic[T]):
 
 def _apart(a: Six, b: Six) -> tuple[float, float]:
     """How far two readings are from each other: gyro rad/s, accelerometer m/s^2."""
-    x, y, z, u, v, w = [p - q for p, q in zip(a, b, strict=True)]
-    return math.sqrt(x * x + y * y + z * z), math.sqrt(u * u + v * v + w * w)
+    return math.dist(a[:3], b[:3]), math.dist(a[3:], b[3:])

@@ -17,7 +17,7 @@ from vical_daemon.estimation.measurements import FloatArray
 GAP_S = 0.05
 """Between samples further apart than this nothing is known, s. A cubic over 50 ms misses a 3 Hz motion of
 1 rad/s by at most h^4 w^4 / 384 = 2e-3 rad/s, less than 1e-4 rad in all; over 100 ms by 16 times as much."""
-_GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
+GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
 _USUAL = 201  # samples whose median interval is the usual one
 
 
@@ -112,7 +112,7 @@ class ImuBuffer:
         """Longest interval between two readings that interpolation bridges, s."""
         recent = self.rows[-_USUAL:, 0]
         period_s = float(np.median(recent[1:] - recent[:-1])) if len(recent) > 2 else 0.0
-        return max(GAP_S, _GAP_PERIODS * period_s)
+        return max(GAP_S, GAP_PERIODS * period_s)
 
     def gap_within(self, from_s: float, to_s: float) -> bool:
         """Whether readings are missing somewhere between two instants, ends included."""
@@ -186,9 +186,10 @@ def _hermite(
     rows: FloatArray, slope: FloatArray, t_s: FloatArray, k: npt.NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
     """Value and derivative of the cubic through rows k and k + 1 at instants `t_s`, shapes (m, 6)."""
-    h = (rows[k + 1, 0] - rows[k, 0])[:, None]
-    u = (t_s[:, None] - rows[k, :1]) / h
-    a, b = rows[k, 1:], rows[k + 1, 1:]
+    before, after = rows[k], rows[k + 1]
+    h = after[:, :1] - before[:, :1]
+    u = (t_s[:, None] - before[:, :1]) / h
+    a, b = before[:, 1:], after[:, 1:]
     A, B = slope[k] * h, slope[k + 1] * h
     d = b - a
     value = a + u * (A + u * (3.0 * d - 2.0 * A - B + u * (A + B - 2.0 * d)))

@@ -8,14 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
-from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
+from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, Six, SpikeFilter
 from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
-from vical_daemon.estimation.inertial.stamp_steps import StampSteps
+from vical_daemon.estimation.inertial.stamp_steps import LEARN, StampSteps
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
-_LEARN = 20  # readings by which the usual interval is known
-_MOST = (MOST_RPS,) * 3 + (MOST_MPS2,) * 3
 _CLIPPED_S = 5.0  # after the first clipped reading, their share is announced
 _UNSEEN_S = 0.5
 """After a jump of the stamps an image is waited for so long, s: a slow camera takes two a second."""
@@ -66,7 +64,7 @@ class ImuIntake:
         self._last: tuple[float, ...] = ()
         self._repeats = 0  # of the newest reading
         self._limits = RangeLimits()
-        self._spikes: SpikeFilter[Reading] = SpikeFilter()
+        self._spikes: SpikeFilter[tuple[int, Six]] = SpikeFilter()
         self._taken = 0
         self._clips = 0  # readings left out since the newest
         self._clipping: tuple[float, int, int] | None = None  # since when, and counts then
@@ -106,8 +104,12 @@ class ImuIntake:
         Returns:
             The readings added: none, this one, or the one held before and this one.
         """
-        six = (*map(float, gyro_rps), *map(float, specific_force_mps2))
-        if not all(-most <= x <= most for x, most in zip(six, _MOST, strict=True)):  # NaN is not, either
+        x, y, z = map(float, gyro_rps)
+        a, b, c = map(float, specific_force_mps2)
+        six = (x, y, z, a, b, c)
+        fast = -MOST_RPS <= x <= MOST_RPS and -MOST_RPS <= y <= MOST_RPS and -MOST_RPS <= z <= MOST_RPS
+        hard = -MOST_MPS2 <= a <= MOST_MPS2 and -MOST_MPS2 <= b <= MOST_MPS2 and -MOST_MPS2 <= c <= MOST_MPS2
+        if not (fast and hard):  # NaN is not within bounds, either
             self.refused += 1
             return []
         if six == self._last:
@@ -118,17 +120,16 @@ class ImuIntake:
         if self.buffer is None:
             self.base_ns = t_imu_ns
             self.buffer = ImuBuffer(t_imu_ns)
-        values = np.array(six)
         added = []
-        for good in self._spikes.sift(six, Reading(t_imu_ns, values[:3], values[3:])):
-            added += self._unless_clipped(self.buffer, good)
+        for good_ns, good in self._spikes.sift(six, (t_imu_ns, six)):
+            added += self._unless_clipped(self.buffer, good_ns, good)
         return added
 
-    def _unless_clipped(self, buffer: ImuBuffer, reading: Reading) -> list[Reading]:
+    def _unless_clipped(self, buffer: ImuBuffer, t_imu_ns: int, six: Six) -> list[Reading]:
         """Add a reading whose channels are all within their range; what others read is not known."""
-        t_s = (reading.t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
+        t_s = (t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
         self._taken += 1
-        if self._limits.clipped([*reading.gyro_rps.tolist(), *reading.specific_force_mps2.tolist()]):
+        if self._limits.clipped(six):
             self.clipped += 1
             self._clips += 1
             self._clipping = self._clipping or (t_s, self._taken, self.clipped)
@@ -137,7 +138,8 @@ class ImuIntake:
         if self.between and t_s < self._newest_s + _APART_S:  # its stamps overlap, or seem to go on
             self.base_ns -= round((self._newest_s + _APART_S - t_s) * 1e9)
             t_s = self._newest_s + _APART_S
-        added = self._in_order(buffer, t_s, reading)
+        values = np.array(six)
+        added = self._in_order(buffer, t_s, Reading(t_imu_ns, values[:3], values[3:]))
         if added:
             self._repeats = self._clips = 0
         return added
@@ -170,7 +172,7 @@ class ImuIntake:
         """Whether a reading follows the newest so closely that interpolation will do."""
         if interval_s <= 0.0:
             return False
-        return interval_s <= GAP_S or len(buffer) < _LEARN or interval_s <= buffer.usual_gap_s
+        return interval_s <= GAP_S or len(buffer) < LEARN or interval_s <= buffer.usual_gap_s
 
     def _jump(
         self, buffer: ImuBuffer, held_s: float, held: Reading, t_s: float, reading: Reading

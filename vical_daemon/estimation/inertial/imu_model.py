@@ -17,6 +17,8 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
+_EYE = np.eye(3)
+
 
 class Motion(NamedTuple):
     """Attitude, position and velocity of the imu in the world, a batch of S; and the two rates at the end.
@@ -83,11 +85,7 @@ def strapdown(
     turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
     if turn_slope is not None and gyro_matrix is not None:
         turn_slope = turn_slope @ gyro_matrix[0].T
-    steps = rotation_steps(omega, dt, turn_slope)
-    dR = np.empty((len(omega), len(dt) + 1, 3, 3))
-    dR[:, 0] = np.eye(3)
-    for k in range(len(dt)):
-        np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
+    dR = _products(rotation_steps(omega, dt, turn_slope))
     f_start = np.matmul(dR, force[..., None])[..., 0]
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
     dv, dp = np.zeros_like(f_start), np.zeros_like(f_start)
@@ -105,6 +103,19 @@ def strapdown(
     np.cumsum(gained, axis=1, out=dv[:, 1:])
     np.cumsum(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
     return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0])
+
+
+def _products(steps: FloatArray) -> FloatArray:
+    """Products of the first 0, 1, 2, ... rotation steps; shape (S, K, 3, 3) -> (S, K + 1, 3, 3)."""
+    dR = np.empty((len(steps), steps.shape[1] + 1, 3, 3))
+    dR[:, 0] = _EYE
+    if len(steps) == 1:  # of two matrices, dot takes half as long as matmul
+        for k, step in enumerate(steps[0]):
+            np.dot(dR[0, k], step, out=dR[0, k + 1])
+    else:
+        for k in range(steps.shape[1]):
+            np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
+    return dR
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -177,7 +188,7 @@ class Influence(NamedTuple):
 
     def by_force(self, force: FloatArray) -> FloatArray:
         """Return the end by a force error, m/s^2 at each node, shape (n + 1, 3), in shape (9,)."""
-        return np.asarray(np.einsum("k,kij,kj->i", self.weights, self.at[:, :, 3:6], force))
+        return np.asarray(np.einsum("kij,kj->i", self.at[:, :, 3:6], self.weights[:, None] * force))
 
     def noise(self, noise: ImuNoise) -> FloatArray:
         """Covariance of the end that white noise of the readings brings, shape (9, 9)."""

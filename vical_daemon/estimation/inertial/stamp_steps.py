@@ -15,7 +15,7 @@ import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
 
-_LEARN = 20  # intervals by which the usual one is known
+LEARN = 20  # intervals by which the usual one is known
 _LEAST_S = 1e-4  # smaller steps are like jitter
 _EVEN_S = 5e-5  # stamps that deviate by more from an even grid were not made by a device's clock
 _FADES = 1.0 - 1.0 / 500.0  # of the largest deviation, an interval
@@ -51,7 +51,7 @@ class StampSteps:
 
     def _learn(self, interval_s: float) -> None:
         self._first.append(interval_s)
-        if len(self._first) == _LEARN:
+        if len(self._first) == LEARN:
             self._period_s = float(np.median(self._first))
             self._largest_s = float(np.abs(np.array(self._first) - self._period_s).max())
             self._first.clear()

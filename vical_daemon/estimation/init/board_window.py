@@ -27,9 +27,10 @@ from vical_daemon.estimation.model.inertial_links import PreintegratedLink, Prei
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
-from vical_daemon.estimation.noise.corner_noise import relative_noise
+from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
+from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 
-_IMAGES = 50  # of each camera: they say where all is linearised, not what is told
+_IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
 _MOST_STEPS = 20
 _DONE = 0.1  # a step that promises less than this of the sum of squares is the last
@@ -38,8 +39,6 @@ _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the lea
 _RELINK_S = 3e-4  # of change of the time shift: links are integrated between the new instants
 _RATE_S = 0.03  # of readings before an instant: they show its angular acceleration
 _OUTLIER = 6.0  # sigmas at which a corner weighs a quarter
-_RAYLEIGH = 1.1774  # median of the length of two standard normal errors
-_LEAST_PX, _MOST_PX = 0.005, 20.0  # corner noise
 
 Frames = list[tuple[float, PointsFrame]]
 
@@ -341,8 +340,8 @@ class BoardWindow:
             lengths = [np.linalg.norm(v.residual[v.seen], axis=1) / v.relative[v.seen] for v in own]
             size = np.concatenate(lengths)
             share = max(1.0 - 6.0 * len(own) / (2.0 * len(size)), 0.05)
-            sigma = float(np.median(size)) / _RAYLEIGH / np.sqrt(share)
-            self.sigma_px[name] = float(np.clip(sigma, _LEAST_PX, _MOST_PX))
+            sigma = float(np.median(size)) / MEDIAN_RAYLEIGH / np.sqrt(share)
+            self.sigma_px[name] = float(np.clip(sigma, LEAST_PX, MOST_PX))
 
 
 def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: ImuBuffer) -> list[Node]:

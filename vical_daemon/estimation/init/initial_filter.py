@@ -12,14 +12,19 @@ from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
+    ARM_SHARE,
     ENTRY_SIGMA,
+    FILTER_START,
     GRAVITY_SIGMA_RAD,
     GYRO_BIAS_SIGMA_RPS,
     KNOWN_OFF_SIGMA,
     KNOWN_SIZE_SIGMA,
     LAG_SIGMA_S,
+    PARTIAL_START_RAD,
+    POSITION_SHARE,
     SIZE_SIGMA,
     SKEW_SIGMA,
+    START_POSITION_M,
 )
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
@@ -92,11 +97,13 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection
     """
     s = np.zeros(layout.size)
     # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
-    lever_arm, position, angle = (UNKNOWN_M, 3.0 * UNKNOWN_M, 0.03)
+    start = FILTER_START
+    lever_arm, position, angle = UNKNOWN_M, 3.0 * UNKNOWN_M, PARTIAL_START_RAD
     if not partial:
         before_m = min(_before_board_m(state, name) for name in layout.cameras)
-        lever_arm, position, angle = min(0.15, 0.35 * before_m), min(0.1, 0.25 * before_m), 0.1
-    s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, 0.5
+        lever_arm, angle = min(start.lever_arm_m, ARM_SHARE * before_m), start.attitude_rad
+        position = min(START_POSITION_M, POSITION_SHARE * before_m)
+    s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, start.velocity_mps
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA
@@ -111,11 +118,11 @@ def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection
         if where.position is not None and where.rotation is not None:
             s[where.position], s[where.rotation] = lever_arm, angle
         if where.timeshift is not None and where.skew is not None:
-            s[where.timeshift], s[where.skew] = 5e-3, SKEW_SIGMA
+            s[where.timeshift], s[where.skew] = start.timeshift_s, SKEW_SIGMA
         if where.intrinsics is not None and where.distortion is not None:
-            s[where.intrinsics], s[where.distortion] = 0.05 * focal, 0.1
+            s[where.intrinsics], s[where.distortion] = start.focal * focal, start.distortion
             if name in layout.held:
                 s[where.intrinsics.start : where.distortion.stop] = layout.held[name].off_sigma
         if where.readout is not None:
-            s[where.readout] = 0.01
+            s[where.readout] = start.readout_s
     return s

@@ -13,6 +13,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.geometry.planar_pose import inliers, planar_pose
+from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 
@@ -113,7 +114,8 @@ def adjusted(
             damping *= 10.0
         dtheta, dposes = last.solve((prior - best[0]) / scale**2, 1.0 / scale**2, damping)
         theta = best[0] + dtheta
-        poses = [(R @ so3.exp(d[3:]), p + d[:3]) for (R, p), d in zip(best[1], dposes, strict=True)]
+        turns = so3.exp(dposes[:, 3:])
+        poses = [(R @ T, p + d[:3]) for (R, p), T, d in zip(best[1], turns, dposes, strict=True)]
     count = sum(2 * len(v.ids) for v in views)
     return best[0], best[1], float(np.sqrt(cost / max(count, 1)))
 
@@ -160,32 +162,33 @@ def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> tuple[li
     return which, poses
 
 
-class _Normal:
-    """Normal equations with the poses eliminated (Schur complement)."""
+class _Normal(NamedTuple):
+    """Normal equations of a lens and m poses.
 
-    def __init__(self, lens: int) -> None:
-        self.A = np.zeros((lens, lens))
-        self.b = np.zeros(lens)
-        self.views: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        self.cost = 0.0
+    Attributes:
+        A, b: Of the lens, shapes (n, n), (n,).
+        P, C, c: Of each pose, with the lens, and its right side; shapes (m, 6, 6), (m, 6, n), (m, 6).
+        cost: Sum of squares, px^2.
+    """
 
-    def add(self, J_lens: FloatArray, J_pose: FloatArray, r: FloatArray) -> None:
-        self.A += J_lens.T @ J_lens
-        self.b += J_lens.T @ r
-        self.views.append((J_pose.T @ J_pose, J_pose.T @ J_lens, J_pose.T @ r))
-        self.cost += float(r @ r)
+    A: FloatArray
+    b: FloatArray
+    P: FloatArray
+    C: FloatArray
+    c: FloatArray
+    cost: float
 
-    def solve(self, b0: FloatArray, a0: FloatArray, damping: float) -> tuple[FloatArray, list[FloatArray]]:
-        A, b = self.A + np.diag(a0), self.b + b0
+    def solve(self, b0: FloatArray, a0: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
+        """Steps of the lens, shape (n,), and of the poses, shape (m, 6), by Schur complement."""
+        A = self.A + np.diag(a0)
         A += damping * np.diag(np.diag(A))
-        inverses = []
-        for P, C, c in self.views:
-            inverse = np.linalg.inv(P + damping * np.diag(np.diag(P)))
-            A -= C.T @ inverse @ C
-            b -= C.T @ inverse @ c
-            inverses.append(inverse)
+        diagonals = np.eye(6) * np.einsum("mii->mi", self.P)[:, None]
+        inverse = np.linalg.inv(self.P + damping * diagonals)
+        reduced = np.matmul(inverse, self.C)
+        A -= np.tensordot(self.C, reduced, axes=((0, 1), (0, 1)))
+        b = self.b + b0 - np.tensordot(reduced, self.c, axes=((0, 1), (0, 1)))
         d: FloatArray = np.linalg.solve(A, b).astype(np.float64)
-        return d, [i @ (c - C @ d) for i, (_, C, c) in zip(inverses, self.views, strict=True)]
+        return d, np.matmul(inverse, (self.c - self.C @ d)[..., None])[..., 0]
 
 
 def _normal(
@@ -195,14 +198,23 @@ def _normal(
     theta: FloatArray,
     model: str,
 ) -> _Normal | None:
+    """All corners at once, summed up by view; None: some lie behind their camera."""
     n = len(theta)
-    out = _Normal(n)
-    for view, (R, p) in zip(views, poses, strict=True):
-        X = target[view.ids]
-        x = X @ R.T + p
-        uv, J_point, J_lens = project_jacobians(x, theta[:4], theta[4:], model)
-        if not np.isfinite(uv).all():
-            return None
-        J_pose = np.concatenate([J_point, J_point @ (-R @ so3.hat(X))], axis=-1)
-        out.add(J_lens.reshape(-1, n), J_pose.reshape(-1, 6), (view.uv_px - uv).ravel())
-    return out
+    X = target[np.concatenate([v.ids for v in views])]
+    ends = np.cumsum([len(v.ids) for v in views])
+    each = [slice(end - len(v.ids), end) for v, end in zip(views, ends, strict=True)]
+    x = np.concatenate([X[at] @ R.T + p for at, (R, p) in zip(each, poses, strict=True)])
+    uv, J_point, J_lens = project_jacobians(x, theta[:4], theta[4:], model)
+    if not np.isfinite(uv).all():
+        return None
+    rows = np.empty((len(X), 2, 7 + n))
+    rows[..., :3] = J_point
+    turned = np.concatenate([J_point[at] @ R for at, (R, _) in zip(each, poses, strict=True)])
+    rows[..., 3:6] = cross(X[:, None], turned)  # j' R (d x X) = (X x R' j)' d
+    rows[..., 6 : 6 + n] = J_lens
+    rows[..., 6 + n] = np.concatenate([v.uv_px for v in views]) - uv
+    sums = np.array([(w := rows[at].reshape(-1, 7 + n)).T @ w for at in each])
+    whole = sums[:, 6:, 6:].sum(axis=0)
+    return _Normal(
+        whole[:n, :n], whole[:n, n], sums[:, :6, :6], sums[:, :6, 6:-1], sums[:, :6, -1], float(whole[n, n])
+    )

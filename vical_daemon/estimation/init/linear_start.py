@@ -77,22 +77,12 @@ def linear_start(
     if integrals is None:
         return None
     D, B = integrals
-    n = len(t_imu_s)
-    T = t_imu_s - t_imu_s[0]
-    A = np.zeros((n, 3, 15 + free_size))
-    eye = np.eye(3)
-    A[:, :, 0:3] = eye
-    A[:, :, 3:6] = T[:, None, None] * eye
-    A[:, :, 6:9] = (0.5 * T * T)[:, None, None] * eye
-    A[:, :, 9:12] = R_world_imu
-    A[:, :, 12:15] = -B
-    if free_size:
-        A[:, :, 15] = -p_world_cam
+    A = _design(t_imu_s, R_world_imu, p_world_cam, B, free_size=free_size)
     w = 1.0 / position_sigma
-    rows = (A * w[:, None, None]).reshape(3 * n, -1)
+    rows = (A * w[:, None, None]).reshape(-1, A.shape[2])
     y = (((0.0 if free_size else p_world_cam) - D) * w[:, None]).ravel()
     prior = np.zeros((6, A.shape[2]))
-    prior[:3, 12:15] = eye / ACCEL_BIAS_SIGMA_MPS2
+    prior[:3, 12:15] = np.eye(3) / ACCEL_BIAS_SIGMA_MPS2
     if held_axes is not None:
         prior[3:, 9:12] = held_axes.T @ held_axes / HELD_M
     A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(6)])
@@ -103,6 +93,22 @@ def linear_start(
     sigma = np.sqrt(np.diag(cov))
     size, sigma_size = (float(x[15]), float(sigma[15])) if free_size else (1.0, 0.0)
     return LinearStart(x[9:12], x[3:6], x[6:9], x[12:15], sigma[9:12], size, sigma_size)
+
+
+def _design(
+    t_s: FloatArray, R_world_imu: FloatArray, p_world_cam: FloatArray, B: FloatArray, *, free_size: bool
+) -> FloatArray:
+    """Derivatives of the camera's positions by [p_0, v_0, g, p_imu_cam, b_a (, s)], (n, 3, 15 or 16)."""
+    T, eye = t_s - t_s[0], np.eye(3)
+    A = np.zeros((len(T), 3, 15 + free_size))
+    A[:, :, 0:3] = eye
+    A[:, :, 3:6] = T[:, None, None] * eye
+    A[:, :, 6:9] = (0.5 * T * T)[:, None, None] * eye
+    A[:, :, 9:12] = R_world_imu
+    A[:, :, 12:15] = -B
+    if free_size:
+        A[:, :, 15] = -p_world_cam
+    return A
 
 
 def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import integrate_twice
 from vical_daemon.estimation.init.target_poses import Lens, TargetPose, pose_of
@@ -27,10 +28,11 @@ from vical_daemon.estimation.model.state import (
 
 _LEAST_IMAGES = 3
 _LEAST_S = 0.1  # of motion: 1 mm of position noise is then 15 mm/s of velocity
-WIDE_RAD = 0.03
+_WIDE_RAD = 0.03
 """Sigma of attitude up to which images are near to linear, rad."""
-WIDE_SHARE = 0.03
+_WIDE_SHARE = 0.03
 """Likewise of position, of the distance to the target."""
+_BLIND_S = 0.5  # without a usable image before sigmas are looked at
 _WIDE_MPS = 0.3  # of velocity: ten times what the images give
 _CALIBRATION = 5.0  # sigmas of the calibration the pose is made with: the data count again by 4 % at most
 
@@ -144,13 +146,33 @@ class MotionRestart:
         turn = float(sigmas[where.rotation].max()) if where.rotation is not None else 0.0
         arm = float(sigmas[where.position].max()) if where.position is not None else 0.0
         out = np.empty(9)
-        out[ATTITUDE] = max(WIDE_RAD, _CALIBRATION * turn)
-        out[POSITION] = max(WIDE_SHARE * distance_m(seen.p_target_cam), _CALIBRATION * arm)
+        out[ATTITUDE] = max(_WIDE_RAD, _CALIBRATION * turn)
+        out[POSITION] = max(_WIDE_SHARE * _distance_m(seen.p_target_cam), _CALIBRATION * arm)
         out[VELOCITY] = max(_WIDE_MPS, _CALIBRATION * arm / span_s)
         return out
 
 
-def distance_m(p_target_cam: FloatArray) -> float:
+def motion_is_lost(f: CalibrationFilter, buffer: ImuBuffer, camera: str, t_cam_s: float) -> bool:
+    """Whether the motion at an image cannot be had from the one before: readings miss, or it drifted far.
+
+    Far is where the pose from the image itself would be as good.
+    """
+    t_s = t_cam_s + f.state.cameras[camera].timeshift_s
+    if buffer.gap_within(f.state.t_s, t_s):
+        return True
+    if t_s < f.state.t_s + _BLIND_S:
+        return False
+    segment = buffer.segment(f.state.t_s, t_s)
+    if segment is None:
+        return False
+    ahead = f.copy()
+    ahead.predict(segment)
+    sigmas = ahead.sigmas()
+    away_m = _distance_m(ahead.state.p_world_imu)
+    return bool(sigmas[ATTITUDE].max() > _WIDE_RAD or sigmas[POSITION].max() > _WIDE_SHARE * away_m)
+
+
+def _distance_m(p_target_cam: FloatArray) -> float:
     """Distance of a camera to the origin of the target, m."""
     return float(np.sqrt(p_target_cam @ p_target_cam))
 

@@ -20,9 +20,9 @@ from vical_daemon.estimation.init.intrinsics_start import (
 from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
 from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _TRIED_S = 0.008 * np.arange(6)
-_SIGNIFICANT = 25.0
 _SHORT_S = 0.004
 _BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 34
 
@@ -41,7 +41,7 @@ def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> f
     squares = np.array([_bent(frames, lens, target, float(r)) for r in tried]) ** 2
     least = int(np.argmin(squares))
     was = squares[int(np.searchsorted(tried, given_s))]
-    if not was - squares[least] > _SIGNIFICANT * squares[least] / _numbers(frames):
+    if not was - squares[least] > SURE_SIGMAS**2 * squares[least] / _numbers(frames):
         return given_s
     if not 0 < least < len(tried) - 1:
         return float(tried[least])

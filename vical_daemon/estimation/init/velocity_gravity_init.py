@@ -12,12 +12,12 @@ from vical_daemon.estimation.init.linear_start import LinearStart, linear_start,
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
+from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _STRETCH_S = 10.0
 _FAR_SIZE = 0.1  # from here to the size of a target the filter does not get by itself
 _SIZES = (0.1, 10.0)  # true over stated; beyond, something else is wrong
-_SURE = 5.0  # sigmas
 _DRIFT_M = 5e-3  # of the double integral over the stretch; with little motion it counts
 
 
@@ -121,7 +121,7 @@ def _other_size(
     found = linear_start(buffer, t, R, p, gyro_bias, sigma, free_size=True)
     if found is None or not _SIZES[0] < found.size < _SIZES[1]:
         return None
-    if abs(found.size - 1.0) < max(_FAR_SIZE, _SURE * found.sigma_size):
+    if abs(found.size - 1.0) < max(_FAR_SIZE, SURE_SIGMAS * found.sigma_size):
         return None
     gravity = float(np.linalg.norm(found.gravity)) / options.gravity_mps2
     return found.size if 0.9 < gravity < 1.1 else None

@@ -22,10 +22,10 @@ from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _MOST_RATIO = 5.0  # of one image's squared innovation over its prediction
 _FAR = 0.03  # a target so much larger or smaller is another one: its prior is too narrow
-_SURE = 5.0  # sigmas
 
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
 
@@ -95,7 +95,7 @@ def _size(f: CalibrationFilter) -> float | None:
     if where is None:
         return None
     size, sigma = f.state.target_scale, float(f.sigmas()[where])
-    return size if abs(size - 1.0) > max(_FAR, _SURE * sigma) else None
+    return size if abs(size - 1.0) > max(_FAR, SURE_SIGMAS * sigma) else None
 
 
 class _Apart(NamedTuple):

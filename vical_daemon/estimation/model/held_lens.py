@@ -1,8 +1,8 @@
-"""A lens that is held: its values stay, what is not known of it does not stay out of the sigmas.
+"""A fixed lens: its values stay, and its uncertainty is included in the sigmas of everything else.
 
-Its errors are states of the filter all the same. That it is as stated (exactly, or to the sigma that its user
-states) is a hypothesis beside it; what is told is the calibration that belongs to the stated values, and its
-covariance includes what the errors of these values do to it. [Schmidt, "Application of state-space methods to
+Its errors are states of the filter all the same. An alternative model takes the lens as given, exactly or to
+the sigma that the user gives. The reported calibration is the one for the given values; its covariance
+includes what errors of these values do to it. [Schmidt, "Application of state-space methods to
 navigation problems", 1966: parameters that are considered; docs/math/filter.md, eq. (19)]
 """
 

@@ -20,7 +20,7 @@ from vical_daemon.estimation.model.unscented import root as root_of
 from vical_daemon.estimation.model.unscented import solve_lower
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
-_ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be told as zero
+_ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
 _EYE = np.eye(3)
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 

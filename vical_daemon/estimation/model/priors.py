@@ -6,6 +6,8 @@ Prior sigmas are many times what a start is worth, so that its data do not count
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 GYRO_BIAS_SIGMA_RPS = 0.02
 """1.1 deg/s: four times the initial bias error of the datasheet (3DM-GX3-25: 0.25 deg/s)."""
 ACCEL_BIAS_SIGMA_MPS2 = 0.3
@@ -28,3 +30,41 @@ OFF = 0.05
 """Share of rigs of which any one thing is not as stated, clocks that do not run alike included."""
 SURE = 0.99
 """Probability from which on something is known, and announced."""
+
+
+class StartSigmas(NamedTuple):
+    """How far motion and calibration may be off at a start, one sigma.
+
+    Attributes:
+        attitude_rad: Of the imu in the world; without a target only its tilt counts.
+        velocity_mps: Of the imu.
+        lever_arm_m: Of each component.
+        rotation_rad: Of the mounting.
+        timeshift_s: Of the camera.
+        focal, centre: Of fx fy and of cx cy, over the focal length.
+        distortion, higher_distortion: Of the first two coefficients, and of those after them.
+        readout_s: From first to last row.
+    """
+
+    attitude_rad: float
+    velocity_mps: float
+    lever_arm_m: float
+    rotation_rad: float
+    timeshift_s: float
+    focal: float
+    centre: float
+    distortion: float
+    higher_distortion: float
+    readout_s: float
+
+
+FILTER_START = StartSigmas(0.1, 0.5, 0.15, 0.1, 5e-3, 0.05, 0.05, 0.1, 0.1, 0.01)
+"""With a target: the closed form has found all of it, to about a fifth of these."""
+PARTIAL_START_RAD = 0.03
+"""Attitude and mounting of a partial start, whose lever arm is unknown: a wider one would bend it."""
+ARM_SHARE, POSITION_SHARE, START_POSITION_M = 0.35, 0.25, 0.1
+"""Most of arm and position, over the distance to the board: no sigma point lies behind it; of position, m."""
+WINDOW_START = StartSigmas(1.0, 5.0, 0.3, 0.2, 0.05, 0.05, 0.03, 0.1, 0.01, 0.015)
+"""Without a target: next to nothing is known of the motion, and of the rest what a rig can be."""
+EQUIDISTANT_SIGMA = 0.05
+"""Each coefficient of an equidistant lens without a target."""

@@ -34,7 +34,7 @@ def rates_after(state: State, segment: ImuSegment, before: Rates) -> Rates:
     Args:
         state: At that instant.
         segment: Readings that lead there; may have no length.
-        before: What it was thought to be; stands for the angular acceleration that nothing needs or tells.
+        before: What it was thought to be; stands for the angular acceleration that nothing needs or shows.
     """
     omega = state.gyro_matrix @ (segment.gyro[-1] - state.gyro_bias)
     force = state.accel_matrix @ (segment.accel[-1] - state.accel_bias)

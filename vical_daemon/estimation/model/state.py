@@ -102,52 +102,56 @@ def make_layout(
         target_m: Points of the target, m, shape (n, 3); None: no target.
         held: Lenses whose errors are states although they are in `fix`, by camera.
     """
-    at = _CORE
-    gyro_matrix = accel_matrix = None
-    if "imu_intrinsics" in estimate:
-        gyro_matrix, accel_matrix = slice(at, at + 9), slice(at + 9, at + 15)
-        at += 15
-    accel_lag = at if "accel_lag" in estimate else None
-    at += accel_lag is not None
-    dynamic = at
-    blocks: dict[str, CameraSlices] = {}
+    places, held = _Places(_CORE), dict(held or {})
+    imu = "imu_intrinsics" in estimate
+    gyro_matrix, accel_matrix = places.block(imu, 9), places.block(imu, 6)
+    accel_lag = places.one("accel_lag" in estimate)
+    dynamic = places.used
+    blocks = {
+        name: _camera_slices(places, model, fix, held=name in held, readout="readout" in estimate)
+        for name, model in models.items()
+    }
+    scale = places.one("target_scale" in estimate)
+    modes = None if target_m is None else TargetModes.of(target_m)
+    shape = places.block(modes is not None and "target_shape" in estimate, MODES)
+    return Layout(
+        places.used, dynamic, gyro_matrix, accel_matrix, accel_lag, blocks, scale, shape, modes, held
+    )
 
-    def take(wanted: bool, n: int) -> slice | None:
-        nonlocal at
+
+@dataclass(slots=True)
+class _Places:
+    """Hands out the places of an error state one after the other; `used`: how many so far."""
+
+    used: int
+
+    def block(self, wanted: bool, n: int) -> slice | None:
+        """Places of n errors; None where they are not wanted."""
         if not wanted:
             return None
-        at += n
-        return slice(at - n, at)
+        self.used += n
+        return slice(self.used - n, self.used)
 
-    for name, model in models.items():
-        position, rotation = take("extrinsics" not in fix, 3), take("extrinsics" not in fix, 3)
-        shift, skew = take("timeshift" not in fix, 1), take("timeshift" not in fix, 1)
-        lens = "intrinsics" not in fix or name in (held or {})
-        intrinsics, distortion = take(lens, 4), take(lens, len(COEFFICIENTS[model]))
-        readout = take("readout" in estimate, 1)
-        blocks[name] = CameraSlices(
-            position,
-            rotation,
-            shift.start if shift else None,
-            skew.start if skew else None,
-            intrinsics,
-            distortion,
-            readout.start if readout else None,
-        )
-    scale = take("target_scale" in estimate, 1)
-    modes = None if target_m is None else TargetModes.of(target_m)
-    shape = take(modes is not None and "target_shape" in estimate, MODES)
-    return Layout(
-        at,
-        dynamic,
-        gyro_matrix,
-        accel_matrix,
-        accel_lag,
-        blocks,
-        scale.start if scale else None,
-        shape,
-        modes,
-        dict(held or {}),
+    def one(self, wanted: bool) -> int | None:
+        """Place of one error; None where it is not wanted."""
+        place = self.block(wanted, 1)
+        return None if place is None else place.start
+
+
+def _camera_slices(
+    places: _Places, model: str, fix: frozenset[str], *, held: bool, readout: bool
+) -> CameraSlices:
+    """Places of one camera; `held`: the errors of its lens are states although it is fixed."""
+    pose, shift = "extrinsics" not in fix, "timeshift" not in fix
+    lens = "intrinsics" not in fix or held
+    return CameraSlices(
+        position=places.block(pose, 3),
+        rotation=places.block(pose, 3),
+        timeshift=places.one(shift),
+        skew=places.one(shift),
+        intrinsics=places.block(lens, 4),
+        distortion=places.block(lens, len(COEFFICIENTS[model])),
+        readout=places.one(readout),
     )
 
 

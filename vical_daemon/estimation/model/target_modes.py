@@ -40,7 +40,7 @@ class TargetModes:
 
     @property
     def sigma_m(self) -> float:
-        """How far a target's edges are expected beside their stated places in each mode, one sigma, m."""
+        """Expected distance of a target's edges from where the file puts them, by mode, one sigma, m."""
         return _EXPECTED * self.half_m
 
     def fields(self, points_m: FloatArray) -> FloatArray:
@@ -53,10 +53,13 @@ class TargetModes:
             Shape (n, 3, 11), per metre at the edges, in the order: narrow, skew; then with the square of x,
             the square of y, and x y: out of the plane (bent, bent, twisted), along x, along y (bowed).
         """
-        u, v = ((points_m[:, :2] - self.centre_m) / self.half_m).T
+        uv = (points_m[:, :2] - self.centre_m) / self.half_m
+        u, v = uv[:, 0], uv[:, 1]
         out = np.zeros((len(points_m), 3, MODES))
-        out[:, 0, 0], out[:, 1, 0] = u, -v
-        out[:, 0, 1], out[:, 1, 1] = v, u
-        second = np.stack([u * u, v * v, u * v], axis=1)
-        out[:, 2, 2:5] = out[:, 0, 5:8] = out[:, 1, 8:11] = second
+        out[:, 0, :2] = uv
+        out[:, 1, 0], out[:, 1, 1] = -v, u
+        second = out[:, 2, 2:5]
+        second[:, :2] = uv * uv
+        second[:, 2] = u * v
+        out[:, 0, 5:8] = out[:, 1, 8:11] = second
         return out

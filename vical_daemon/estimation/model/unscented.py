@@ -135,8 +135,11 @@ def _lower(n: int) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def _eye(n: int) -> FloatArray:
-    return np.eye(n, order="F")
+def unit(n: int) -> FloatArray:
+    """The unit matrix of size n, made once; not to be written to."""
+    out: FloatArray = np.eye(n, order="F")
+    out.flags.writeable = False
+    return out
 
 
 def compress(M: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, float, int]:
@@ -193,7 +196,7 @@ def correct(S: FloatArray, M: FloatArray, r: FloatArray) -> Correction:
     """
     n, k = S.shape[0], M.shape[1]
     # QR of [I; M] with columns in reverse, which costs half as much where the rows of I are known to be that
-    Lambda = np.ascontiguousarray(dtpqrt(0, min(k, _BLOCK), _eye(k), M[:, ::-1])[0][::-1, ::-1])
+    Lambda = np.ascontiguousarray(dtpqrt(0, min(k, _BLOCK), unit(k), M[:, ::-1])[0][::-1, ::-1])
     y = solve_lower(Lambda, M.T @ r, transposed=True)
     inner = Lambda[:n, :n]
     new = solve_lower(inner, S.T, transposed=True).T

@@ -18,9 +18,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.significance import STRETCHES_DISAGREE
 
-_SIGNIFICANT = 0.01  # one set of clean data in a hundred may lose by it, not one unknown
-_LEAST_TOLD = 1e-9  # of the variance of all: a run that tells less tells nothing
+_LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
 _LEAST = 3
 _LONGEST_RUN = 4
@@ -74,7 +75,7 @@ class BlockJackknife:
             innovation: Measured minus predicted, over the corner noise, shape (2n,).
             by_pose: Derivatives of the whitened pixels by attitude and position, shape (2n, 6).
             by: By the unknowns, shape (2n, m).
-            values: Present values of these, shape (m,).
+            values: Present values of the first of these; the others are zero, shape (at most m,).
 
         Returns:
             Whether a stretch was closed and there are enough of them to be compared.
@@ -84,12 +85,14 @@ class BlockJackknife:
             self._close()
             self._begin_s = t_s
         # whatever the pose of the image may be: only what no pose explains says something about the rest
-        rows = np.column_stack([by_pose, by, innovation])
+        rows = np.concatenate([by_pose, by, innovation[:, None]], axis=1)
         N, p = rows.T @ rows, by_pose.shape[1]
-        posed = N[:p, :p] + _RIDGE * np.trace(N[:p, :p]) * np.eye(p)
-        N = N[p:, p:] - N[p:, :p] @ np.linalg.solve(posed, N[:p, p:])
+        posed = N[:p, :p].copy()
+        posed.ravel()[:: p + 1] += _RIDGE * posed.trace()
+        explained = solve_lower(root(posed), N[:p, p:])
+        N = N[p:, p:] - explained.T @ explained
         A, b = N[:-1, :-1], N[:-1, -1]
-        said = _JackknifeBlock(A, b + A @ values)
+        said = _JackknifeBlock(A, b + A[:, : len(values)] @ values)
         self._now = said if self._now is None else self._now.plus(said)
         return closed and len(self._done) >= _LEAST
 
@@ -124,10 +127,10 @@ class BlockJackknife:
         without = np.matmul(Q, (b.sum(axis=0) - out @ b)[..., None])[..., 0]
         # covariance of the changes were errors independent: stretches do not tell equally much
         C = np.einsum("rpi,rsij,sjp->rsp", Q, left, Q, optimize=True) - np.diag(P)
-        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_TOLD * np.diag(P))
+        usual = np.maximum(np.einsum("rrp->rp", C), _LEAST_INFORMATION * np.diag(P))
         ratio = ((without - values) ** 2 / usual).mean(axis=0)
         # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
-        limit = chdtri(dof, _SIGNIFICANT / k) / dof
+        limit = chdtri(dof, STRETCHES_DISAGREE / k) / dof
         student = dof / np.maximum(dof - 2.0, 1.0)
         return JackknifeResult(values, P, np.where(ratio > limit, student * ratio, 1.0))

@@ -15,6 +15,7 @@ the eight smooth modes of a plane's image, make it honest again:
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -22,12 +23,12 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 MODES = 8
 _MIN_CORNERS = 8
 _LAGS = 20
 _TAPER = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
-_SIGNIFICANT = 5.0
 _FLOOR = 0.5
 _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 16.0
@@ -43,19 +44,20 @@ def modes(uv: FloatArray) -> FloatArray:
 
     Args:
         uv: *Predicted* pixels, shape (n, 2). Over measured ones the modes would contain the very noise
-            they are to be told apart from.
+            they are to be distinguished from.
 
     Returns:
         Columns, shape (2n, 8).
     """
-    centred = uv - uv.mean(axis=0)
-    x, y = (centred / (np.sqrt((centred**2).mean()) + 1e-9)).T
+    centred = uv - np.add.reduce(uv, axis=0) / len(uv)
+    flat = centred.ravel()
+    centred /= math.sqrt(float(flat @ flat) / len(flat)) + 1e-9
+    half = 0.5 * centred
     out = np.zeros((len(uv), 2, MODES))
     out[:, 0, 0] = out[:, 1, 1] = 1.0
-    out[:, 0, 2] = out[:, 1, 4] = x
-    out[:, 0, 3] = out[:, 1, 5] = y
-    out[:, 0, 6], out[:, 1, 6] = 0.5 * x * x, 0.5 * x * y
-    out[:, 0, 7], out[:, 1, 7] = 0.5 * x * y, 0.5 * y * y
+    out[:, 0, 2:4] = out[:, 1, 4:6] = centred
+    np.multiply(half[:, :1], centred, out=out[:, :, 6])
+    np.multiply(half[:, 1:], centred, out=out[:, :, 7])
     return out.reshape(-1, MODES)
 
 
@@ -69,19 +71,20 @@ def normalised(
     """
     if len(uv) < _MIN_CORNERS:
         return None
-    whitened = 1.0 / np.repeat(sigma, 2)
-    W = modes(uv) * whitened[:, None]
+    W = np.concatenate([modes(uv), ways, innovation.reshape(-1, 1)], axis=1)
+    W /= np.repeat(sigma, 2)[:, None]
+    along = W[:, :MODES].T @ W
     try:
-        L = root(W.T @ W)  # W = Q L'
+        L = root(along[:, :MODES])  # of the modes, Q L'
     except np.linalg.LinAlgError:
         return None
-    diagonal = np.diag(L)
+    diagonal = L.diagonal()
     if diagonal.min() < 1e-6 * diagonal.max():
         return None
-    Q = solve_lower(L, W.T).T * whitened[:, None]
-    seen, state = innovation.ravel() @ Q, (Q.T @ ways) @ moves
-    out: FloatArray = np.clip(seen / np.sqrt(1.0 + (state**2).sum(axis=1)), -_CLIP, _CLIP)
-    return out
+    along = solve_lower(L, along[:, MODES:])  # Q' of ways and innovation
+    state = along[:, :-1] @ moves
+    out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.einsum("ij,ij->i", state, state))
+    return np.minimum(np.maximum(out, -_CLIP), _CLIP)
 
 
 @dataclass(slots=True)
@@ -116,7 +119,7 @@ class Consistency:
     def alarmed(self) -> bool:
         """The innovations have jumped: allowed for by how long this rig's errors usually last, and how large.
 
-        Where lens or board do not fit, the view decides: half a board at the image's edge is no knock.
+        Where lens or board do not fit, the view decides: half a board at the image's edge is no bump.
         """
         return self.images > _LAGS and self.alarm > _CUSUM_LIMIT * self.factor * np.sqrt(self.scale)
 
@@ -170,4 +173,4 @@ class Consistency:
             return
         total = 2.0 * float(_TAPER @ self._lagged[1:] / self._lagged[0])
         noise = 2.0 * float(np.sqrt(_TAPER @ _TAPER / (MODES * self._weight)))
-        self.factor = 1.0 + total if total > max(_SIGNIFICANT * noise, _FLOOR) else 1.0
+        self.factor = 1.0 + total if total > max(SURE_SIGMAS * noise, _FLOOR) else 1.0

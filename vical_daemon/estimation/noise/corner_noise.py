@@ -10,7 +10,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 
 _GUESS_DOF, _GUESS_FADES = 100.0, 300.0  # degrees of freedom
-_LEAST_PX = 0.005
+LEAST_PX, MOST_PX = 0.005, 20.0
 
 
 def relative_noise(stated_px: FloatArray | None, n: int) -> FloatArray:
@@ -60,4 +60,4 @@ class CornerNoise:
             self._dof *= keep
         guess = _GUESS_DOF * math.exp(-self._dof / _GUESS_FADES)
         square = (self._sum + guess * self.guess_px**2) / (self._dof + guess)
-        self.sigma_px = min(max(math.sqrt(square), _LEAST_PX), 20.0)
+        self.sigma_px = min(max(math.sqrt(square), LEAST_PX), MOST_PX)

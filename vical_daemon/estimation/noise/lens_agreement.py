@@ -1,10 +1,9 @@
-"""Do stretches of the data agree about the lens, and is it of its model? How much larger its sigmas must be.
+"""Sigmas of the lens: do stretches of the data agree about it, and does its model lack a term?
 
-A lens model never fits quite, and what it gets wrong depends on where in the image and at which slant the
-target is seen. Each stretch therefore says what it would have the lens be (see `stretches`), and the
-variances of the lens are as much larger as stretches disagree. What all stretches get wrong alike no
-comparison shows. So the model's next power of the radius is estimated beside: where it is there beyond
-doubt, the parameters are known no better than they would move with it.
+A lens model never fits exactly. Its misfit depends on where in the image and at which slant the target is
+seen. So each stretch gives its own lens (block jackknife), and the variances of the lens grow by as much as
+the stretches disagree. No comparison shows an error that all stretches share. So the next power of the radius
+is estimated as well: if it is significant, the sigmas are at least as large as what it would move.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ import numpy as np
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.block_jackknife import BlockJackknife
+from vical_daemon.estimation.significance import LENS_TERM_SIGMAS
 
 _STRETCH_S = 5.0
-_BEYOND_DOUBT = 4.0  # sigmas of the next power of the radius: by chance once in 16000
 _WEAK = 0.1  # of the focal length: as good as nothing known
 _WEAK_DISTORTION = 0.5
 # the two highest powers of the radius among fx fy cx cy and the distortion
@@ -60,14 +59,14 @@ class LensAgreement:
             lens: Present values, shape (n,).
         """
         by = with_next_power(by_lens, self.model)
-        if not self._stretches.learn(t_s, innovation, by_pose, by, np.append(lens, 0.0)):
+        if not self._stretches.learn(t_s, innovation, by_pose, by, lens):
             return
         weak = lens_sigmas(lens[0], len(lens) + 1)
         n = len(lens)
         self.factors = self._stretches.compared(weak[:n]).factors
         free = self._stretches.compared(weak)
         power, variance = free.values[n], free.covariance[n, n]
-        doubt = _BEYOND_DOUBT**2 * free.factors[n] * variance
+        doubt = LENS_TERM_SIGMAS**2 * free.factors[n] * variance
         there = power if power**2 > doubt else 0.0
         self.moved = free.covariance[:n, n] * (there / variance)
 
@@ -88,6 +87,6 @@ def with_next_power(by_lens: FloatArray, model: str) -> FloatArray:
         Shape (2k, n + 1).
     """
     below, highest = (by_lens[:, k].reshape(-1, 2) for k in _RADIAL[model])
-    size = np.maximum((below**2).sum(axis=1), 1e-30)  # each power is the one below times radius squared
-    power = (highest * ((below * highest).sum(axis=1) / size)[:, None]).ravel()
-    return np.column_stack([by_lens, power])
+    size = np.maximum(np.einsum("ij,ij->i", below, below), 1e-30)
+    ratio = np.einsum("ij,ij->i", below, highest) / size  # each power is the one below times radius squared
+    return np.concatenate([by_lens, (highest * ratio[:, None]).reshape(-1, 1)], axis=1)

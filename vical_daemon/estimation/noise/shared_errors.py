@@ -17,12 +17,12 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
 from vical_daemon.estimation.noise.variance_components import Observed, variances
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _MEMORY = 400  # images
 _LEAST = 20
 _EVERY = 5  # images between two looks at all that is remembered
 _SELDOM_FROM, _SELDOM = 100, 4  # later it changes little: one look in so many
-_SIGNIFICANT = 5.0  # standard deviations above what images without such errors would give
 _STILL_SIGNIFICANT = 1.0  # to go on with what was found
 _CLIP = 6.0  # standard deviations: one outlier is no correlation
 _FLOOR = np.array([2e-5, 5e-3])  # s, px
@@ -36,7 +36,7 @@ class SharedErrors:
     """Running estimate of one camera.
 
     Attributes:
-        jitter_s: Standard deviation of a stamp, s; 0 while it cannot be told from none.
+        jitter_s: Standard deviation of a stamp, s; 0 while it cannot be distinguished from none.
         shift_px: Standard deviation by which a whole image is off, per axis, px; 0 likewise.
         images: Images taken in.
     """
@@ -105,8 +105,8 @@ class SharedErrors:
         """Estimate both, where they show."""
         jitters, shifts = self.jitter_s > 0.0, self.shift_px > 0.0
         self._look(
-            _STILL_SIGNIFICANT if jitters else _SIGNIFICANT,
-            _STILL_SIGNIFICANT if shifts else _SIGNIFICANT,
+            _STILL_SIGNIFICANT if jitters else SURE_SIGMAS,
+            _STILL_SIGNIFICANT if shifts else SURE_SIGMAS,
         )
 
     def _look(self, jitter_needs: float, shift_needs: float) -> None:

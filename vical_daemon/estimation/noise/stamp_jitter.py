@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.significance import MEDIAN_CHI2, SURE_SIGMAS
 
-_SIGNIFICANT = 5.0  # standard deviations above what stamps without jitter would give
 _CLIP = 36.0  # squared standard deviations: outliers are not jitter
 _FLOOR_S = 2e-5
 _ROUNDS = 8
@@ -26,10 +26,10 @@ def excess(square: FloatArray, usual: FloatArray) -> float:
     """
     ratio = np.minimum(square / usual, _CLIP)
     telling = 1.0 / np.maximum(usual, np.median(usual))  # images with a wide prior have little to say
-    if telling @ (ratio - 1.0) < _SIGNIFICANT * np.sqrt(2.0 * float(telling @ telling)):
+    if telling @ (ratio - 1.0) < SURE_SIGMAS * np.sqrt(2.0 * float(telling @ telling)):
         return 0.0
-    # maximum likelihood by scoring; 0.455 is the median of a chi-square variable
-    variance = max(float(np.median(square)) / 0.455 - float(np.median(usual)), 0.0)
+    # maximum likelihood by scoring
+    variance = max(float(np.median(square)) / MEDIAN_CHI2 - float(np.median(usual)), 0.0)
     for _ in range(_ROUNDS):
         expected = usual + variance
         weight = expected**-2

@@ -90,7 +90,7 @@ def _score(observed: Observed, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivative of the log-likelihood by both variances, and its Fisher information."""
     b, A, C = observed
     V = C + (A * np.array([v[0], v[1], v[1]])) @ A
-    whiten = np.linalg.inv(V + 1e-12 * np.eye(3) * np.trace(V, axis1=1, axis2=2)[:, None, None])
+    whiten = _inverse(V)
     PA = whiten @ A
     T = A @ PA
     h = np.matmul(b[:, None], PA)[:, 0]
@@ -100,3 +100,16 @@ def _score(observed: Observed, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     T2 = (T * T).sum(axis=0)
     score = 0.5 * np.array([over[:, 0].sum(), over[:, 1:].sum()])
     return score, 0.5 * np.array([[T2[0, 0], T2[0, 1:].sum()], [T2[0, 1:].sum(), T2[1:, 1:].sum()]])
+
+
+def _inverse(V: FloatArray) -> FloatArray:
+    """Inverses of covariances, shape (n, 3, 3), by cofactors: half the time of LAPACK's for each of them."""
+    a, b, c, d, e, f = np.ascontiguousarray(V.reshape(-1, 9).T)[[0, 1, 2, 4, 5, 8]]
+    ridge = 1e-12 * (a + d + f)
+    a, d, f = a + ridge, d + ridge, f + ridge
+    out = np.empty((3, 3, len(V)))
+    out[0, 0], out[1, 1], out[2, 2] = d * f - e * e, a * f - c * c, a * d - b * b
+    out[0, 1], out[0, 2], out[1, 2] = c * e - b * f, b * e - c * d, b * c - a * e
+    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+    out /= a * out[0, 0] + b * out[0, 1] + c * out[0, 2]
+    return np.asarray(out.transpose(2, 0, 1))

@@ -1,11 +1,10 @@
-"""Do the clocks of camera and imu run alike? Both answers are kept, each as likely as the data make it.
+"""Model selection: do the clocks of camera and imu drift apart?
 
-Most cameras are stamped by the clock that stamps the imu, and to ask them for a drift would double the sigma
-of their time shift; some run on a crystal of their own, 100 ppm off, and whoever takes those as constant is
-ten sigmas wrong after ten seconds. So the filter always has the drift as a state. That it is zero is a
-hypothesis beside it: its Gaussian is the filter's own, conditioned on no drift, and its odds come from how
-far the estimated drift lies from zero (Savage-Dickey density ratio). What is published are mean and
-covariance of the mixture. [docs/math/filter.md, eq. (16)]
+Most cameras are stamped by the imu's clock; estimating a drift doubles the sigma of their time shift. Others
+have their own crystal, 100 ppm off; without a drift they are ten sigmas wrong after ten seconds.
+So the drift is always a state of the filter. No drift is the alternative model: its Gaussian is the filter's
+own, conditioned on no drift. Its odds follow from how far the estimated drift lies from zero (Savage-Dickey
+density ratio). The published mean and covariance are those of the mixture. [docs/math/filter.md, eq. (16)]
 """
 
 from __future__ import annotations
@@ -95,7 +94,7 @@ def let_drift(f: CalibrationFilter, camera: str, *, anew: bool) -> Event:
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
-    """Return the filter as it is to be told: mean and covariance over both hypotheses, for each camera."""
+    """Return the filter to be reported: mean and covariance over both models, for each camera."""
     for name in f.layout.cameras:
         f = _mixed(f, name, apart(f, name), lenses_known(f))
     return f
@@ -114,7 +113,7 @@ def _mixed(f: CalibrationFilter, camera: str, p: float, S: FloatArray) -> Calibr
     sigma = float(np.sqrt(S[index] @ S[index]))
     k = S @ (S[index] / sigma)
     z = f.state.cameras[camera].skew / sigma
-    square = z * z / f.consistency[camera].factor  # of what is told, which is `factor` times P
+    square = z * z / f.consistency[camera].factor  # of the reported covariance, `factor` times P
     less = (1.0 - p) * (1.0 - p * square)
     mixed: FloatArray = f.S - (1.0 - np.sqrt(1.0 - less)) * np.outer(k / sigma, f.S[index])
     return replace(f, state=retract(f.state, f.layout, -(1.0 - p) * z * k), S=mixed)

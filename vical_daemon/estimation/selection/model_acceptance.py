@@ -1,4 +1,4 @@
-"""What turned out not to be as stated is announced; no hypothesis that it is stands beside it any longer."""
+"""Commits to an alternative model above 99 % and announces it."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ class ModelAcceptance:
 def _needed(name: str, every: dict[str, Block], shares: dict[tuple[str, ...], float]) -> int:
     """Images before a block is announced.
 
-    A lag is small beside what images that do not fit do: only once that is measured is it known. The same
-    holds for whatever seems to be off beside a fixed lens that is wrong; the first images may show either.
+    Images that do not fit can look like a lag; their misfit must be measured first. A wrong fixed lens can
+    look like any of the blocks; the first images may show either.
     """
     held = [other for other, block in every.items() if block.held]
     if name in held:

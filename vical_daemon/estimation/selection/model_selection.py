@@ -1,12 +1,11 @@
-"""Which of the things taken for true are not? All answers are kept, each as likely as the data make it.
+"""Model selection: are the target's size and shape, the IMU's matrices and lag, and fixed lenses as given?
 
-To ask every rig for size and shape of its board, the matrices of its IMU and the lag of its accelerometer
-would make the answer up to three times less certain; to take those that are a little off for true puts it ten
-stated sigmas off. So the filter always has them among its states. That some of them, or all, are zero are
-hypotheses beside it: each one's Gaussian is the filter's own, conditioned on that, and its odds come from how
-far the states lie from zero (Savage-Dickey density ratio). What is told are mean and covariance of the
-mixture. A lens that is held is one of these things; but what is told then is the calibration that belongs to
-the stated lens, and how far the mixture lies from that.
+Estimating all of them on every rig would make the result up to three times less certain. Assuming that they
+are exact puts the result up to ten stated sigmas off where they are not. So they are always states of the
+filter. Each combination of them that may be zero is an alternative model. Its Gaussian is the filter's own,
+conditioned on these zeros. Its odds follow from how far the states lie from zero (Savage-Dickey density
+ratio). The reported mean and covariance are those of the mixture. With a fixed lens the reported mean is that
+of the calibration for the lens as given; the covariance includes how far the mixture lies from it.
 [docs/math/filter.md, eq. (18) and (19)]
 """
 
@@ -27,9 +26,9 @@ from vical_daemon.estimation.model.unscented import root, solve_lower
 
 IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
 IN_DOUBT = {
-    IMU: "sigmas are small; whether the imu's scale and alignment are true is not sure yet",
-    SIZE: "sigmas are small; whether the target is as large as stated is not sure yet",
-    TARGET: "sigmas are small; whether the target is as stated is not sure yet",
+    IMU: "sigmas are small; it is not clear yet whether the imu's scale and alignment are as specified",
+    SIZE: "sigmas are small; it is not clear yet whether the target has the size in its file",
+    TARGET: "sigmas are small; it is not clear yet whether the target has the shape in its file",
 }
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
@@ -45,7 +44,7 @@ class Block:
         values: As estimated, shape (n,).
         sigma: Of their prior, shape (n,).
         stated: How well they are known where what they describe is as stated, shape (n,); zeros: exactly.
-        held: They are told as zero in any case.
+        held: They are reported as zero in any case.
     """
 
     where: slice
@@ -100,7 +99,7 @@ def blocks(f: CalibrationFilter) -> dict[str, Block]:
 
 
 def lenses_known(f: CalibrationFilter) -> FloatArray:
-    """Square root of the covariance, as it is told, if the errors of all lenses that are held were known."""
+    """Square root of the reported covariance if the errors of all fixed lenses were known."""
     if not f.layout.held:
         return f.S
     scaled = [f.S[f.layout.lens(n)] / lens.off_sigma[:, None] for n, lens in f.layout.held.items()]
@@ -144,7 +143,7 @@ def _log_evidence(learnt: FloatArray, weighted: FloatArray) -> float:
 
 
 def factor(f: CalibrationFilter) -> float:
-    """By how much the variances of all that is told exceed the filter's own (see `consistency`)."""
+    """Reported variances over the filter's own (see `consistency`)."""
     return max((c.factor for c in f.consistency.values()), default=1.0)
 
 
@@ -175,8 +174,7 @@ def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
 def _beyond_prior(shares: dict[tuple[str, ...], float], name: str) -> dict[tuple[str, ...], float]:
     """Count that a block is not zero by so much only as the data speak for it.
 
-    Of a lens that is held nobody asks to be told what one in twenty of them might do where the data say
-    nothing of it.
+    The prior alone, one fixed lens in twenty, would widen every result. It counts only where data support it.
     """
     p = not_zero(shares, name)
     if p in (0.0, 1.0):
@@ -229,8 +227,8 @@ def off(f: CalibrationFilter, name: str) -> float:
 def in_doubt(f: CalibrationFilter, *, converged: bool = False) -> str:
     """Name of a block for which the data speak, though not yet surely: they soon will. Empty: none.
 
-    Images that do not fit may never decide it; what is told covers both then. What has `converged` stays so
-    until the block is more likely off than not: of many looks, one sees 5 % by chance.
+    Images that do not fit may never decide it; the reported covariance then covers both. A converged result
+    stays so until the block is more likely off than not: of many looks, one sees 5 % by chance.
     """
     if misfit(f) != 1.0:
         return ""
@@ -240,29 +238,31 @@ def in_doubt(f: CalibrationFilter, *, converged: bool = False) -> str:
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
-    """Return the filter as it is to be told: mean and covariance over all hypotheses.
+    """Return the filter to be reported: mean and covariance over all models.
 
     Where a lens is held the mean is that of the hypotheses with this lens exactly as stated; the covariance
     is about that mean, of all that may be.
     """
     every = blocks(f)
     held = [name for name, block in every.items() if block.held]
-    columns, shifts, told, shares = [], [], [], []
+    columns, shifts, reported, shares = [], [], [], []
     for true, p in weights(f).items():
         if p < _NEGLIGIBLE:
             continue
         S, d = _given(f, every, true)
         columns.append(np.sqrt(p) * S)
         shifts.append(d)
-        told.append(_given(f, every, {*true, *held}, exactly=held)[1] if held else d)
+        reported.append(_given(f, every, {*true, *held}, exactly=held)[1] if held else d)
         shares.append(p)
     if len(shares) == 1 and not shifts[0].any() and not held:
         return f
     share, d = np.array(shares) / sum(shares), np.array(shifts)
-    mean = share @ np.array(told)
+    mean = share @ np.array(reported)
     for name in held:
         mean[every[name].where] = every[name].values
-    apart = (np.sqrt(share / factor(f))[:, None] * (d - mean)).T  # of what is told, which is `factor` times P
+    apart = (
+        np.sqrt(share / factor(f))[:, None] * (d - mean)
+    ).T  # of the reported covariance, `factor` times P
     return replace(f, state=retract(f.state, f.layout, -mean), S=np.concatenate([*columns, apart], axis=1))
 
 

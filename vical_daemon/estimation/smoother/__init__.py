@@ -1,1 +1,1 @@
-"""The parts of target-free calibration: start, windows of bundle adjustment, what is carried on and told."""
+"""The parts of target-free calibration: start, windows of bundle adjustment, handover and report."""

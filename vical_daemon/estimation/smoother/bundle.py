@@ -18,6 +18,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.retract import orthonormal
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.smoother.carry import (
     FULL,
     INERTIAL,
@@ -263,10 +264,10 @@ class Bundle:
         size = np.sqrt((e[ok] ** 2).sum(axis=1))
         if not len(size):
             return
-        # median of a Rayleigh variable is 1.1774 sigma; degrees of freedom used up by the fit
+        # degrees of freedom used up by the fit
         share = np.sqrt(max(self._dof(seen) / max(2 * int(ok.sum()), 1), 0.05))
         self.problem.sigma_px = float(
-            np.clip(self.problem.sigma_px * np.median(size) / 1.1774 / share, 0.02, 20.0)
+            np.clip(self.problem.sigma_px * np.median(size) / MEDIAN_RAYLEIGH / share, 0.02, 20.0)
         )
         self.problem.spread = float(np.sqrt(correlation(np.where(ok[:, None], e, 0.0), seen)))
 

@@ -14,7 +14,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.imu_scale import NUMBERS
-from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.model.retract import orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.window import Window
@@ -24,7 +24,7 @@ ARM, TURN, SHIFT, LENS, DRIFT, READOUT, IMU = slice(0, 3), slice(3, 6), 6, slice
 LAG = slice(32, 33)
 INERTIAL = slice(IMU.start, LAG.stop)
 FULL = LAG.stop
-_HELD_M = 1e-4
+HELD_M = 1e-4
 BIASES = slice(5, 11)  # of a carry
 CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
 
@@ -127,7 +127,8 @@ def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Margin
         sigmas: Of the calibration errors, shape (FULL,).
     """
     biases = [GYRO_BIAS_SIGMA_RPS] * 3 + [ACCEL_BIAS_SIGMA_MPS2] * 3
-    wide = np.concatenate([[1.0] * 2, [5.0] * 3, biases, sigmas[np.flatnonzero(active)]])
+    motion = [WINDOW_START.attitude_rad] * 2 + [WINDOW_START.velocity_mps] * 3
+    wide = np.concatenate([motion, biases, sigmas[np.flatnonzero(active)]])
     R, t_s = window.R[0], window.frames[0][0]
     root, speed = np.diag(1.0 / wide), R.T @ window.v[0]
     return MarginalPrior(R.copy(), speed, np.zeros(6), window.camera, root, active, t_s, window.imu)
@@ -138,7 +139,7 @@ def held_along(carry: MarginalPrior, axis: FloatArray) -> MarginalPrior:
     if not carry.active[:3].all():
         return carry
     row = np.zeros((1, len(carry.root)))
-    row[0, CALIBRATION : CALIBRATION + 3] = axis / _HELD_M
+    row[0, CALIBRATION : CALIBRATION + 3] = axis / HELD_M
     stacked = np.vstack([carry.root, row])
     return replace(carry, root=np.linalg.qr(stacked)[1])
 

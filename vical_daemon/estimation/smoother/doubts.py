@@ -1,4 +1,4 @@
-"""What a target-free calibration asks beside: do clocks drift, is the imu off, does the shutter roll?"""
+"""Model selection without a target: do clocks drift, is the imu off, does the shutter roll?"""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from vical_daemon.estimation.selection.clock_drift import (
     stamps_variance,
 )
 from vical_daemon.estimation.selection.model_acceptance import known_off
+from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
-_SURELY_ROLLING = 5.0  # sigmas
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
 _WHERE = {hypotheses.IMU: np.arange(FULL)[IMU], hypotheses.LAG: np.arange(FULL)[LAG]}
 _SIGMA = {hypotheses.IMU: ENTRY_SIGMA, hypotheses.LAG: LAG_SIGMA_S}
@@ -68,7 +68,7 @@ class TargetFreeDoubts:
         sigmas = np.sqrt(factor * np.diag(carry.calibration()))
         if not self.rolling:
             readout_s, sigma_s = carry.camera.readout_s, float(sigmas[READOUT])
-            self.rolling = abs(readout_s) > max(_SURELY_ROLLING * sigma_s, _SHORTEST_S)
+            self.rolling = abs(readout_s) > max(SURE_SIGMAS * sigma_s, _SHORTEST_S)
             if self.rolling:
                 kind = ROLLING[carry.camera.readout_axis or ROWS]
                 events.append(Event(kind, self._camera, float(readout_s), sigma_s))
@@ -95,7 +95,7 @@ class TargetFreeDoubts:
         return ""
 
     def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> Doubts:
-        """How likely each is, for what is told; arguments as for `watch`."""
+        """How likely each model is, for the report; arguments as for `watch`."""
         weights = self._weights(carry, factor)
         every = max(weights, key=len)
         if not compared and weights[every] < 0.5:

@@ -100,7 +100,7 @@ def with_process_noise(
 
 
 def next_window(window: Window, carry: MarginalPrior) -> Window:
-    """A window that begins at the last image of this one, which has told what it had to tell."""
+    """A window that begins at the last image of this one; that image has been used."""
     t, last = window.frames[-1]
     none = PointsFrame(last.camera, last.t_cam_ns, last.ids[:0], last.uv_px[:0])
     empty = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))

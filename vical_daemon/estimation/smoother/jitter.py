@@ -16,9 +16,9 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.stamp_jitter import excess
+from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.window import IntArray, Window
 
-_SURE = 5.0  # sigmas
 _OPEN_S = 1.0  # as good as no prior, where a rig that stands still shows nothing
 
 
@@ -64,7 +64,7 @@ class StampOffsets:
         """
         tau, _ = self.delays()
         power = float((tau**2).sum())
-        return bool(float(tau[1:] @ tau[:-1]) * np.sqrt(len(tau)) > _SURE * power > 0.0)
+        return bool(float(tau[1:] @ tau[:-1]) * np.sqrt(len(tau)) > SURE_SIGMAS * power > 0.0)
 
     def by_states(self, J: FloatArray, at: IntArray, size: int) -> FloatArray:
         """B'J over all states, shape (F, size); `at` (F - 1, c): where the columns of J live."""

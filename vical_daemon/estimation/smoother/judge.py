@@ -6,9 +6,8 @@ from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.special import chdtri
 
-from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
+from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.trace import Trace
@@ -19,26 +18,20 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
+from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, MarginalPrior
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.status.excitation import (
-    ALL_WAYS,
-    RunningMotion,
-    excitation_advice,
-    weak_directions,
-)
+from vical_daemon.estimation.status.excitation import excitation_advice, weak_directions
+from vical_daemon.estimation.status.incoming import LOST, PATIENCE_S, Incoming, lacking_verdict
 from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
-from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
+from vical_daemon.estimation.wording import cause_text, direction_line, guidance_text
 
-_PATIENCE_S = 15.0
-_LOST = 3.0
 _ENOUGH_WINDOWS = 2
 _MOST_SIGMA_PX = 3.0
 _MOST_INERTIAL = 2.5
 _MOST_REFUSED = 0.4
-_DOUBT = 1e-5  # chance of a window that disagrees this much
 _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
@@ -61,15 +54,10 @@ class TargetFreeStatus:
         self, options: CalibrationOptions, camera: str, active: BoolArray, *, rolling: bool = False
     ) -> None:
         self.options, self.camera, self.active = options, camera, active
-        self._motion = RunningMotion()
-        self.imu_samples = self.frames_ignored = self.frames_seen = 0
+        self._in = Incoming("no features have been followed yet: is the picture dark or blurred?")
         self._steady = SteadyStatus()
-        self._events = EventLog()
         self.misfit: tuple[Cause, float] = Cause.NONE, 0.0
         self._against_since_s: float | None = None  # images contradict what is known since then
-        self._reason, self._motion_missing = "", False
-        self._first_ns = self._newest_ns = 0
-        self._first_frame_s: float | None = None
         self._started_s: float | None = None
         self._now_s = 0.0
         self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
@@ -90,28 +78,20 @@ class TargetFreeStatus:
     # ------------------------------------------------------------------ what happens
     def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
         """Count one inertial reading."""
-        self._motion.add((t_ns - (self._first_ns or t_ns)) * 1e-9, gyro)
-        if not self.imu_samples:
-            self._first_ns = t_ns
-        self.imu_samples += 1
-        self._newest_ns = t_ns
-        self._events.now_s = self._elapsed_s
+        self._in.saw_imu(t_ns, gyro)
 
     def saw_points(self, t_s: float, count: int) -> None:
         """Count one image with `count` tracks."""
-        if count >= 4:
-            self.frames_seen += 1
-            if self._first_frame_s is None:
-                self._first_frame_s = t_s
+        self._in.saw_points(t_s, count)
 
     def waiting(self, why: str, motion_missing: bool) -> None:
         """No start yet; `motion_missing`: more motion, not more time, would help."""
         before = "" if motion_missing or not self._given_up[0] else f"{cause_text(*self._given_up)}; "
-        self._reason, self._motion_missing = before + why, motion_missing
+        self._in.reason, self._in.motion_missing = before + why, motion_missing
 
     def started(self, t_s: float) -> None:
         """A window runs from `t_s` on."""
-        self._reason = ""
+        self._in.reason = ""
         if self._started_s is None:
             self._started_s = t_s
         if self._bumped:
@@ -137,7 +117,7 @@ class TargetFreeStatus:
             self.contradicted(against_s)
         if kept is None and against_s and self._growing[1]:
             self._withdrawn.append(self._growing)
-        self._reason, self._motion_missing = cause_text(why, value), False
+        self._in.reason, self._in.motion_missing = cause_text(why, value), False
         if kept is not None and not self._quiet[0]:
             self._quiet = why, value
         if kept is None:
@@ -153,12 +133,12 @@ class TargetFreeStatus:
     def contradicted(self, against_s: float) -> None:
         """Images of the last `against_s` seconds contradict the calibration: not known yet why."""
         if self._against_since_s is None:
-            self._against_since_s = self._elapsed_s - against_s
+            self._against_since_s = self._in.elapsed_s - against_s
 
     @property
     def against_s(self) -> float:
         """For how long images have contradicted the calibration, s; 0: they do not."""
-        return 0.0 if self._against_since_s is None else self._elapsed_s - self._against_since_s
+        return 0.0 if self._against_since_s is None else self._in.elapsed_s - self._against_since_s
 
     @property
     def proven(self) -> bool:
@@ -184,8 +164,7 @@ class TargetFreeStatus:
 
     def announce_all(self, events: Iterable[Event]) -> None:
         """Put events into the next estimate."""
-        for event in events:
-            self._events.add(event)
+        self._in.announce_all(events)
 
     def _announce(
         self,
@@ -197,16 +176,12 @@ class TargetFreeStatus:
         cause_value: float | None = None,
     ) -> None:
         event = Event(kind, self.camera, value, cause=cause, cause_value=cause_value)
-        self._events.add(event, once)
+        self._in.announce(event, once)
 
     @property
     def status(self) -> Status:
         """Where the calibration stands, as of the last estimate."""
         return self._steady.status
-
-    @property
-    def _elapsed_s(self) -> float:
-        return (self._newest_ns - self._first_ns) * 1e-9
 
     # ------------------------------------------------------------------ windows
     def fits(self, fit: Fit, *, first: bool = False) -> bool:
@@ -255,11 +230,11 @@ class TargetFreeStatus:
         P_new = fit.carry.at(carry.t_cam_s).covariance()[CALIBRATION:, CALIBRATION:]
         scale = np.sqrt(np.diag(P_old))
         values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
-        told = values > 0.02  # directions in which the window had something to say
-        if not told.any():
+        informed = values > 0.02  # directions in which the window has information
+        if not informed.any():
             return True
         d = vectors.T @ (fit.change / scale)
-        statistic, dof = float((d[told] ** 2 / values[told]).sum()), int(told.sum())
+        statistic, dof = float((d[informed] ** 2 / values[informed]).sum()), int(informed.sum())
         full = np.zeros(FULL)
         full[np.flatnonzero(self.active)] = fit.change
         agree = self.excess(statistic, dof, full) <= 1.0
@@ -280,7 +255,7 @@ class TargetFreeStatus:
         return min(ratio, 1.0) if self.factor() >= _MODEL_FITS and not _matters(change) else ratio
 
     def _limit(self, dof: int) -> float:
-        limit = float(chdtri(dof, _DOUBT)) * self.factor()
+        limit = chi_square_limit(dof, WINDOW_CONTRADICTS) * self.factor()
         # at first not enough is seen to tell a poor model from a changed rig
         return limit if self._windows >= _LEARNING else 50.0 * limit
 
@@ -323,30 +298,30 @@ class TargetFreeStatus:
         doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), converged=converged)
         verdict = self._decide(camera is not None, running, missing, doubt)
         if verdict.guidance and carry is not None:
-            advice = excitation_advice(self._motion, carry.camera.R_imu_cam, carry.bias[:3])
+            advice = excitation_advice(self._in.motion, carry.camera.R_imu_cam, carry.bias[:3])
             verdict = verdict._replace(guidance=advice or verdict.guidance)
-        told = self._steady.follow(verdict, self._elapsed_s)
+        reported = self._steady.follow(verdict, self._in.elapsed_s)
         self._ever_converged |= self.status == Status.CONVERGED
         if camera is not None and self.status == Status.DEGENERATE:
-            camera.withheld.extend(m for m in missing if m.excess > _LOST)
+            camera.withheld.extend(m for m in missing if m.excess > LOST)
             camera.unobservable.extend(direction_line(m) for m in camera.withheld)
         refused, seen = (sum(x) for x in zip(*self._refused, strict=True)) if self._refused else (0, 0)
         return CalibrationEstimate(
-            self._newest_ns,
+            self._in.newest_ns,
             self.status,
-            told.reason,
-            self._progress(camera is not None, missing),
-            guidance_text(told.guidance),
-            self._elapsed_s,
-            self.frames_seen,
-            self.imu_samples,
+            reported.reason,
+            self._in.progress(self.status, camera is not None, missing),
+            guidance_text(reported.guidance),
+            self._in.elapsed_s,
+            self._in.frames_seen,
+            self._in.imu_samples,
             {} if camera is None else {self.camera: camera},
-            None if carry is None else imu_estimate(carry, matrices_told=self.doubts.imu_asked),
+            None if carry is None else imu_estimate(carry, matrices_asked=self.doubts.imu_asked),
             gravity,
             self.nis_per_dof(),
             refused / max(seen, 1),
-            self._events.take(),
-            told.guidance,
+            self._in.take_events(),
+            reported.guidance,
         )
 
     def _camera(self, carry: MarginalPrior) -> CameraEstimate:
@@ -358,18 +333,18 @@ class TargetFreeStatus:
     def _missing(self, e: CameraEstimate, carry: MarginalPrior) -> list[WeakDirection]:
         covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
         return weak_directions(
-            covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, carry.bias[:3]
+            covariance, R, e.timeshift_sigma_s, self._in.motion, self.options.targets, carry.bias[:3]
         )
 
     def _decide(self, known: bool, running: bool, missing: list[WeakDirection], doubt: str) -> Verdict:
         """By the data up to now; `doubt`: what may not be as it is taken to be, or nothing."""
         if not known:
-            return self._before_start()
+            return self._in.before_start(self._bumped)
         if not running and self._windows == 0:
-            return Verdict(Status.INITIALISING, self._reason)
+            return Verdict(Status.INITIALISING, self._in.reason)
         if self._against_since_s is not None:
             return Verdict(Status.CONVERGING, LOOKING_AGAIN, against_s=self.against_s)
-        pause = "" if running else f" (paused: {self._reason or cause_text(*self._quiet)})"
+        pause = "" if running else f" (paused: {self._in.reason or cause_text(*self._quiet)})"
         missing = self._steady.counted(missing)
         if not missing:
             if self._windows < _ENOUGH_WINDOWS:
@@ -381,35 +356,8 @@ class TargetFreeStatus:
             if doubt:
                 return Verdict(Status.CONVERGING, doubt + pause)
             return Verdict(Status.CONVERGED, pause.strip(" ()"))
-        worst = missing[0]
-        if self._now_s - (self._started_s or 0.0) > _PATIENCE_S and worst.excess > _LOST:
-            names = "; ".join(direction_sigma(g) for g in missing[:3])
-            return Verdict(Status.DEGENERATE, f"the motion does not show: {names}" + pause, worst.guidance)
-        return Verdict(Status.CONVERGING, direction_sigma(worst) + pause, worst.guidance)
-
-    def _before_start(self) -> Verdict:
-        if self._bumped:
-            why = cause_text(self._bumped)
-            return Verdict(Status.INCONSISTENT, f"{why}; calibrating anew: {self._reason}")
-        if not self.imu_samples:
-            return Verdict(Status.WAITING, "no inertial data yet")
-        if self._first_frame_s is None:
-            return Verdict(
-                Status.WAITING, "no features have been followed yet: is the picture dark or blurred?"
-            )
-        seen_for = self._elapsed_s - self._first_frame_s
-        if self._motion_missing and seen_for > _PATIENCE_S:
-            advice = excitation_advice(self._motion, None) or ALL_WAYS
-            return Verdict(Status.DEGENERATE, self._reason, advice)
-        return Verdict(Status.INITIALISING, self._reason or "collecting the first seconds")
-
-    def _progress(self, known: bool, missing: list[WeakDirection]) -> float:
-        if self.status == Status.CONVERGED:
-            return 1.0
-        if not known:
-            return min(0.1, 0.001 * self.frames_seen)
-        worst = max((g.excess for g in missing), default=1.0)
-        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
+        patient = self._now_s - (self._started_s or 0.0) > PATIENCE_S
+        return lacking_verdict(missing, patient=patient, pause=pause)
 
 
 def _matters(change: FloatArray) -> bool:

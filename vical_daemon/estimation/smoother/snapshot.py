@@ -12,8 +12,9 @@ from vical_daemon.estimation.filter.unobservable_directions import held_covarian
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.model.imu_scale import matrices
+from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.clock_drift import evidence, probability
 from vical_daemon.estimation.smoother.carry import (
     ARM,
@@ -33,14 +34,14 @@ _GYRO = slice(IMU.start, IMU.start + 9)
 
 
 class Doubts(NamedTuple):
-    """How what is carried is to be told.
+    """How what is carried is to be reported.
 
     Attributes:
-        factor: Measured variance over the stated one; multiplies what is told.
+        factor: Measured variance over the stated one; multiplies the reported covariance.
         drifting: The camera's clock is known to run apart from the imu's.
         stated: Probabilities, each with the errors that are zero then: what of the imu is as stated.
-        gyro_frame: The camera is told in the frame in which the gyro's matrix is symmetric.
-        rolling: The shutter is known to be a rolling one: its readout is told.
+        gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
+        rolling: The shutter is known to be a rolling one: its readout is reported.
     """
 
     factor: float = 1.0
@@ -62,32 +63,26 @@ def camera_estimate(
         rms_px: RMS of the residuals.
         held: Axis of the imu along which the lever arm is not known, unit, shape (3,); None: there is none.
     """
-    camera, covariance = _told(carry, doubts)
+    camera, covariance = _averaged(carry, doubts)
     if held is not None:
         covariance[:3, :3] += held_covariance(np.outer(held, held))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
-    q = so3.quat_from_matrix(camera.R_imu_cam)
-    return CameraEstimate(
-        PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), covariance[:6, :6].tolist()),
-        float(camera.timeshift_s),
-        float(sigma[SHIFT]),
-        camera.intrinsics.tolist(),
-        sigma[LENS][:4].tolist(),
-        camera.distortion_model,
-        camera.distortion.tolist(),
-        sigma[LENS][4:].tolist(),
-        rms_px,
-        sigma_px,
-        [],
-        float(camera.readout_s) if doubts.rolling else 0.0,
-        float(sigma[READOUT]) if doubts.rolling else 0.0,
-        readout_axis=camera.readout_axis if doubts.rolling else "",
-        calibration_covariance=covariance[: LENS.stop, : LENS.stop].tolist(),
+    return camera_snapshot(
+        camera,
+        pose=covariance[:6, :6],
+        timeshift_sigma_s=sigma[SHIFT],
+        lens=np.concatenate([camera.intrinsics, camera.distortion]),
+        lens_sigma=sigma[LENS],
+        readout_sigma_s=sigma[READOUT],
+        rms_px=rms_px,
+        sigma_px=sigma_px,
+        joint=covariance[: LENS.stop, : LENS.stop],
+        rolling=doubts.rolling,
     )
 
 
-def _told(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
-    """Camera and covariance (FULL, FULL) over the hypotheses about imu and clock; see `hypotheses`."""
+def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
+    """Camera and covariance (FULL, FULL) over the models of imu and clock; see `model_selection`."""
     camera, numbers, P = _over_imu(carry, doubts)
     if doubts.gyro_frame:
         camera, P = _in_gyro_frame(camera, numbers, P)
@@ -123,9 +118,7 @@ def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> t
     return camera, J @ P @ J.T
 
 
-def imu_estimate(carry: MarginalPrior, *, matrices_told: bool) -> ImuEstimate:
+def imu_estimate(carry: MarginalPrior, *, matrices_asked: bool) -> ImuEstimate:
     """Biases and their sigmas; where asked for, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[5:11])
-    told = [m.tolist() for m in matrices(carry.imu)] if matrices_told else [[], []]
-    bias = carry.bias
-    return ImuEstimate(bias[:3].tolist(), bias[3:].tolist(), sigma[:3].tolist(), sigma[3:].tolist(), *told)
+    return imu_snapshot(carry.bias, sigma, matrices(carry.imu) if matrices_asked else ())

@@ -21,12 +21,12 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLink, make_link
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.carry import HELD_M
 from vical_daemon.estimation.smoother.window import Landmarks, Window, rays_of
 
 _ROUNDS = 8
 _MIN_FEATURES = 15
 _BIAS_SIGMA, _MAX_ARM_M = 0.2, 1.5
-_HELD_M = 1e-4
 _MOST_BEHIND = 0.3  # share of the observations
 _RAY_SIGMA = 2e-3
 _NEAR, _FAR = 0.1, 100.0
@@ -54,7 +54,7 @@ class ArmPrior:
         """Of z = (v0, gravity, lever arm, accel bias), shape (12, 12)."""
         out = np.diag([0.0] * 6 + [self.sigma_m**-2] * 3 + [_BIAS_SIGMA**-2] * 3)
         if self.held is not None:
-            out[6:9, 6:9] += np.outer(self.held, self.held) / _HELD_M**2
+            out[6:9, 6:9] += np.outer(self.held, self.held) / HELD_M**2
         return out
 
 

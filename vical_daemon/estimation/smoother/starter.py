@@ -10,10 +10,11 @@ import numpy as np
 
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
-from vical_daemon.estimation.model.priors import LAG_SIGMA_S, SKEW_SIGMA
+from vical_daemon.estimation.model.priors import EQUIDISTANT_SIGMA, LAG_SIGMA_S, SKEW_SIGMA, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.carry import MarginalPrior
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
@@ -44,7 +45,6 @@ _PARTIAL_S = 6.0  # before, a second axis may come yet
 _EVERY_S, _EVERY_MOST_S = 1.0, 4.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
-_READOUT_SIGMA_S = 0.015
 _MIN_TRACKS = 12
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _FULL_FITS = 2
@@ -285,11 +285,14 @@ def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
         camera: Its focal length counts.
         imu_sigma: Of the entries of the imu's matrices.
     """
-    f = float(camera.intrinsics[0])
-    lens = [0.05 * f, 0.05 * f, 0.03 * f, 0.03 * f]
-    distortion = [0.1, 0.1, 0.01, 0.01] if camera.distortion_model == "radtan" else [0.05] * 4
+    start, f = WINDOW_START, float(camera.intrinsics[0])
+    pose = [start.lever_arm_m] * 3 + [start.rotation_rad] * 3
+    lens = [start.focal * f] * 2 + [start.centre * f] * 2
+    distortion = [start.distortion] * 2 + [start.higher_distortion] * 2
+    if camera.distortion_model != RADTAN:
+        distortion = [EQUIDISTANT_SIGMA] * 4
     imu = [imu_sigma] * ENTRIES + [LAG_SIGMA_S]
-    return np.array([0.3] * 3 + [0.2] * 3 + [0.05] + lens + distortion + [SKEW_SIGMA, _READOUT_SIGMA_S] + imu)
+    return np.array([*pose, start.timeshift_s, *lens, *distortion, SKEW_SIGMA, start.readout_s, *imu])
 
 
 def _known(known: MarginalPrior) -> _Found:

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vical_daemon.estimation.significance import DRIFT_DOUBT_SIGMAS, DRIFT_SIGMAS
+
 _EVERY_S = 1.0
 _SPAN = 20
-_LIMIT = 6.0
-_DOUBT = 3.0
 
 
 @dataclass(slots=True)
@@ -54,5 +54,5 @@ class DriftWatch:
             default=0.0,
         )
         self._past.append((t_s, value, variance))
-        self.doubtful = bool(far > _DOUBT)
-        return bool(far > _LIMIT)
+        self.doubtful = bool(far > DRIFT_DOUBT_SIGMAS)
+        return bool(far > DRIFT_SIGMAS)

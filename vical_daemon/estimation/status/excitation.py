@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.measurements import ConvergenceTargets
+from vical_daemon.estimation.wording import ALONG
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,7 +28,6 @@ _ONE_AXIS = (
     0.03  # second over first eigenvalue of the rates' scatter below which the rig turned about one axis
 )
 _BLOCK_S = 0.1
-_ALONG = 0.85  # cosine above which two directions are called the same
 _STEADY = 0.3  # change of the rate in a second over the rate, below which it turns steadily
 _NEAR = 0.5  # cosine above which turning about an axis is much the same as about a direction
 _GOOD_AXES: tuple[Axis, ...] = ("x", "y")  # any two will do; with these the target stays in view
@@ -227,7 +227,7 @@ class _Turning:
 
     def for_lever_arm(self, axis: FloatArray) -> Guidance:
         if self.one_axis and self.rms_rps >= _STILL_RPS:
-            along = abs(float(axis @ self.axis_cam)) > _ALONG
+            along = abs(float(axis @ self.axis_cam)) > ALONG
             return self.about_another(Verb.TURN if along else Verb.TURN_FASTER)
         return self._about_others(axis)
 

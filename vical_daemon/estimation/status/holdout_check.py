@@ -28,6 +28,7 @@ class HoldoutCheck:
     """Takes a copy of the filter every 1.5 s and asks it 0.3 s later what it would have expected."""
 
     _copy: CalibrationFilter | None = None
+    _earlier: CalibrationFilter | None = None
     _next_s: float = float("-inf")
 
     def follow(
@@ -40,7 +41,7 @@ class HoldoutCheck:
         """
         if self._copy is None:
             if f.state.t_s >= self._next_s:
-                self._copy = f.copy()
+                self._copy = self._earlier = f.copy(self._earlier)
             return None
         held = self._copy
         t_s = t_cam_s + held.state.cameras[frame.camera].timeshift_s

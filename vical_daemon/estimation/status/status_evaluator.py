@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
+from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.snapshot import camera_estimate, imu_estimate
@@ -28,21 +28,16 @@ from vical_daemon.estimation.result import (
 )
 from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.selection import model_selection as hypotheses
-from vical_daemon.estimation.status.excitation import (
-    ALL_WAYS,
-    RunningMotion,
-    excitation_advice,
-    weak_directions,
-)
+from vical_daemon.estimation.status.excitation import ALL_WAYS, excitation_advice, weak_directions
 from vical_daemon.estimation.status.holdout_check import imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
+from vical_daemon.estimation.status.incoming import LOST, PATIENCE_S, Incoming, lacking_verdict
 from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
-from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
+from vical_daemon.estimation.wording import direction_line, direction_sigma, guidance_text
 
 _ENOUGH_FRAMES = 60
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
-_PATIENCE_S = 15.0
-_LOST = 3.0  # a direction this far above its target after the patience is called unobservable
+_EVERY_READINGS = 16  # the size of one in so many is kept
 _NIS_BAD = 4.0
 _HELD_BACK_BAD = 9.0
 _RECENT = 60
@@ -61,22 +56,13 @@ class StatusEvaluator:
         self.options = options
         self.layout = layout
         self._imu_asked = "imu_intrinsics" in options.estimate
-        self._motion = RunningMotion()
-        self.imu_samples = 0
+        self._in = Incoming("the target has not been seen yet: show the whole board to the camera")
         self.frames = 0
-        self.frames_seen = 0
-        self.frames_ignored = 0
-        self.frames_refused = 0
-        self._events = EventLog()
         self._steady = SteadyStatus()
         self.bumped = Cause.NONE
         self.in_doubt = ""
         self._ever_converged = False
-        self._start_reason = ""
-        self._motion_missing = False
         self._partial = ""
-        self._first_ns = self._newest_ns = 0
-        self._first_frame_s: float | None = None
         self._started_s: float | None = None
         self._reopened_s = -np.inf
         self._points = [0, 0]
@@ -92,29 +78,21 @@ class StatusEvaluator:
     # ------------------------------------------------------------------ what happens
     def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
         """Count one inertial reading."""
-        if not self.imu_samples:
-            self._first_ns = t_ns
-        self.imu_samples += 1
-        self._newest_ns = t_ns
-        self._events.now_s = (t_ns - self._first_ns) * 1e-9
-        self._motion.add((t_ns - self._first_ns) * 1e-9, gyro)
-        if self.imu_samples % 16 == 1:
+        self._in.saw_imu(t_ns, gyro)
+        if self._in.imu_samples % _EVERY_READINGS == 1:
             self._size.append(float(np.sqrt(accel @ accel)))
 
     def saw_points(self, t_s: float, count: int) -> None:
         """Count one image with `count` points in it."""
-        if count >= 4:
-            self.frames_seen += 1
-            if self._first_frame_s is None:
-                self._first_frame_s = t_s
+        self._in.saw_points(t_s, count)
 
     def waiting(self, why: str, motion_missing: bool = False) -> None:
         """The start is not possible yet; `motion_missing`: more motion, not more time, would help."""
-        self._start_reason, self._motion_missing = why, motion_missing
+        self._in.reason, self._in.motion_missing = why, motion_missing
 
     def started(self, t_s: float, partial: str = "") -> None:
         """The filter runs from `t_s` on; `partial`: what the motion did not show, and was guessed."""
-        self._start_reason, self._started_s, self._partial = "", t_s, partial
+        self._in.reason, self._started_s, self._partial = "", t_s, partial
         self._recent_used.clear()
         self._nis.clear()
         self._held_back.clear()
@@ -129,12 +107,11 @@ class StatusEvaluator:
 
     def announce(self, event: Event, once: str = "") -> None:
         """Put an event into the next estimate; of those with the same `once` only the first."""
-        self._events.add(event, once)
+        self._in.announce(event, once)
 
     def announce_all(self, events: Iterable[Event]) -> None:
         """Put events into the next estimate."""
-        for event in events:
-            self._events.add(event)
+        self._in.announce_all(events)
 
     def changed(self, why: Cause) -> None:
         """The rig is not what it was: the calibration is being taken anew."""
@@ -157,7 +134,7 @@ class StatusEvaluator:
             scale: `Consistency.scale` of the camera.
         """
         self._held_back.append(ratio)
-        self.held_out.append(HeldOutCheck(self._now_s, ratio))
+        self.held_out.append(HeldOutCheck(self._in.elapsed_s, ratio))
         error = imu_noise_error(self._held_back, scale)
         if error is not None:
             self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
@@ -168,7 +145,6 @@ class StatusEvaluator:
         self._points[1] += len(report.accepted)
         self._recent_used.append(report.used)
         if not report.used:
-            self.frames_refused += 1
             return
         self.frames += 1
         self._nis.append((report.nis, report.dof))
@@ -214,39 +190,35 @@ class StatusEvaluator:
         verdict = self._decide(f, missing)
         if verdict.guidance and f is not None:
             first = next(iter(f.state.cameras.values()))
-            advice = excitation_advice(self._motion, first.R_imu_cam, f.state.gyro_bias)
+            advice = excitation_advice(self._in.motion, first.R_imu_cam, f.state.gyro_bias)
             verdict = verdict._replace(guidance=advice or verdict.guidance)
-        told = self._steady.follow(verdict, self._now_s)
-        advice = told.guidance
+        reported = self._steady.follow(verdict, self._in.elapsed_s)
+        advice = reported.guidance
         if not advice and f is not None and self.status != Status.INCONSISTENT:
             advice = self._cover.advice()
         self._ever_converged |= self.status == Status.CONVERGED
         if f is not None and (self.status == Status.DEGENERATE or f.unshown is not None):
             cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
         return CalibrationEstimate(
-            self._newest_ns,
+            self._in.newest_ns,
             self.status,
-            told.reason,
-            self._progress(missing),
+            reported.reason,
+            self._in.progress(self.status, bool(missing), [g for gs in missing.values() for g in gs]),
             guidance_text(advice),
-            self._now_s,
+            self._in.elapsed_s,
             self.frames,
-            self.imu_samples,
+            self._in.imu_samples,
             cameras,
             None if shown is None else imu_estimate(shown, matrices=self._imu_asked),
             [] if shown is None else shown.state.gravity.tolist(),
             self.nis_per_dof(),
             self._points[0] / max(self._points[1], 1),
-            self._events.take(),
+            self._in.take_events(),
             advice,
         )
 
-    @property
-    def _now_s(self) -> float:
-        return (self._newest_ns - self._first_ns) * 1e-9
-
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
-        """The filter as it is told: over all hypotheses about imu, target and clocks."""
+        """The filter to be reported: mean and covariance over all models of imu, target and clocks."""
         f = hypotheses.averaged(f)
         return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
 
@@ -262,18 +234,18 @@ class StatusEvaluator:
             return []
         covariance, R = np.array(e.T_imu_cam.covariance), f.state.cameras[name].R_imu_cam
         return weak_directions(
-            covariance, R, e.timeshift_sigma_s, self._motion, self.options.targets, f.state.gyro_bias
+            covariance, R, e.timeshift_sigma_s, self._in.motion, self.options.targets, f.state.gyro_bias
         )
 
     @staticmethod
     def _withheld(e: CameraEstimate, missing: list[WeakDirection]) -> CameraEstimate:
-        lost = [m for m in missing if m.excess > _LOST]
+        lost = [m for m in missing if m.excess > LOST]
         return replace(e, unobservable=[direction_line(m) for m in lost], withheld=lost)
 
     def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[WeakDirection]]) -> Verdict:
         """Status, reason and guidance by the data up to now."""
         if f is None:
-            return self._before_start()
+            return self._in.before_start(self.bumped, self._unit_trouble())
         trouble = self._trouble()
         if trouble:
             return Verdict(Status.INCONSISTENT, trouble)
@@ -292,15 +264,11 @@ class StatusEvaluator:
                     Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet"
                 )
             return Verdict(Status.CONVERGED)
-        worst = lacking[0]
         lens = self._lens_to_blame(f, missing)
         if lens:
-            return Verdict(Status.CONVERGING, f"{direction_sigma(worst)}: {lens}: leave it free")
-        patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > _PATIENCE_S
-        if patient and worst.excess > _LOST:
-            names = "; ".join(direction_sigma(g) for g in lacking[:3])
-            return Verdict(Status.DEGENERATE, f"the motion does not show: {names}", worst.guidance)
-        return Verdict(Status.CONVERGING, direction_sigma(worst), worst.guidance)
+            return Verdict(Status.CONVERGING, f"{direction_sigma(lacking[0])}: {lens}: leave it free")
+        patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > PATIENCE_S
+        return lacking_verdict(lacking, patient=patient)
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
         """What is wrong with a lens that is held, if nothing were missing but for that; else empty."""
@@ -310,25 +278,6 @@ class StatusEvaluator:
         name = max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
         how = "not this camera's" if hypotheses.lens_block(name) in f.off else "not known better"
         return f"the fixed lens of {name} is {how}"
-
-    def _before_start(self) -> Verdict:
-        if self.bumped:
-            why = cause_text(self.bumped)
-            return Verdict(Status.INCONSISTENT, f"{why}; calibrating anew: {self._start_reason}")
-        if not self.imu_samples:
-            return Verdict(Status.WAITING, "no inertial data yet")
-        unit = self._unit_trouble()
-        if unit:
-            return Verdict(Status.INCONSISTENT, unit)
-        if self._first_frame_s is None:
-            return Verdict(
-                Status.WAITING, "the target has not been seen yet: show the whole board to the camera"
-            )
-        seen_for = (self._newest_ns - self._first_ns) * 1e-9 - self._first_frame_s
-        if self._motion_missing and seen_for > _PATIENCE_S:
-            advice = excitation_advice(self._motion, None) or ALL_WAYS
-            return Verdict(Status.DEGENERATE, self._start_reason, advice)
-        return Verdict(Status.INITIALISING, self._start_reason or "collecting the first seconds")
 
     def _unit_trouble(self) -> str:
         if len(self._size) < 20:
@@ -351,11 +300,3 @@ class StatusEvaluator:
 
     def _held_back_fine(self) -> bool:
         return len(self._held_back) >= 2 and float(np.median(self._held_back)) < _HELD_BACK_BAD
-
-    def _progress(self, missing: dict[str, list[WeakDirection]]) -> float:
-        if self.status == Status.CONVERGED:
-            return 1.0
-        if not missing:
-            return min(0.1, 0.001 * self.frames_seen)
-        worst = max((g.excess for gs in missing.values() for g in gs), default=1.0)
-        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.significance import MEDIAN_CHI2_3, ORIENTATION_REFUSED, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftSolution, solve
 from vical_daemon.estimation.temporal.orientation_noise import estimate_scales, scaled, scales_of
 from vical_daemon.estimation.temporal.orientation_problem import (
@@ -31,8 +32,7 @@ __all__ = ["DriftNoise", "Fit", "OrientationSensor", "polish"]
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-_GATE = 16.27  # chi-square, 3 degrees of freedom, 99.9 %
-_MEDIAN_CHI2_3 = 2.366
+_GATE = chi_square_limit(3, ORIENTATION_REFUSED)
 _ROUNDS = 12
 _SHIFT_DONE_S = 2e-8
 # in which rounds the noises are estimated and with what steps, for one sensor and for several
@@ -144,7 +144,7 @@ def _update(
         x = solution.x[4 * i : 4 * i + 4]
         local = np.einsum("kji,kj->ki", s.R_world_ref.T @ s.R_world_sensor, noise[rows])
         d2 = np.einsum("ki,ki->k", local, np.linalg.solve(s.covariance, local[..., None])[..., 0])
-        by_median = 0.5 * float(np.log(max(float(np.median(d2)), 1e-12) / _MEDIAN_CHI2_3))
+        by_median = 0.5 * float(np.log(max(float(np.median(d2)), 1e-12) / MEDIAN_CHI2_3))
         by_median = max(by_median, s.least_log_scale)
         log_scale = by_median if rescale else s.log_scale
         largest = max(largest, abs(float(x[3])))

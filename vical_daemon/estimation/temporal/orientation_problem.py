@@ -61,7 +61,7 @@ class OrientationSensor:
     jitter_s: float = 0.0
 
     @property
-    def told_rad(self) -> float:
+    def stated_rad(self) -> float:
         """Noise of one orientation as `covariance` says it, rms per axis, rad."""
         return float(np.sqrt(np.trace(self.covariance.mean(axis=0)) / 3.0))
 
@@ -72,7 +72,7 @@ class OrientationSensor:
         A stream integrated from a gyro has next to no noise, and eliminating the drift from still smaller
         residuals costs all digits.
         """
-        return float(np.log(LEAST_NOISE_RAD / self.told_rad))
+        return float(np.log(LEAST_NOISE_RAD / self.stated_rad))
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.significance import SHIFT_MISFIT, SURE_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 
 _GRID_S = 5e-3  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
 _LEAST_IMAGES = 8
 _STEPS, _DERIVATIVE_S = 5, 1e-4  # Gauss-Newton from the nearest place on the grid
-_FITS_P = 1e-6  # chance that orientations which fit are said not to
-_SURE = 25.0  # of the sum of squares: five sigma
 _APART_S = 0.05  # other places on the curve begin so far from the best
 
 
@@ -124,9 +122,9 @@ def find_shift(
         return None
     best = float((_errors(curve, seen, R_imu_cam, np.array([shift_s])) ** 2).sum())
     dof = 3 * len(seen.t_cam_s) - 4
-    if best > usual_level * float(chdtri(dof, _FITS_P)):
+    if best > usual_level * chi_square_limit(dof, SHIFT_MISFIT):
         return None
-    sure = best + _SURE * usual_level
+    sure = best + SURE_SIGMAS**2 * usual_level
     if float(cost[:-1][np.abs(grid[:-1] - shift_s) > _APART_S].min(initial=np.inf)) < sure:
         return None
     return ShiftFit(shift_s, float(np.sqrt(usual_level / curvature)), float(cost[-1]) > sure)

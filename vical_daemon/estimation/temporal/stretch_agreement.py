@@ -12,15 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
+from vical_daemon.estimation.significance import STRETCHES_DISAGREE, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem, solve
 
 FloatArray = npt.NDArray[np.float64]
 
 _STRETCHES = 6
 _LEAST_ROWS = 20  # orientations in a stretch
-_CHANCE = 0.01  # how often stretches that do agree are taken for some that do not
 
 
 def widening(problem: DriftProblem, used: npt.NDArray[np.bool_], sensors: int) -> FloatArray:
@@ -66,7 +65,7 @@ def scatter_factor(values: Sequence[FloatArray], covariances: Sequence[FloatArra
     mean = np.linalg.solve(information.sum(axis=0), np.einsum("kij,kj->i", information, x))
     chi2 = float(np.einsum("ki,kij,kj->", x - mean, information, x - mean))
     freedom = x.size - x.shape[1]
-    return float(np.sqrt(chi2 / freedom)) if chi2 > chdtri(freedom, _CHANCE) else 1.0
+    return float(np.sqrt(chi2 / freedom)) if chi2 > chi_square_limit(freedom, STRETCHES_DISAGREE) else 1.0
 
 
 def _stretches(problem: DriftProblem, used: npt.NDArray[np.bool_], sensors: int) -> list[slice]:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.significance import RATE_SIGMAS
 from vical_daemon.estimation.temporal.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
@@ -24,7 +25,7 @@ from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro, clean_orientations
 from vical_daemon.estimation.temporal.td_icp_joint_result import JointResult, PairDelay, SensorDelay
-from vical_daemon.estimation.temporal.td_icp_refusals import RATE_SIGMAS, UNEVEN, refuse_start
+from vical_daemon.estimation.temporal.td_icp_refusals import UNEVEN, refuse_start
 from vical_daemon.estimation.temporal.td_icp_result import OK, REFUSED, TdIcpOptions, TdIcpResult
 
 __all__ = [
@@ -147,7 +148,7 @@ def _from_alone(
     t, R, covariance, index = cleaned
     curve = GyroCurve.integrate(t_imu, gyro, alone.gyro_bias_rps)
     R_world_ref = _world(curve, t, R, alone.used[index], alone.timeshift_cam_imu_s, alone.R_imu_cam)
-    told = float(np.sqrt(np.trace(covariance.mean(axis=0)) / 3.0))
+    stated = float(np.sqrt(np.trace(covariance.mean(axis=0)) / 3.0))
     return OrientationSensor(
         t,
         R,
@@ -156,7 +157,7 @@ def _from_alone(
         alone.R_imu_cam,
         R_world_ref,
         alone.used[index],
-        log_scale=float(np.log(alone.camera_noise_rad / told)),
+        log_scale=float(np.log(alone.camera_noise_rad / stated)),
         log_slow=float(np.log(alone.slow_noise_ratio)),
         jitter_s=options.stamp_jitter_s,
     )

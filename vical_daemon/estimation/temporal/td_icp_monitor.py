@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.significance import JUMP_SIGMAS
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 
 FloatArray = npt.NDArray[np.float64]
 
-_JUMP_SIGMAS = 6.0
 _DRIFT_WALK = 1e-6  # how much the drift rate may change, 1/sqrt(s)
 _OFFSET_WALK_S = 2e-6  # wander of the delay itself, s/sqrt(s)
 
@@ -69,7 +69,7 @@ class DelayTracker:
             x, P = _predict(state, t_s)
             S = float(P[0, 0] + variance)
             innovation = z - float(x[0])
-            jumped = bool(innovation**2 > _JUMP_SIGMAS**2 * S)
+            jumped = bool(innovation**2 > JUMP_SIGMAS**2 * S)
             K = P[:, 0] / S
             P = P - np.outer(K, P[0])
             state = (t_s, x + K * innovation, 0.5 * (P + P.T))

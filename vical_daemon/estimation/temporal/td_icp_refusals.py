@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.significance import RATE_SIGMAS
 from vical_daemon.estimation.temporal.orientation_fit import Fit
 from vical_daemon.estimation.temporal.rotation_start import Start
 from vical_daemon.estimation.temporal.rotation_suspects import stretched
@@ -22,7 +23,6 @@ _SHIFT_LOST_S = 3e-3
 _ROTATION_LOST_RAD = 3.0 * _DEG
 UNEVEN = 1e-3  # no two crystals are as far apart
 _STRETCHED = 5e-3  # beyond this no delay makes sense
-RATE_SIGMAS = 6.0
 
 
 class Refusal(NamedTuple):

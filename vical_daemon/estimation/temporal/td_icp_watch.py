@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
+from vical_daemon.estimation.significance import DISAGREEMENT_SIGMAS
 from vical_daemon.estimation.temporal.camera_orientations import target_orientations
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport, DelayTracker
 
 FloatArray = npt.NDArray[np.float64]
 
-_SIGMAS = 4.0
 _FLOOR_S = 2e-4  # lens and board are not exact: below this the two may differ for good
 _LASTING = 2  # windows in a row
 _FRAME_S = 0.18  # of the images one in so many seconds is enough
@@ -210,7 +210,7 @@ def _judged(camera: _Camera, known: CameraEstimate, result: TdIcpResult, t_s: fl
     if known.timeshift_sigma_s < _KNOWN_S:
         joint = float(np.hypot(report.timeshift_sigma_s, known.timeshift_sigma_s))
         apart = abs(report.timeshift_s - known.timeshift_cam_imu_s)
-        against = before.against + 1 if apart > max(_SIGMAS * joint, _FLOOR_S) else 0
+        against = before.against + 1 if apart > max(DISAGREEMENT_SIGMAS * joint, _FLOOR_S) else 0
     return DelayVerdict(
         report,
         before.windows + 1,

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.significance import MEDIAN_ABSOLUTE
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 FloatArray = npt.NDArray[np.float64]
@@ -126,7 +127,7 @@ def _adjusted(pairs: list[Pair]) -> list[tuple[FloatArray, FloatArray] | None]:
         e, J, basis = _linearise(R, t, rays_1, rays_2)
         cost = _middle(np.where(there, np.abs(e), np.inf), count)
         if i >= _PLAIN_STEPS:
-            scale = 3.0 * cost[:, None] / 0.6745 + 1e-9
+            scale = 3.0 * cost[:, None] / MEDIAN_ABSOLUTE + 1e-9
             weight = there / (1.0 + (e / scale) ** 2) ** 2
         Jt = np.swapaxes(J * weight[..., None], 1, 2)
         A = Jt @ J

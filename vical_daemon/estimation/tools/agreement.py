@@ -17,8 +17,9 @@ from scipy.special import chdtrc, gammaln
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.result import CameraEstimate
+from vical_daemon.estimation.significance import CALIBRATIONS_DISAGREE
 
-FALSE_ALARM = 1e-3
+FALSE_ALARM = CALIBRATIONS_DISAGREE
 """Probability that at least one of several calibrations is wrongly said to disagree, if sigmas are true."""
 LEVER_ARM, ROTATION, TIME_SHIFT, LENS = "lever arm", "rotation", "time shift", "lens"
 

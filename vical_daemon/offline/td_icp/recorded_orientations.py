@@ -159,7 +159,7 @@ def _from_quaternions(
     if np.ptp(q[good], axis=0).max() == 0.0:
         raise InputError(f"{name}: its orientation never changes (not filled in by the sender?)")
     R = so3.matrix_from_quat(so3.quat_normalise(q[good]))
-    told: float | FloatArray = _POSE_SIGMA_RAD
+    sigma_rad: float | FloatArray = _POSE_SIGMA_RAD
     if sigma is not None and sigma[good].min() > 0.0:
-        told = np.clip(sigma[good], 1e-5, 3.0)
-    return OrientationStream(name, seconds(t_ns[good], base_ns), R, told)
+        sigma_rad = np.clip(sigma[good], 1e-5, 3.0)
+    return OrientationStream(name, seconds(t_ns[good], base_ns), R, sigma_rad)

@@ -112,12 +112,12 @@ class IidcDevice:
     def absolute(self, feature: int) -> float:
         """Read a feature in its physical unit (shutter: s, gain: dB)."""
         value = c_float()
-        self.call("feature_get_absolute_value", feature, byref(value), doing="tell a feature")
+        self.call("feature_get_absolute_value", feature, byref(value), doing="report a feature")
         return value.value
 
     def is_automatic(self, feature: int) -> bool:
         """Tell whether the camera chooses a feature itself."""
-        return self.number("feature_get_mode", feature, doing="tell a mode") != abi.FEATURE_MODE_MANUAL
+        return self.number("feature_get_mode", feature, doing="report a mode") != abi.FEATURE_MODE_MANUAL
 
     def set_absolute(self, feature: int, value: float, what: str, unit: str) -> float:
         """Set a feature by hand, in its physical unit; returns the value obtained."""
@@ -129,7 +129,7 @@ class IidcDevice:
             feature,
             byref(low),
             byref(high),
-            doing=f"tell its {what} range",
+            doing=f"report its {what} range",
         )
         if not low.value * 0.999 <= value <= high.value * 1.001:
             bounds_text = f"{low.value:g} to {high.value:g} {unit}"
@@ -155,7 +155,7 @@ class IidcDevice:
 
     def start(self, buffers: int) -> int:
         """Set the ring up and let the camera send; returns the descriptor to poll."""
-        if self.number("video_get_transmission", doing="tell whether it sends"):
+        if self.number("video_get_transmission", doing="report whether it sends"):
             # nobody of ours holds it (see BusClock): a program that crashed left it sending
             self.call("video_set_transmission", abi.OFF, doing="stop to send")
         self.call("capture_setup", buffers, abi.CAPTURE_FLAGS_DEFAULT, doing="set its ring up (bandwidth?)")

@@ -64,7 +64,7 @@ def _fixed_mode(
     known = [(m, *abi.MODES[m]) for m in offered if m in abi.MODES]
     size = (settings.width, settings.height)
     if settings.width is None:
-        current = device.number("video_get_mode", doing="tell its video mode")
+        current = device.number("video_get_mode", doing="report its video mode")
         size = abi.MODES[current][:2] if current in abi.MODES else (0, 0)
     for coding in wanted:
         for mode, width, height, its_coding in known:
@@ -83,7 +83,7 @@ def _fixed_rate(device: IidcDevice, mode: int, rate_hz: float | None) -> int | N
     device.call("video_get_supported_framerates", mode, byref(rates), doing="list its frame rates")
     offered = [r for r in rates.framerates[: rates.num] if r in abi.FRAMERATES_HZ]
     if rate_hz is None:
-        current = device.number("video_get_framerate", doing="tell its frame rate")
+        current = device.number("video_get_framerate", doing="report its frame rate")
         return current if current in offered else max(offered, default=None)
     return next((r for r in offered if abs(abi.FRAMERATES_HZ[r] - rate_hz) < 0.01 * rate_hz), None)
 

@@ -190,7 +190,7 @@ class Controls:
     def get(self, name: str | int) -> int:
         """Read a control's value, in its own unit."""
         control = self._need(name)
-        return self._transfer(abi.VIDIOC_G_EXT_CTRLS, control, 0, f"tell its {control.name}")
+        return self._transfer(abi.VIDIOC_G_EXT_CTRLS, control, 0, f"report its {control.name}")
 
     def set(self, name: str | int, value: int) -> int:
         """Write a control and return the value that the device took.

@@ -209,7 +209,7 @@ class VideoNode:
     def current_format(self) -> ObtainedFormat:
         """Return the format that is set."""
         fmt = abi.Format(type=self._buf_type)
-        self.request(abi.VIDIOC_G_FMT, fmt, "tell its format")
+        self.request(abi.VIDIOC_G_FMT, fmt, "report its format")
         return _obtained(fmt)
 
     def set_format(self, pixel_format: str, width: int, height: int) -> ObtainedFormat:

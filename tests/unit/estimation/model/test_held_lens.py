@@ -191,4 +191,4 @@ def test_a_right_fixed_lens_is_not_doubted(run):
 
 def test_where_nothing_is_estimated_that_a_lens_could_harm_it_is_no_state(run):
     fixed = CalibrationOptions(fix=frozenset({"intrinsics", "extrinsics", "timeshift"}))
-    assert calibrate(run, fixed).layout.cameras[NAME].intrinsics is None
+    assert calibrate(run, fixed).rig.layout.cameras[NAME].intrinsics is None

@@ -78,7 +78,7 @@ def test_a_crooked_board_is_found_and_the_lens_with_it(crooked):
     assert np.abs(off / camera.intrinsics_sigma).max() < 3.5
     # beside what each corner has for itself, and a plane of its own: the world frame is free
     f = c.filter
-    found = c.layout.target_modes.fields(BOARD) @ f.state.target_shape
+    found = c.rig.layout.target_modes.fields(BOARD) @ f.state.target_shape
     left = crooked_board(seed) - BOARD - found
     plane = np.column_stack([BOARD[:, :2], np.ones(len(BOARD))])
     left_z = left[:, 2] - plane @ np.linalg.lstsq(plane, left[:, 2], rcond=None)[0]
@@ -135,4 +135,7 @@ def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypat
     )
     c.judge._steady.reset(Status.CONVERGING)  # a converged status would stand for two seconds
     assert c.estimate().status == Status.CONVERGING
-    assert c.estimate().reason == "sigmas are small; whether the target is as stated is not sure yet"
+    assert (
+        c.estimate().reason
+        == "sigmas are small; it is not clear yet whether the target has the shape in its file"
+    )

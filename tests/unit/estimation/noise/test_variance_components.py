@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from vical_daemon.estimation.noise.variance_components import Observed, variances
+from vical_daemon.estimation.noise.variance_components import Observed, _inverse, variances
 
 
 def drawn(seed, v0, v1, n=60):
@@ -60,3 +60,11 @@ def test_a_way_in_which_nothing_moves_has_no_variance():
     v = variances(observed, (0.0, 0.0))
     assert v[0] == 0.0
     assert v[1] > 0.5
+
+
+def test_inverses_are_those_of_lapack_whatever_the_units():
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(50, 3, 5)) * np.array([1e3, 1.0, 0.1])[:, None]
+    V = A @ A.swapaxes(1, 2)
+    expected = np.linalg.inv(V + 1e-12 * np.eye(3) * np.trace(V, axis1=1, axis2=2)[:, None, None])
+    np.testing.assert_allclose(_inverse(V), expected, rtol=1e-6, atol=0.0)

@@ -1,0 +1,76 @@
+"""What a rig with a target is taken to be, and what of it is estimated; data that contradict it change it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray
+from vical_daemon.estimation.model.held_lens import FixedLens
+from vical_daemon.estimation.model.state import Layout, State, make_layout
+from vical_daemon.estimation.selection import model_selection
+
+_ALWAYS = frozenset({model_selection.IMU, model_selection.LAG, model_selection.SIZE})
+"""Always states, whether asked for or not: see `model_selection`."""
+
+
+class RigModel:
+    """Cameras, target and error state.
+
+    Args:
+        options: Switches.
+        cameras: What is known about each camera.
+        target_points_m: Points of the target as stated, m, shape (n, 3).
+
+    Attributes:
+        priors: What is known about each camera.
+        target: Points of the target as far as its size is known, m, shape (n, 3).
+        size: Of the target over the stated one, where that is far off.
+        layout: Where the errors live.
+    """
+
+    def __init__(
+        self, options: CalibrationOptions, cameras: dict[str, CameraPrior], target_points_m: FloatArray
+    ) -> None:
+        self.priors, self.target, self.size = dict(cameras), target_points_m, 1.0
+        self._options = options
+        self._held = self._held_lenses()
+        self._states = options.estimate | _ALWAYS
+        if "intrinsics" not in options.fix or self._held:  # else a wrong lens would look like a bent target
+            self._states |= {model_selection.TARGET}
+        self.layout = self._lay_out()
+
+    def _held_lenses(self) -> dict[str, FixedLens]:
+        """Lenses whose errors matter to something that is estimated, by camera."""
+        fix = self._options.fix
+        if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
+            return {}
+        lenses = {name: FixedLens.of(prior) for name, prior in self.priors.items()}
+        return {name: lens for name, lens in lenses.items() if lens is not None}
+
+    def _lay_out(self) -> Layout:
+        models = {name: prior.distortion_model for name, prior in self.priors.items()}
+        return make_layout(
+            models, fix=self._options.fix, estimate=self._states, target_m=self.target, held=self._held
+        )
+
+    def estimate_readout(self, camera: str, axis: str) -> None:
+        """A shutter turned out to roll along `axis`: its readout is one more unknown."""
+        self._states |= {"readout"}
+        self.priors[camera] = replace(self.priors[camera], readout_axis=axis)
+        self.layout = self._lay_out()
+
+    def resize(self, size: float) -> None:
+        """The target turned out to be `size` times as large as it was taken to be."""
+        self.target = self.target * size
+        self.size *= size
+        self.layout = self._lay_out()
+
+    def start_from_lenses_of(self, state: State) -> None:
+        """Take the lenses that were estimated as what is known about them."""
+        for name, camera in state.cameras.items():
+            if self.layout.lens_free(name):
+                self.priors[name] = replace(
+                    self.priors[name],
+                    intrinsics=tuple(camera.intrinsics.tolist()),
+                    distortion=tuple(camera.distortion.tolist()),
+                )

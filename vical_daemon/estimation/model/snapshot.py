@@ -1,0 +1,74 @@
+"""One camera and the imu as the plain numbers of an estimate, with a target and without."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+
+
+def camera_snapshot(
+    camera: CameraState,
+    *,
+    pose: FloatArray,
+    timeshift_sigma_s: float,
+    lens: FloatArray,
+    lens_sigma: FloatArray,
+    readout_sigma_s: float,
+    rms_px: float,
+    sigma_px: float,
+    joint: FloatArray,
+    rolling: bool = True,
+    jitter_s: float = 0.0,
+) -> CameraEstimate:
+    """Put what is reported of one camera together.
+
+    Args:
+        camera: Its nominal values.
+        pose: Covariance of T_imu_cam, order [px py pz rx ry rz], shape (6, 6).
+        timeshift_sigma_s: Of the time shift, s.
+        lens: fx fy cx cy and the distortion as reported, shape (n,).
+        lens_sigma: Standard deviations, shape (n,).
+        readout_sigma_s: Of the readout, s.
+        rms_px: RMS of the residuals, px.
+        sigma_px: Corner or feature noise, px.
+        joint: Covariance of [pose, time shift, lens], shape (7 + n, 7 + n).
+        rolling: Its shutter is known to roll, or taken to: its readout is reported.
+        jitter_s: Of its stamps, s.
+    """
+    q = so3.quat_from_matrix(camera.R_imu_cam)
+    return CameraEstimate(
+        T_imu_cam=PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), pose.tolist()),
+        timeshift_cam_imu_s=float(camera.timeshift_s),
+        timeshift_sigma_s=float(timeshift_sigma_s),
+        intrinsics=lens[:4].tolist(),
+        intrinsics_sigma=lens_sigma[:4].tolist(),
+        distortion_model=camera.distortion_model,
+        distortion=lens[4:].tolist(),
+        distortion_sigma=lens_sigma[4:].tolist(),
+        reprojection_rms_px=float(rms_px),
+        corner_sigma_px=float(sigma_px),
+        readout_s=float(camera.readout_s) if rolling else 0.0,
+        readout_sigma_s=float(readout_sigma_s) if rolling else 0.0,
+        resolution=[int(size) for size in camera.resolution],
+        readout_axis=camera.readout_axis if rolling else "",
+        stamp_jitter_s=float(jitter_s),
+        calibration_covariance=joint.tolist(),
+    )
+
+
+def imu_snapshot(bias: FloatArray, sigma: FloatArray, matrices: Sequence[FloatArray] = ()) -> ImuEstimate:
+    """Put what is reported of the imu together.
+
+    Args:
+        bias: Of gyro (rad/s) and accelerometer (m/s^2), shape (6,).
+        sigma: Standard deviations, shape (6,).
+        matrices: M_g and M_a where they are asked for, shape (3, 3) each.
+    """
+    blocks = [np.asarray(x).tolist() for x in (bias[:3], bias[3:], sigma[:3], sigma[3:])]
+    return ImuEstimate(*blocks, *(m.tolist() for m in matrices))

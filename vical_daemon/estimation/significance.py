@@ -1,0 +1,53 @@
+"""How often each decision may be wrong on data that fit the model, and the limits that follow: one table.
+
+A rate counts false alarms per test. Tests that are repeated for every image or every second have small ones.
+"""
+
+from __future__ import annotations
+
+from scipy.special import chdtri
+
+# Chance, of a chi-square variable.
+CORNER_REFUSED = 1e-4
+"""A good corner is refused before the correction; some 50 corners an image, twenty images a second."""
+RESIDUAL_REFUSED = 2e-5
+"""A good corner is refused by what the correction leaves of its error."""
+IMAGE_REFUSED = 1e-9
+"""A good image is refused as a whole."""
+ORIENTATION_REFUSED = 1e-3
+"""A good orientation of a sensor is refused in the joint fit of `td_icp`."""
+STRETCHES_DISAGREE = 0.01
+"""Stretches of a recording that do agree are taken for some that do not: sigmas grow for nothing."""
+WINDOW_CONTRADICTS = 1e-5
+"""A window without a target that does agree is taken for a changed rig."""
+SHIFT_MISFIT = 1e-6
+"""Orientations that fit at a time shift are taken for some that do not."""
+CALIBRATIONS_DISAGREE = 1e-3
+"""Calibrations that are the same are called different by `vical compare`, `verify` or `merge`."""
+
+# Standard deviations, of a normal variable (two-sided).
+SURE_SIGMAS = 5.0
+"""6e-7: a term of the noise, a rolling shutter, another size of the target is taken as real."""
+LENS_TERM_SIGMAS = 4.0
+"""6e-5: a lens model lacks the next power of the radius."""
+DRIFT_SIGMAS, DRIFT_DOUBT_SIGMAS = 6.0, 3.0
+"""2e-9 and 3e-3: a time shift has left where it was, surely or perhaps; asked once a second over 20 spans."""
+JUMP_SIGMAS = 6.0
+"""2e-9: a time shift that `td_icp` follows has jumped; asked at every window."""
+RATE_SIGMAS = 6.0
+"""2e-9: two clocks do not run at one rate, so that a recording is refused."""
+DISAGREEMENT_SIGMAS = 4.0
+"""6e-5: `td_icp` and the filter disagree about the time shift; several times in a row are needed."""
+
+# Medians, for standard deviations that outliers do not move.
+MEDIAN_ABSOLUTE = 0.6745
+"""Of the size of a standard normal variable."""
+MEDIAN_RAYLEIGH = 1.1774
+"""Of the length of two."""
+MEDIAN_CHI2, MEDIAN_CHI2_3 = 0.455, 2.366
+"""Of a chi-square variable with one degree of freedom, and with three."""
+
+
+def chi_square_limit(dof: int, false_alarm: float) -> float:
+    """Largest value of a chi-square variable that may be chance."""
+    return float(chdtri(dof, false_alarm))

@@ -1,0 +1,138 @@
+"""The first window of a target-free calibration: made from the first seconds, adjusted, and looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import NamedTuple
+
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior
+from vical_daemon.estimation.smoother.bundle import Bundle, Fit
+from vical_daemon.estimation.smoother.carry import MarginalPrior
+from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
+from vical_daemon.estimation.smoother.judge import TargetFreeStatus
+from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
+from vical_daemon.estimation.smoother.starter import Starter
+from vical_daemon.estimation.smoother.waiting_tracks import Stamped
+from vical_daemon.estimation.smoother.window import Window
+
+_STEPS = 30  # of the adjustment, at most
+DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
+
+
+class Noise(NamedTuple):
+    """Noise of the images as the last window measured it.
+
+    Attributes:
+        sigma_px: Of a feature, px.
+        spread: How long its errors last.
+        jitter_s: Of the stamps, s.
+    """
+
+    sigma_px: float
+    spread: float = 1.0
+    jitter_s: float = 0.0
+
+    @classmethod
+    def of(cls, fit: Fit) -> Noise:
+        """Return that of an adjusted window."""
+        return cls(fit.sigma_px, fit.spread, fit.jitter_s)
+
+
+class Begun(NamedTuple):
+    """A window that has been started."""
+
+    bundle: Bundle
+    fit: Fit
+
+
+class FirstWindow:
+    """Makes first windows, from nothing or with the calibration of before.
+
+    Args:
+        options: Switches and noise.
+        prior: What is known about the camera.
+        active: Which of the calibration errors are estimated, shape (FULL,).
+        status: Says whether a window fits, and agrees with what was known.
+
+    Attributes:
+        starter: Finds rotations, delay and structure.
+    """
+
+    def __init__(
+        self, options: CalibrationOptions, prior: CameraPrior, active: BoolArray, status: TargetFreeStatus
+    ) -> None:
+        self._options, self._prior, self._active, self._status = options, prior, active, status
+        self.starter = Starter(options, prior)
+
+    def begin(
+        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None, noise: Noise
+    ) -> Begun | str:
+        """Start a window from a stretch, with the calibration of before where there is one; or why not."""
+        window = self.starter.window(buffer, frames, known)
+        if isinstance(window, str):
+            return window
+        return self.adjusted(buffer, window, known, noise) or DOES_NOT_FIT
+
+    def of_another(
+        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior, stepped_s: float
+    ) -> MarginalPrior | str:
+        """What was known, with the biases by the first images of another recording; or why there are none."""
+        window = self.starter.window(buffer, frames, None)
+        if isinstance(window, str):
+            return window
+        if self.starter.held is not None:
+            self.starter.held = None
+            return "the rig turns about one axis only so far: turn it about a second one"
+        return of_another_recording(known, window, stepped_s)
+
+    def adjusted(
+        self,
+        buffer: ImuBuffer,
+        window: Window,
+        known: MarginalPrior | None,
+        noise: Noise,
+        reopened: Collection[int] = (),
+    ) -> Begun | None:
+        """Adjust a first window with what is known but for some errors; None where it does not fit."""
+        bundle, carry, fit = self._solved(buffer, window, known, noise, reopened)
+        seek_axis = known is None and not (self._prior.readout_axis or self._prior.readout_s)
+        if seek_axis and fit is not None and shows_columns(bundle, fit):
+            by_columns = self._solved(buffer, read_by_columns(window), known, noise, reopened)
+            if by_columns[2] is not None and by_columns[2].sigma_px < fit.sigma_px:
+                bundle, carry, fit = by_columns
+        if fit is None or not (fit.settled and self._status.fits(fit, first=True)):
+            return None
+        if known is not None and not self._status.agrees(fit, carry, complete=False):
+            return None
+        if seek_axis:
+            axis = bundle.window.camera.readout_axis
+            self._prior = self.starter.prior = replace(self._prior, readout_axis=axis)
+        return Begun(bundle, fit)
+
+    def _solved(
+        self,
+        buffer: ImuBuffer,
+        window: Window,
+        known: MarginalPrior | None,
+        noise: Noise,
+        reopened: Collection[int],
+    ) -> tuple[Bundle, MarginalPrior, Fit | None]:
+        """Adjust a window with what is known but for some errors."""
+        imu_sigma = self._status.doubts.imu_sigma
+        carry = initial_prior(window, known, self._active, self.starter.held, imu_sigma, reopened)
+        bundle = Bundle(window, carry, *noise)
+        return bundle, carry, bundle.solve(buffer, _STEPS)
+
+    def guess_from(self, known: MarginalPrior) -> None:
+        """Take what was known of the lens as a guess, and seek all else anew."""
+        lens = known.camera
+        self._prior = replace(
+            self._prior,
+            intrinsics=tuple(lens.intrinsics.tolist()),
+            distortion=tuple(lens.distortion.tolist()),
+            T_imu_cam=None if self._active[0] else self._prior.T_imu_cam,
+            readout_s=lens.readout_s,
+        )
+        self.starter = Starter(self._options, self._prior)

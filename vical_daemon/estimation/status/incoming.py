@@ -1,0 +1,126 @@
+"""What came in so far, and what is said of a calibration that is not there yet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vical_daemon.estimation.events import Cause, Event, EventLog
+from vical_daemon.estimation.guidance import WeakDirection
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.status.excitation import ALL_WAYS, RunningMotion, excitation_advice
+from vical_daemon.estimation.status.steady_status import Verdict
+from vical_daemon.estimation.wording import cause_text, direction_sigma
+
+PATIENCE_S = 15.0
+"""So long after it could first have shown, a direction that the motion does not show is called that."""
+LOST = 3.0
+"""A direction whose sigma is this many times its limit after the patience is called unobservable."""
+
+
+@dataclass(slots=True)
+class Incoming:
+    """Counts readings and images, follows the motion and collects events.
+
+    Attributes:
+        nothing_seen: What is said while no image shows anything.
+        imu_samples: Readings so far.
+        frames_seen: Images with points so far.
+        newest_ns: Stamp of the newest reading.
+        first_frame_s: When the first image with points came, s; None: none did.
+        reason: Why there is no start yet.
+        motion_missing: More motion, not more time, would help.
+        motion: What the gyro shows of the motion.
+    """
+
+    nothing_seen: str
+    imu_samples: int = 0
+    frames_seen: int = 0
+    newest_ns: int = 0
+    first_frame_s: float | None = None
+    reason: str = ""
+    motion_missing: bool = False
+    motion: RunningMotion = field(default_factory=RunningMotion)
+    _events: EventLog = field(default_factory=EventLog)
+    _first_ns: int = 0
+
+    def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
+        """Count one inertial reading."""
+        if not self.imu_samples:
+            self._first_ns = t_ns
+        self.imu_samples += 1
+        self.newest_ns = t_ns
+        self._events.now_s = self.elapsed_s
+        self.motion.add(self.elapsed_s, gyro)
+
+    def saw_points(self, t_s: float, count: int) -> None:
+        """Count one image with `count` points or tracks in it."""
+        if count >= 4:
+            self.frames_seen += 1
+            if self.first_frame_s is None:
+                self.first_frame_s = t_s
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time of the data since the first reading, s."""
+        return (self.newest_ns - self._first_ns) * 1e-9
+
+    def announce(self, event: Event, once: str = "") -> None:
+        """Put an event into the next estimate; of those with the same `once` only the first."""
+        self._events.add(event, once)
+
+    def announce_all(self, events: Iterable[Event]) -> None:
+        """Put events into the next estimate."""
+        for event in events:
+            self._events.add(event)
+
+    def take_events(self) -> list[Event]:
+        """Events since the last call."""
+        return self._events.take()
+
+    def before_start(self, changed: Cause, trouble: str = "") -> Verdict:
+        """What is said before there is a calibration.
+
+        Args:
+            changed: Why the one before was given up; none: there was none.
+            trouble: What is wrong with the readings; empty: nothing.
+        """
+        if changed:
+            return Verdict(Status.INCONSISTENT, f"{cause_text(changed)}; calibrating anew: {self.reason}")
+        if not self.imu_samples:
+            return Verdict(Status.WAITING, "no inertial data yet")
+        if trouble:
+            return Verdict(Status.INCONSISTENT, trouble)
+        if self.first_frame_s is None:
+            return Verdict(Status.WAITING, self.nothing_seen)
+        if self.motion_missing and self.elapsed_s - self.first_frame_s > PATIENCE_S:
+            advice = excitation_advice(self.motion, None) or ALL_WAYS
+            return Verdict(Status.DEGENERATE, self.reason, advice)
+        return Verdict(Status.INITIALISING, self.reason or "collecting the first seconds")
+
+    def progress(self, status: Status, known: bool, weak: list[WeakDirection]) -> float:
+        """How far the calibration is, 0 to 1: logarithmic in the largest sigma over its limit."""
+        if status == Status.CONVERGED:
+            return 1.0
+        if not known:
+            return min(0.1, 0.001 * self.frames_seen)
+        worst = max((direction.excess for direction in weak), default=1.0)
+        return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
+
+
+def lacking_verdict(lacking: list[WeakDirection], *, patient: bool, pause: str = "") -> Verdict:
+    """What is said of directions that are not known well enough, the worst first.
+
+    Args:
+        lacking: These, at least one.
+        patient: They have had `PATIENCE_S` to show.
+        pause: Why images are not used at present, in words; empty: they are.
+    """
+    worst = lacking[0]
+    if patient and worst.excess > LOST:
+        names = "; ".join(direction_sigma(g) for g in lacking[:3])
+        return Verdict(Status.DEGENERATE, f"the motion does not show: {names}" + pause, worst.guidance)
+    return Verdict(Status.CONVERGING, direction_sigma(worst) + pause, worst.guidance)

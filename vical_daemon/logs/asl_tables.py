@@ -1,0 +1,171 @@
+"""Tables and small files of an ASL/EuRoC folder: numbers, lists of images, the size of the images."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import re
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from vical_drivers.user_files import open_file, read_file, read_text
+
+from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
+from vical_daemon.logs.model import RecordingError
+
+_NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
+IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
+_SMALL = 2**25  # bytes; a packed table may always unpack to this size
+_SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
+
+
+def without_cut_line(text: bytes, columns: int) -> bytes:
+    """Return a table without its last line if that is cut off."""
+    kept, newline, last = text.rpartition(b"\n")
+    if not newline or not last.strip() or last.lstrip().startswith(b"#"):
+        return text
+    cells = last.split(b",")
+    return text if len(cells) >= columns and all(cell.strip() for cell in cells[:columns]) else kept + newline
+
+
+def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
+    """Parse a table of numbers; stamps keep all digits: integers, or text where the first is a fraction."""
+    begin = _first_data_row(text)
+    if _fractional(text, begin):
+        dtype = np.dtype([("t", "U40"), *((name, dtype[name]) for name in (dtype.names or ())[1:])])
+    try:
+        rows: npt.NDArray[Any] = np.loadtxt(
+            io.BytesIO(text[begin:]),
+            dtype=dtype,
+            delimiter=",",
+            comments="#",
+            ndmin=1,
+            usecols=range(columns_of(dtype)),
+        )
+    except (ValueError, OverflowError, UnicodeDecodeError) as error:
+        reason = str(error).split(";")[0].rstrip(".")
+        raise RecordingError(f"{path}: {reason}; expected {columns}") from None
+    return rows
+
+
+def _fractional(text: bytes, begin: int) -> bool:
+    """Whether the first stamp is written with a point or an exponent."""
+    first = next(
+        (
+            line
+            for line in io.BytesIO(text[begin : begin + 2**20])
+            if line.strip() and line.lstrip()[:1] != b"#"
+        ),
+        b"",
+    )
+    return any(mark in first.split(b",")[0].lower() for mark in (b".", b"e"))
+
+
+def accelerometer_first(title: str) -> bool:
+    """Whether the title of a table names the accelerometer before the gyro."""
+    names = [name.strip().lower() for name in title.lstrip("# ").split(",")]
+    accel = [i for i, name in enumerate(names) if re.match(r"a(?![a-z]*(ng|tt))|lin|spec|force|f_", name)]
+    gyro = [i for i, name in enumerate(names) if re.match(r"w(_|x|y|z)|gyr|ang|omega|rot", name)]
+    return len(accel) >= 3 and len(gyro) >= 3 and accel[0] < gyro[0]
+
+
+def columns_of(dtype: np.dtype[Any]) -> int:
+    """How many columns a row of this type fills."""
+    names = dtype.names or ()
+    return sum(int(np.prod(dtype[name].shape)) for name in names)
+
+
+def read_table(path: Path) -> bytes:
+    """Read a table, packed or not.
+
+    Raises:
+        RecordingError: It cannot be read, or is empty or too large.
+    """
+    try:
+        text = _unpacked(path) if path.suffix == ".gz" else read_file(path, TABLE_LIMIT)
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        raise RecordingError(f"{path} is no sound gzip file; unpack or download it again") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from None
+    if not text or text.isspace():
+        raise RecordingError(f"{path} is empty")
+    return text
+
+
+def _unpacked(path: Path) -> bytes:
+    """Unpack a table, up to the largest plausible size.
+
+    Raises:
+        RecordingError: It is larger.
+    """
+    with open_file(path, TABLE_LIMIT) as packed:
+        limit = min(TABLE_LIMIT, max(_SMALL, _SHRINKS * os.fstat(packed.fileno()).st_size))
+        with gzip.GzipFile(fileobj=packed) as file:
+            text = file.read(limit + 1)
+    if len(text) > limit:
+        raise RecordingError(
+            f"{path} unpacks to more than {limit / 1e6:.0f} MB; a table does not, is it one?"
+        )
+    return text
+
+
+def _first_data_row(text: bytes) -> int:
+    """Return the offset behind a title line without ``#``."""
+    end = text.find(b"\n")
+    first = text[: end if end >= 0 else len(text)].strip()
+    if first and not first.startswith(b"#") and not first[:1].isdigit() and first[:1] not in b"-+":
+        return end + 1 if end >= 0 else 0
+    return 0
+
+
+def image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[str]]:
+    """Return stamps and files of ``data.csv``, and names without a file; names cannot leave the folder."""
+    stamps: list[str] = []
+    files, lost = [], []
+    for number, line in enumerate(read_table(table).decode("utf-8", "replace").splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        stamp, _, name = (part.strip() for part in line.partition(","))
+        name = name.split(",")[0].strip() or f"{stamp}.png"
+        if not _NUMBER.fullmatch(stamp) or Path(name).name != name:
+            raise RecordingError(
+                f"{table} line {number}: expected 'timestamp [ns],filename', found '{line[:80]}'"
+            )
+        path = next((p for p in (folder / "data" / name, folder / name) if p.is_file()), None)
+        if path is None:
+            lost.append(name)
+            continue
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
+            raise RecordingError(f"{path}: images must be png or jpg")
+        stamps.append(stamp)
+        files.append(path)
+    return stamps, files, lost
+
+
+def image_size(folder: Path) -> tuple[int, int] | None:
+    """Return the size of the images from ``sensor.yaml`` or the first PNG."""
+    sensor = folder / "sensor.yaml"
+    if sensor.is_file():
+        import yaml
+
+        try:
+            text = read_text(sensor, MAX_BYTES)
+            refuse_hostile(text, sensor.name)
+            size = yaml.safe_load(text)["resolution"]
+            return int(size[0]), int(size[1])
+        except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
+            pass  # EuRoC's own files begin with %YAML:1.0, which some parsers refuse
+    first = next(iter(sorted((folder / "data").glob("*.png"))), None)
+    if first is not None:
+        with open_file(first) as file:
+            head = file.read(24)
+        if head[12:16] == b"IHDR":
+            width, height = struct.unpack(">II", head[16:24])
+            return width, height
+    return None
