@@ -34,6 +34,7 @@ from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeF
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.inertial.stamp_steps import StampSteps
 from vical_daemon.estimation.init import initial_filter
+from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
@@ -52,9 +53,9 @@ _NEVER = 10**9
 
 def _no_state(block: str) -> Callable[[], list[tuple[Any, ...]]]:
     def drop(self: Any) -> None:
-        self._states = (self._states - {block}) | (self.options.estimate & {block})
+        self._states = (self._states - {block}) | (self._options.estimate & {block})
 
-    return lambda: [first(Calibrator, "_lay_out", drop)]
+    return lambda: [first(RigModel, "_lay_out", drop)]
 
 
 def _ones(self: Any) -> None:
