@@ -132,7 +132,7 @@ def test_a_drifting_clock_is_followed_from_the_first_answer_on(skew_ppm):
 
 
 def test_a_small_step_of_the_time_shift_is_no_constant_drift():
-    """1 ms at 12 s: taken for a drift from the first second on, it is 0.2 ms and 3 sigmas off ten seconds later."""
+    """1 ms at 12 s: as a drift from the first second on, it is 0.2 ms and 3 sigmas off ten seconds later."""
     out, events = calibrated(0.0, 22.0, (Bump(12.0, timeshift_s=1e-3),))
     assert any(e.kind is EventKind.CLOCK_WANDER for e in events)
     assert not any(e.kind is EventKind.BUMPED for e in events)
