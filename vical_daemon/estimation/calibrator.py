@@ -350,7 +350,8 @@ class Calibrator:
             self.judge.announce(Event(EventKind.POSE_LOST))
         elif action in (Action.SKEW, Action.WANDER):
             anew = action is Action.WANDER
-            self.judge.announce(clock_drift.let_drift(f, frame.camera, anew=anew))
+            once = f"wander {frame.camera}" if anew else ""
+            self.judge.announce(clock_drift.let_drift(f, frame.camera, anew=anew), once=once)
         elif action is Action.RESTART:
             self._restart(f)
 

@@ -228,7 +228,7 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.CLOCK_WANDER: About(
         "The rate between the clocks of camera and IMU changes. Value: present drift.",
         "s/s",
-        "Once per camera, when the time shift leaves where earlier estimates put it, by 6 sigma.",
+        "Once per camera, when the drift leaves where earlier estimates put it, by 6 sigma.",
     ),
     EventKind.STAMP_JITTER: About(
         "The stamps of the images jitter; allowed for. Value: standard deviation.",

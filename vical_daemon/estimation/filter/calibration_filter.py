@@ -171,7 +171,6 @@ class CalibrationFilter:
         self.nis_level += 0.05 * (level - self.nis_level)
         lessons.learn(self, image, lin, fit)
         self._accept(fit.S, fit.dx)
-        self._pay_for_jitter(image.camera)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
@@ -222,15 +221,6 @@ class CalibrationFilter:
         if shared is not None and (shared.jitter_s or shared.shift_px):
             lin.shared = lin.by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas)
         return lin
-
-    def _pay_for_jitter(self, camera: str) -> None:
-        """Inflate the time shift's variance for images fused before the jitter was known."""
-        index, shared = self.layout.cameras[camera].timeshift, self.shared.get(camera)
-        owed = shared.owed() if index is not None and shared is not None else 0.0
-        if owed:
-            column = np.zeros(self.layout.size)
-            column[index] = np.sqrt(owed)
-            self.inflate_covariance(column)
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""

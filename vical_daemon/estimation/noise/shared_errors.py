@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
 from vical_daemon.estimation.noise.variance_components import Observed, variances
 from vical_daemon.estimation.significance import SURE_SIGMAS
@@ -28,7 +28,6 @@ _CLIP = 6.0  # standard deviations: one outlier is no correlation
 _FLOOR = np.array([2e-5, 5e-3])  # s, px
 _TELLING = 100  # images; the correlation of neighbours is then known to 0.1
 _PERSISTENT = 0.5  # of the variance: nearer to that of a model error (1) than to that of a jitter (0)
-_GROWN = 1.5  # the variance; less is scatter
 WAYS = 3  # late, to the side, down
 
 
@@ -48,14 +47,11 @@ class SharedErrors:
     _A: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
     _C: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
     _b: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS)))
-    _allowed: FloatArray = field(default_factory=lambda: np.zeros(_MEMORY))  # s^2, when the image was used
-    _counts: BoolArray = field(default_factory=lambda: np.zeros(_MEMORY, dtype=bool))
 
     def begin(self) -> None:
         """Go on with what was learnt, in a filter that has used none of these images."""
         if self.images >= _LEAST:
             self._look_again()
-        self._counts[:] = False
 
     @property
     def sigmas(self) -> FloatArray:
@@ -100,7 +96,6 @@ class SharedErrors:
         place = self.images % _MEMORY
         self._A[place], self._b[place] = A, innovation @ ways
         self._C[place] = level * (A + state @ state.T)
-        self._allowed[place], self._counts[place] = self.jitter_s**2, True
         self.images += 1
         every = _EVERY * (_SELDOM if self.images > _SELDOM_FROM else 1)
         if self.images >= _LEAST and self.images % every == 0:
@@ -120,22 +115,6 @@ class SharedErrors:
         observed = Observed(self._b[:n], self._A[:n], self._C[:n])
         sigma = np.sqrt(variances(observed, (jitter_needs, shift_needs)))
         self.jitter_s, self.shift_px = np.where(sigma > _FLOOR, sigma, 0.0).tolist()
-
-    def owed(self) -> float:
-        """Variance, s^2, by which the time shift is known less well than a filter thinks; asked once.
-
-        Images used with less jitter than is known by now weighed too much: the variance of their weighted
-        mean is sum w^2 (variance + jitter^2) / (sum w)^2, and not 1 / sum w.
-        """
-        counts, variance = self._counts & (self._A[:, 0, 0] > 0.0), self.jitter_s**2
-        short = counts & (variance > _GROWN * self._allowed)
-        if not short.any():
-            return 0.0
-        usual = self._C[counts, 0, 0] / self._A[counts, 0, 0] ** 2
-        weight = 1.0 / (usual + self._allowed[counts])
-        lacking = np.where(short[counts], variance - self._allowed[counts], 0.0)
-        self._allowed[short] = variance
-        return float(weight**2 @ lacking / weight.sum() ** 2)
 
 
 def shared_ways(state: State, layout: Layout, camera: str) -> FloatArray:

@@ -100,11 +100,6 @@ def averaged(f: CalibrationFilter) -> CalibrationFilter:
     return f
 
 
-def conditioned_on_no_drift(f: CalibrationFilter, camera: str) -> CalibrationFilter:
-    """Return the filter on the assumption that this camera's clock does not drift."""
-    return _mixed(f, camera, 0.0, f.S)
-
-
 def _mixed(f: CalibrationFilter, camera: str, p: float, S: FloatArray) -> CalibrationFilter:
     """The mixture: with probability `p` what the filter says, else that conditioned on no drift.
 

@@ -1,8 +1,9 @@
 """Decides when the rig is no longer what the filter learnt, and what to do about it.
 
 A strong jump makes images unusable (they are refused); a weaker one raises the innovations (CUSUM in
-`Consistency`); a drift shows in the estimates themselves (`DriftWatch`). A lost pose looks like a jump, too,
-so the pose is taken anew first; only if images still do not fit is the calibration itself in doubt.
+`Consistency`); a time shift that begins to drift, or steps by a little, shows in its drift (`DriftWatch`). A
+lost pose looks like a jump, too, so the pose is taken anew first; only if images still do not fit is the
+calibration itself in doubt.
 """
 
 from __future__ import annotations
@@ -10,10 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+import numpy as np
+
 from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.selection.clock_drift import conditioned_on_no_drift, surely_apart
+from vical_daemon.estimation.selection.clock_drift import stamps_variance, surely_apart
 from vical_daemon.estimation.status.drift_watch import DriftWatch
 
 _REFUSED_POSE = 10  # images in a row before the pose is taken anew
@@ -21,7 +24,7 @@ _REFUSED_CHANGED = 8  # images in a row, soon after that, before the calibration
 _SOON_S = 4.0
 _LOOK_CLOSER = 10  # images after an alarm: what has changed shows only in those after it
 _SETTLE_S = 3.0  # after a start the innovations still move
-_DRIFT_FLOOR_S = 30e-6
+_DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 _DRIFT_AFTER_S = 2.0
 
 
@@ -92,24 +95,25 @@ class ChangeWatch:
             if not self._closer:
                 self.why = Cause.IMAGES_DISAGREE
                 return Action.RESTART
+        if self._closer or self._refused:  # something has changed: what, is not known yet
+            return Action.NONE
         return self._look_for_drift(report.camera, f)
 
     def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
-        """See once a second whether the clocks run apart, or the time shift moves in another way."""
-        index, t_s = f.layout.cameras[camera].timeshift, f.state.t_s
-        if index is None or camera in f.drifting or t_s < self._started_s + _DRIFT_AFTER_S:
+        """See once a second whether the clocks run apart, or a drift is not what it was."""
+        index, t_s = f.layout.cameras[camera].skew, f.state.t_s
+        if index is None or t_s < self._started_s + _DRIFT_AFTER_S:
             return Action.NONE
-        watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR_S))
-        watch.floor = max(_DRIFT_FLOOR_S, f.stamp_sigma_s)
+        watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR))
+        watch.floor = float(
+            np.hypot(_DRIFT_FLOOR, np.sqrt(stamps_variance(f.stamp_sigma_s, t_s - f.began_s)))
+        )
         if not watch.due(t_s):
             return Action.NONE
-        if surely_apart(f, camera):
+        variance = float(f.S[index] @ f.S[index])
+        changes = watch.drifts(t_s, f.state.cameras[camera].skew, variance, f.consistency[camera].factor)
+        begins = camera not in f.drifting and surely_apart(f, camera)
+        if changes or (begins and watch.doubtful):
             self._drift.pop(camera)
-            return Action.SKEW
-        alike = conditioned_on_no_drift(f, camera)
-        variance = float(alike.S[index] @ alike.S[index])
-        value = alike.state.cameras[camera].timeshift_s
-        if not watch.drifts(t_s, value, variance, f.consistency[camera].factor):
-            return Action.NONE
-        self._drift.pop(camera)
-        return Action.WANDER
+            return Action.WANDER
+        return Action.SKEW if begins else Action.NONE

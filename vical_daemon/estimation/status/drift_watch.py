@@ -1,8 +1,8 @@
 """Notices that a parameter taken as constant is not: two estimates of the same filter, some time apart.
 
 For a consistent filter the later estimate is the earlier one plus news, and the variance of their difference
-is P_earlier - P_later. A difference far outside it means that the parameter moved (a clock that drifts, a
-mount that creeps), however small the filter believes its error to be. [Hausman, 1978, applied to a filter]
+is P_earlier - P_later. A difference far outside it means that the parameter moved (a clock whose rate
+changes), however small the filter believes its error to be. [Hausman, 1978, applied to a filter]
 """
 
 from __future__ import annotations

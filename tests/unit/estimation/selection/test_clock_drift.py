@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 from vical_mocks.points import simulate
-from vical_mocks.rig import reference_rig
+from vical_mocks.rig import Bump, reference_rig
 
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.events import EventKind
@@ -15,12 +15,7 @@ from vical_daemon.estimation.model.priors import SKEW_SIGMA
 from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
-from vical_daemon.estimation.selection.clock_drift import (
-    apart,
-    averaged,
-    conditioned_on_no_drift,
-    stamps_variance,
-)
+from vical_daemon.estimation.selection.clock_drift import _mixed, apart, averaged, stamps_variance
 
 NAME = "cam0"
 
@@ -57,7 +52,7 @@ def test_clocks_that_run_alike_are_the_gaussian_conditioned_on_no_drift():
     index, shift = f.layout.cameras[NAME].skew, f.layout.cameras[NAME].timeshift
     P = f.S @ f.S.T
     gain = P[:, index] / P[index, index]
-    alike = conditioned_on_no_drift(f, NAME)
+    alike = _mixed(f, NAME, 0.0, f.S)
     np.testing.assert_allclose(alike.S @ alike.S.T, P - np.outer(gain, P[index]), atol=1e-18)
     moved = alike.state.cameras[NAME]
     assert moved.skew == pytest.approx(0.0, abs=1e-18)
@@ -100,9 +95,9 @@ def test_odds_go_the_way_of_the_evidence():
     assert averaged(f) is f
 
 
-def calibrated(skew_ppm, seconds=13.0):
+def calibrated(skew_ppm, seconds=13.0, bumps=()):
     """Every second's estimate, its events, and the truth."""
-    rig = reference_rig(5, timeshift_cam_imu_s=0.01, clock_skew_ppm=skew_ppm)
+    rig = reference_rig(5, timeshift_cam_imu_s=0.01, clock_skew_ppm=skew_ppm, bumps=bumps)
     run = simulate(5, seconds, rig=rig)
     lens = CameraPrior((640, 480), tuple(rig.lens.intrinsics), "radtan", tuple(rig.lens.distortion))
     c = Calibrator(CalibrationOptions(fix=frozenset({"intrinsics"})), {NAME: lens}, run.points_m)
@@ -134,6 +129,15 @@ def test_a_drifting_clock_is_followed_from_the_first_answer_on(skew_ppm):
     assert abs(out[-1][0]) < 3.0 * out[-1][1]
     assert any(e.kind is EventKind.CLOCK_DRIFT for e in events)
     assert abs(out[-1][0]) < 3e-4
+
+
+def test_a_small_step_of_the_time_shift_is_no_constant_drift():
+    """1 ms at 12 s: as a drift from the first second on, it is 0.2 ms and 3 sigmas off ten seconds later."""
+    out, events = calibrated(0.0, 22.0, (Bump(12.0, timeshift_s=1e-3),))
+    assert any(e.kind is EventKind.CLOCK_WANDER for e in events)
+    assert not any(e.kind is EventKind.BUMPED for e in events)
+    assert all(abs(error) < 2.5 * sigma for error, sigma, _ in out[-6:])
+    assert abs(out[-1][0]) < 1e-4
 
 
 def test_clocks_that_run_alike_pay_little():

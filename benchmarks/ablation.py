@@ -1,0 +1,136 @@
+"""Which mechanisms of the estimation earn their place: each is taken away in turn.
+
+    python -m benchmarks ablation                              all data, all mechanisms (hours)
+    python -m benchmarks ablation --data euroc,rigs            some data
+    python -m benchmarks ablation --only "noise scale"         some mechanisms (may be repeated)
+    python -m benchmarks ablation --table                      the tables of what has been run
+
+Nothing in the product knows of it: `ablation_patches` changes the estimation while the study runs. It can
+be interrupted; what has been run is in the folder --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import ablation_data as data
+from benchmarks import runner
+from benchmarks.ablation_board import BOARD
+from benchmarks.ablation_disturbances import DISTURBANCES, disturbed
+from benchmarks.ablation_free import FREE
+from benchmarks.ablation_patches import without
+from benchmarks.ablation_tables import print_tables
+
+NOTHING = "nothing (as it is)"
+MECHANISMS = BOARD | FREE
+Trial = tuple[str, str, int, "partial[runner.Result]"]
+"""Data, case, seed, and what runs it."""
+_EUROC = {"fixed": 0, "free": 0, "tracks": 0}
+_RIGS, _FREE_RIGS, _OWN, _SEEDS = range(301, 305), range(301, 304), range(2), range(1)
+
+
+def trials(wanted: set[str], name: str) -> Iterator[Trial]:
+    """What is to be run without a mechanism, or as it is."""
+    mechanism = MECHANISMS.get(name)
+    board = mechanism is None or not mechanism.free
+    free = mechanism is None or mechanism.free or name in SHARED
+    if "euroc" in wanted:
+        for mode in _EUROC:
+            if free if mode == "tracks" else board:
+                yield "euroc", mode, 0, partial(data.euroc, mode)
+    if "rigs" in wanted and board:
+        for seed in _RIGS:
+            yield "rigs", "", seed, partial(data.random_rig, False, seed)
+    if "free_rigs" in wanted and free:
+        for seed in _FREE_RIGS:
+            yield "free_rigs", "", seed, partial(data.random_rig, True, seed)
+    if "faults" in wanted:
+        own = set(data.FAULTS) if mechanism is None else set(mechanism.faults)
+        for fault in data.FAULTS:
+            if fault in own:
+                for seed in _OWN:
+                    yield "faults", fault, seed, partial(data.faulty_rig, fault, seed)
+    cases = set(DISTURBANCES) if mechanism is None else set(mechanism.disturbances)
+    for kind, on, target_free in (("disturbances", board, False), ("free_disturbances", free, True)):
+        for seed in _SEEDS if kind in wanted and on else ():
+            for case in DISTURBANCES:
+                if case in cases:
+                    yield kind, case, seed, partial(disturbed, case, name, target_free, seed)
+
+
+SHARED = {
+    "camera clock set",
+    "imu stamps remapped",
+    "imu clipped",
+    "imu spikes",
+    "imu repeated",
+    "images repeated",
+}
+"""Mechanisms with a board that also serve without."""
+DATA = ("euroc", "rigs", "faults", "disturbances", "free_rigs", "free_disturbances")
+
+
+def main(argv: list[str]) -> int:
+    """Run what is missing; print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks ablation", description=__doc__)
+    parser.add_argument("--data", default=",".join(DATA), help=f"which data (default: {','.join(DATA)})")
+    parser.add_argument("--only", action="append", help="only this mechanism (may be repeated)")
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/raw"))
+    parser.add_argument("--keep-old", action="store_true", help="accept stored results of other code")
+    args = parser.parse_args(argv)
+    code = runner.fingerprint("vical_daemon/estimation", "mocks/vical_mocks")
+    accepted = None if args.keep_old else code
+    unknown = (set(args.data.split(",")) - set(DATA)) | (set(args.only or ()) - set(MECHANISMS))
+    if unknown:
+        parser.error(f"not known: {', '.join(sorted(unknown))}; mechanisms: {', '.join(MECHANISMS)}")
+    store = args.out / "ablation.jsonl"
+    if not args.table:
+        if "euroc" in args.data and not data.euroc_halves.FOLDER.is_dir():
+            print(f"no recording at {data.euroc_halves.FOLDER}: leave euroc out with --data", file=sys.stderr)
+            return 1
+        _run(store, args.data.split(","), [NOTHING, *(args.only or MECHANISMS)], code, accepted)
+    print_tables(_stored(store, accepted), NOTHING)
+    return 0
+
+
+def _run(store: Path, wanted: list[str], names: list[str], code: str, accepted: str | None) -> None:
+    store.parent.mkdir(parents=True, exist_ok=True)
+    done = {(r["mechanism"], r["data"], r["case"], r["seed"]) for r in _stored(store, accepted)}
+    with store.open("a", encoding="utf-8") as file:
+        for kind in wanted:
+            for name in names:
+                begin = time.process_time()
+                with without(MECHANISMS.get(name)):
+                    for which, case, seed, run in trials({kind}, name):
+                        if (name, which, case, seed) in done:
+                            continue
+                        row = {"mechanism": name, "data": which, "case": case, "seed": seed, "code": code}
+                        try:
+                            row["result"] = run()
+                        except (np.linalg.LinAlgError, ValueError, AssertionError, OverflowError) as error:
+                            row["result"] = {"failed": f"{type(error).__name__}: {error}"}
+                        file.write(json.dumps(row, default=runner._plain) + "\n")
+                        file.flush()
+                print(f"{kind}, without {name}: {time.process_time() - begin:.0f} s", file=sys.stderr)
+
+
+def _stored(store: Path, code: str | None) -> list[runner.Result]:
+    """Results made by this code; None: by any."""
+    if not store.exists():
+        return []
+    rows = []
+    for line in store.read_text(encoding="utf-8").splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:  # the last line of an interrupted run
+            continue
+    return [row for row in rows if code in (None, row.get("code"))]

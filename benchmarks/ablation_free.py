@@ -1,0 +1,188 @@
+"""Mechanisms of the calibration without a board, for `benchmarks ablation`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from benchmarks.ablation_patches import (
+    DRIFTS,
+    HARDLY,
+    MOVED,
+    SMALL,
+    WRONG,
+    Mechanism,
+    gives,
+    held_at,
+    then,
+)
+from vical_daemon.estimation import target_free
+from vical_daemon.estimation.smoother import bundle, handover, judge, normal, quality, starter
+from vical_daemon.estimation.smoother.bundle import Bundle
+from vical_daemon.estimation.smoother.carry import DRIFT
+from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.jitter import StampOffsets
+from vical_daemon.estimation.smoother.judge import TargetFreeStatus
+from vical_daemon.estimation.target_free import TargetFreeCalibrator
+
+
+def _own_factor(self: TargetFreeStatus) -> float:
+    return self.factor()
+
+
+def _agreed() -> list[tuple[Any, ...]]:
+    agrees = TargetFreeStatus.agrees
+
+    def always(self: Any, *args: Any, **kwargs: Any) -> bool:
+        agrees(self, *args, **kwargs)
+        return True
+
+    return [(TargetFreeStatus, "agrees", always)]
+
+
+def _compared() -> list[tuple[Any, ...]]:
+    weighed = TargetFreeDoubts.weighed
+    return [
+        (
+            TargetFreeDoubts,
+            "weighed",
+            lambda self, carry, factor, _compared: weighed(self, carry, factor, True),
+        )
+    ]
+
+
+def _no_free_drift(self: Any) -> None:
+    self.active[DRIFT] = False
+
+
+def _both_blocks(*_args: Any) -> tuple[int, ...]:
+    return target_free.BOTH
+
+
+FREE: dict[str, Mechanism] = {
+    "free: clock drift": Mechanism(
+        MOVED,
+        "a state for the drift of the time shift",
+        lambda: [then(TargetFreeCalibrator, "__init__", _no_free_drift)],
+        free=True,
+        faults=("free: skew 100 ppm",),
+        disturbances=("nothing", DRIFTS),
+    ),
+    "free: walk of the delay": Mechanism(
+        MOVED,
+        "the time shift may wander from window to window",
+        lambda: [(handover, "_SHIFT_WALK", 0.0)],
+        free=True,
+        disturbances=("nothing", DRIFTS),
+    ),
+    "free: lasting jitter": Mechanism(
+        MOVED,
+        "late stamps that follow each other: the clock stepped",
+        lambda: [(StampOffsets, "lasts", gives(False))],
+        free=True,
+        disturbances=("5 ms", "20 ms", "camera clock +0.5 s"),
+    ),
+    "free: what has changed": Mechanism(
+        MOVED,
+        "mounting and clock tested apart; without: both are new",
+        lambda: [(target_free, "changed_blocks", _both_blocks)],
+        free=True,
+        disturbances=("5 ms", "20 ms", "2 deg"),
+    ),
+    "free: windows fit": Mechanism(
+        WRONG,
+        "noise, links and refused features of a window",
+        lambda: [
+            (judge, "_MOST_SIGMA_PX", np.inf),
+            (judge, "_MOST_INERTIAL", np.inf),
+            (judge, "_MOST_REFUSED", np.inf),
+        ],
+        free=True,
+        faults=("free: 3 % outliers",),
+        disturbances=("20 ms", "2 deg", "30 % junk corners for 3 s"),
+    ),
+    "free: windows fit, links": Mechanism(
+        WRONG, "only the links", lambda: [(judge, "_MOST_INERTIAL", np.inf)], free=True
+    ),
+    "free: windows agree": Mechanism(
+        WRONG,
+        "a window that contradicts what is known is given up",
+        _agreed,
+        free=True,
+        disturbances=("5 ms", "0.5 deg", "10 mm"),
+    ),
+    "free: small changes": Mechanism(
+        WRONG,
+        "where the model fits poorly, a small contradiction is no change",
+        lambda: [(judge, "_matters", gives(True))],
+        free=True,
+        disturbances=("nothing", "5 ms"),
+    ),
+    "free: tolerant at first": Mechanism(
+        WRONG,
+        "fifty times the limit in the first four windows",
+        lambda: [(judge, "_LEARNING", 0)],
+        free=True,
+        disturbances=("nothing",),
+    ),
+    "free: outliers refused": Mechanism(
+        WRONG,
+        "observations beyond 4.5 sigma",
+        lambda: [(Bundle, "_refuse", gives(0))],
+        free=True,
+        faults=("free: 3 % outliers",),
+    ),
+    "free: Huber": Mechanism(
+        WRONG,
+        "large errors weigh less",
+        lambda: [(normal, "HUBER", 1e9), (quality, "HUBER", 1e9)],
+        free=True,
+        faults=("free: 3 % outliers",),
+    ),
+    "free: windows' scatter": Mechanism(
+        SMALL,
+        "variances by how much windows disagree",
+        lambda: [(TargetFreeStatus, "factor", gives(1.0))],
+        free=True,
+    ),
+    "free: scatter before two windows": Mechanism(
+        SMALL,
+        "until confirmed, disagreement counts at once and in full",
+        lambda: [(TargetFreeStatus, "_reported_factor", _own_factor)],
+        free=True,
+    ),
+    "free: withdrawn answers": Mechanism(
+        SMALL,
+        "what contradicted answers given up counts, too",
+        lambda: [(TargetFreeStatus, "_withdrawn", held_at([]), True)],
+        free=True,
+    ),
+    "free: pixel errors last": Mechanism(
+        SMALL,
+        "errors that stay with a feature count once",
+        lambda: [(bundle, "correlation", gives(1.0))],
+        free=True,
+    ),
+    "free: stamp jitter": Mechanism(
+        SMALL,
+        "late and early images as unknowns",
+        lambda: [(Bundle, "_doubts_stamps", gives(False))],
+        free=True,
+        faults=("free: stamp jitter 1 ms",),
+    ),
+    "free: lag of the accelerometer": Mechanism(
+        SMALL,
+        "the delay between gyro and accelerometer as an unknown",
+        lambda: [(starter, "LAG_SIGMA_S", HARDLY * starter.LAG_SIGMA_S)],
+        free=True,
+        faults=("free: accelerometer 0.3 ms late",),
+    ),
+    "free: imu before comparison": Mechanism(
+        SMALL,
+        "before windows can be compared the imu is doubted at least by half",
+        _compared,
+        free=True,
+        faults=("free: imu 0.3 % off",),
+    ),
+}
