@@ -58,7 +58,9 @@ def test_a_wrong_calibration_is_found_replaced_and_the_new_one_holds(tmp_path):
     truth = make_rig(board, 12.5).rig
     store = CalibrationStore(tmp_path / "state" / "calibration")
     file = store.save("6223-00001", "SIM-00001", "cam0", wrong_calibration(truth), 1)
-    text = EXAMPLE.read_text().replace("web: {enabled: true}", "mode: verify\nverify: {recalibrate: true}")
+    text = EXAMPLE.read_text().replace(
+        "web: {enabled: true}", "mode: verify\nverify: {recalibrate: true, cpu_percent: 100}"
+    )
     text = text.replace("record: {enabled: false}", "record: {images: false}")
     (tmp_path / "vical.yaml").write_text(
         text.replace("no_hardware_target", str(EXAMPLE.parent.absolute() / "no_hardware_target"))
@@ -69,7 +71,7 @@ def test_a_wrong_calibration_is_found_replaced_and_the_new_one_holds(tmp_path):
     }
     command = [sys.executable, "-m", "vical_daemon", "run", "-c", str(tmp_path / "vical.yaml")]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-    end_s = time.monotonic() + 240.0
+    end_s = time.monotonic() + 330.0  # it took 205 s at a load of 14 on two cores
     results = []
     try:
         socket = tmp_path / "run" / "zenoh.sock"

@@ -49,7 +49,7 @@ _PUBLISH_S = 1.0
 _QUEUE_LIMIT = 20_000  # samples, as for calibrating
 STRETCH_S = 30.0
 """Longest stretch of data between two pauses, s: as a check takes at most where the motion shows enough."""
-_BLIND_S = 3.0  # without points a stretch ends: the board is not in view
+_BLIND_S = 5.0  # without points a stretch ends: the board is not in view (the first image waits for OpenCV)
 _STILL_S = 3.0  # without motion a stretch ends
 _FINE_S = 60.0
 """Calibrating goes on for this long after convergence at most, s, to get a result that can be verified."""
