@@ -19,12 +19,14 @@ class Lens:
         distortion: 4 coefficients: radtan k1 k2 p1 p2 or equidistant k1 k2 k3 k4.
         resolution: Width, height, px.
         model: "radtan" or "equidistant".
+        sixth_power: One more coefficient, of the sixth power of the radius (k3 of `plumb_bob`); radtan only.
     """
 
     intrinsics: tuple[float, float, float, float] = (520.0, 520.0, 320.0, 240.0)
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     resolution: tuple[int, int] = (640, 480)
     model: str = "radtan"
+    sixth_power: float = 0.0
 
     def project(self, p_cam: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Project points of the camera frame.
@@ -72,7 +74,7 @@ class Lens:
     def _fold_squared(self) -> float:
         """Square of the radius at which the polynomial turns back; no real lens shows what is beyond."""
         k1, k2 = self.distortion[:2]
-        turns = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2]).roots()
+        turns = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2, 7.0 * self.sixth_power]).roots()
         real = turns[np.abs(turns.imag) < 1e-12].real
         return float(min(real[real > 0.0], default=np.inf))
 
@@ -82,7 +84,7 @@ class Lens:
         r2 = x * x + y * y
         k1, k2, k3, k4 = self.distortion
         if self.model == "radtan":
-            radial = 1 + r2 * (k1 + r2 * k2)
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * self.sixth_power))
             tangential_x = 2 * k3 * x * y + k4 * (r2 + 2 * x * x)
             tangential_y = k3 * (r2 + 2 * y * y) + 2 * k4 * x * y
             return np.stack([radial * x + tangential_x, radial * y + tangential_y], axis=-1)

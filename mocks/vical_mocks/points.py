@@ -23,23 +23,29 @@ def board_points(columns: int = 8, rows: int = 6, spacing_m: float = 0.05) -> Fl
     return np.stack([col.ravel() * spacing_m, row.ravel() * spacing_m, np.zeros(col.size)], axis=-1)
 
 
-def crooked_board(seed: int) -> FloatArray:
-    """The board of `board_points` as a printer and a table make it, m, (48, 3).
+def crooked_board(seed: int, flat_m: FloatArray | None = None) -> FloatArray:
+    """A board as a printer and a table make it, m, (n, 3).
 
     Narrower than tall by 0.2 % and skew (one-sigma), bent and twisted by 0.5 mm at its edges, bowed in its
     plane by 0.2 mm, each corner 0.15 mm beside its place; not turned, shifted or grown as a whole, which no
     image shows.
+
+    Args:
+        seed: Of the errors.
+        flat_m: The board as it should be, shape (n, 3); None: that of `board_points`. Its size scales the
+            errors, which are those of a board 350 mm wide.
     """
     rng = np.random.default_rng([seed, 63])
-    points = board_points()
+    points = board_points() if flat_m is None else flat_m
+    size = float(np.ptp(points[:, 0]) / 0.35)
     x, y = (points[:, :2] - points[:, :2].mean(axis=0)).T
     narrow, skew = 1e-3 * rng.standard_normal(2)
     half = np.array([x.max(), y.max()])
     second = np.stack([(x / half[0]) ** 2, (y / half[1]) ** 2, x * y / half.prod()], axis=-1)
-    off = second @ (np.array([0.2e-3, 0.2e-3, 0.5e-3]) * rng.standard_normal((3, 3)))
+    off = second @ (size * np.array([0.2e-3, 0.2e-3, 0.5e-3]) * rng.standard_normal((3, 3)))
     off[:, 0] += narrow * x + skew * y
     off[:, 1] += skew * x - narrow * y
-    out: FloatArray = points + off - off.mean(axis=0) + 0.15e-3 * rng.standard_normal(points.shape)
+    out: FloatArray = points + off - off.mean(axis=0) + size * 0.15e-3 * rng.standard_normal(points.shape)
     return out
 
 

@@ -1,0 +1,249 @@
+"""Is the cause that vical announces the true one? A confusion table of single causes and announcements.
+
+    python -m benchmarks attribution --trials 30                      the reference rig, 30 motions
+    python -m benchmarks attribution --trials 30 --zoo                random rigs
+    python -m benchmarks attribution --trials 10 --case "imu 1 %"     one cause
+
+Each recording has one cause and no other. A row counts the rigs in which the cause was announced, and those
+in which any other was. Gaps of the images are facts and not causes: boards leave the view.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
+from vical_mocks.points import SimulatedRun, board_points, crooked_board, simulate
+from vical_mocks.random_rigs import draw
+from vical_mocks.rig import Bump, Rig, reference_rig
+from vical_mocks.rotations import exp_so3
+from vical_mocks.tracks import room_landmarks, simulate_tracks
+
+from benchmarks import runner
+from benchmarks.montecarlo import lying, summary, with_lens_off
+from vical_daemon.estimation.events import EventKind as Kind
+from vical_daemon.estimation.measurements import CalibrationOptions
+
+AT_S = 18.0
+"""When a sudden cause begins, s: most rigs have converged by then."""
+NOTICED_S = 3.0
+_CLEAN = ("frame_sigma_px", "stamp_jitter_s", "outlier_fraction", "missing_fraction", "frame_drop_fraction")
+_FACTS = {Kind.IMAGE_GAP, Kind.STARTED_ANEW}
+_OF_A_BUMP = frozenset({Kind.CAMERA_MOVED, Kind.CAMERA_TURNED, Kind.POSE_LOST})
+
+
+def _exact(rig: Rig, rng: np.random.Generator) -> Rig:  # noqa: ARG001
+    return rig
+
+
+def _matrices(size: float, rig: Rig, rng: np.random.Generator) -> Rig:
+    """Scale and alignment off by `size`, one sigma; what of the gyro's is no turn of the imu's frame."""
+    G, A = size * rng.standard_normal((2, 3, 3))
+    return replace(rig, gyro_matrix=np.eye(3) + 0.5 * (G + G.T), accel_matrix=np.eye(3) + A)
+
+
+def _bumped(rig: Rig, rng: np.random.Generator) -> Rig:
+    """Turned by 2 deg and moved by 10 mm, in random directions."""
+    turn, move = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    bump = Bump(AT_S, tuple((np.deg2rad(2.0) * turn).tolist()), tuple((0.01 * move).tolist()))
+    return replace(rig, bumps=(bump,))
+
+
+def _one_term_more(rig: Rig, rng: np.random.Generator) -> Rig:
+    """A sixth power of the radius that moves the corners of the image by 3 % of their distance."""
+    width, height = rig.lens.resolution
+    radius = np.hypot(0.5 * width, 0.5 * height) / rig.lens.intrinsics[0]
+    size = float(rng.choice([-1.0, 1.0])) * 0.03 / radius**6
+    return replace(rig, lens=replace(rig.lens, sixth_power=size))
+
+
+def _without_imu(seconds: float, run: SimulatedRun) -> SimulatedRun:
+    t_s = (run.t_imu_ns - run.options.epoch_ns) * 1e-9
+    keep = (t_s < AT_S) | (t_s >= AT_S + seconds)
+    return replace(
+        run,
+        t_imu_ns=run.t_imu_ns[keep],
+        gyro_rps=run.gyro_rps[keep],
+        specific_force_mps2=run.specific_force_mps2[keep],
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """One cause.
+
+    Attributes:
+        right: What should be announced, any of them; empty: nothing.
+        also: What may be announced, too, because it is true as well.
+        simulation: Fields of `SimulationOptions`.
+        rig: Changes the rig.
+        after: Changes the recording.
+        held: The lens is fixed.
+        lens_off: At values that are not this camera's.
+        crooked, size: The board is bent, or as many times as large as stated.
+        board_only: It makes no sense without a board.
+        sudden: The calibration changes at `AT_S`; it may take `NOTICED_S` to notice.
+    """
+
+    right: frozenset[Kind] = frozenset()
+    also: frozenset[Kind] = frozenset()
+    simulation: dict[str, Any] = field(default_factory=dict)
+    rig: Callable[[Rig, np.random.Generator], Rig] = _exact
+    after: Callable[[SimulatedRun], SimulatedRun] = lambda run: run
+    held: bool = False
+    lens_off: bool = False
+    crooked: bool = False
+    size: float = 1.0
+    board_only: bool = False
+    sudden: bool = False
+
+
+def _is(*right: Kind, **more: Any) -> Case:
+    return Case(frozenset(right), **more)
+
+
+def _rolling(axis: str) -> Callable[[Rig, np.random.Generator], Rig]:
+    return lambda rig, _: replace(rig, readout_s=0.02, readout_axis=axis)
+
+
+CASES: dict[str, Case] = {
+    "none": Case(),
+    "none, lens fixed": Case(held=True),
+    "image stamps jitter by 1 ms": _is(Kind.STAMP_JITTER, simulation={"stamp_jitter_s": 1e-3}),
+    "whole images off by 0.3 px": Case(simulation={"frame_sigma_px": 0.3}),
+    "5 % outliers": Case(simulation={"outlier_fraction": 0.05}),
+    "lens of one term more": _is(Kind.LENS_TERM_MISSING, rig=_one_term_more, board_only=True),
+    "fixed lens wrong": _is(Kind.FIXED_LENS, held=True, lens_off=True, board_only=True),
+    "board bent by 0.5 mm": _is(Kind.TARGET_SHAPE, crooked=True, board_only=True),
+    "board 3 % larger": _is(Kind.TARGET_SIZE, size=1.03, board_only=True),
+    "imu 0.3 %": _is(Kind.IMU_INTRINSICS, rig=partial(_matrices, 3e-3)),
+    "imu 1 %": _is(Kind.IMU_INTRINSICS, rig=partial(_matrices, 1e-2)),
+    "accelerometer 1 ms late": _is(Kind.ACCEL_LAG, simulation={"accel_lag_s": 1e-3}),
+    "rows read in 20 ms": _is(Kind.ROLLING_SHUTTER, rig=_rolling("rows")),
+    "columns read in 20 ms": _is(Kind.ROLLING_COLUMNS, rig=_rolling("columns")),
+    "clocks 100 ppm apart": _is(Kind.CLOCK_DRIFT, rig=lambda rig, _: replace(rig, clock_skew_ppm=100.0)),
+    "imu gap of 0.5 s": _is(Kind.IMU_GAP, after=partial(_without_imu, 0.5)),
+    "bump": _is(Kind.BUMPED, Kind.STARTED_OVER, also=_OF_A_BUMP, rig=_bumped, sudden=True),
+}
+
+
+def make_run(case: Case, seed: int, seconds: float, *, zoo: bool, target_free: bool) -> SimulatedRun:
+    """The recording of one trial; a random mounting of the reference rig, or a random rig."""
+    rng = np.random.default_rng([seed, 82])
+    simulation: dict[str, Any] = {}
+    if zoo:
+        drawn, _ = draw(seed, 1.0, target_free=target_free)
+        rig, points = drawn.rig, drawn.points_m
+        simulation = {k: v for k, v in vars(drawn.options).items() if k != "epoch_ns" and k not in _CLEAN}
+    else:
+        shift_s = float(rng.uniform(-0.05, 0.05))
+        R = reference_rig(seed).R_imu_cam @ exp_so3(0.1 * rng.standard_normal(3))
+        rig = reference_rig(seed, timeshift_cam_imu_s=shift_s, R_imu_cam=R)
+        points = room_landmarks(seed, 200) if target_free else board_points()
+    rig, simulation = case.rig(rig, rng), simulation | case.simulation
+    if target_free:
+        return case.after(simulate_tracks(seed, seconds, rig=rig, landmarks_m=points, **simulation))
+    true = case.size * (crooked_board(seed, points) if case.crooked else points)
+    return replace(case.after(simulate(seed, seconds, rig=rig, points_m=true, **simulation)), points_m=points)
+
+
+def trial(name: str, seconds: float, zoo: bool, target_free: bool, seed: int) -> runner.Result:
+    """One recording with one cause."""
+    case = CASES[name]
+    run = make_run(case, seed, seconds, zoo=zoo, target_free=target_free)
+    prior = camera_prior(run, seed, StartErrors(), exact_lens=case.held)
+    prior = replace(prior, readout_s=0.0, readout_axis="")
+    if case.lens_off:
+        prior = with_lens_off(prior, seed, told=False)
+    options = CalibrationOptions(
+        fix=frozenset({"intrinsics"} if case.held else ()),
+        target_free=target_free,
+        imu_noise=imu_noise(run),
+    )
+    record = feed(run, CalibratorSubject(options, prior, None if target_free else run.points_m))
+    return summary(record, 7, []) | {"rig": {"lens": run.rig.lens.model, "rate": run.options.camera_rate_hz}}
+
+
+def announced(result: runner.Result) -> list[tuple[float, str, float]]:
+    """What was announced as a cause: when, kind, value."""
+    return [
+        (t_s, event["kind"], event["value"])
+        for t_s, event in result["events"]
+        if event["kind"] not in {str(kind) for kind in _FACTS}
+    ]
+
+
+def applies(case: Case, result: runner.Result) -> bool:
+    """Whether the cause exists for this rig: a fisheye lens has no term that `plumb_bob` adds."""
+    return Kind.LENS_TERM_MISSING not in case.right or result["rig"]["lens"] == "radtan"
+
+
+def row(name: str, results: list[runner.Result]) -> str:
+    """One line of the confusion table."""
+    case = CASES[name]
+    results = [r for r in results if r["trace"]["t_s"] and applies(case, r)]
+    right = {str(kind) for kind in case.right}
+    also = right | {str(kind) for kind in case.also}
+    kinds = [{kind for _, kind, _ in announced(r)} for r in results]
+    when = [min(t for t, kind, _ in announced(r) if kind in right) for r in results if _any(r, right)]
+    found = f"{len(when)} of {len(results)}" if right else "(nothing)"
+    wrong = Counter(kind for said in kinds for kind in said - also)
+    others = ", ".join(f"{kind} {count}" for kind, count in wrong.most_common()) or "-"
+    at = f"{np.median(when):.0f} / {max(when):.0f}" if when else "-"
+    rigs = sum(bool(said - also) for said in kinds)
+    converged = sum(r["trace"]["status"][-1] == "converged" for r in results)
+    return (
+        f"| {name} | {len(results)} | {found} | {at} | {rigs} | {others} "
+        f"| {converged} | {sum(_lies(case, r) for r in results)} |"
+    )
+
+
+def _lies(case: Case, result: runner.Result) -> bool:
+    """Whether it was ever `converged` beyond 5 sigma, but for the time in which a change is noticed."""
+    trace = result["trace"]
+    at = [k for k, t_s in enumerate(trace["t_s"]) if not (case.sudden and AT_S <= t_s < AT_S + NOTICED_S)]
+    return lying({"trace": {key: [trace[key][k] for k in at] for key in ("status", "error", "sigma")}})
+
+
+def _any(result: runner.Result, kinds: set[str]) -> bool:
+    return any(kind in kinds for _, kind, _ in announced(result))
+
+
+def main(argv: list[str]) -> int:
+    """Run the study."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks attribution", description=__doc__)
+    runner.add_arguments(parser, trials=30, seconds=30.0)
+    parser.add_argument("--zoo", action="store_true", help="random rigs instead of the reference rig")
+    parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
+    parser.add_argument("--list", action="store_true", help="print every wrong announcement, too")
+    args = parser.parse_args(argv)
+    code = runner.fingerprint("vical_daemon/estimation", "benchmarks/attribution.py", "mocks/vical_mocks")
+    print(
+        "| cause | rigs | announced | after s (median / worst) | rigs with another announcement | which "
+        "| converged at the end | converged beyond 5 sigma |\n|---|---|---|---|---|---|---|---|"
+    )
+    kind = ("free" if args.target_free else "board") + ("_zoo" if args.zoo else "")
+    wrong = []
+    for name in args.case or CASES:
+        if args.target_free and CASES[name].board_only:
+            continue
+        work = partial(trial, name, args.seconds, args.zoo, args.target_free)
+        store = f"attribution_{kind}_{runner.slug(name)}_{args.seconds:g}s"
+        results = runner.run_trials(store, work, runner.seeds_of(args), args, code)
+        print(row(name, results), flush=True)
+        also = {str(k) for k in CASES[name].right | CASES[name].also}
+        for seed, result in zip(runner.seeds_of(args), results, strict=True):
+            wrong += [
+                f"{name}, seed {seed}: {what} {value if value is None else f'{value:.3g}'} after {t_s:.0f} s"
+                for t_s, what, value in announced(result)
+                if what not in also
+            ]
+    if args.list:
+        print("\n" + "\n".join(wrong))
+    return 0
