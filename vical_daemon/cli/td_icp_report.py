@@ -46,6 +46,11 @@ def print_single(
     print(f"  lens         {lens_line(used)}")
     print(f"               {used.origin}")
     print(f"  noise of one sighting  {np.rad2deg(result.camera_noise_rad):.3f} deg")
+    if result.readout_axis:
+        print(
+            f"  rolling shutter that reads {result.readout_axis}, "
+            f"in {1e3 * result.readout_s:+.1f} ± {1e3 * result.readout_sigma_s:.1f} ms"
+        )
     if result.widened > 1.0:
         print(f"  sigmas widened {_because(result.widened)}")
     for row in watch:

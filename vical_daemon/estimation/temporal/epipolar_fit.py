@@ -28,6 +28,7 @@ from vical_daemon.estimation.temporal.epipolar_errors import (
     track_noise,
 )
 from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
+from vical_daemon.estimation.temporal.epipolar_shutter import AXES, READOUT_SIGMA_S, EpipolarShutter
 from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
 
 _ITERATIONS = 18
@@ -36,12 +37,16 @@ _BIAS_SIGMA_RPS = 0.02  # of a gyro that was not zeroed
 _FOCAL_SIGMA, _RATIO_SIGMA, _CENTRE_SIGMA = 0.1, 0.003, 0.03
 _DISTORTION_SIGMA = {"radtan": (0.1, 0.1, 0.005, 0.005), "equidistant": (0.05, 0.05, 0.05, 0.05)}
 _LENS_AFTER = 4  # iterations with the lens as given
+_READOUT_STEPS = 4  # from a solution without one
 _GOOD = 0.25  # weight of a feature that fits
 _LEAST_SLOPE = 0.2
 _BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
 _FAR_S, _FAR_EVERY = (1.0, 2.0), 4  # pairs that show how long errors last
 _STRETCH_S = 5.0  # of the data, solved alone for comparison
 _BLOCK_S = 0.5  # errors of the fit are taken as independent beyond this
+
+At = tuple[FloatArray, float, FloatArray]
+"""Mounting, delay and bias."""
 
 
 @dataclass(slots=True)
@@ -61,6 +66,9 @@ class EpipolarFit:
         stretches: What stretches of the data say alone, [mounting about the camera's axes, rad; delay, s] and
             its covariance, with errors that persist along tracks; empty unless asked for.
         covariance: The same for the whole, shape (4, 4); with errors that persist.
+        readout_s: Readout by columns and by rows, s, shape (2,); as fitted along where an axis was named, else
+            as the fit would go on with both.
+        readout_covariance: Of both, s^2, shape (2, 2); infinite: nothing is said.
     """
 
     R_imu_cam: FloatArray
@@ -74,6 +82,8 @@ class EpipolarFit:
     inliers: float
     stretches: list[tuple[FloatArray, FloatArray]] = field(default_factory=list)
     covariance: FloatArray = field(default_factory=lambda: np.full((4, 4), np.nan))
+    readout_s: FloatArray = field(default_factory=lambda: np.zeros(2))
+    readout_covariance: FloatArray = field(default_factory=lambda: np.full((2, 2), np.inf))
 
 
 def epipolar_fit(
@@ -88,6 +98,8 @@ def epipolar_fit(
     max_step_s: float = 0.02,
     most: int = _ITERATIONS,
     gyro_density: float | None = None,
+    resolution: tuple[int, int] | None = None,
+    rolling: str = "",
 ) -> EpipolarFit | None:
     """Fit mounting, delay, gyro bias (and the focal length) to tracks.
 
@@ -103,6 +115,8 @@ def epipolar_fit(
         most: Iterations.
         gyro_density: Of the gyro's noise, rad/s/sqrt(Hz); where given, what is known of errors that persist
             along tracks goes into `covariance` and `stretches`.
+        resolution: Width, height, px; None: nothing is said of a rolling shutter.
+        rolling: `COLUMNS` or `ROWS`: the readout of a shutter that rolls that way is fitted, too.
 
     Returns:
         The fit; None where the tracks do not allow one. Sigmas are empirical (sandwich over half-second
@@ -113,6 +127,8 @@ def epipolar_fit(
         return None
     fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens, max_step_s)
     fit.gyro_density, fit.frames = gyro_density, frames
+    if resolution is not None:
+        fit.shutter = EpipolarShutter(resolution, [AXES.index(rolling)] if rolling else [])
     return fit.run(R_imu_cam.copy(), timeshift_s, most)
 
 
@@ -142,6 +158,7 @@ class _Fit:
         self.frames: list[tuple[float, PointsFrame]] = []
         self.dray: list[FloatArray] = []
         self.shrinking = np.zeros((len(pairs.of), 2))
+        self.shutter: EpipolarShutter | None = None
         self._rays()
 
     def _rays(self) -> None:
@@ -168,9 +185,19 @@ class _Fit:
         return np.asarray(out)
 
     def run(self, R: FloatArray, shift: float, most: int) -> EpipolarFit | None:
-        bias = np.zeros(3)
+        found = self._solve((R, shift, np.zeros(3)), range(most))
+        if found is None:
+            return None
+        readout = np.zeros(2), np.full((2, 2), np.inf)
+        if self.shutter is not None and self.fit_lens and not self.shutter.axes:
+            readout = self._readout(self.shutter, found[0])
+        return self._result(*found, readout)
+
+    def _solve(self, at: At, steps: range) -> tuple[At, FloatArray] | None:
+        """Improve mounting, delay, bias (and lens and readout in place); with the weights of the features."""
+        R, shift, bias = at
         weight = np.where(self.ok, 1.0, 0.0)
-        for step in range(most):
+        for step in steps:
             lin = self._linearise(R, shift, bias)
             if lin is None:
                 return None
@@ -178,7 +205,7 @@ class _Fit:
             spread = 1.4826 * float(np.median(np.abs(e[self.ok]))) + 1e-9
             k = 4.0 if step < 5 else 2.5
             weight = np.where(self.ok, 1.0 / (1.0 + (e / (k * spread)) ** 2) ** 2, 0.0)
-            size = 15 if self.fit_lens and step >= _LENS_AFTER else 7
+            size = J.shape[1] if self.fit_lens and step >= _LENS_AFTER else 7
             H, g, _ = self._normal(e, J[:, :size], Jt, weight / spread**2)
             if size > 7:
                 g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
@@ -192,14 +219,16 @@ class _Fit:
             bias = bias + dx[4:7]
             if size > 7:
                 self.intrinsics = self.intrinsics + dx[7:11]
-                self.distortion = self.distortion + dx[11:]
+                self.distortion = self.distortion + dx[11:15]
+                if self.shutter is not None:
+                    self.shutter.readout_s[self.shutter.axes] += dx[15:]
                 self._rays()
             if step > _LENS_AFTER + 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
                 break
-        return self._result(R, shift, bias, weight)
+        return (R, shift, bias), weight
 
     def _prior(self, H: FloatArray, g: FloatArray, bias: FloatArray) -> None:
-        """Add what is known before: of the bias, and of the lens where it is among the unknowns."""
+        """Add what is known before: of the bias, of lens and readout where they are among the unknowns."""
         H[range(4, 7), range(4, 7)] += _BIAS_SIGMA_RPS**-2
         g[4:7] += bias / _BIAS_SIGMA_RPS**2
         if len(g) == 7:
@@ -211,13 +240,16 @@ class _Fit:
         P[2:4, 2:4] = np.eye(2) / (_CENTRE_SIGMA * f) ** 2
         P[4:, 4:] = np.diag(np.array(_DISTORTION_SIGMA[self.model]) ** -2.0)
         off = np.concatenate([self.intrinsics - self.given[0], self.distortion - self.given[1]])
-        H[7:, 7:] += P
-        g[7:] += P @ off
+        H[7:15, 7:15] += P
+        g[7:15] += P @ off
+        if self.shutter is not None:
+            H[range(15, len(g)), range(15, len(g))] += READOUT_SIGMA_S**-2
+            g[15:] += self.shutter.readout_s[self.shutter.axes] / READOUT_SIGMA_S**2
 
     def _linearise(
         self, R: FloatArray, shift: float, bias: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Normalised errors (n,), derivatives by the shared unknowns (n, 7 or 15) and by t (n, 2)."""
+        """Normalised errors (n,), derivatives by the shared unknowns (n, 7, 15 or more) and by t (n, 2)."""
         p = self.pairs
         t = self.t_cam + shift
         curve = Attitudes(self.t_imu, self.gyro, bias)
@@ -229,12 +261,16 @@ class _Fit:
         dR = np.swapaxes(A1, 1, 2) @ A2
         R12 = R.T @ dR @ R
         usable = (inside[p.first] & inside[p.second])[p.of] & self.ok
-        b = np.matmul(R12[p.of], self.b[..., None])[..., 0]
-        n = cross(self.a, b) * usable[:, None]
+        a, b_own, turning, shutter = self.a, self.b, None, self.shutter
+        if shutter is not None and shutter.axes:
+            turning = shutter.turning((a, b_own), lambda at: curve.rate_at(at) @ R, t, p)
+            a, b_own = shutter.at_the_middle((a, b_own), turning, p)
+        b = np.matmul(R12[p.of], b_own[..., None])[..., 0]
+        n = cross(a, b) * usable[:, None]
         M = np.add.reduceat(n[:, :, None] * n[:, None, :], p.begin)
         vectors = np.linalg.eigh(M)[1]
         d, Bt = vectors[:, :, 0][p.of], vectors[:, :, 1:][p.of]
-        ta, tb = cross(d, self.a), cross(d, b)
+        ta, tb = cross(d, a), cross(d, b)
         length = np.sqrt((ta**2).sum(-1) + (tb**2).sum(-1)) + 1e-6
         e = np.where(usable, (d * n).sum(-1) / length, 0.0)
         if self.fit_lens:
@@ -242,18 +278,47 @@ class _Fit:
             self.shrinking = usable[:, None] * across / across.sum(-1, keepdims=True) / self.intrinsics[:2]
         # a turn delta local to the second image: d . (a x R (delta x b)) = delta . (b x R^T (d x a))
         back = np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0]
-        local = cross(self.b, back)
+        local = cross(b_own, back)
         by_turn = self._turns(R, R12, dR, rate, area, A2)
         J = np.einsum("ni,nik->nk", local, by_turn[p.of])
         if self.fit_lens:
             lens = np.einsum("ni,nik->nk", back, self.dray[1]) - np.einsum("ni,nik->nk", tb, self.dray[0])
             J = np.concatenate([J, lens], axis=1)
+            if shutter is not None and turning is not None:
+                J = np.concatenate([J, shutter.derivatives(-tb, back, turning, p)], axis=1)
         Jt = np.einsum("ni,nik->nk", n, Bt)
         if self.gyro_density is not None:
             share = (usable / length)[:, None]
             turned = np.matmul((A2 @ R)[p.of], local[..., None])[..., 0]
             self.effects = Effects(-tb[:, :2] * share, back[:, :2] * share, turned * share)
         return e, J * (usable / length)[:, None], Jt * (usable / length)[:, None]
+
+    def _readout(self, shutter: EpipolarShutter, at: At) -> tuple[FloatArray, FloatArray]:
+        """What a solution without a readout becomes with those of both axes, s, (2,), and their covariance."""
+        lens = self.intrinsics, self.distortion
+        self.shutter = replace(shutter, axes=[0, 1], readout_s=np.zeros(2))
+        found = self._solve(at, range(_LENS_AFTER, _LENS_AFTER + _READOUT_STEPS))
+        readout_s, covariance = self.shutter.readout_s, np.full((2, 2), np.inf)
+        lin = None if found is None else self._linearise(*found[0])
+        if found is not None and lin is not None:
+            (e, J, Jt), weight = lin, found[1]
+            square = float(weight @ lin[0] ** 2 / weight.sum())
+            H, _, each = self._normal(e, J, Jt, weight / square)
+            self._prior(H, np.zeros(len(H)), found[0][2])
+            inverse = np.linalg.inv(H)
+            covariance = (inverse @ self._blocks(each) @ inverse + inverse)[15:, 15:]
+        self.shutter, (self.intrinsics, self.distortion) = shutter, lens
+        self._rays()
+        return readout_s, covariance
+
+    def _blocks(self, each: FloatArray) -> FloatArray:
+        """Covariance of the gradient by how half seconds of it scatter; `each`: of the pairs, (P, p)."""
+        t = self.t_cam[self.pairs.first]
+        block = ((t - t[0]) / _BLOCK_S).astype(int)
+        sums = np.zeros((int(block.max()) + 1, each.shape[1]))
+        np.add.at(sums, block, each)
+        out: FloatArray = sums.T @ sums
+        return out
 
     def _turns(
         self,
@@ -289,8 +354,9 @@ class _Fit:
         return H, each.sum(axis=0), each
 
     def _result(
-        self, R: FloatArray, shift: float, bias: FloatArray, weight: FloatArray
+        self, at: At, weight: FloatArray, readout: tuple[FloatArray, FloatArray]
     ) -> EpipolarFit | None:
+        R, shift, bias = at
         lin = self._linearise(R, shift, bias)
         if lin is None:
             return None
@@ -305,12 +371,12 @@ class _Fit:
             inverse = np.linalg.inv(H)
         except np.linalg.LinAlgError:
             return None
-        t = self.t_cam[self.pairs.first]
-        block = ((t - t[0]) / _BLOCK_S).astype(int)
-        sums = np.zeros((int(block.max()) + 1, H.shape[0]))
-        np.add.at(sums, block, each)
-        covariance = inverse @ (sums.T @ sums) @ inverse + inverse
+        covariance = inverse @ self._blocks(each) @ inverse + inverse
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        if self.shutter is not None and self.shutter.axes:
+            variance = np.full((2, 2), np.inf)
+            variance[self.shutter.axes, self.shutter.axes] = covariance[15, 15]
+            readout = self.shutter.readout_s, variance
         stretches: list[tuple[FloatArray, FloatArray]] = []
         whole = np.full((4, 4), np.nan)
         if self.gyro_density is not None:
@@ -333,6 +399,7 @@ class _Fit:
             float(good[self.ok].mean()),
             stretches,
             whole,
+            *readout,
         )
 
     def _persistent(
@@ -416,9 +483,7 @@ class _Fit:
         change = 0.5 * (moved[1] + moved[2]) - moved[0]
         return np.asarray(-share * np.linalg.solve(give * H, change)[:4], dtype=np.float64)
 
-    def _track_noise(
-        self, at: tuple[FloatArray, float, FloatArray], e: FloatArray, good: BoolArray
-    ) -> TrackNoise:
+    def _track_noise(self, at: At, e: FloatArray, good: BoolArray) -> TrackNoise:
         """Errors of single sightings by the residuals, those of pairs far apart among them."""
         lag = (self.t_cam[self.pairs.second] - self.t_cam[self.pairs.first])[self.pairs.of]
         short, effects = self.pairs, self.effects

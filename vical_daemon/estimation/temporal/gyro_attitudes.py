@@ -39,3 +39,7 @@ class Attitudes:
         rate = self.rate[k] * (1 - share) + self.rate[k + 1] * share
         R = self.R[k] @ so3.exp(0.5 * (self.rate[k] + rate) * h[:, None])
         return R, rate, self.area[k] + 0.5 * (self.R[k] + R) * h[:, None, None]
+
+    def rate_at(self, t_s: FloatArray) -> FloatArray:
+        """Rate, rad/s, shape (k, 3), at instants; outside the samples that of the nearest."""
+        return np.stack([np.interp(t_s, self.t_s, axis) for axis in self.rate.T], axis=-1)

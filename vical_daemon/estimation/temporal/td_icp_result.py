@@ -73,6 +73,10 @@ class TdIcpResult:
         still: Refused because the rig stands still.
         widened: By how much stretches of the data disagree beyond what their noise explains (1: they agree);
             the sigmas are widened by it.
+        readout_s: From tracks, where they show a rolling shutter: from the first line to the last, s; negative:
+            it begins at the right or at the bottom.
+        readout_sigma_s: Its standard deviation, s.
+        readout_axis: What it reads one after the other, "rows" or "columns"; empty: no rolling shutter shows.
     """
 
     status: str
@@ -95,6 +99,9 @@ class TdIcpResult:
     stamp_rate_sigma: float = float("nan")
     still: bool = False
     widened: float = 1.0
+    readout_s: float = 0.0
+    readout_sigma_s: float = 0.0
+    readout_axis: str = ""
 
     def to_json(self) -> dict[str, object]:
         """Return what `vical td-icp --json` prints."""
@@ -115,6 +122,9 @@ class TdIcpResult:
             "stamp_rate_ppm": _number(1e6 * self.stamp_rate),
             "stamp_rate_sigma_ppm": _number(1e6 * self.stamp_rate_sigma),
             "widened": self.widened,
+            "readout_s": self.readout_s,
+            "readout_sigma_s": self.readout_sigma_s,
+            "readout_axis": self.readout_axis,
         }
 
 

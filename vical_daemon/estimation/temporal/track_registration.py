@@ -3,7 +3,8 @@
 Rotations strung together from pairs of images are only good for a start; from there mounting, delay and gyro
 bias are fitted to the tracks themselves (`epipolar_fit`), in windows of the recording. Their covariances know
 errors that persist along tracks (`epipolar_errors`) and the gyro's noise; what they do not know shows in how
-stretches of five seconds scatter (`stretch_agreement`).
+stretches of five seconds scatter (`stretch_agreement`). Where the tracks show a rolling shutter for sure, all
+is fitted once more with its readout (`epipolar_shutter`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
+from vical_daemon.estimation.temporal.epipolar_shutter import AXES, rolling_axis
 from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
@@ -39,6 +41,7 @@ def track_registration(
     frames: Frames,
     lens: Lens,
     options: TdIcpOptions | None = None,
+    resolution: tuple[int, int] | None = None,
 ) -> TdIcpResult:
     """Find delay, mounting and gyro bias from a gyro and tracks.
 
@@ -48,6 +51,7 @@ def track_registration(
         frames: (stamp in the camera's clock in s, tracks), in order of time; an id names the same point.
         lens: fx fy cx cy, distortion, model.
         options: As for `td_icp`.
+        resolution: Width, height, px; None: the shutter is taken for global.
 
     Returns:
         As `td_icp`; `pairs` counts images. Never raises on data.
@@ -63,21 +67,38 @@ def track_registration(
     start = _start(imu, windows, lens, options)
     if start.status == REFUSED:
         return start
-    fits: list[tuple[int, EpipolarFit]] = []
+    fits = _fits(imu, windows, lens, options, start, resolution, "")
+    axis = rolling_axis([(f.readout_s, f.readout_covariance) for _, f in fits])
+    if axis:
+        fits = _fits(imu, windows, lens, options, start, resolution, axis) or fits
+    if not fits:
+        reason = "too few features are followed from image to image, or they do not fit the gyro's rotation"
+        return TdIcpResult(REFUSED, reason, rejected=len(frames))
+    return _together(fits, len(frames), start.iterations, axis)
+
+
+def _fits(
+    imu: tuple[FloatArray, FloatArray],
+    windows: list[Frames],
+    lens: Lens,
+    options: TdIcpOptions,
+    start: TdIcpResult,
+    resolution: tuple[int, int] | None,
+    rolling: str,
+) -> list[tuple[int, EpipolarFit]]:
+    """Fit each window: number of its images, and the fit, of those that hold."""
+    fits = []
     for window in windows:
         t, gyro = _near(imu, window, start.timeshift_cam_imu_s)
         fit = None
         if len(t) > 100:
             fit = epipolar_fit(
                 t, gyro, window, lens, start.R_imu_cam, start.timeshift_cam_imu_s,
-                fit_lens=True, gyro_density=options.gyro_density,
+                fit_lens=True, gyro_density=options.gyro_density, resolution=resolution, rolling=rolling,
             )  # fmt: skip
         if fit is not None and fit.inliers > _INLIERS and np.isfinite(fit.timeshift_sigma_s):
             fits.append((len(window), fit))
-    if not fits:
-        reason = "too few features are followed from image to image, or they do not fit the gyro's rotation"
-        return TdIcpResult(REFUSED, reason, rejected=len(frames))
-    return _together(fits, len(frames), start.iterations)
+    return fits
 
 
 def _windows(frames: Frames) -> list[Frames]:
@@ -125,7 +146,7 @@ def _start(
     return result
 
 
-def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -> TdIcpResult:
+def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int, axis: str) -> TdIcpResult:
     """Weighted mean of the windows; sigmas widened where stretches of the recording disagree."""
     best = min((f for _, f in fits), key=lambda f: f.timeshift_sigma_s)
     offsets = np.array(
@@ -149,6 +170,12 @@ def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -
     covariance[[3, 4, 5], [3, 4, 5]] = np.var([f.gyro_bias for _, f in fits], axis=0) + 1e-8
     reasons = lost_in_words(covariance, R)
     pairs = sum(n for n, _ in fits)
+    readout_s = readout_sigma_s = 0.0
+    if axis:
+        k = AXES.index(axis)
+        variance = np.array([f.readout_covariance[k, k] for _, f in fits])
+        readout_s = float(np.average([f.readout_s[k] for _, f in fits], weights=1.0 / variance))
+        readout_sigma_s = float(widened.max() / np.sqrt((1.0 / variance).sum()))
     return TdIcpResult(
         status=DEGENERATE if reasons else OK,
         reason="; ".join(reasons),
@@ -163,4 +190,7 @@ def _together(fits: list[tuple[int, EpipolarFit]], n_frames: int, rounds: int) -
         iterations=rounds,
         camera_noise_rad=float(np.median([f.error for _, f in fits])),
         widened=float(widened.max()),
+        readout_s=readout_s,
+        readout_sigma_s=readout_sigma_s,
+        readout_axis=axis,
     )

@@ -56,7 +56,7 @@ def register_camera(request: TdIcpRequest, watch_s: float | None = None) -> Sing
     if stream.kind == "tracks":
         frames, used = track_frames(recording, stream, prior, base)
         lens = (used.lens.intrinsics, used.lens.distortion, used.lens.model)
-        result = track_registration(t_imu, gyro, frames, lens, options)
+        result = track_registration(t_imu, gyro, frames, lens, options, used.lens.resolution)
         if watch_s is not None:
             raise OptionError("--watch needs a board: tracks of unknown points are fitted as a whole")
         return SingleResult(imu, camera, result, used)
