@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from vical_daemon.cli import errors, options, plain_output, table
+from vical_daemon.cli import errors, leaving, options, plain_output, table
 
 logging.raiseExceptions = False  # a log that cannot be written (full disk, closed terminal) is no traceback
 
@@ -46,7 +46,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit code.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    code = _run(list(sys.argv[1:] if argv is None else argv))
+    if argv is None and leaving.threads_remain():
+        return leaving.leave(code)
+    return code
+
+
+def _run(words: list[str]) -> int:
+    """Run one command; its exit code."""
     plain_output.accept_any_encoding()
     try:
         code = _dispatch(words)

@@ -9,12 +9,12 @@ import os
 import sys
 import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.children import STOP_S, Children
 from vical_daemon.cli.errors import EXIT_USAGE, NOTHING_TO_RUN, CliError, report_thread
+from vical_daemon.cli.leaving import leave
 from vical_daemon.cli.options import add_config, add_json
 from vical_daemon.cli.stop_signals import die_with, leave_at_once, stop_signals
 
@@ -61,20 +61,7 @@ def run(args: argparse.Namespace) -> int:
     threading.excepthook = report_thread
     with stop_signals(leave_at_once, STOP_S if args.parent else 0) as stop:
         code = _run_roles(config, roles, stop)
-    return _leave(code)
-
-
-def _leave(code: int) -> int:
-    """End the process here: everything is closed, and what the libraries' threads still do is not wanted.
-
-    Threads of zenoh that wait for the interpreter while it shuts down are killed by it in the middle of
-    foreign code, which aborts the process ("exception not rethrown") and looks like a crash to systemd.
-    """
-    logging.shutdown()
-    with suppress(OSError):  # the terminal may be closed
-        sys.stdout.flush()
-        sys.stderr.flush()
-    os._exit(code)
+    return leave(code)
 
 
 def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
