@@ -6,10 +6,8 @@ All disturbances of a seed are the same until `AT_S`: that part is followed once
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 from vical_mocks.harness.feed import (
@@ -27,10 +25,10 @@ from vical_mocks.tracks import room_landmarks, simulate_tracks
 
 from benchmarks import gaps, runner
 from benchmarks.changes import STEPS
+from benchmarks.gaps import AFTER_S, AT_S, Late, Retimed, step
 from vical_daemon.estimation.events import EventKind
-from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
+from vical_daemon.estimation.measurements import CalibrationOptions
 
-AT_S, AFTER_S = 20.0, 10.0
 _LOOK_S = 0.5
 _WRONG = 5.0  # sigmas: farther off while converged
 _BLIND_S = 3.0  # for so long nobody can know of a change
@@ -47,28 +45,6 @@ _CHANGES = {
 _MOUNTING = {EventKind.BUMPED, EventKind.STARTED_OVER}
 _DELAY = {EventKind.TIMESHIFT_STEPPED, EventKind.STAMPS_STEPPED, EventKind.IMU_CLOCK_REMAPPED}
 _DRIFT = {EventKind.CLOCK_WANDER, EventKind.CLOCK_DRIFT}
-Late = Callable[[float], float]
-
-
-class Retimed(CalibratorSubject):
-    """Gets the data in their true order, one sensor's stamps `late_s(t_s)` later than they are."""
-
-    sensor = ""
-    late_s: Late
-    epoch_ns = 0
-
-    def add_imu(self, t_ns: int, gyro: Any, force: Any) -> None:
-        """See `Subject`."""
-        super().add_imu(self._stamp("imu", t_ns), gyro, force)
-
-    def add_points(self, frame: PointsFrame) -> None:
-        """See `Subject`."""
-        super().add_points(replace(frame, t_cam_ns=self._stamp("camera", frame.t_cam_ns)))
-
-    def _stamp(self, sensor: str, t_ns: int) -> int:
-        if sensor != self.sensor:
-            return t_ns
-        return t_ns + round(1e9 * self.late_s(1e-9 * (t_ns - self.epoch_ns)))
 
 
 @dataclass(frozen=True)
@@ -92,10 +68,6 @@ class Disturbance:
     sensor: str = ""
     late_s: Late = lambda _t_s: 0.0
     longer_s: float = 0.0
-
-
-def _step(by_s: float, t_s: float) -> float:
-    return by_s if t_s >= AT_S else 0.0
 
 
 def _drift(rate: float, t_s: float) -> float:
@@ -132,7 +104,7 @@ def _junk(share: float, seconds: float, run: SimulatedRun) -> SimulatedRun:
 
 
 def _clock(sensor: str, by_s: float, expected: set[EventKind]) -> Disturbance:
-    return Disturbance(frozenset(expected), sensor=sensor, late_s=partial(_step, by_s))
+    return Disturbance(frozenset(expected), sensor=sensor, late_s=partial(step, by_s))
 
 
 def _gap(sensors: str, seconds: float, *kinds: EventKind) -> Disturbance:

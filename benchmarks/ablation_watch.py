@@ -1,6 +1,6 @@
 """A delay that moves in some way: do rotations alone (`DelayWatch`) warn where the filter does not?
 
-The daemon runs the watch beside the filter; it changes no estimate. So nothing is taken away here: both are
+The daemon runs both; the watch changes no estimate. So nothing is taken away here: both are
 run, and what each announces is compared.
 """
 
@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from vical_mocks.harness.feed import (
-    CalibratorSubject,
     Record,
     Snapshot,
     StartErrors,
@@ -25,7 +24,7 @@ from vical_mocks.points import SimulatedRun, simulate
 from vical_mocks.rig import reference_rig
 
 from benchmarks import runner
-from benchmarks.ablation_disturbances import Late
+from benchmarks.gaps import Late, Retimed
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
 from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
@@ -60,11 +59,10 @@ MOVES: dict[str, Late] = {
 }
 
 
-class Watched(CalibratorSubject):
-    """The calibrator with the watch beside it, as the daemon runs them; the camera's stamps move."""
+class Watched(Retimed):
+    """The calibrator and the watch, as the daemon runs them; the camera's stamps move."""
 
-    late_s: Late
-    epoch_ns: int
+    sensor = "camera"
     delay: DelayWatch
     warned_s: float | None = None
 
@@ -75,10 +73,8 @@ class Watched(CalibratorSubject):
 
     def add_points(self, frame: PointsFrame) -> None:
         """See `Subject`."""
-        late_s = self.late_s(1e-9 * (frame.t_cam_ns - self.epoch_ns))
-        frame = replace(frame, t_cam_ns=frame.t_cam_ns + round(1e9 * late_s))
         super().add_points(frame)
-        self.delay.add_points(frame)
+        self.delay.add_points(replace(frame, t_cam_ns=self.stamp("camera", frame.t_cam_ns)))
 
     def look(self, run: SimulatedRun, t_s: float, record: Record) -> Snapshot | None:
         """See `Subject`; the watch compares itself with the estimate."""

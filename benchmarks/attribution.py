@@ -25,16 +25,16 @@ from vical_mocks.rig import Bump, Rig, reference_rig
 from vical_mocks.rotations import exp_so3
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 
-from benchmarks import runner
+from benchmarks import gaps, runner
 from benchmarks.montecarlo import lying, summary, with_lens_off
 from vical_daemon.estimation.events import EventKind as Kind
 from vical_daemon.estimation.measurements import CalibrationOptions
 
-AT_S = 18.0
-"""When a sudden cause begins, s: most rigs have converged by then."""
+AT_S = gaps.AT_S
+"""When a sudden cause begins, s."""
 NOTICED_S = 3.0
 _CLEAN = ("frame_sigma_px", "stamp_jitter_s", "outlier_fraction", "missing_fraction", "frame_drop_fraction")
-_FACTS = {Kind.IMAGE_GAP, Kind.STARTED_ANEW}
+_FACTS = {Kind.IMAGE_GAP, Kind.STARTED_ANEW, Kind.WENT_ON}
 _OF_A_BUMP = frozenset({Kind.CAMERA_MOVED, Kind.CAMERA_TURNED, Kind.POSE_LOST})
 
 
@@ -61,17 +61,6 @@ def _one_term_more(rig: Rig, rng: np.random.Generator) -> Rig:
     radius = np.hypot(0.5 * width, 0.5 * height) / rig.lens.intrinsics[0]
     size = float(rng.choice([-1.0, 1.0])) * 0.03 / radius**6
     return replace(rig, lens=replace(rig.lens, sixth_power=size))
-
-
-def _without_imu(seconds: float, run: SimulatedRun) -> SimulatedRun:
-    t_s = (run.t_imu_ns - run.options.epoch_ns) * 1e-9
-    keep = (t_s < AT_S) | (t_s >= AT_S + seconds)
-    return replace(
-        run,
-        t_imu_ns=run.t_imu_ns[keep],
-        gyro_rps=run.gyro_rps[keep],
-        specific_force_mps2=run.specific_force_mps2[keep],
-    )
 
 
 @dataclass(frozen=True)
@@ -128,7 +117,7 @@ CASES: dict[str, Case] = {
     "rows read in 20 ms": _is(Kind.ROLLING_SHUTTER, rig=_rolling("rows")),
     "columns read in 20 ms": _is(Kind.ROLLING_COLUMNS, rig=_rolling("columns")),
     "clocks 100 ppm apart": _is(Kind.CLOCK_DRIFT, rig=lambda rig, _: replace(rig, clock_skew_ppm=100.0)),
-    "imu gap of 0.5 s": _is(Kind.IMU_GAP, after=partial(_without_imu, 0.5)),
+    "imu gap of 0.5 s": _is(Kind.IMU_GAP, after=partial(gaps.cut, "imu", 0.5)),
     "bump": _is(Kind.BUMPED, Kind.STARTED_OVER, also=_OF_A_BUMP, rig=_bumped, sudden=True),
 }
 

@@ -41,6 +41,7 @@ LOOK_S = 0.25
 GAPS_S = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 60.0)
 STEPS_S = (0.02, 0.5, 3600.0)
 Change = Callable[[SimulatedRun], SimulatedRun]
+Late = Callable[[float], float]
 
 
 def _during(run: SimulatedRun, seconds: float) -> tuple[Any, Any]:
@@ -82,21 +83,31 @@ def freeze(sensor: str, seconds: float, run: SimulatedRun) -> SimulatedRun:
     return replace(run, frames=frames)
 
 
-class Stepped(CalibratorSubject):
-    """Gets the data in their true order, one sensor's with other stamps from `AT_S` on."""
+class Retimed(CalibratorSubject):
+    """Gets the data in their true order, one sensor's stamps `late_s(t_s)` later than they are."""
 
-    sensor, step_ns, at_ns = "", 0, 0
+    sensor = ""
+    late_s: Late
+    epoch_ns = 0
 
     def add_imu(self, t_ns: int, gyro: Any, force: Any) -> None:
         """See `Subject`."""
-        super().add_imu(self._stamp("imu", t_ns), gyro, force)
+        super().add_imu(self.stamp("imu", t_ns), gyro, force)
 
     def add_points(self, frame: PointsFrame) -> None:
         """See `Subject`."""
-        super().add_points(replace(frame, t_cam_ns=self._stamp("camera", frame.t_cam_ns)))
+        super().add_points(replace(frame, t_cam_ns=self.stamp("camera", frame.t_cam_ns)))
 
-    def _stamp(self, sensor: str, t_ns: int) -> int:
-        return t_ns + self.step_ns if sensor == self.sensor and t_ns >= self.at_ns else t_ns
+    def stamp(self, sensor: str, t_ns: int) -> int:
+        """The stamp that this reading of a sensor gets, ns."""
+        if sensor != self.sensor:
+            return t_ns
+        return t_ns + round(1e9 * self.late_s(1e-9 * (t_ns - self.epoch_ns)))
+
+
+def step(by_s: float, t_s: float) -> float:
+    """Stamps that step at `AT_S`."""
+    return by_s if t_s >= AT_S else 0.0
 
 
 CASES: dict[str, tuple[Change, float]] = {
@@ -164,11 +175,11 @@ def recorded(case: str, seed: int, *, lens_known: bool, target_free: bool) -> Re
     """
     change, lasts_s = CASES[case]
     before, record = pickle.loads(_before(seed, lens_known, target_free))
-    subject = Stepped.__new__(Stepped)
+    subject = Retimed.__new__(Retimed)
     subject.calibrator = before.calibrator
     run = simulated(case, seed, target_free=target_free)
-    subject.sensor, subject.step_ns = case.split()[0], round(_added_s(case) * 1e9)
-    subject.at_ns = run.options.epoch_ns + round(AT_S * 1e9)
+    subject.sensor, subject.late_s = case.split()[0], partial(step, _added_s(case))
+    subject.epoch_ns = run.options.epoch_ns
     end_s = AT_S + lasts_s + AFTER_S
     run = change(run)
     follow(run, subject, record, LOOK_S, after_s=COMMON_S, until_s=end_s)

@@ -74,6 +74,7 @@ class Cause(StrEnum):
     SCENE_MOVES = "scene_moves"
     NO_PARALLAX = "no_parallax"
     SECOND_AXIS = "second_axis"
+    IMAGES_SHIFTED = "images_shifted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +87,7 @@ class Event:
         value: Its figure, in the SI unit that `REFERENCE` gives; None: it has none.
         sigma: Standard deviation of the value, same unit; None: not known.
         t_s: When, in seconds since the first inertial reading; None: not known.
-        cause: Why; for `BUMPED`, `STARTED_OVER` and `WENT_ON`.
+        cause: Why; for `BUMPED`, `STARTED_OVER` and `WENT_ON`. Of `STAMP_JITTER`: what else it may be.
         cause_value: Figure of the cause, see `Cause`; None: it has none.
         said: Text of the kinds in `SAID`. Those of kind `OTHER` come from a log written before events were
             typed, or after a kind was added that is not known here.
@@ -233,7 +234,8 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.STAMP_JITTER: About(
         "The stamps of the images jitter; allowed for. Value: standard deviation.",
         "s",
-        "Once per camera, from 0.3 ms; with a board, once neighbours are known to be late independently.",
+        "Once per camera, from 0.3 ms; with a board, once neighbours are known to be late independently. "
+        "Without one, images that are shifted as a whole are not distinguished: cause `images_shifted`.",
     ),
     EventKind.STAMPS_STEPPED: About(
         "A camera's clock was set. Value: step against the IMU's stamps.",

@@ -251,6 +251,7 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.INERTIAL_MISFIT: lambda v: f"inertial data and images disagree ({v:.1f} times their noise)",
     Cause.SCENE_MOVES: lambda v: f"{v:.0%} of the features do not move with the scene",
     Cause.NO_PARALLAX: lambda _: "the camera stands still, or features are lost before they show depth",
+    Cause.IMAGES_SHIFTED: lambda _: "whole images are shifted: not distinguished without a board",
     Cause.SECOND_AXIS: lambda _: (
         "the rig turns about a second axis now: starting anew, with all of the lever arm"
     ),
@@ -343,7 +344,11 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     ),
     EventKind.STAMP_JITTER: (
         "",
-        lambda e: f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}; allowed for",
+        lambda e: (
+            f"the stamps of the images jitter by {_of(e, 1e3, 'ms', '.1f')}"
+            + (f", or {cause_text(e.cause)}" if e.cause else "")
+            + "; allowed for"
+        ),
     ),
     EventKind.STAMPS_STEPPED: (
         "",

@@ -20,19 +20,14 @@ def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
         InputError: Nothing there that holds a calibration.
         ExportError: A file that is not of the expected form.
     """
-    from vical_daemon.results.export import ExportError
-    from vical_daemon.results.files import known_without_lens
+    from vical_daemon.results.files import read_known_file
     from vical_daemon.results.known import known_cameras
 
     path = Path(source)
-    try:
-        rig = read_source(source)
-        return known_cameras(rig, path.name), rig
-    except ExportError as error:
-        known = known_without_lens(path)
-        if known is None:
-            raise error from None
-        return known, None
+    if path.suffix in (".yaml", ".yml") and path.is_file():
+        return read_known_file(path)
+    rig = read_source(source)
+    return known_cameras(rig, path.name), rig
 
 
 def read_source(source: str) -> Rig:

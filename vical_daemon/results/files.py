@@ -48,13 +48,13 @@ def read_known_file(path: Path) -> tuple[dict[str, KnownCamera], Rig | None]:
         rig = read_rig(path)
         return known_cameras(rig, path.name), rig
     except ExportError as error:
-        known = known_without_lens(path)
+        known = _known_without_lens(path)
         if known is None:
             raise error from None
         return known, None
 
 
-def known_without_lens(path: Path) -> dict[str, KnownCamera] | None:
+def _known_without_lens(path: Path) -> dict[str, KnownCamera] | None:
     """Read a Kalibr file that may lack the lens; None if it is none.
 
     Raises:

@@ -54,7 +54,7 @@ from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 
 _EYE = np.eye(3)
-_TINY = 1e-30 * np.eye(9)  # noise densities may be told as zero
+_TINY = 1e-30 * np.eye(9)  # noise densities may be given as zero
 _TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 

@@ -79,8 +79,8 @@ def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
         return np.zeros(4 + len(camera.distortion))
     raw = f.sigmas()
     if name in f.layout.held:
-        told = spread * raw[f.layout.lens(name)]
-        return np.where(told > _ROUNDING * f.layout.held[name].off_sigma, told, 0.0)
+        known = spread * raw[f.layout.lens(name)]
+        return np.where(known > _ROUNDING * f.layout.held[name].off_sigma, known, 0.0)
     agreement = f.agreement[name]
     filtered = np.maximum(np.sqrt(agreement.factors), spread) * np.concatenate(
         [raw[where.intrinsics], raw[where.distortion]]

@@ -3,7 +3,7 @@
 A driver that maps a device's clock learns it from arrivals, and where the first ones were late it finds out
 some seconds later, by milliseconds: from one reading to the next all stamps move. To a filter that is a rig
 whose time shift jumps, and motion that is missing. The device's clock itself is even; so readings are put on
-an even axis, and the step belongs to the time shift told: t_imu = t_cam + shift by the stamps of *now*.
+an even axis, and the step belongs to the reported time shift: t_imu = t_cam + shift by the stamps of *now*.
 Only stamps that are even but for such steps are touched; others (taken on arrival) are as they are.
 """
 

@@ -213,7 +213,7 @@ class TargetFreeStatus:
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
         self._against_since_s = None
         if self.jitter_s >= ANNOUNCED_S:
-            self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter")
+            self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter", cause=Cause.IMAGES_SHIFTED)
 
     def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.

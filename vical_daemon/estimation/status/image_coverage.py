@@ -1,6 +1,6 @@
 """Where in the picture corners have been seen: beyond that a lens that is estimated is extrapolated.
 
-On a real recording a half without corners near two edges of the picture told a lens that was 3.5 px off there
+On a real recording a half without corners near two edges of the picture gave a lens that was 3.5 px off there
 (docs/math/filter.md): its mounting was right, and what it would be used for next was not.
 
 Asked for is only what can be shown: a detector that needs the whole target sees no corners at the edges.

@@ -127,7 +127,7 @@ class StatusEvaluator:
         return self._steady.status
 
     def held_back(self, ratio: float, scale: float) -> None:
-        """Take in how well the imu alone foretold an image.
+        """Take in how well the imu alone predicted an image.
 
         Args:
             ratio: Squared error over its predicted variance.

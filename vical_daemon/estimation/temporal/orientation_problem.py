@@ -20,12 +20,12 @@ from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-_MIN_INTERVAL_S = 2e-5  # two sensors may see the same instant; their drift may not be told apart to infinity
+_MIN_INTERVAL_S = 2e-5  # two stamps may coincide; the drift between them must not become infinitely certain
 LEAST_NOISE_RAD = 1e-5  # two seconds of arc: below every stamp's rounding at a motion of 60 deg/s
 _SLOW_START = -1.5  # where the search for log(slow error after a second / noise of one orientation) starts
 _TURN_UNKNOWN = 1.0 / 5.0**2  # information about a world that may be turned by any angle
 # The gyro's scale errors and the symmetric part of its misalignment: xx yy zz, xy yz xz. The antisymmetric
-# part is a rotation of the gyro's axes and cannot be told from the mounting.
+# part is a rotation of the gyro's axes and cannot be distinguished from the mounting.
 _SYMMETRIC = np.zeros((9, 6))
 _SYMMETRIC[[0, 4, 8], [0, 1, 2]] = 1.0
 _SYMMETRIC[[1, 3, 5, 7, 2, 6], [3, 3, 4, 4, 5, 5]] = 1.0
