@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.significance import CALIBRATIONS_DISAGREE
 from vical_daemon.results.known import BLOCKS
 
@@ -62,7 +62,7 @@ class Odds:
 
     Attributes:
         log_changed: Log of the odds of `changed` (all ways alike) against `as stored`, before any prior.
-        blocks: Those that have moved, where something has.
+        blocks: Those that have moved, where something has: the fewest that explain the recording.
         moved: Change of every error under that hypothesis, in its unit, shape (n,).
         moved_covariance: Of it.
         log_holds: By block, log of the odds of `as stored` against the likeliest change that counts.
@@ -111,7 +111,7 @@ def odds(d: FloatArray, S: FloatArray, stored: FloatArray, counts: FloatArray) -
         for places in [np.concatenate([present[name] for name in names])]
     ]
     logs = np.array([log for log, _, _ in hypotheses])
-    _, names, places = max(hypotheses, key=lambda h: h[0])
+    _, names, places = _fewest(hypotheses)
     moved, covariance = _moved(e, S, places)
     stored_information = np.asarray(np.linalg.inv(C))
     holds, visible, floor = {}, {}, {}
@@ -133,6 +133,19 @@ def odds(d: FloatArray, S: FloatArray, stored: FloatArray, counts: FloatArray) -
         visible,
         floor,
     )
+
+
+def _fewest(
+    hypotheses: list[tuple[float, tuple[str, ...], IntArray]],
+) -> tuple[float, tuple[str, ...], IntArray]:
+    """Return the likeliest of the hypotheses with the fewest blocks that the recording does not rule out.
+
+    A block is named only where the recording cannot be explained without it: the odds against every
+    hypothesis with fewer blocks exceed the bound of a false alarm.
+    """
+    best = max(log for log, _, _ in hypotheses)
+    possible = [h for h in hypotheses if h[0] > best - math.log(1.0 / FALSE_ALARM)]
+    return min(possible, key=lambda h: (len(h[1]), -h[0]))
 
 
 def _log_odds(e: FloatArray, S: FloatArray, places: Iterable[int]) -> float:

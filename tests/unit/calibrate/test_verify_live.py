@@ -268,6 +268,7 @@ def test_the_role_publishes_answer_status_event_and_the_calibration_in_use(run, 
     assert max(r.image_rate_hz for r in role_run.results) == 10.0  # not the 30 of calibrating
     role_run.play(messages, lambda: "holds" in getattr(role_run.statuses.get("verify/cam0"), "message", ""))
     assert role_run.statuses["verify/cam0"].level is Level.OK
+    role_run.play(messages, lambda: role_run.events)  # sent after the answer
     assert [e.kind for e in role_run.events] == [EventKind.STORED_HOLDS]
     in_use = role_run.last.camera_estimate
     np.testing.assert_allclose(in_use.T_imu_cam.p_m, run.rig.p_imu_cam, atol=1e-12)

@@ -54,6 +54,16 @@ def test_a_change_that_counts_is_found_named_and_sized(block, places):
     assert same.probability < 0.01
 
 
+def test_a_block_is_named_only_if_the_recording_cannot_be_explained_without_it():
+    """A turn far beyond doubt, and a time shift of three sigmas, which chance explains as well."""
+    sigma = np.where(np.arange(15) == 6, 1e-4, COUNTS / 12.0)
+    d = np.zeros(15)
+    d[4], d[6] = 4.0 * COUNTS[4], 3.0 * sigma[6]
+    assert odds(d, np.diag(sigma**2), 0.1 * np.diag(sigma**2), COUNTS).blocks == ("rotation",)
+    d[6] = 8.0 * sigma[6]
+    assert odds(d, np.diag(sigma**2), 0.1 * np.diag(sigma**2), COUNTS).blocks == ("rotation", "time shift")
+
+
 def test_what_is_not_visible_is_not_decided():
     """A sigma as large as what counts: neither `holds` nor `changed`; a stored sigma raises what counts."""
     S = np.diag(COUNTS**2)
