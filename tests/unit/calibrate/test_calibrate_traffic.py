@@ -163,7 +163,6 @@ class Service:
             return self.made[-1]
 
         patch.setattr(estimate, "make_estimator", make)
-        patch.setattr(estimate, "make_watch", lambda _: None)
         patch.setattr(notify, "event", lambda name, text, **_: self.events.append((name, text)))
         self.thread = threading.Thread(
             target=estimate.run, args=(config, self.bus, self.stop), kwargs={"clock": private_clock()}
