@@ -219,16 +219,6 @@ BOARD: dict[str, Mechanism] = {
         lambda: [(StatusEvaluator, "_trouble", gives(""))],
         disturbances=(*JUNK, "gyro clips"),
     ),
-    "held-back check": Mechanism(
-        WRONG,
-        "a copy of the filter predicts an image by the imu alone",
-        lambda: [
-            (Calibrator, "_ask_held_back", gives(None)),
-            (StatusEvaluator, "_held_back_fine", gives(True)),
-        ],
-        faults=("imu noise told 10 times too small",),
-        disturbances=("nothing", "2 deg"),
-    ),
     "steady status": Mechanism(
         WRONG,
         "converged stays so over a doubt of 2 s and twice the sigma",

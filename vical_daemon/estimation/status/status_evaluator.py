@@ -39,7 +39,6 @@ _ENOUGH_FRAMES = 60
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _EVERY_READINGS = 16  # the size of one in so many is kept
 _NIS_BAD = 4.0
-_HELD_BACK_BAD = 9.0
 _RECENT = 60
 _KEPT_CHECKS = 2400  # one every 1.5 s: an hour
 
@@ -259,10 +258,6 @@ class StatusEvaluator:
                 return Verdict(Status.CONVERGING, CONFIRMING)
             if self.in_doubt:
                 return Verdict(Status.CONVERGING, self.in_doubt)
-            if not self._held_back_fine():
-                return Verdict(
-                    Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet"
-                )
             return Verdict(Status.CONVERGED)
         lens = self._lens_to_blame(f, missing)
         if lens:
@@ -297,6 +292,3 @@ class StatusEvaluator:
         if len(self._nis) >= 40 and self.nis_per_dof() > _NIS_BAD:
             return f"innovations are {self.nis_per_dof():.1f} times what they should be"
         return ""
-
-    def _held_back_fine(self) -> bool:
-        return len(self._held_back) >= 2 and float(np.median(self._held_back)) < _HELD_BACK_BAD
