@@ -303,7 +303,7 @@ BOARD: dict[str, Mechanism] = {
     ),
     "size of the target": Mechanism(
         SMALL,
-        "boards that are not as large as stated",
+        "boards that have not the size in their file",
         _no_state(model_selection.SIZE),
         faults=("board 3 % smaller than stated",),
     ),
@@ -318,7 +318,7 @@ BOARD: dict[str, Mechanism] = {
     ),
     "what is off: mixture": Mechanism(
         SMALL,
-        "as stated and not as hypotheses; without: imu, lag, size and shape always unknown",
+        "as specified and not as hypotheses; without: imu, lag, size and shape always unknown",
         lambda: [
             (model_selection, "weights", _always_free),
             (model_selection, "in_doubt", gives("")),

@@ -1,4 +1,4 @@
-"""Temporal calibration: RMSE beside the bound, honest sigmas, outliers, holes, several sensors, real data.
+"""Temporal calibration: RMSE and the bound, honest sigmas, outliers, holes, several sensors, real data.
 
 The thesis' Table 3.1 is 100 trials on each of four trajectories; tables 3.2 and 3.3 are a hand-held camera
 and imu, and several sensors of one robot.

@@ -81,12 +81,12 @@ def with_blocks(seed):
     )
     subject = CalibratorSubject(options, prior, None)
     last = feed(run, subject).snapshots[-1]
-    told = subject.calibrator.estimate()
-    camera, carry = told.cameras["cam0"], subject.calibrator.latest
+    estimate = subject.calibrator.estimate()
+    camera, carry = estimate.cameras["cam0"], subject.calibrator.latest
     matrices = np.concatenate(
         [
-            (np.array(told.imu.gyro_matrix) - np.linalg.inv(rig.gyro_matrix)).ravel(),
-            (np.array(told.imu.accel_matrix) - lower)[np.tril_indices(3)],
+            (np.array(estimate.imu.gyro_matrix) - np.linalg.inv(rig.gyro_matrix)).ravel(),
+            (np.array(estimate.imu.accel_matrix) - lower)[np.tril_indices(3)],
         ]
     )
     P = carry.calibration()[IMU, IMU]

@@ -87,7 +87,7 @@ class Calibrator:
         self._reports: list[FrameReport] = []  # of the images of a start
 
     def _new_starting(self, off: Collection[str] = ()) -> Initializer:
-        """For a rig of which it is known what is not as stated."""
+        """For a rig of which it is known what is not as specified."""
         options = replace(self.options, estimate=self.options.estimate | set(off))
         return Initializer(options, self.rig.layout, self.rig.target, self._step)
 
@@ -238,7 +238,7 @@ class Calibrator:
         self.judge.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
-        """The target is by far not as large as stated: go on with one that is; its size is asked for."""
+        """The target is far from the size in its file: go on with the size found, and estimate it."""
         self.rig.resize(size)
         self.judge.layout = self.rig.layout
         self._starting.go_on_with(self.rig.layout, self.rig.target, {hypotheses.SIZE})

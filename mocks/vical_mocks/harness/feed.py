@@ -25,7 +25,7 @@ PARAMETERS = ("px", "py", "pz", "rx", "ry", "rz", "td", "fx", "fy", "cx", "cy", 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What an estimator said at one time, beside the truth.
+    """What an estimator reported at one time, and the truth.
 
     Attributes:
         t_s: When (imu time since the start).

@@ -37,7 +37,7 @@ def config() -> Config:
 
 
 class Recorded:
-    """An estimator that takes everything, and fails or waits when told to."""
+    """An estimator that takes everything, and fails or waits on request."""
 
     def __init__(self) -> None:
         self.frames = self.imu_samples = 0

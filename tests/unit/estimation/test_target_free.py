@@ -42,7 +42,7 @@ def simulated(seed=4, seconds=12.0, shift_s=-0.03, **options):
 
 
 def looking(seed, motion, *arguments):
-    """A rig that moves as told while its camera looks into the room."""
+    """A rig that moves as given while its camera looks into the room."""
     plain = reference_rig(seed)
     return replace(plain, trajectory=motion(*arguments, T_imu_cam=(plain.R_imu_cam, plain.p_imu_cam)))
 
@@ -107,8 +107,8 @@ def test_starts_while_three_tenths_of_the_features_move(seed):
 
 
 def test_a_window_far_from_settled_throws_no_good_observations_out():
-    # a lens that nearly folds at the corners, told roughly: windows stop far from the truth with a quarter of
-    # the good observations refused, and small sigmas (seed 2 of `benchmarks zoo --target-free`)
+    # a lens that nearly folds at the corners, roughly known: windows stop far from the truth with a quarter
+    # of the good observations refused, and small sigmas (seed 2 of `benchmarks zoo --target-free`)
     run, _ = draw(2, 25.0, target_free=True)
     run.frames[:] = [f for f in run.frames if f.t_s < 4.7]
     prior = camera_prior(run, 2, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=False)

@@ -76,7 +76,7 @@ class CalibrationFilter:
         shared: Measured errors that the corners of an image share, by camera.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
-        off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
+        off: What is known not to be as specified, as in `CalibrationOptions.estimate` (see `hypotheses`).
         rates: Rates at the state's instant.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
@@ -188,7 +188,7 @@ class CalibrationFilter:
         )
 
     def _by_held(self, lin: Linear) -> FloatArray:
-        """What residuals gain where lenses that are held are taken as stated, px, shape (n, 2), or 0."""
+        """What residuals gain where lenses that are held are taken as given, px, shape (n, 2), or 0."""
         if not self.layout.held:
             return np.zeros(())
         lenses = self.layout.held.items()

@@ -42,7 +42,7 @@ class Instant(NamedTuple):
 
 @dataclass(slots=True)
 class LinearisedFilter(CalibrationFilter):
-    """A filter whose `state` is the reference about which it is linearised; its mean is beside it.
+    """A filter whose `state` is the reference about which it is linearised; its mean is stored apart.
 
     Attributes:
         offset: The mean, as errors of `state`, shape (n,).

@@ -71,7 +71,7 @@ _KNOWN_SIGMA = {IMU: KNOWN_OFF_SIGMA, SIZE: KNOWN_SIZE_SIGMA}
 
 @dataclass(slots=True)
 class ModelAcceptance:
-    """Asks once a second what is known not to be as stated."""
+    """Asks once a second what is known not to be as specified."""
 
     _next_s: float = -np.inf
 
@@ -117,7 +117,7 @@ def _off(f: CalibrationFilter, name: str) -> Event:
         return Event(EventKind.FIXED_LENS, camera, off_px, sigma_px)
     if name in _KNOWN_SIGMA:
         _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
-    if name == TARGET:  # what stretches said of the lens, they said with the target as stated
+    if name == TARGET:  # what stretches said of the lens, they said with the target as in its file
         f.agreement = {camera: LensAgreement(agreement.model) for camera, agreement in f.agreement.items()}
     block = blocks(f)[name]
     return known_off(name, block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])

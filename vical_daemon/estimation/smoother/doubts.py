@@ -117,7 +117,7 @@ class TargetFreeDoubts:
         return evidence(carry.camera.skew, variance)
 
     def _weights(self, carry: MarginalPrior, factor: float) -> Weights:
-        """Probability of each hypothesis about the imu, named by what is as stated.
+        """Probability of each hypothesis about the imu, named by what is as specified.
 
         Where windows disagree although all is free, it is the images, and what they say about the imu is
         worth less by as much again.
@@ -134,7 +134,7 @@ class TargetFreeDoubts:
 
 
 def _numbers(carry: MarginalPrior) -> FloatArray:
-    """What is not as stated of the imu, at its place among the errors, shape (FULL,)."""
+    """Errors of the imu's scale, alignment and lag, at their place among the errors, shape (FULL,)."""
     out = np.zeros(FULL)
     out[INERTIAL] = carry.imu
     return out

@@ -121,7 +121,7 @@ class _Fit:
 
     Errors are angles: a longer focal length makes those of the same pixels smaller, and would be preferred
     without any reason in the scene. What that adds to the gradient of fx and fy (`shrinking`) is taken out;
-    on a cart, where nothing else tells fy, it had come out 60 % too long.
+    on a cart, where nothing else shows fy, it had come out 60 % too long.
     """
 
     def __init__(

@@ -44,9 +44,9 @@ def undisturbed():
 @pytest.mark.parametrize("case", [c for c in gaps.CASES if "clock" in c])
 def test_a_clock_that_is_set_moves_the_time_shift_alone(case, undisturbed):
     record = recorded(case, 1)
-    told = kinds_after(record)
-    assert sum(kind in DISTURBANCES for kind in told) == 1, told
-    assert not BUMPS & set(told)
+    kinds = kinds_after(record)
+    assert sum(kind in DISTURBANCES for kind in kinds) == 1, kinds
+    assert not BUMPS & set(kinds)
     judged = gaps.judged(record, case)
     assert judged["was_converged"]
     assert judged["lies"] == []
