@@ -29,6 +29,7 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.plausible import usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
 from vical_daemon.estimation.selection import clock_drift
@@ -41,7 +42,6 @@ from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
-_STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
 _STEPPED_LEAST_S = 1e-3
 _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
@@ -384,7 +384,7 @@ class Calibrator:
         assert index is not None
         step_s = fit.timeshift_s - known.timeshift_s
         known.timeshift_s = fit.timeshift_s
-        f.forget(index, max(_STEPPED_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
+        f.forget(index, max(AGAIN_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
         self.watch.shift_reopened()
         self.judge.reopened(f.state.t_s)
         return step_s

@@ -37,6 +37,9 @@ JUMP_SIGMAS = 6.0
 RATE_SIGMAS = 6.0
 """2e-9: two clocks do not run at one rate, so that a recording is refused."""
 
+EVERY_S = 1.0
+"""Decisions that need not follow every image are made this often, s."""
+
 # Medians, for standard deviations that outliers do not move.
 MEDIAN_ABSOLUTE = 0.6745
 """Of the size of a standard normal variable."""

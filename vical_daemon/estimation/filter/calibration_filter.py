@@ -30,6 +30,7 @@ from vical_daemon.estimation.filter.linearise import (
 )
 from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
@@ -53,7 +54,6 @@ from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 
-_EYE = np.eye(3)
 _TINY = 1e-30 * np.eye(9)  # noise densities may be given as zero
 _TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
@@ -329,8 +329,8 @@ class CalibrationFilter:
         """Columns that biases and what else wanders gain in `dt` seconds, shape (n, k)."""
         drift = np.flatnonzero(self.walk)
         columns = np.zeros((self.layout.size, 6 + len(drift)))
-        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * _EYE
-        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * _EYE
+        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * so3.IDENTITY
+        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * so3.IDENTITY
         columns[drift, 6 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
         return columns
 

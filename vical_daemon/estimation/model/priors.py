@@ -58,6 +58,8 @@ class StartSigmas(NamedTuple):
     readout_s: float
 
 
+AGAIN_SIGMAS = 5.0
+"""Prior over sigma of what was found from data that are used once more: they count again by 4 % at most."""
 FILTER_START = StartSigmas(0.1, 0.5, 0.15, 0.1, 5e-3, 0.05, 0.05, 0.1, 0.1, 0.01)
 """With a target: the closed form has found all of it, to about a fifth of these."""
 PARTIAL_START_RAD = 0.03

@@ -25,8 +25,8 @@ from vical_daemon.estimation.selection.model_selection import (
     not_zero,
     weights,
 )
+from vical_daemon.estimation.significance import EVERY_S
 
-_EVERY_S = 1.0
 _MEASURED = 400  # images
 _SEEN = 100  # images, as many as `consistency` wants
 _KINDS = {
@@ -79,7 +79,7 @@ class ModelAcceptance:
         """Return what is to be announced, by the name of the block."""
         if f.state.t_s < self._next_s:
             return {}
-        self._next_s = f.state.t_s + _EVERY_S
+        self._next_s = f.state.t_s + EVERY_S
         shares = weights(f)
         every, images = blocks(f), max(c.images for c in f.consistency.values())
         known = [
