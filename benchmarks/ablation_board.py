@@ -174,7 +174,7 @@ BOARD: dict[str, Mechanism] = {
     "gate of images": Mechanism(
         WRONG,
         "whole images far from where they are expected",
-        lambda: [(CalibrationFilter, "_surprising", gives(False))],
+        lambda: [(CalibrationFilter, "_misses_gate", gives(False))],
         disturbances=(*STEPS, *JUNK[1:3]),
     ),
     "refused images counted": Mechanism(

@@ -1,7 +1,7 @@
 """The estimator as the roles see it: measurements in, calibration out. No clock, no thread, no I/O.
 
 Flow: `starting` collects until a start succeeds -> filter everything collected -> follow the stream behind a
-short lag (so that inertial data always bracket each image) -> `judge` says how far to trust it.
+short lag (so that inertial data always bracket each image) -> `evaluator` says how far to trust it.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.plausible import usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
-from vical_daemon.estimation.selection import clock_drift
-from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
@@ -68,7 +67,7 @@ class Calibrator:
             raise ValueError("target-free calibration needs TargetFreeCalibrator")
         self.options = options
         self.rig = RigModel(options, cameras, np.asarray(target_points_m, dtype=np.float64))
-        self.judge = StatusEvaluator(options, self.rig.layout)
+        self.evaluator = StatusEvaluator(options, self.rig.layout)
         self.filter: CalibrationFilter | None = None
         self._intake = SensorIntake()
         self._pending = FrameQueue(list(cameras))
@@ -78,7 +77,7 @@ class Calibrator:
         self._lost: MotionRestart | None = None
         self._used_ns: dict[str, int] = {}  # stamp of the last image used, by camera
         self._held_back = HoldoutCheck()
-        self._beyond_doubt = ModelAcceptance()
+        self._acceptance = ModelAcceptance()
         self._past = RecentPast()
         # A step of the time shift, until images confirm it: when to announce it, camera, shift before, s.
         self._unproven: tuple[float, str, float] | None = None
@@ -100,8 +99,8 @@ class Calibrator:
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
-            self.judge.saw_imu(*reading)
-        self.judge.announce_all(self._intake.imu_news())
+            self.evaluator.saw_imu(*reading)
+        self.evaluator.announce_all(self._intake.imu_news())
 
     @property
     def _buffer(self) -> ImuBuffer | None:
@@ -118,13 +117,13 @@ class Calibrator:
             sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
         t_cam_s = self._intake.take_image(frame)
-        self.judge.announce_all(self._intake.image_news())
+        self.evaluator.announce_all(self._intake.image_news())
         if t_cam_s is None:
             self._intake.images_ignored += 1
             return
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
-        self.judge.saw_points(t_cam_s, len(frame.ids))
+        self.evaluator.saw_points(t_cam_s, len(frame.ids))
         self._pending.push(t_cam_s, frame)
 
     def _clock_was_set(self, camera: str) -> None:
@@ -173,11 +172,11 @@ class Calibrator:
         found = self._attempt(self._buffer)
         if found.filter is None:
             if self.filter is None:
-                self.judge.waiting(found.reason, found.motion_missing)
+                self.evaluator.waiting(found.reason, found.motion_missing)
             return
         if self.rig.size != 1.0:
             event = Event(EventKind.TARGET_SIZE, value=self.rig.size - 1.0)
-            self.judge.announce(event, once=hypotheses.SIZE)
+            self.evaluator.announce(event, once=model_selection.SIZE)
         self._begin(found.filter, found)
 
     def _attempt(self, buffer: ImuBuffer) -> Attempt:
@@ -203,7 +202,7 @@ class Calibrator:
             self._kept_until_s = f.state.t_s + _PROVEN_S
         self._stale = None
         self._held_back, self._lost, self._past = HoldoutCheck(), None, RecentPast()
-        self.judge.started(f.state.t_s, found.reason)
+        self.evaluator.started(f.state.t_s, found.reason)
         self.watch.started(f.state.t_s)
         self._starting.anew()
         left = self._take_start(f, found.frames)
@@ -233,15 +232,15 @@ class Calibrator:
     def _estimate_readout(self, camera: str, axis: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self.rig.estimate_readout(camera, axis)
-        self.judge.layout = self.rig.layout
+        self.evaluator.layout = self.rig.layout
         self._starting.go_on_with(self.rig.layout, self.rig.target)
-        self.judge.announce(Event(ROLLING[axis], camera))
+        self.evaluator.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
         """The target is far from the size in its file: go on with the size found, and estimate it."""
         self.rig.resize(size)
-        self.judge.layout = self.rig.layout
-        self._starting.go_on_with(self.rig.layout, self.rig.target, {hypotheses.SIZE})
+        self.evaluator.layout = self.rig.layout
+        self._starting.go_on_with(self.rig.layout, self.rig.target, {model_selection.SIZE})
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
@@ -320,8 +319,8 @@ class Calibrator:
         if self._unproven is not None and f.state.t_s > self._unproven[0]:
             self._announce_step(f, *self._unproven[1:])
             self._unproven = None
-        for block, event in self._beyond_doubt.look(f).items():
-            self.judge.announce(event, once=block)
+        for block, event in self._acceptance.look(f).items():
+            self.evaluator.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
         return [report]
 
@@ -329,14 +328,14 @@ class Calibrator:
         """Take an image and its verdict into what is remembered and reported."""
         self._used_ns[frame.camera] = frame.t_cam_ns
         self._past.saw(f, report, frame, t_cam_s)
-        self.judge.saw_frame(report, f)
+        self.evaluator.saw_frame(report, f)
 
     def _ask_held_back(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """Judge how well an image was predicted that the held-back copy of the filter has not used."""
         assert self._buffer is not None
         ratio = self._held_back.follow(f, frame, t_cam_s, self.rig.target, self._buffer)
         if ratio is not None:
-            self.judge.held_back(ratio, f.consistency[frame.camera].scale)
+            self.evaluator.held_back(ratio, f.consistency[frame.camera].scale)
 
     def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""
@@ -347,11 +346,11 @@ class Calibrator:
             return
         if action is Action.POSE:
             self._lose_motion()
-            self.judge.announce(Event(EventKind.POSE_LOST))
+            self.evaluator.announce(Event(EventKind.POSE_LOST))
         elif action in (Action.SKEW, Action.WANDER):
             anew = action is Action.WANDER
             once = f"wander {frame.camera}" if anew else ""
-            self.judge.announce(clock_drift.let_drift(f, frame.camera, anew=anew), once=once)
+            self.evaluator.announce(clock_drift.let_drift(f, frame.camera, anew=anew), once=once)
         elif action is Action.RESTART:
             self._restart(f)
 
@@ -376,7 +375,7 @@ class Calibrator:
 
     def _announce_step(self, f: CalibrationFilter, camera: str, before_s: float) -> None:
         step_s = f.state.cameras[camera].timeshift_s - before_s
-        self.judge.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
+        self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
         """Take a time shift as found anew, all else as it is known; the step, s."""
@@ -386,7 +385,7 @@ class Calibrator:
         known.timeshift_s = fit.timeshift_s
         f.forget(index, max(AGAIN_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
         self.watch.shift_reopened()
-        self.judge.reopened(f.state.t_s)
+        self.evaluator.reopened(f.state.t_s)
         return step_s
 
     def _restart(self, f: CalibrationFilter) -> None:
@@ -403,7 +402,7 @@ class Calibrator:
         if sound is not None:
             self.rig.start_from_lenses_of(sound.state)
         self._unproven = None
-        self.judge.changed(self.watch.why)
+        self.evaluator.changed(self.watch.why)
         self._stale, self.filter = sound, None
         self._starting = self._new_starting(sound.off if sound else ())
 
@@ -463,20 +462,20 @@ class Calibrator:
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
-        self.judge.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
-        return self._intake.by_present_stamps(self.judge.estimate(self.filter, self._stale))
+        self.evaluator.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
+        return self._intake.by_present_stamps(self.evaluator.estimate(self.filter, self._stale))
 
     def _in_doubt(self, f: CalibrationFilter) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
         if self.watch.doubtful or any(clock_drift.in_doubt(f, name) for name in self.rig.priors):
             return clock_drift.CLOCKS_IN_DOUBT
-        converged = self.judge.status == Status.CONVERGED
-        return hypotheses.IN_DOUBT.get(hypotheses.in_doubt(f, converged=converged), "")
+        converged = self.evaluator.status == Status.CONVERGED
+        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, converged=converged), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
-        return self._intake.trace_by_present_stamps(self.judge.trace(camera), camera)
+        return self._intake.trace_by_present_stamps(self.evaluator.trace(camera), camera)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return how well the IMU alone predicted images before they were used, oldest first."""
-        return list(self.judge.held_out)
+        return list(self.evaluator.held_out)

@@ -23,7 +23,7 @@ from vical_mocks.trajectory import one_axis, still
 from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.carry import FULL
-from vical_daemon.estimation.smoother.judge import TargetFreeStatus
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 
@@ -78,13 +78,17 @@ def test_stamps_that_jitter_are_noticed_and_allowed_for(jitter_s):
     for shot in record.snapshots:
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s
     # 0.2 ms are less than one image shows here: seen or not, they do no harm
-    assert (0.65 if jitter_s > 5e-4 else 0.0) * jitter_s <= subject.calibrator.judge.jitter_s < 1.5 * jitter_s
+    assert (
+        (0.65 if jitter_s > 5e-4 else 0.0) * jitter_s
+        <= subject.calibrator.evaluator.jitter_s
+        < 1.5 * jitter_s
+    )
     assert len([e for _, e in record.events if e.kind is EventKind.STAMP_JITTER]) == (jitter_s == 1e-3)
 
 
 def test_good_stamps_are_believed(followed):
     _, subject, record = followed
-    assert subject.calibrator.judge.jitter_s == 0.0
+    assert subject.calibrator.evaluator.jitter_s == 0.0
     assert not [e for _, e in record.events if e.kind is EventKind.STAMP_JITTER]
 
 
@@ -207,10 +211,10 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 
 
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
-    judge = TargetFreeStatus(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
-    judge.doubts.drifting = True
-    judge.changed()
-    assert not judge.doubts.drifting
+    evaluator = TargetFreeStatus(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
+    evaluator.doubts.drifting = True
+    evaluator.changed()
+    assert not evaluator.doubts.drifting
 
 
 def test_a_drifting_clock_is_followed_also_over_darkness():

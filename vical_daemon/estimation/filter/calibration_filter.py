@@ -1,7 +1,7 @@
 """The filter: square-root sigma-point propagation with the IMU and update with the points of one image.
 
 Equations and derivation: docs/math/filter.md. Nothing here decides *whether* to believe a result; that is
-`judge`. The filter never raises on data: each update returns a verdict.
+`StatusEvaluator`. The filter never raises on data: each update returns a verdict.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from vical_daemon.estimation.filter import noise_updates as lessons
+from vical_daemon.estimation.filter import noise_updates
 from vical_daemon.estimation.filter.image_update import (
     ImageFit,
     corner_gate,
@@ -76,7 +76,7 @@ class CalibrationFilter:
         shared: Measured errors that the corners of an image share, by camera.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
-        off: What is known not to be as specified, as in `CalibrationOptions.estimate` (see `hypotheses`).
+        off: What is known not to be as specified, as in `CalibrationOptions.estimate` (see `model_selection`).
         rates: Rates at the state's instant.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
@@ -157,7 +157,7 @@ class CalibrationFilter:
         if keep.sum() < 4:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
-        if self._surprising(fit):
+        if self._misses_gate(fit):
             level = fit.nis / max(fit.dof, 1)
             return self._refused(
                 image,
@@ -165,7 +165,7 @@ class CalibrationFilter:
                 predicted,
                 f"innovation of the image is {level:.1f} times what it should be",
             )
-        lessons.learn(self, image, lin, fit)
+        noise_updates.learn(self, image, lin, fit)
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
@@ -207,7 +207,7 @@ class CalibrationFilter:
         """Which corners are where they may be expected, shape (n,)."""
         return corner_gate(image, innovation, lin)
 
-    def _surprising(self, fit: ImageFit) -> bool:
+    def _misses_gate(self, fit: ImageFit) -> bool:
         """Whether a whole image is not where it may be expected."""
         return fit.nis > frame_limit(fit.dof)
 
@@ -231,7 +231,7 @@ class CalibrationFilter:
             image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why, predicted
         )
 
-    def surprise(self, image: Image) -> float | None:
+    def prediction_nis(self, image: Image) -> float | None:
         """Mean squared innovation of an image in the smooth modes, over its prediction."""
         lin = self._linearise(image)
         keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)

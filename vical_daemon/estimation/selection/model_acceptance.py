@@ -38,7 +38,7 @@ _KINDS = {
 
 
 def known_off(block: str, values: FloatArray, sigmas: FloatArray) -> Event:
-    """The announcement for a block of `hypotheses` that is off, with the entry that is most surely so.
+    """The announcement for a block of `model_selection` that is off, with the entry that is most surely so.
 
     Args:
         block: Its name.

@@ -11,9 +11,9 @@ from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, 
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.carry import MarginalPrior
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
-from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
 from vical_daemon.estimation.smoother.starter import Starter
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
 

@@ -26,8 +26,7 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
-from vical_daemon.estimation.selection import clock_drift
-from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.status.excitation import ALL_WAYS, excitation_advice, weak_directions
 from vical_daemon.estimation.status.holdout_check import imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
@@ -218,7 +217,7 @@ class StatusEvaluator:
 
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter to be reported: mean and covariance over all models of imu, target and clocks."""
-        f = hypotheses.averaged(f)
+        f = model_selection.averaged(f)
         return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
@@ -267,11 +266,11 @@ class StatusEvaluator:
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
         """What is wrong with a lens that is held, if nothing were missing but for that; else empty."""
-        known = replace(f, S=hypotheses.lenses_known(f)) if f.layout.held else f
+        known = replace(f, S=model_selection.lenses_known(f)) if f.layout.held else f
         if known is f or any(self._missing(self._camera(n, known), n, known) for n in self.layout.cameras):
             return ""
         name = max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
-        how = "not this camera's" if hypotheses.lens_block(name) in f.off else "not known better"
+        how = "not this camera's" if model_selection.lens_block(name) in f.off else "not known better"
         return f"the fixed lens of {name} is {how}"
 
     def _unit_trouble(self) -> str:

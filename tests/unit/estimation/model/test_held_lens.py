@@ -20,8 +20,7 @@ from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.selection import clock_drift
-from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection import clock_drift, model_selection
 
 NAME = "cam0"
 HELD = CalibrationOptions(fix=frozenset({"intrinsics"}))
@@ -84,7 +83,7 @@ def arm_of(problem: Linear, x):
 
 def test_a_lens_that_is_as_stated_costs_nothing_and_is_known_exactly():
     problem = Linear(off=0.0)
-    shown = hypotheses.averaged(problem.filter())
+    shown = model_selection.averaged(problem.filter())
     x, P = problem.posterior(np.zeros(8))
     np.testing.assert_allclose(shown.state.cameras[NAME].p_imu_cam, arm_of(problem, x), atol=1e-8)
     rest = np.ones(problem.layout.size, dtype=bool)
@@ -96,8 +95,8 @@ def test_a_lens_that_is_as_stated_costs_nothing_and_is_known_exactly():
 def test_a_wrong_lens_keeps_the_answer_of_the_stated_one_and_widens_it_by_what_the_lens_does():
     problem = Linear(off=1.0)
     f = problem.filter()
-    assert hypotheses.off(f, hypotheses.lens_block(NAME)) > 0.99
-    shown = hypotheses.averaged(f)
+    assert model_selection.off(f, model_selection.lens_block(NAME)) > 0.99
+    shown = model_selection.averaged(f)
     x, _ = problem.posterior(np.zeros(8))
     free, P = problem.posterior(problem.lens.off_sigma)
     position = problem.layout.cameras[NAME].position
@@ -115,7 +114,7 @@ def test_a_wrong_lens_keeps_the_answer_of_the_stated_one_and_widens_it_by_what_t
 
 def test_a_stated_sigma_is_allowed_for_even_where_nothing_contradicts_the_lens():
     problem = Linear(off=0.0, given=True)
-    shown = hypotheses.averaged(problem.filter())
+    shown = model_selection.averaged(problem.filter())
     held, _ = problem.posterior(np.zeros(8))
     best, P = problem.posterior(problem.lens.sigma)
     position = problem.layout.cameras[NAME].position
@@ -139,12 +138,12 @@ def test_the_odds_of_a_stated_sigma_are_those_of_two_priors():
         multivariate_normal(np.zeros(9), H @ np.diag(s**2) @ H.T + 0.09 * np.eye(9)).logpdf(z)
         for s in (np.ones(4), share)
     ]
-    found = hypotheses.log_bayes_factor(P @ H.T @ z / 0.09, P, 1.0, share)
+    found = model_selection.log_bayes_factor(P @ H.T @ z / 0.09, P, 1.0, share)
     assert found == pytest.approx(by_priors[0] - by_priors[1], abs=1e-6)
 
 
 def test_what_is_said_of_the_clocks_does_not_move_a_lens_that_is_held():
-    shown = clock_drift.averaged(hypotheses.averaged(Linear(off=1.0).filter()))
+    shown = clock_drift.averaged(model_selection.averaged(Linear(off=1.0).filter()))
     values = np.concatenate([shown.state.cameras[NAME].intrinsics, shown.state.cameras[NAME].distortion])
     np.testing.assert_allclose(values, Linear(off=1.0).lens.values, rtol=1e-6, atol=1e-9)
 

@@ -133,7 +133,7 @@ def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypat
     monkeypatch.setattr(
         "vical_daemon.estimation.selection.model_selection.in_doubt", lambda _, **_how: TARGET
     )
-    c.judge._steady.reset(Status.CONVERGING)  # a converged status would stand for two seconds
+    c.evaluator._steady.reset(Status.CONVERGING)  # a converged status would stand for two seconds
     assert c.estimate().status == Status.CONVERGING
     assert (
         c.estimate().reason

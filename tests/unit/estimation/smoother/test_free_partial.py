@@ -84,7 +84,7 @@ def test_a_second_axis_makes_it_whole():
     ordinary = subject.look
 
     def look(*arguments):
-        held.append(subject.calibrator.judge.held is not None)
+        held.append(subject.calibrator.evaluator.held is not None)
         return ordinary(*arguments)
 
     subject.look = look
