@@ -76,7 +76,7 @@ class CalibrationFilter:
         shared: Measured errors that the corners of an image share, by camera.
         unshown: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
-        off: What is known not to be as specified, as in `CalibrationOptions.estimate` (see `model_selection`).
+        off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
         rates: Rates at the state's instant.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
