@@ -108,7 +108,7 @@ def test_a_doubt_of_a_second_does_not_take_convergence_back(done):
     evaluator.in_doubt = "a doubt"
     short = evaluator.estimate(done.filter)
     assert (short.status, short.reason, short.progress) == (Status.CONVERGED, "", 1.0)
-    evaluator.saw_imu(evaluator._in.newest_ns + 3_000_000_000, np.zeros(3), np.zeros(3))
+    evaluator.saw_reading(evaluator.newest_ns + 3_000_000_000, np.zeros(3), np.zeros(3))
     lasting = evaluator.estimate(done.filter)
     assert (lasting.status, lasting.reason) == (Status.CONVERGING, "a doubt")
 
