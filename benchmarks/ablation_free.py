@@ -20,9 +20,9 @@ from benchmarks.ablation_patches import (
 from vical_daemon.estimation import target_free
 from vical_daemon.estimation.smoother import bundle, handover, normal, quality, starter, target_free_status
 from vical_daemon.estimation.smoother.bundle import Bundle
-from vical_daemon.estimation.smoother.carry import DRIFT
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.jitter import StampOffsets
+from vical_daemon.estimation.smoother.marginal_prior import DRIFT
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 

@@ -13,7 +13,7 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.smoother.carry import IMU
+from vical_daemon.estimation.smoother.marginal_prior import IMU
 
 pytestmark = pytest.mark.statistical
 TRIALS, SECONDS, CAMERA_HZ = 6, 9.0, 8.0

@@ -148,7 +148,7 @@ class Calibrator:
         """Do what can be done with what has arrived."""
         if self._buffer is None:
             return []
-        if self.filter is None or self.filter.unshown is not None:
+        if self.filter is None or self.filter.unobservable is not None:
             self._maybe_start()
         return self._follow(flush=False)
 
@@ -220,9 +220,9 @@ class Calibrator:
             if report is None:
                 self._intake.images_ignored += 1
                 continue
-            if f.unshown is not None:
+            if f.unobservable is not None:
                 self._starting.take([(t_cam_s, frame)])
-                f.unshown.follow(f)
+                f.unobservable.follow(f)
             now = f.plain()
             self._ask_held_back(now, frame, t_cam_s)
             self._note(now, report, frame, t_cam_s)
@@ -305,9 +305,9 @@ class Calibrator:
         if report is None:
             self._intake.images_ignored += 1
             return []
-        if f.unshown is not None:
+        if f.unobservable is not None:
             self._starting.take([(t_cam_s, frame)])
-            f.unshown.follow(f)
+            f.unobservable.follow(f)
         needed_s = min(f.state.t_s, self._starting.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
         self._ask_held_back(f, frame, t_cam_s)
@@ -361,7 +361,7 @@ class Calibrator:
         its lens, until the misfit is no longer one of the time shift alone.
         """
         assert self._buffer is not None
-        if self.rig.layout.cameras[camera].timeshift is None or f.unshown is not None:
+        if self.rig.layout.cameras[camera].timeshift is None or f.unobservable is not None:
             return False
         before = self._past.filter(f)
         fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
@@ -393,7 +393,7 @@ class Calibrator:
 
         Where what was kept soon turns out not to fit either, nothing is.
         """
-        if f.unshown is not None:  # nothing has changed: the guesses were wrong
+        if f.unobservable is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
             self._starting.anew()
             return
@@ -425,7 +425,7 @@ class Calibrator:
     @property
     def can_go_on(self) -> bool:
         """Whether another recording can go on with this calibration: its start left no direction unknown."""
-        return self.filter is not None and self.filter.unshown is None
+        return self.filter is not None and self.filter.unobservable is None
 
     def next_recording(self, *, common_clock: bool = True) -> None:
         """What comes from now on is another recording of the same rig; call `finish` first.

@@ -22,7 +22,10 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
+from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
+from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
+from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
     FULL,
     LENS,
@@ -30,9 +33,6 @@ from vical_daemon.estimation.smoother.carry import (
     MarginalPrior,
     calibration_difference,
 )
-from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
-from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.reports import window_reports
 from vical_daemon.estimation.smoother.starter import Starter
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus

@@ -22,7 +22,7 @@ from vical_mocks.trajectory import one_axis, still
 
 from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.smoother.carry import FULL
+from vical_daemon.estimation.smoother.marginal_prior import FULL
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 

@@ -9,7 +9,7 @@ from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.smoother.carry import IMU, LAG
+from vical_daemon.estimation.smoother.marginal_prior import IMU, LAG
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 from vical_daemon.estimation.wording import event_text
 

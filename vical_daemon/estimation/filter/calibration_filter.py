@@ -74,7 +74,7 @@ class CalibrationFilter:
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
         shared: Measured errors that the corners of an image share, by camera.
-        unshown: After a partial start: axes along which lever arms are not known.
+        unobservable: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
         rates: Rates at the state's instant.
@@ -91,7 +91,7 @@ class CalibrationFilter:
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     shared: dict[str, SharedErrors] = field(default_factory=dict)
-    unshown: UnobservableDirections | None = None
+    unobservable: UnobservableDirections | None = None
     drifting: set[str] = field(default_factory=set)
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))

@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.smoother.carry import FULL, SHIFT
+from vical_daemon.estimation.smoother.marginal_prior import FULL, SHIFT
 
 MOUNTING: tuple[int, ...] = tuple(range(6))
 CLOCK: tuple[int, ...] = (SHIFT,)

@@ -16,7 +16,15 @@ from vical_daemon.estimation.selection.clock_drift import (
 )
 from vical_daemon.estimation.selection.model_acceptance import known_off
 from vical_daemon.estimation.significance import SURE_SIGMAS
-from vical_daemon.estimation.smoother.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import (
+    DRIFT,
+    FULL,
+    IMU,
+    INERTIAL,
+    LAG,
+    READOUT,
+    MarginalPrior,
+)
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
 _SHORTEST_S = 1e-3  # of a readout that is worth a word

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
-from vical_daemon.estimation.smoother.carry import MarginalPrior
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
 from vical_daemon.estimation.smoother.starter import Starter
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus

@@ -10,7 +10,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.selection.clock_drift import SKEW_WALK
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     BIASES,
     CALIBRATION,

@@ -16,7 +16,7 @@ from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.clock_drift import evidence, probability
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     DRIFT,
     FULL,

@@ -16,7 +16,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
 from vical_daemon.estimation.model.priors import EQUIDISTANT_SIGMA, LAG_SIGMA_S, SKEW_SIGMA, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart, NoStartError
 from vical_daemon.estimation.smoother.window import Window

@@ -19,8 +19,8 @@ from vical_daemon.estimation.result import (
 )
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Fit
-from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, MarginalPrior
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, DRIFT, FULL, MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import LOST, PATIENCE_S, Evaluator, lacking_verdict
 from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict

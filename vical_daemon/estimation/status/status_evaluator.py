@@ -168,7 +168,7 @@ class StatusEvaluator(Evaluator):
         advice = reported.guidance
         if not advice and f is not None and self.status != Status.INCONSISTENT:
             advice = self._cover.advice()
-        if f is not None and (self.status == Status.DEGENERATE or f.unshown is not None):
+        if f is not None and (self.status == Status.DEGENERATE or f.unobservable is not None):
             cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
         return CalibrationEstimate(
             self.newest_ns,

@@ -12,9 +12,9 @@ from vical_mocks.tracks import room_landmarks, simulate_tracks
 from benchmarks import gaps
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.smoother.carry import FULL
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
 from vical_daemon.estimation.smoother.jitter import StampOffsets
+from vical_daemon.estimation.smoother.marginal_prior import FULL
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
 DISTURBANCES = {

@@ -7,7 +7,8 @@ from scipy.stats import multivariate_normal
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.marginal_prior import (
     CALIBRATION,
     FULL,
     IMU,
@@ -16,7 +17,6 @@ from vical_daemon.estimation.smoother.carry import (
     MarginalPrior,
     root_of,
 )
-from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.snapshot import camera_estimate
 
 PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])

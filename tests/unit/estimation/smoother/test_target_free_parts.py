@@ -15,7 +15,9 @@ from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_link
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.inertial import Order
+from vical_daemon.estimation.smoother.jitter import StampOffsets
+from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
     FULL,
     INERTIAL,
@@ -24,8 +26,6 @@ from vical_daemon.estimation.smoother.carry import (
     later,
     moved,
 )
-from vical_daemon.estimation.smoother.inertial import Order
-from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.quality import correlation
 from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart
 from vical_daemon.estimation.smoother.starter import start_sigmas

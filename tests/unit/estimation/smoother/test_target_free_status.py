@@ -8,7 +8,7 @@ import pytest
 from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import CALIBRATION, FULL, MarginalPrior, root_of
+from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, FULL, MarginalPrior, root_of
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 
 SIGMA = np.array(
