@@ -91,9 +91,8 @@ def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
 def _timeshift_sigma(f: CalibrationFilter, sigma: FloatArray, where: CameraSlices) -> float:
     if where.timeshift is None:
         return 0.0
-    return float(
-        np.hypot(sigma[where.timeshift], f.unobservable.timeshift_sigma_s if f.unobservable else 0.0)
-    )
+    hidden_s = 0.0 if f.unobservable is None else f.unobservable.timeshift_sigma_s
+    return float(np.hypot(sigma[where.timeshift], hidden_s))
 
 
 def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
