@@ -18,7 +18,14 @@ from benchmarks.ablation_patches import (
     then,
 )
 from vical_daemon.estimation import target_free
-from vical_daemon.estimation.smoother import bundle, handover, normal, quality, starter, target_free_status
+from vical_daemon.estimation.smoother import (
+    bundle,
+    handover,
+    normal,
+    quality,
+    target_free_initializer,
+    target_free_status,
+)
 from vical_daemon.estimation.smoother.bundle import Bundle
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.jitter import StampOffsets
@@ -174,7 +181,7 @@ FREE: dict[str, Mechanism] = {
     "free: lag of the accelerometer": Mechanism(
         SMALL,
         "the delay between gyro and accelerometer as an unknown",
-        lambda: [(starter, "LAG_SIGMA_S", HARDLY * starter.LAG_SIGMA_S)],
+        lambda: [(target_free_initializer, "LAG_SIGMA_S", HARDLY * target_free_initializer.LAG_SIGMA_S)],
         free=True,
         faults=("free: accelerometer 0.3 ms late",),
     ),

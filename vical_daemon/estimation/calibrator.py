@@ -71,7 +71,7 @@ class Calibrator:
         self.filter: CalibrationFilter | None = None
         self._intake = SensorIntake()
         self._pending = FrameQueue(list(cameras))
-        self._starting = self._new_starting()
+        self._initializer = self._new_initializer()
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._lost: MotionRestart | None = None
@@ -85,7 +85,7 @@ class Calibrator:
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._reports: list[FrameReport] = []  # of the images of a start
 
-    def _new_starting(self, off: Collection[str] = ()) -> Initializer:
+    def _new_initializer(self, off: Collection[str] = ()) -> Initializer:
         """For a rig of which it is known what is not as specified."""
         options = replace(self.options, estimate=self.options.estimate | set(off))
         return Initializer(options, self.rig.layout, self.rig.target, self._step)
@@ -164,10 +164,10 @@ class Calibrator:
         """Collect while there is no filter, and try to start one; a partial one gives way to a full one."""
         assert self._buffer is not None
         if self.filter is None:
-            self._starting.take(self._pending.take_all())
+            self._initializer.take(self._pending.take_all())
             self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
-            self._buffer.trim(self._starting.oldest_s - _KEEP_S)
-        if not (at_end or self._starting.due(self._buffer.newest_s)):
+            self._buffer.trim(self._initializer.oldest_s - _KEEP_S)
+        if not (at_end or self._initializer.due(self._buffer.newest_s)):
             return
         found = self._attempt(self._buffer)
         if found.filter is None:
@@ -182,7 +182,7 @@ class Calibrator:
     def _attempt(self, buffer: ImuBuffer) -> Attempt:
         """Try to start; where the data contradict the model of the rig, change that and try again."""
         may_be_partial = self.filter is None
-        found = self._starting.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+        found = self._initializer.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
         for _ in range(_MOST_CHANGES):
             if found.rolling is not None:
                 self._estimate_readout(*found.rolling)
@@ -190,7 +190,7 @@ class Calibrator:
                 self._resize(found.size)
             else:
                 break
-            found = self._starting.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+            found = self._initializer.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
         return found
 
     def _begin(self, f: LinearisedFilter, found: Attempt) -> None:
@@ -204,7 +204,7 @@ class Calibrator:
         self._held_back, self._lost, self._past = HoldoutCheck(), None, RecentPast()
         self.evaluator.started(f.state.t_s, found.reason)
         self.watch.started(f.state.t_s)
-        self._starting.anew()
+        self._initializer.anew()
         left = self._take_start(f, found.frames)
         self.filter = f.plain()
         for t, frame in [*left, *later]:
@@ -221,7 +221,7 @@ class Calibrator:
                 self._intake.images_ignored += 1
                 continue
             if f.unobservable is not None:
-                self._starting.take([(t_cam_s, frame)])
+                self._initializer.take([(t_cam_s, frame)])
                 f.unobservable.follow(f)
             now = f.plain()
             self._ask_held_back(now, frame, t_cam_s)
@@ -233,14 +233,14 @@ class Calibrator:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self.rig.estimate_readout(camera, axis)
         self.evaluator.layout = self.rig.layout
-        self._starting.go_on_with(self.rig.layout, self.rig.target)
+        self._initializer.go_on_with(self.rig.layout, self.rig.target)
         self.evaluator.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
         """The target is far from the size in its file: go on with the size found, and estimate it."""
         self.rig.resize(size)
         self.evaluator.layout = self.rig.layout
-        self._starting.go_on_with(self.rig.layout, self.rig.target, {model_selection.SIZE})
+        self._initializer.go_on_with(self.rig.layout, self.rig.target, {model_selection.SIZE})
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
@@ -306,9 +306,9 @@ class Calibrator:
             self._intake.images_ignored += 1
             return []
         if f.unobservable is not None:
-            self._starting.take([(t_cam_s, frame)])
+            self._initializer.take([(t_cam_s, frame)])
             f.unobservable.follow(f)
-        needed_s = min(f.state.t_s, self._starting.oldest_s)
+        needed_s = min(f.state.t_s, self._initializer.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
         self._ask_held_back(f, frame, t_cam_s)
         if not f.plausible():
@@ -395,7 +395,7 @@ class Calibrator:
         """
         if f.unobservable is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
-            self._starting.anew()
+            self._initializer.anew()
             return
         before = self._past.filter(f)
         sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
@@ -404,7 +404,7 @@ class Calibrator:
         self._unproven = None
         self.evaluator.changed(self.watch.why)
         self._stale, self.filter = sound, None
-        self._starting = self._new_starting(sound.off if sound else ())
+        self._initializer = self._new_initializer(sound.off if sound else ())
 
     def _seek(self, f: CalibrationFilter, lost: MotionRestart, camera: str) -> MotionRestart:
         """After the clock of a camera was set: find its time shift from the images collected."""
@@ -450,7 +450,7 @@ class Calibrator:
         self._past, self._unproven = RecentPast(), None
         self._used_ns.clear()
         self._seek_shift.clear()
-        self._starting.anew()
+        self._initializer.anew()
         self._held_back, self._lost = HoldoutCheck(), None
         if f is not None:
             self.watch.shift_reopened()

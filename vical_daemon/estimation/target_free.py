@@ -1,6 +1,6 @@
 """Calibration without a target: tracks of unknown points and an IMU in, calibration out. No clock, no I/O.
 
-Flow: buffer -> `free.starter.Starter` (rotations and delay from the epipolar constraint, then speed, gravity
+Flow: buffer -> `TargetFreeInitializer` (rotations and delay from the epipolar constraint, then speed, gravity
 and structure linearly) -> one inertial bundle adjustment per window of a few seconds, grown as images arrive
 -> what the window knows is carried into the next as a prior on tilt, speed, biases and calibration. How far a
 window's own data moved the calibration, against how far they may, says whether to believe it.
@@ -34,7 +34,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     calibration_difference,
 )
 from vical_daemon.estimation.smoother.reports import window_reports
-from vical_daemon.estimation.smoother.starter import Starter
+from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
@@ -108,9 +108,9 @@ class TargetFreeCalibrator:
         self.evaluator.announce_all(self._intake.imu_news())
 
     @property
-    def starter(self) -> Starter:
+    def initializer(self) -> TargetFreeInitializer:
         """What tries to start."""
-        return self._first.starter
+        return self._first.initializer
 
     @property
     def _buffer(self) -> ImuBuffer | None:
@@ -211,12 +211,12 @@ class TargetFreeCalibrator:
         known = self.latest
         self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
         hint = None if self._anew else known
-        frames = self.starter.stretch(self._buffer, self._pending, end, hint, last=flush)
+        frames = self.initializer.stretch(self._buffer, self._pending, end, hint, last=flush)
         if frames is None:
             return False
         begun = frames if isinstance(frames, str) else self._begin(self._buffer, frames, known)
         if isinstance(begun, str):
-            self.evaluator.waiting(begun, self.starter.motion_missing)
+            self.evaluator.waiting(begun, self.initializer.motion_missing)
             return False
         window, fit = begun.bundle.window, begun.fit
         self._fitted_s = last = window.frames[-1][0]
@@ -224,7 +224,7 @@ class TargetFreeCalibrator:
         self.window, self.carry, self.latest = window, begun.bundle.carry, fit.carry
         self._noise = Noise.of(fit)
         self._anew = False
-        self.evaluator.held = self.starter.held
+        self.evaluator.held = self.initializer.held
         self.evaluator.started(window.frames[0][0])
         self.evaluator.saw_fit(fit, last + window.shift_s)
         if _full(window):
@@ -249,14 +249,14 @@ class TargetFreeCalibrator:
         if begun is DOES_NOT_FIT:
             self.evaluator.contradicted(frames[-1][0] - frames[0][0])
         if self.evaluator.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
-            held, anew = self.starter.held, self._first.begin(buffer, frames, None, self._noise)
+            held, anew = self.initializer.held, self._first.begin(buffer, frames, None, self._noise)
             if isinstance(anew, Begun):
                 self._closed, self._confirmed, self._seek_shift = 0, False, False
                 self.evaluator.changed()
             else:
-                self.starter.held = held
+                self.initializer.held = held
             return anew
-        window = self.starter.window_anew(buffer, frames, known)
+        window = self.initializer.window_anew(buffer, frames, known)
         if isinstance(window, str):
             return begun
         free = self._first.adjusted(buffer, window, known, self._noise, BOTH)
@@ -315,7 +315,7 @@ class TargetFreeCalibrator:
         if not self.evaluator.fits(fit):
             self._lost(*self.evaluator.misfit, against_s=against_s)
             return
-        if self.starter.held is not None and has_turned(window.R, self.starter.held):
+        if self.initializer.held is not None and has_turned(window.R, self.initializer.held):
             self._start_whole()
             return
         if self._closed and not self._agrees(fit, self.carry, complete=_full(window)):
@@ -363,7 +363,7 @@ class TargetFreeCalibrator:
         """After a partial start, the rig turns about a second axis: all of the calibration will show."""
         self.window = self.carry = self.latest = None
         self._closed = 0
-        self.starter.again()
+        self.initializer.again()
         self.evaluator.lost(Cause.SECOND_AXIS, None, None)
 
     def _lost(
@@ -391,13 +391,13 @@ class TargetFreeCalibrator:
         if unproven:  # one window stands against one: neither is known to be right
             self.latest, self._closed, self._confirmed = None, 0, False
         self.carry = None
-        self.starter.again()
+        self.initializer.again()
         self.evaluator.lost(why, value, self.latest, against_s)
 
     @property
     def can_go_on(self) -> bool:
         """Whether another recording can continue this calibration: no direction of it is unknown."""
-        return self.latest is not None and self.starter.held is None
+        return self.latest is not None and self.initializer.held is None
 
     def next_recording(self, *, common_clock: bool = True) -> None:
         """What comes from now on is another recording of the same rig; see `Calibrator.next_recording`."""
@@ -410,7 +410,7 @@ class TargetFreeCalibrator:
             camera, offset_s = self.latest.camera, self._intake.offset_s(self.camera)
             self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + offset_s)
         self._anew = self.latest is not None
-        self.starter.again()
+        self.initializer.again()
         self.evaluator.next_recording()
         self._stepped_s = abs(self._intake.imu_stepped_s)
         self._intake.next_recording()

@@ -27,8 +27,8 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     moved,
 )
 from vical_daemon.estimation.smoother.quality import correlation
-from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart
-from vical_daemon.estimation.smoother.starter import start_sigmas
+from vical_daemon.estimation.smoother.target_free_initializer import start_sigmas
+from vical_daemon.estimation.smoother.track_start import ArmPrior, TrackStart
 from vical_daemon.estimation.temporal.epipolar_fit import epipolar_fit
 
 SHIFT_S = 0.013
@@ -68,7 +68,7 @@ class Scene:
         start = moved(self.camera, np.zeros(FULL))
         start.p_imu_cam = np.zeros(3)
         imu = np.concatenate([self.rig.gyro_bias.value(0.0), np.zeros(3 + numbers)])
-        linear = LinearStart(self.buffer, self.frames, start, imu, self.noise, 9.80665)
+        linear = TrackStart(self.buffer, self.frames, start, imu, self.noise, 9.80665)
         return linear.window(ArmPrior(np.zeros(3)))
 
 

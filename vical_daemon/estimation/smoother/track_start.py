@@ -64,7 +64,7 @@ class _Linear(NamedTuple):
     misfit: float  # median angle by which rays miss their points, rad
 
 
-class LinearStart:
+class TrackStart:
     """A stretch of tracks whose rotations are known, ready to be solved for one mounting or many.
 
     Args:
