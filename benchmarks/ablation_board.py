@@ -174,13 +174,7 @@ BOARD: dict[str, Mechanism] = {
     "gate of images": Mechanism(
         WRONG,
         "whole images far from where they are expected",
-        lambda: [(CalibrationFilter, "_surprising", gives(False))],
-        disturbances=(*STEPS, *JUNK[1:3]),
-    ),
-    "gate of images: level": Mechanism(
-        WRONG,
-        "the limit of that gate follows the usual level (nis_level)",
-        lambda: [(CalibrationFilter, "nis_level", held_at(1.0))],
+        lambda: [(CalibrationFilter, "_misses_gate", gives(False))],
         disturbances=(*STEPS, *JUNK[1:3]),
     ),
     "refused images counted": Mechanism(
@@ -224,16 +218,6 @@ BOARD: dict[str, Mechanism] = {
         "inconsistent while a third is refused, or innovations four times too large",
         lambda: [(StatusEvaluator, "_trouble", gives(""))],
         disturbances=(*JUNK, "gyro clips"),
-    ),
-    "held-back check": Mechanism(
-        WRONG,
-        "a copy of the filter predicts an image by the imu alone",
-        lambda: [
-            (Calibrator, "_ask_held_back", gives(None)),
-            (StatusEvaluator, "_held_back_fine", gives(True)),
-        ],
-        faults=("imu noise told 10 times too small",),
-        disturbances=("nothing", "2 deg"),
     ),
     "steady status": Mechanism(
         WRONG,
@@ -319,7 +303,7 @@ BOARD: dict[str, Mechanism] = {
     ),
     "size of the target": Mechanism(
         SMALL,
-        "boards that are not as large as stated",
+        "boards that have not the size in their file",
         _no_state(model_selection.SIZE),
         faults=("board 3 % smaller than stated",),
     ),
@@ -334,7 +318,7 @@ BOARD: dict[str, Mechanism] = {
     ),
     "what is off: mixture": Mechanism(
         SMALL,
-        "as stated and not as hypotheses; without: imu, lag, size and shape always unknown",
+        "as specified and not as hypotheses; without: imu, lag, size and shape always unknown",
         lambda: [
             (model_selection, "weights", _always_free),
             (model_selection, "in_doubt", gives("")),

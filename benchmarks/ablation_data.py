@@ -83,9 +83,9 @@ def _drawn(target_free: bool, seed: int) -> tuple[SimulatedRun, bool]:
 
 def random_rig(target_free: bool, seed: int) -> runner.Result:
     """One rig of `benchmarks zoo`."""
-    run, told = _drawn(target_free, seed)
-    prior = camera_prior(run, seed, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=told)
-    fix = frozenset({"intrinsics"}) if told else frozenset[str]()
+    run, known = _drawn(target_free, seed)
+    prior = camera_prior(run, seed, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=known)
+    fix = frozenset({"intrinsics"}) if known else frozenset[str]()
     options = CalibrationOptions(fix=fix, target_free=target_free, imu_noise=imu_noise(run))
     subject = CalibratorSubject(options, prior, None if target_free else run.points_m)
     return kept(feed(run, subject))
@@ -113,12 +113,12 @@ class Fault:
     Attributes:
         case: As in `benchmarks montecarlo`.
         changed: What else is done to its recording.
-        noise_told: Times the imu's noise densities that are told.
+        noise_stated: Times the imu's noise densities that are stated.
     """
 
     case: montecarlo.Case
     changed: Change = lambda run: run
-    noise_told: float = 1.0
+    noise_stated: float = 1.0
 
 
 def _bent(run: SimulatedRun) -> SimulatedRun:
@@ -165,7 +165,7 @@ FAULTS: dict[str, Fault] = {
     "drift 20 ppm": Fault(montecarlo.Case(skew_ppm=20.0)),
     "lens model misses": Fault(montecarlo.Case(), _bent),
     "detector's own error": Fault(montecarlo.Case(simulation={"corner_sigma_px": 0.05}), _drawn_aside),
-    "imu noise told 10 times too small": Fault(montecarlo.Case(), noise_told=0.1),
+    "imu noise stated 10 times too small": Fault(montecarlo.Case(), noise_stated=0.1),
     **{
         f"free: {name.removeprefix('target-free, ')}": Fault(_CASES[name])
         for name in (
@@ -188,13 +188,13 @@ def _faulty(name: str, seed: int) -> SimulatedRun:
 def faulty_rig(name: str, seed: int) -> runner.Result:
     """The reference rig with one fault."""
     fault, run = FAULTS[name], _faulty(name, seed)
-    if fault.noise_told == 1.0:
+    if fault.noise_stated == 1.0:
         return kept(feed(run, montecarlo.make_subject(fault.case, run, seed, "vical")))
-    noise, s = imu_noise(run), fault.noise_told
-    told = replace(
+    noise, s = imu_noise(run), fault.noise_stated
+    stated = replace(
         noise,
         gyro_density=s * noise.gyro_density,
         accel_density=s * noise.accel_density,
     )
     prior = camera_prior(run, seed, StartErrors(), exact_lens=False)
-    return kept(feed(run, CalibratorSubject(CalibrationOptions(imu_noise=told), prior, run.points_m)))
+    return kept(feed(run, CalibratorSubject(CalibrationOptions(imu_noise=stated), prior, run.points_m)))

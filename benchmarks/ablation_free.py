@@ -18,12 +18,19 @@ from benchmarks.ablation_patches import (
     then,
 )
 from vical_daemon.estimation import target_free
-from vical_daemon.estimation.smoother import bundle, handover, judge, normal, quality, starter
+from vical_daemon.estimation.smoother import (
+    bundle,
+    handover,
+    normal,
+    quality,
+    target_free_initializer,
+    target_free_status,
+)
 from vical_daemon.estimation.smoother.bundle import Bundle
-from vical_daemon.estimation.smoother.carry import DRIFT
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.jitter import StampOffsets
-from vical_daemon.estimation.smoother.judge import TargetFreeStatus
+from vical_daemon.estimation.smoother.marginal_prior import DRIFT
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 
@@ -94,16 +101,16 @@ FREE: dict[str, Mechanism] = {
         WRONG,
         "noise, links and refused features of a window",
         lambda: [
-            (judge, "_MOST_SIGMA_PX", np.inf),
-            (judge, "_MOST_INERTIAL", np.inf),
-            (judge, "_MOST_REFUSED", np.inf),
+            (target_free_status, "_MOST_SIGMA_PX", np.inf),
+            (target_free_status, "_MOST_INERTIAL", np.inf),
+            (target_free_status, "_MOST_REFUSED", np.inf),
         ],
         free=True,
         faults=("free: 3 % outliers",),
         disturbances=("20 ms", "2 deg", "30 % junk corners for 3 s"),
     ),
     "free: windows fit, links": Mechanism(
-        WRONG, "only the links", lambda: [(judge, "_MOST_INERTIAL", np.inf)], free=True
+        WRONG, "only the links", lambda: [(target_free_status, "_MOST_INERTIAL", np.inf)], free=True
     ),
     "free: windows agree": Mechanism(
         WRONG,
@@ -115,14 +122,14 @@ FREE: dict[str, Mechanism] = {
     "free: small changes": Mechanism(
         WRONG,
         "where the model fits poorly, a small contradiction is no change",
-        lambda: [(judge, "_matters", gives(True))],
+        lambda: [(target_free_status, "_matters", gives(True))],
         free=True,
         disturbances=("nothing", "5 ms"),
     ),
     "free: tolerant at first": Mechanism(
         WRONG,
         "fifty times the limit in the first four windows",
-        lambda: [(judge, "_LEARNING", 0)],
+        lambda: [(target_free_status, "_LEARNING", 0)],
         free=True,
         disturbances=("nothing",),
     ),
@@ -174,7 +181,7 @@ FREE: dict[str, Mechanism] = {
     "free: lag of the accelerometer": Mechanism(
         SMALL,
         "the delay between gyro and accelerometer as an unknown",
-        lambda: [(starter, "LAG_SIGMA_S", HARDLY * starter.LAG_SIGMA_S)],
+        lambda: [(target_free_initializer, "LAG_SIGMA_S", HARDLY * target_free_initializer.LAG_SIGMA_S)],
         free=True,
         faults=("free: accelerometer 0.3 ms late",),
     ),

@@ -1,4 +1,4 @@
-"""Tables of `benchmarks ablation`: each mechanism's figures beside those of the estimation as it is."""
+"""Tables of `benchmarks ablation`: each mechanism's figures and those of the estimation as it is."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def _disturbances(mechanisms: dict[str, Rows], nothing: str) -> None:
     base = mechanisms[nothing]
     for name in [nothing, *(m for m in mechanisms if m != nothing)]:
         rows = {k: r for k, r in mechanisms[name].items() if "failed" not in r}
-        told = [r["found"] for r in rows.values() if r["found"] is not None]
+        found = [r["found"] for r in rows.values() if r["found"] is not None]
         false = sum(bool(r["false"]) for r in rows.values())
         differs = []
         for case in dict.fromkeys(c for c, _ in base):
@@ -109,7 +109,7 @@ def _disturbances(mechanisms: dict[str, Rows], nothing: str) -> None:
             if name != nothing and now is not None and was is not None and now[:3] != was[:3]:
                 differs.append(f"{case}: {_words(was)} -> {_words(now)}")
         print(
-            f"| {name} | {len(rows)} | {sum(told)}/{len(told)} | {false} "
+            f"| {name} | {len(rows)} | {sum(found)}/{len(found)} | {false} "
             f"| {sum(r['end_z'] > 3.0 for r in rows.values())} "
             f"| {sum(bool(r['lies']) for r in rows.values())} | {'; '.join(differs)} |"
         )

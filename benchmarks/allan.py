@@ -1,4 +1,4 @@
-"""Allan analysis of five simulated four-hour recordings of a GX3-25 at rest, per axis, beside the truth."""
+"""Allan analysis of five simulated four-hour recordings of a GX3-25 at rest, per axis, and the truth."""
 
 from __future__ import annotations
 

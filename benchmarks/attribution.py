@@ -75,7 +75,7 @@ class Case:
         after: Changes the recording.
         held: The lens is fixed.
         lens_off: At values that are not this camera's.
-        crooked, size: The board is bent, or as many times as large as stated.
+        crooked, size: The board is bent, or as many times as large as in its file.
         board_only: It makes no sense without a board.
         sudden: The calibration changes at `AT_S`; it may take `NOTICED_S` to notice.
     """
@@ -149,7 +149,7 @@ def trial(name: str, seconds: float, zoo: bool, target_free: bool, seed: int) ->
     prior = camera_prior(run, seed, StartErrors(), exact_lens=case.held)
     prior = replace(prior, readout_s=0.0, readout_axis="")
     if case.lens_off:
-        prior = with_lens_off(prior, seed, told=False)
+        prior = with_lens_off(prior, seed, stated=False)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"} if case.held else ()),
         target_free=target_free,

@@ -39,7 +39,7 @@ _CONTEXT = mp.get_context("spawn")
 
 
 def undisturbed(run: SimulatedRun, config: Config, begin_ns: int) -> CalibrationEstimate:
-    """What the same data give with nothing beside them."""
+    """What the same data give with nothing else on the bus."""
     role = EstimateRole(config, make_estimator(config))
     for _, key, payload in good_messages(run, begin_ns):
         if "cam1" not in key:
@@ -62,7 +62,7 @@ class Seen:
     heard_s: dict[str, float] = field(default_factory=dict)
 
     def take(self, sample: Sample, t_s: float) -> None:
-        """Take a status or an estimate; junk on those keys is told from the true ones by what it says."""
+        """Take a status or an estimate; junk on those keys differs from the true ones in its content."""
         try:
             if "/status/" in sample.key:
                 message = m.decode_diagnostics(sample.payload)

@@ -1,10 +1,10 @@
-"""Acquisition beside frozen, slow, dying and hostile clients of the bus: what it costs the sensors.
+"""Acquisition next to frozen, slow, dying and hostile clients of the bus: what it costs the sensors.
 
     python -m benchmarks bus_faults --seconds 8
 
 This process hosts the bus and publishes 1000 Hz inertial data and 30 Hz images of 360 kB, as `acquire`
-does. A good subscriber in a process of its own counts what arrives and how late. Beside them, one fault
-at a time. Last, a calibration runs in processes of its own beside junk on all keys (`bus_calibration`):
+does. A good subscriber in a process of its own counts what arrives and how late. Meanwhile, one fault
+at a time. Last, a calibration runs in processes of its own with junk on all keys (`bus_calibration`):
 
     python -m benchmarks bus_faults --only calibration
 """
@@ -40,7 +40,7 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks bus_faults")
     parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--junk", type=int, default=JUNK)
-    parser.add_argument("--calibration-junk", type=int, default=CALIBRATION_JUNK, help="messages beside it")
+    parser.add_argument("--calibration-junk", type=int, default=CALIBRATION_JUNK, help="junk messages")
     parser.add_argument("--only", nargs="+", help="names of faults, restart, or calibration")
     args = parser.parse_args(argv)
     faults: dict[str, Callable[[Path, float], list[Any]]] = {
@@ -71,7 +71,7 @@ def _wanted(name: str, words: list[str] | None) -> bool:
 
 
 def _scenarios(faults: dict[str, Callable[[Path, float], list[Any]]], seconds: float) -> int:
-    """One row for each fault; inertial samples lost beside all of them."""
+    """One row for each fault; inertial samples lost during all of them."""
     if not faults:
         return 0
     print("| fault | imu sent | lost | rejected | publish p50 / p99 / max ms | age p50 / p99 / max ms "
@@ -87,7 +87,7 @@ def _scenarios(faults: dict[str, Callable[[Path, float], list[Any]]], seconds: f
 
 
 def scenario(fault: Callable[[Path, float], list[Any]], seconds: float) -> dict[str, Any]:
-    """Publish for some seconds beside a fault and return what the good subscriber saw."""
+    """Publish for some seconds during a fault and return what the good subscriber saw."""
     from vical_daemon.bus.zenoh_bus import open_bus
 
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""The way of an image: driver -> bus -> recorder in processes of their own, an estimator's load beside."""
+"""The way of an image: driver -> bus -> recorder in processes of their own, with an estimator's load."""
 
 from __future__ import annotations
 

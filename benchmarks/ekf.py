@@ -146,7 +146,7 @@ class EkfSubject:
 
     def __init__(self, options: CalibrationOptions, prior: CameraPrior, points_m: FloatArray) -> None:
         self.options, self.points_m = options, points_m
-        self.starter: _Starter | None = _Starter(options, {CAMERA: prior}, points_m)
+        self.initializer: _Starter | None = _Starter(options, {CAMERA: prior}, points_m)
         self.filter: PlainEkf | None = None
         self._rows: list[FloatArray] = []
         self._frames: list[PointsFrame] = []
@@ -157,20 +157,20 @@ class EkfSubject:
         if not self._rows:
             self._base_ns = t_ns
         self._rows.append(np.concatenate([[(t_ns - self._base_ns) * 1e-9], gyro, force]))
-        if self.starter is not None:
-            self.starter.add_imu(t_ns, gyro, force)
+        if self.initializer is not None:
+            self.initializer.add_imu(t_ns, gyro, force)
         self._follow()
 
     def add_points(self, frame: PointsFrame) -> None:
         """See `vical_mocks.harness.feed.Subject`."""
         self._frames.append(frame)
-        if self.starter is None:
+        if self.initializer is None:
             return
-        self.starter.add_points(frame)
-        self.starter.process()
-        if self.starter.filter is not None:
-            self._start(self.starter.filter)
-            self.starter = None
+        self.initializer.add_points(frame)
+        self.initializer.process()
+        if self.initializer.filter is not None:
+            self._start(self.initializer.filter)
+            self.initializer = None
 
     def finish(self) -> None:
         """See `vical_mocks.harness.feed.Subject`."""

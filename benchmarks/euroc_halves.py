@@ -92,7 +92,7 @@ def held_back(
 ) -> list[FrameReport]:
     """Images that had no part in a calibration, with it held fixed.
 
-    Where the calibration was made with a target that is not as stated (`target_off`), so it is here: its
+    Where the calibration was made with a target that differs from its file (`target_off`), so it is here: its
     shape is the target's, not the camera's.
     """
     q = np.roll(camera.T_imu_cam.q_wxyz, -1)

@@ -151,7 +151,7 @@ def simulated(case: str, seed: int, *, target_free: bool) -> SimulatedRun:
 
 
 def trial(case: str, lens_known: bool, target_free: bool, seed: int) -> runner.Result:
-    """One recording with the disturbance of a case; after steps of a clock beside the one without."""
+    """One recording with the disturbance of a case; after steps of a clock next to the one without."""
     disturbed = recorded(case, seed, lens_known=lens_known, target_free=target_free)
     result = judged(disturbed, case)
     if "clock" in case:
@@ -254,13 +254,13 @@ _DISTURBANCES = {
 
 
 def _row(case: str, results: list[runner.Result]) -> str:
-    told = [r for r in results if r["was_converged"]]
+    known = [r for r in results if r["was_converged"]]
     named = sum(any(kind in _DISTURBANCES for kind in r["reported"]) for r in results)
     bumps = [r["bumped_s"] for r in results if r["bumped_s"] is not None]
     worst = f", at most {max(bumps):.1f} s later" if bumps else ""
     apart = [r["apart_mm"] for r in results if "apart_mm" in r]
-    back = [r["back_s"] for r in told]
-    grown = [r["grown"] for r in told if r["grown"]]
+    back = [r["back_s"] for r in known]
+    grown = [r["grown"] for r in known if r["grown"]]
     return (
         f"| {case} | {len(results)} | {named} | {len(bumps)}{worst} "
         f"| {np.median(back) if back else np.nan:.1f} / {max(back, default=np.nan):.1f} "

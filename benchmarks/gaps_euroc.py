@@ -120,16 +120,16 @@ def follow(items: Items, *, target_free: bool, folder: Path) -> Followed:
 
 
 def row(case: str, over_s: float, followed: Followed, plain: Followed) -> str:
-    """One line: events beside those of the undisturbed run, when converged again, what has moved."""
+    """One line: events that the undisturbed run has not, when converged again, what has moved."""
     usual = {kind for _, kind in plain.events}
-    told = ", ".join(kind for _, kind in followed.events if kind not in usual) or "nothing"
+    events = ", ".join(kind for _, kind in followed.events if kind not in usual) or "nothing"
     late = [t for t, status in followed.statuses if t > over_s and status is not Status.CONVERGED]
     back_s = max(late) + _LOOK_S - over_s if late else 0.0
     arm_m = np.subtract(followed.camera.T_imu_cam.p_m, plain.camera.T_imu_cam.p_m)
     moved_ms = 1e3 * (followed.camera.timeshift_cam_imu_s - plain.camera.timeshift_cam_imu_s)
     sigma_m = np.sqrt(np.trace(np.array(plain.camera.T_imu_cam.covariance)[:3, :3]))
     return (
-        f"| {case} | {told} | {back_s:.1f} | {1e3 * np.linalg.norm(arm_m):.2f} ({1e3 * sigma_m:.2f}) "
+        f"| {case} | {events} | {back_s:.1f} | {1e3 * np.linalg.norm(arm_m):.2f} ({1e3 * sigma_m:.2f}) "
         f"| {moved_ms:+.3f} |"
     )
 
@@ -146,9 +146,7 @@ def main(argv: list[str]) -> int:
         return 1
     items = read(args.data)
     plain = follow(items, target_free=args.target_free, folder=args.data)
-    print(
-        "| disturbance | reported beside | converged again after s | lever arm moved mm (sigma) | shift ms |"
-    )
+    print("| disturbance | also reported | converged again after s | lever arm moved mm (sigma) | shift ms |")
     print("|---|---|---|---|---|")
     for case in args.case or CASES:
         over_s, change = CASES[case]

@@ -44,7 +44,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--fifo", action="store_true", help="real-time scheduling, as the service has it")
     parser.add_argument("--protocol", choices=("single-byte", "mip"), default="single-byte")
     parser.add_argument("--no-bus", action="store_true", help="the bus in memory: the driver's part alone")
-    parser.add_argument("--floor", action="store_true", help="beside each case: only read and publish")
+    parser.add_argument("--floor", action="store_true", help="with each case: only read and publish")
     parser.add_argument("--freeze", action="store_true", help="stop the subscriber (SIGSTOP) after 8 s")
     parser.add_argument("--only-floor", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--acquire", default="", help=argparse.SUPPRESS)  # the process under test: a port

@@ -1,4 +1,4 @@
-"""IMU time stamps against the emulated device's true sampling instants, beside what other drivers do."""
+"""IMU time stamps against the emulated device's true sampling instants, and what other drivers do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Monte Carlo: RMSE beside the Cramer-Rao bound, NEES, coverage, time; also of a plain EKF."""
+"""Monte Carlo: RMSE and the Cramer-Rao bound, NEES, coverage, time; also of a plain EKF."""
 
 from __future__ import annotations
 
@@ -50,19 +50,19 @@ class Case:
         start: Errors of the starting values.
         timeshift_s: True time shift; None: uniform in +-50 ms, by seed.
         skew_ppm: Drift of the camera's clock.
-        gravity_error_mps2: Added to the magnitude that the estimator is told.
+        gravity_error_mps2: Added to the magnitude that the estimator is given.
         target_free: Landmarks instead of a board.
         random_mounting: The camera points anywhere on the imu, 20 cm away.
-        trials: How many when not told otherwise.
+        trials: How many by default.
         simulation: Options of the simulation.
         rig: Changes of the rig.
         bound: Changes of the bound's model.
         estimate: Optional blocks of the estimator.
-        readout_told: The readout of a rolling shutter is told.
-        crooked: The board is not as stated: see `vical_mocks.points.crooked_board`.
+        readout_known: The readout of a rolling shutter is given.
+        crooked: The board differs from its file: see `vical_mocks.points.crooked_board`.
         board_size: True size of the board over its stated size.
         lens_off: The lens is held (`lens_known`) at values that are off by 0.5 % of f, 5 px of the centre,
-            0.01 of k1, one sigma each; "stated": and the estimator is told these sigmas.
+            0.01 of k1, one sigma each; "stated": and the estimator is given these sigmas.
         imu_off: One sigma of each entry of the imu's matrices, of which the gyro's is symmetric (what is not
             is a turn of the imu's frame).
     """
@@ -79,7 +79,7 @@ class Case:
     rig: dict[str, Any] = field(default_factory=dict)
     bound: dict[str, Any] = field(default_factory=dict)
     estimate: frozenset[str] = frozenset()
-    readout_told: bool = True
+    readout_known: bool = True
     crooked: bool = False
     board_size: float = 1.0
     lens_off: str = ""
@@ -107,12 +107,12 @@ CASES: dict[str, Case] = {
     "5 % outliers, 30 % half-hidden": Case(
         simulation={"outlier_fraction": 0.05, "hidden_fraction": 0.3}, trials=20
     ),
-    "gravity told 0.02 m/s^2 wrong": Case(gravity_error_mps2=0.02, trials=20),
+    "gravity stated 0.02 m/s^2 wrong": Case(gravity_error_mps2=0.02, trials=20),
     "skew 100 ppm": Case(skew_ppm=100.0, trials=20),
     "stamp jitter 1 ms": Case(simulation={"stamp_jitter_s": 1e-3}, trials=20),
     "whole images off by 0.3 px": Case(simulation={"frame_sigma_px": 0.3}, trials=20),
     "rolling shutter of 20 ms, nothing said": Case(
-        rig={"readout_s": 0.02}, bound={"readout": True}, readout_told=False, trials=20
+        rig={"readout_s": 0.02}, bound={"readout": True}, readout_known=False, trials=20
     ),
     "board 3 % smaller than stated": Case(board_size=0.97, bound={"target_scale_prior": 0.1}, trials=20),
     "board 30 % larger than stated": Case(board_size=1.3, bound={"target_scale_prior": 0.1}, trials=20),
@@ -146,7 +146,7 @@ CASES: dict[str, Case] = {
         start=StartErrors(0.05, 5.0),
         rig={"readout_s": 0.02},
         bound={"readout": True},
-        readout_told=False,
+        readout_known=False,
         trials=20,
     ),
     "target-free, accelerometer 0.3 ms late": Case(
@@ -198,8 +198,8 @@ def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject
     """The estimator of one trial: "vical" or "ekf"."""
     prior = camera_prior(run, seed, case.start, exact_lens=case.lens_known)
     if case.lens_off:
-        prior = with_lens_off(prior, seed, told=case.lens_off == "stated")
-    if not case.readout_told:
+        prior = with_lens_off(prior, seed, stated=case.lens_off == "stated")
+    if not case.readout_known:
         prior = replace(prior, readout_s=0.0)
     options = CalibrationOptions(
         fix=frozenset({"intrinsics"}) if case.lens_known else frozenset(),
@@ -213,8 +213,8 @@ def make_subject(case: Case, run: SimulatedRun, seed: int, kind: str) -> Subject
     return CalibratorSubject(options, prior, None if case.target_free else board_points())
 
 
-def with_lens_off(prior: CameraPrior, seed: int, *, told: bool) -> CameraPrior:
-    """A lens that is not quite this camera's; `told`: with how well it is known."""
+def with_lens_off(prior: CameraPrior, seed: int, *, stated: bool) -> CameraPrior:
+    """A lens that is not quite this camera's; `stated`: with how well it is known."""
     assert prior.intrinsics is not None
     assert prior.distortion is not None
     rng = np.random.default_rng([seed, 64])
@@ -227,7 +227,7 @@ def with_lens_off(prior: CameraPrior, seed: int, *, told: bool) -> CameraPrior:
         intrinsics=(fx * grown, fy * grown, cx + du, cy + dv),
         distortion=(k1, *prior.distortion[1:]),
     )
-    if not told:
+    if not stated:
         return off
     rest = (0.0,) * (len(prior.distortion) - 1)
     return replace(

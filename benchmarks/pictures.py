@@ -4,7 +4,7 @@
 
 A browser looks at the live page of a running `vical demo`; afterwards `vical calibrate --report` makes the
 report from the log of that demo, and what `vical watch` shows is drawn from the messages in it. Where the
-real recording lies beside the checkout, its report is taken as well.
+real recording lies next to the checkout, its report is taken as well.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Two recordings of one rig calibrated as one: honest, and as good as both together?
 
 Pairs of simulated recordings with the rig in common; motion, biases and the direction of gravity differ. And
-the halves of EuRoC's recording as two recordings, beside the whole.
+the halves of EuRoC's recording as two recordings, and the whole.
 """
 
 from __future__ import annotations

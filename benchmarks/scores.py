@@ -1,4 +1,4 @@
-"""What is made of many trials: RMSE beside the bound, honesty of the sigmas, coverage, tables and plots."""
+"""What is made of many trials: RMSE and the bound, honesty of the sigmas, coverage, tables and plots."""
 
 from __future__ import annotations
 

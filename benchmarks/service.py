@@ -69,7 +69,7 @@ def main(argv: list[str]) -> int:
 
 
 def _install(machine: Machine) -> None:
-    """Put the service into the machine by its own command, and the feed beside it."""
+    """Put the service into the machine by its own command, and the feed next to it."""
     from vical_daemon.cli import main as vical
 
     root = machine.root
@@ -166,7 +166,7 @@ def _stops(machine: Machine, count: int) -> tuple[str, str]:
 
 
 def _judge_logs(root: Path, deeds: list[tuple[float, str]]) -> list[tuple[str, str]]:
-    """Open every log (after recovery where it was not closed), and lay holes of the IMU beside the deeds."""
+    """Open every log (after recovery where it was not closed), compare the IMU's gaps with the actions."""
     folder = root / "var/lib/vical/log"
     for part in sorted(folder.glob("*.part")):
         recover(part)

@@ -1,4 +1,4 @@
-"""CPU time beside peers in the same run, one thread each: medians, and how they grow."""
+"""CPU time and that of peers in the same run, one thread each: medians, and how they grow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detection and tracking of `benchmarks speed`: vical beside OpenCV and the C AprilTag library."""
+"""Detection and tracking of `benchmarks speed`: vical compared with OpenCV and the C AprilTag library."""
 
 from __future__ import annotations
 

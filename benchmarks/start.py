@@ -3,7 +3,7 @@
     python -m benchmarks start --trials 30
     python -m benchmarks start --case "318" --case "EuRoC, lens free"
 
-Rigs of the zoo with the lens told and not told (the zoo itself tells it to three of ten), the reference rig,
+Rigs of the zoo with the lens known and not known (in the zoo itself three of ten know it), the reference rig,
 the slow rig of seed 318 with several draws of its noise, and the real EuRoC recording begun every five
 seconds. With the lens held EuRoC is compared with Kalibr, with the lens free with the answer of the whole
 recording: z there contains what is wrong with the model of the lens.
@@ -223,23 +223,23 @@ def rows(name: str, results: list[runner.Result]) -> None:
             # a rig that sees little must not hide all others: medians of the lengths
             lengths = [unit * float(np.median(np.linalg.norm(x[:, place], axis=1))) for x in (error, sigma)]
             cells.append("{:.3g}, {:.3g}".format(*lengths))
-        told = (
+        rest = (
             f"{np.median(nees):.2f}, {np.mean(nees):.2f} | {z.max():.1f} | {int((z > 5.0).any(axis=1).sum())}"
         )
-        print(begin + f"| {at} | " + " | ".join(cells) + f" | {told} |", flush=True)
+        print(begin + f"| {at} | " + " | ".join(cells) + f" | {rest} |", flush=True)
 
 
 def cases(folder: Path, trials: int, first_seed: int) -> dict[str, tuple[Any, range]]:
     """By name: what runs one of its trials, and the seeds."""
     seeds = range(first_seed, first_seed + trials)
     found: dict[str, tuple[Any, range]] = {}
-    for told, known in (("lens told", True), ("lens free", False)):
-        found[f"zoo, {told}"] = (partial(simulated, "zoo", known), seeds)
-        found[f"reference, {told}"] = (partial(simulated, "reference", known), seeds)
+    for lens, known in (("lens known", True), ("lens free", False)):
+        found[f"zoo, {lens}"] = (partial(simulated, "zoo", known), seeds)
+        found[f"reference, {lens}"] = (partial(simulated, "reference", known), seeds)
     found[f"{_SLOW}, lens free"] = (partial(simulated, "slow", False), range(min(trials, 16)))
     if folder.is_dir():
-        for told, known in (("lens held", True), ("lens free", False)):
-            found[f"EuRoC, {told}"] = (partial(euroc, folder, known), range(13))
+        for lens, known in (("lens held", True), ("lens free", False)):
+            found[f"EuRoC, {lens}"] = (partial(euroc, folder, known), range(13))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Target-free on data of others: OpenVINS's simulator beside OpenVINS, real corners as unknown points."""
+"""Target-free on data of others: OpenVINS's simulator, and OpenVINS on it, real corners as unknown points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TIMES_S = (10.0, 30.0, 60.0, 120.0)
 
 
 def run(
-    folder: Path, truth: dict[str, Any], *, given: bool, lens_fixed: bool, beside: dict[float, Figures]
+    folder: Path, truth: dict[str, Any], *, given: bool, lens_fixed: bool, others: dict[float, Figures]
 ) -> list[str]:
     """Rows of the table: errors, sigmas and NEES at the times of interest and at the end."""
     start = camera_of(folder / "initial.yaml")
@@ -50,7 +50,7 @@ def run(
         else:
             calibrator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)  # type: ignore[attr-defined]
         while waiting and (t_ns - items[0][0]) * 1e-9 >= waiting[0]:
-            rows.append(row(f"{waiting[0]:g} s", calibrator, truth, beside.get(waiting.pop(0))))
+            rows.append(row(f"{waiting[0]:g} s", calibrator, truth, others.get(waiting.pop(0))))
     calibrator.finish()
     cost = f"start {sum(spent_s[False]):.1f} s CPU, then {1e3 * np.mean(spent_s[True]):.1f} ms a frame"
     rows.append(row(f"end, {calibrator.estimate().status}, {cost}", calibrator, truth, None))
@@ -63,7 +63,7 @@ def row(
     truth: dict[str, Any],
     other: Figures | None,
 ) -> str:
-    """One line: errors (sigma) of rotation, lever arm and time shift; OpenVINS beside; NEES of the seven."""
+    """One line: errors (sigma) of rotation, lever arm and time shift; OpenVINS's; NEES of the seven."""
     cameras = calibrator.estimate().cameras
     if not cameras:
         return f"| {name} | - | - | - | - |"
@@ -75,11 +75,11 @@ def row(
     error = np.concatenate([arm, turn])
     nees = (error @ np.linalg.solve(P, error) + (shift / c.timeshift_sigma_s) ** 2) / 7
     s = np.sqrt([np.trace(P[3:, 3:]), np.trace(P[:3, :3])])
-    beside = [f" / {x:g}" for x in other] if other else ["", "", ""]
+    theirs = [f" / {x:g}" for x in other] if other else ["", "", ""]
     return (
-        f"| {name} | {np.rad2deg(np.linalg.norm(turn)):.3f} ({np.rad2deg(s[0]):.3f}){beside[0]} "
-        f"| {1e3 * np.linalg.norm(arm):.2f} ({1e3 * s[1]:.2f}){beside[1]} "
-        f"| {1e3 * abs(shift):.3f} ({1e3 * c.timeshift_sigma_s:.3f}){beside[2]} | {nees:.2f} |"
+        f"| {name} | {np.rad2deg(np.linalg.norm(turn)):.3f} ({np.rad2deg(s[0]):.3f}){theirs[0]} "
+        f"| {1e3 * np.linalg.norm(arm):.2f} ({1e3 * s[1]:.2f}){theirs[1]} "
+        f"| {1e3 * abs(shift):.3f} ({1e3 * c.timeshift_sigma_s:.3f}){theirs[2]} | {nees:.2f} |"
     )
 
 
@@ -103,7 +103,7 @@ def main(argv: list[str]) -> int:
         folder = args.data / "euroc_imu_april"
         cases += [
             (
-                "EuRoC corners as unknown points, beside Kalibr",
+                "EuRoC corners as unknown points, compared with Kalibr",
                 folder,
                 folder / "reference_kalibr.yaml",
                 False,
@@ -115,7 +115,7 @@ def main(argv: list[str]) -> int:
             print(f"no recording at {folder}: name the folder with --data", file=sys.stderr)
             return 1
         print(f"\n{title}\n\n{head}")
-        beside = {} if lens_fixed else OPENVINS
-        for line in run(folder, camera_of(truth), given=given, lens_fixed=lens_fixed, beside=beside):
+        others = {} if lens_fixed else OPENVINS
+        for line in run(folder, camera_of(truth), given=given, lens_fixed=lens_fixed, others=others):
             print(line, flush=True)
     return 0

@@ -1,4 +1,4 @@
-"""Temporal calibration: RMSE beside the bound, honest sigmas, outliers, holes, several sensors, real data.
+"""Temporal calibration: RMSE and the bound, honest sigmas, outliers, holes, several sensors, real data.
 
 The thesis' Table 3.1 is 100 trials on each of four trajectories; tables 3.2 and 3.3 are a hand-held camera
 and imu, and several sensors of one robot.
@@ -14,10 +14,10 @@ import numpy as np
 from vical_mocks.rotations import exp_so3
 from vical_mocks.trajectory import hand_motion
 
-from benchmarks.td_icp_live import study_online, study_wrong
 from benchmarks.td_icp_streams import study_handheld, study_joint, study_real
 from benchmarks.td_icp_tracks import study_tracks
 from benchmarks.td_icp_trials import DEG, HEADER, IMU_HZ, TRAJECTORIES, row_of, simulate_gyro, trial
+from benchmarks.td_icp_wrong import study_wrong
 
 
 def study_main(trials: int) -> None:
@@ -85,7 +85,7 @@ def figure_start(path: Path) -> None:
 def main(argv: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks td_icp", description=__doc__)
     parser.add_argument("--trials", type=int, default=100)
-    parser.add_argument("--study", default="main,robust,wrong,handheld,joint,tracks,real,online")
+    parser.add_argument("--study", default="main,robust,wrong,handheld,joint,tracks,real")
     parser.add_argument("--data", type=Path, default=Path("../shared/data/euroc_imu_april"))
     parser.add_argument("--figure", type=Path, help="only draw the figure of the coarse start there")
     args = parser.parse_args(list(argv))
@@ -100,7 +100,6 @@ def main(argv: Sequence[str]) -> int:
         "joint": lambda: study_joint(args.trials),
         "tracks": lambda: study_tracks(min(args.trials, 30)),
         "real": lambda: study_real(args.data),
-        "online": study_online,
     }
     for name in args.study.split(","):
         if name not in studies:

@@ -23,10 +23,10 @@ _UNSURE = 1e-4  # probability of an honest answer with a larger normalised error
 
 def trial(target_free: bool, imu_off: bool, seconds: float, seed: int) -> runner.Result:
     """One rig, nothing given but its noise densities and a lens 3 % off."""
-    run, told = draw(seed, seconds, target_free=target_free, imu_off=imu_off)
-    prior = camera_prior(run, seed, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=told)
+    run, known = draw(seed, seconds, target_free=target_free, imu_off=imu_off)
+    prior = camera_prior(run, seed, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=known)
     options = CalibrationOptions(
-        fix=frozenset({"intrinsics"}) if told else frozenset(),
+        fix=frozenset({"intrinsics"}) if known else frozenset(),
         target_free=target_free,
         imu_noise=imu_noise(run),
     )
@@ -34,7 +34,7 @@ def trial(target_free: bool, imu_off: bool, seconds: float, seed: int) -> runner
     result = summary(feed(run, subject), 7, [])
     sampling = {k: v for k, v in vars(run.options).items() if k in draw_sampling(np.random.default_rng(0))}
     rate = run.rig.trajectory.mean_rate_dps(seconds)
-    return result | {"rig": sampling | {"deg/s": rate, "f": run.rig.lens.intrinsics[0], "lens_told": told}}
+    return result | {"rig": sampling | {"deg/s": rate, "f": run.rig.lens.intrinsics[0], "lens_known": known}}
 
 
 def print_summary(name: str, results: list[runner.Result]) -> None:
@@ -60,16 +60,16 @@ def print_summary(name: str, results: list[runner.Result]) -> None:
 def print_suspects(results: list[runner.Result], seeds: range) -> None:
     """The rigs with the worst answers, and those without one."""
     for seed, r in zip(seeds, results, strict=True):
-        told = ", ".join(f"{k} {v:.3g}" for k, v in r["rig"].items() if v)
+        rig = ", ".join(f"{k} {v:.3g}" for k, v in r["rig"].items() if v)
         if not r["trace"]["t_s"]:
-            print(f"seed {seed}: no answer ({r['statuses'][-1][2]}); {told}")
+            print(f"seed {seed}: no answer ({r['statuses'][-1][2]}); {rig}")
             continue
         error, sigma = (np.array(r["trace"][k])[:, :7] for k in ("error", "sigma"))
         z = np.abs(error) / sigma
         if z.max() > 4.5:
             second, which = np.unravel_index(int(z.argmax()), z.shape)
             at = f"{PARAMETERS[which]} {z.max():.1f} sigma off after {r['trace']['t_s'][second]:.0f} s"
-            print(f"seed {seed}: {at}, said {r['trace']['status'][second]}; {told}")
+            print(f"seed {seed}: {at}, said {r['trace']['status'][second]}; {rig}")
 
 
 def main(argv: list[str]) -> int:

@@ -1,6 +1,6 @@
 """The test's side of the fake FireWire bus: builds the preloaded library and shares a page with it.
 
-The bus itself is `fake_firewire.c` beside the camera tests; the structure here and there are the same.
+The bus itself is `fake_firewire.c` next to the camera tests; the structure here and there are the same.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A simulated rig that runs in real time beside the program under test: a GX3-25 on a pty and a camera.
+"""A simulated rig that runs in real time next to the program under test: a GX3-25 on a pty and a camera.
 
 Each device has a process of its own, as hardware has its own processor: what the daemon computes does not
 disturb when bytes and frames leave. One trajectory moves both.
@@ -250,7 +250,7 @@ def _run_camera(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -
     pipe.send(None)
     sequence = 0
     while True:
-        # Whoever cannot keep up skips pictures; the sequence number tells.
+        # Whoever cannot keep up skips pictures; the sequence number shows it.
         now_s = time.monotonic() - t_start_s
         sequence = max(sequence + 1, int(np.ceil((now_s - 0.05) * settings.camera_rate_hz)))
         t_s = sequence / settings.camera_rate_hz

@@ -45,7 +45,7 @@ class AttitudeFilter:
         self._told = False
 
     def run(self) -> None:
-        """It was given an attitude, or told to begin."""
+        """It was given an attitude, or a command to begin."""
         self._told = True
 
     def state(self, k: int) -> int:

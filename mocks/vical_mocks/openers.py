@@ -1,4 +1,4 @@
-"""Who has a terminal open besides the emulator itself: told by inotify, a pseudo terminal does not say."""
+"""Who has a terminal open besides the emulator itself, by inotify: a pseudo terminal does not show it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Openers:
                 self.count = max(0, self.count - 1)
                 closed = True
         if closed and self.count == 0:
-            self.count = self._seen()  # of two openings at one instant inotify tells as of one
+            self.count = self._seen()  # of two openings at one instant inotify reports one
         return closed and self.count == 0
 
     def _seen(self) -> int:

@@ -27,7 +27,7 @@ def crooked_board(seed: int, flat_m: FloatArray | None = None) -> FloatArray:
     """A board as a printer and a table make it, m, (n, 3).
 
     Narrower than tall by 0.2 % and skew (one-sigma), bent and twisted by 0.5 mm at its edges, bowed in its
-    plane by 0.2 mm, each corner 0.15 mm beside its place; not turned, shifted or grown as a whole, which no
+    plane by 0.2 mm, each corner 0.15 mm from its place; not turned, shifted or grown as a whole, which no
     image shows.
 
     Args:

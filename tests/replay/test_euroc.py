@@ -69,7 +69,7 @@ def test_with_the_published_lens_it_reaches_kalibrs_result_and_says_that_the_len
 
 
 def test_a_lens_that_radtan_does_not_quite_fit_is_no_knock(capsys):
-    """After the hole at 59 s half a board at the image's edge had been told as `bumped`."""
+    """After the hole at 59 s half a board at the image's edge had been reported as `bumped`."""
     arguments = ["--target", str(FOLDER / "target.yaml"), "--initial", str(FOLDER / "initial.yaml")]
     code = main(["calibrate", str(FOLDER), *arguments, "--json", "--quiet"])
     result = json.loads(capsys.readouterr().out)

@@ -1,4 +1,4 @@
-"""Tracks of another project's simulator: ten seconds, mounting unknown, beside that project's figures."""
+"""Tracks of another project's simulator: ten seconds, mounting unknown, next to that project's figures."""
 
 from dataclasses import replace
 from pathlib import Path

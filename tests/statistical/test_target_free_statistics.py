@@ -13,7 +13,7 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.smoother.carry import IMU
+from vical_daemon.estimation.smoother.marginal_prior import IMU
 
 pytestmark = pytest.mark.statistical
 TRIALS, SECONDS, CAMERA_HZ = 6, 9.0, 8.0
@@ -81,12 +81,12 @@ def with_blocks(seed):
     )
     subject = CalibratorSubject(options, prior, None)
     last = feed(run, subject).snapshots[-1]
-    told = subject.calibrator.estimate()
-    camera, carry = told.cameras["cam0"], subject.calibrator.latest
+    estimate = subject.calibrator.estimate()
+    camera, carry = estimate.cameras["cam0"], subject.calibrator.latest
     matrices = np.concatenate(
         [
-            (np.array(told.imu.gyro_matrix) - np.linalg.inv(rig.gyro_matrix)).ravel(),
-            (np.array(told.imu.accel_matrix) - lower)[np.tril_indices(3)],
+            (np.array(estimate.imu.gyro_matrix) - np.linalg.inv(rig.gyro_matrix)).ravel(),
+            (np.array(estimate.imu.accel_matrix) - lower)[np.tril_indices(3)],
         ]
     )
     P = carry.calibration()[IMU, IMU]

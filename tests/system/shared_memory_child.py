@@ -41,7 +41,7 @@ def _publish(bus: Any, sizes: dict[str, int], count: int) -> None:
 
 
 def _end(bus: Any, names: Iterable[str]) -> None:
-    """Send one byte for each camera, whose number tells of images lost before it."""
+    """Send one byte for each camera, whose number shows images lost before it."""
     for name in names:
         bus.publish(topics.IMAGE.key("rig0", name), b".")
 

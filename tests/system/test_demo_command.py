@@ -31,7 +31,7 @@ def test_every_role_takes_part(tmp_path: Path, capsys: pytest.CaptureFixture[str
         code, out, err = _demo(folder, 40, capsys)
     assert out, f"no result on stdout, exit code {code}; stderr:\n{err}"
     result = json.loads(out.splitlines()[-1])
-    # Five seconds may be too few to converge; the demo says so itself.
+    # Five seconds may be too few to converge; the demo reports that itself.
     assert (code == 0) == (result["status"] == "converged")
     assert code == 0 or "the demo failed" in err.splitlines()[-1], err
     assert "Traceback" not in err, err

@@ -1,4 +1,4 @@
-"""Images over the bus under every limit of locked memory: each arrives, or its number tells that it did not.
+"""Images over the bus under every limit of locked memory: each arrives, or its number shows that it did not.
 
 Every row runs in processes of its own, because the limit, and what a process has locked, are the process's.
 """

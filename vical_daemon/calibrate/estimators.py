@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from vical_daemon.bus import topics
 from vical_daemon.config.model import Config, ConfigError
 from vical_daemon.config.priors import calibration_options, camera_prior
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
-
-if TYPE_CHECKING:
-    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
 
 
 class Estimator(Protocol):
@@ -90,19 +87,6 @@ def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None)
 
     assert config.target_path is not None  # checked by `config.load`
     return Calibrator(options, priors, load_target(config.target_path).points_m)
-
-
-def make_watch(config: Config) -> DelayWatch | None:
-    """Make the check of the time shift against rotations alone; None without a target."""
-    if config.target_path is None or config.calibration.mode == "target_free":
-        return None
-    from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
-    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
-    from vical_daemon.vision.target import load_target
-
-    noise = calibration_options(config).imu_noise
-    options = TdIcpOptions(gyro_density=noise.gyro_density, gyro_walk=noise.gyro_walk, gyro_log_sigma=0.7)
-    return DelayWatch(load_target(config.target_path).points_m, config.calibration_cameras, options)
 
 
 def input_keys(config: Config) -> list[str]:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
 from vical_daemon.bus import topics
 from vical_daemon.bus.messages import (
     DiagnosticStatus,
@@ -18,9 +15,6 @@ from vical_daemon.bus.messages import (
 from vical_daemon.bus.outgoing import Message
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.result import CalibrationEstimate, Status
-
-if TYPE_CHECKING:
-    from vical_daemon.estimation.temporal.td_icp_watch import DelayVerdict
 
 
 def calibration_messages(config: Config, estimate: CalibrationEstimate) -> list[Message]:
@@ -81,24 +75,3 @@ def calibration_status(estimate: CalibrationEstimate | None, counters: dict[str,
         "rejected_fraction": f"{estimate.rejected_fraction:.4f}",
     }
     return DiagnosticStatus(Level.WARN if bad else Level.OK, "estimate", message, "", values | counters)
-
-
-def delay_statuses(verdicts: Mapping[str, DelayVerdict]) -> list[DiagnosticStatus]:
-    """Return per camera the time shift from rotations alone; a warning if the filter differs."""
-    return [
-        DiagnosticStatus(
-            Level.WARN if verdict.warning else Level.OK,
-            f"{name} delay",
-            verdict.warning or _delay_words(verdict),
-            "",
-            verdict.values(),
-        )
-        for name, verdict in verdicts.items()
-    ]
-
-
-def _delay_words(verdict: DelayVerdict) -> str:
-    report = verdict.report
-    if report is None:
-        return verdict.why_refused or "waiting for motion"
-    return f"{1e3 * report.timeshift_s:+.2f} ± {1e3 * report.timeshift_sigma_s:.2f} ms from rotations alone"

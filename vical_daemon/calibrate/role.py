@@ -17,7 +17,7 @@ from vical_daemon.bus.messages import DiagnosticStatus, Level, MessageError, dec
 from vical_daemon.bus.outgoing import Message, publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
 from vical_daemon.calibrate.checkpoint import Checkpoint
-from vical_daemon.calibrate.estimators import Estimator, input_keys, make_estimator, make_watch
+from vical_daemon.calibrate.estimators import Estimator, input_keys, make_estimator
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.calibrate.worker import PUBLISH_S, STUCK_S, EstimateRole
 from vical_daemon.config.model import Config
@@ -81,7 +81,7 @@ def calibrate(
     priors = persistence.priors()
     checkpoint = Checkpoint(folder, config, clock)
     estimator = _resumed(checkpoint, persistence) or _new_estimator(config, priors, persistence)
-    role = EstimateRole(config, estimator, inspect=persistence.watch, watch=make_watch(config))
+    role = EstimateRole(config, estimator, inspect=persistence.watch)
     supervisor = _Supervisor(config, role, persistence, checkpoint)
     publish(bus, persistence.stored_messages())
     commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
@@ -95,11 +95,11 @@ def calibrate(
             _log.info("calibrating anew by command")
             checkpoint.forget()
             priors = persistence.discard() if "discard" in words else priors
-            role.reset(make_estimator(config, priors), make_watch(config))
+            role.reset(make_estimator(config, priors))
         if persistence.replaced:
             checkpoint.forget()
             priors = persistence.begin_again()
-            role.reset(_new_estimator(config, priors, persistence), make_watch(config))
+            role.reset(_new_estimator(config, priors, persistence))
             publish(bus, persistence.stored_messages())
         while True:  # in batches, so that a backlog does not delay publications
             publish(bus, supervisor.work(queue.take(256), time.monotonic()))
@@ -168,7 +168,7 @@ class _Supervisor:
         self._stuck_s = 0.0
         self._checkpoint.forget()
         priors = self._persistence.priors(wait_s=0.0)
-        self._role.reset(make_estimator(self._config, priors), make_watch(self._config))
+        self._role.reset(make_estimator(self._config, priors))
         pause_s = self._restarts.failed(why, time.monotonic())
         text = f"the estimator failed and starts again{f' in {pause_s:.0f} s' if pause_s else ''}: {why}"
         _log.error("%s", text)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Sample
@@ -27,16 +27,12 @@ from vical_daemon.calibrate.publications import (
     calibration_messages,
     calibration_status,
     companion_messages,
-    delay_statuses,
 )
 from vical_daemon.calibrate.reorder_buffer import ReorderBuffer
 from vical_daemon.calibrate.stamp_gate import StampGate
 from vical_daemon.config.model import Config
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate
-
-if TYPE_CHECKING:
-    from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
 
 Keep = Callable[[Sequence[Any]], None]
 Inspect = Callable[[CalibrationEstimate], CalibrationEstimate]
@@ -56,7 +52,6 @@ class EstimateRole:
         period_s: Time between two publications.
         keep: Gets the report on every frame; None: they are dropped.
         inspect: Gets every estimate before it is published and may add to it.
-        watch: Checks the time shift against rotations alone; None: no check.
     """
 
     def __init__(
@@ -67,11 +62,9 @@ class EstimateRole:
         *,
         keep: Keep | None = None,
         inspect: Inspect | None = None,
-        watch: DelayWatch | None = None,
     ) -> None:
         self.config, self.estimator = config, estimator
         self._period_s, self._keep, self._inspect = period_s, keep, inspect
-        self._watch = watch
         self._predictions = Predictions(config.rig)
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
         self._status_key = topics.STATUS.key(config.rig, "imu")
@@ -152,23 +145,19 @@ class EstimateRole:
         self._gates.clear()
         self.estimator.next_recording(common_clock=common_clock)
 
-    def reset(self, estimator: Estimator, watch: DelayWatch | None = None) -> None:
-        """Start again with a new estimator (and watch)."""
+    def reset(self, estimator: Estimator) -> None:
+        """Start again with a new estimator."""
         self._order.pop_all()
         self._images_in_order = 0
-        self.estimator, self.latest, self._watch = estimator, None, watch
+        self.estimator, self.latest = estimator, None
         self._next_s = self._next_companion_s = -float("inf")
 
     def _feed(self, items: list[ImuMessage | PointsFrame]) -> None:
         for item in items:
             if isinstance(item, ImuMessage):
                 self.estimator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
-                if self._watch is not None:
-                    self._watch.add_imu(item.stamp_ns, item.gyro_rps)
             else:
                 self._images_in_order -= 1
-                if self._watch is not None:
-                    self._watch.add_points(item)
                 self.estimator.add_points(item)
                 self._report(self.estimator.process())
 
@@ -183,8 +172,6 @@ class EstimateRole:
         self._next_s = now_s + self._period_s
         estimate = self.estimator.estimate()
         self.latest = estimate = self._inspect(estimate) if self._inspect else estimate
-        if self._watch is not None:
-            self._watch.look(estimate)
         messages = calibration_messages(self.config, estimate) + self._predictions.messages()
         if now_s >= self._next_companion_s:
             self._next_companion_s = now_s + COMPANION_S
@@ -210,9 +197,8 @@ class EstimateRole:
             "stamp_jumps": str(sum(gate.jumps for gate in self._gates.values())),
             **{name: str(count) for name, count in self.estimator.left_out.items()},
         }
-        verdicts = {} if self._watch is None else self._watch.verdicts
         status = calibration_status(self.latest, counters)
         if stuck_s > STUCK_S:
             text = f"stuck: images arrive, none used or refused for {stuck_s:.0f} s"
             status = replace(status, level=Level.STALE, message=text)
-        return [status, *delay_statuses(verdicts)]
+        return [status]

@@ -32,7 +32,7 @@ def socket_path(bus: BusConfig) -> Path:
 def open_for_roles(config: Config, roles: Sequence[str], stop: threading.Event) -> Bus | None:
     """Open the bus for a process with these roles: the one that acquires hosts it, others are clients.
 
-    A client waits for its router as long as it takes (None when told to stop meanwhile): services start
+    A client waits for its router as long as it takes (None when stopped meanwhile): services start
     in any order. A process with only one of the acquiring roles hosts the bus unless another one does.
 
     Raises:
@@ -103,7 +103,7 @@ def _wait_for_router(config: Config, stop: threading.Event) -> ZenohBus | None:
         try:
             return open_bus(mode="client", socket=path, **_credentials(config.bus))
         except BusError as error:
-            if not reported and time.monotonic() - begin_s > _QUIET_S:  # the host may start beside us
+            if not reported and time.monotonic() - begin_s > _QUIET_S:  # the host may start at the same time
                 _log.info("waiting for the bus: %s", error)
                 reported = True
         notify.ready("waiting for the bus")  # or systemd takes a late router for our failure

@@ -20,7 +20,7 @@ _RESTARTED_NS = 20_000_000  # larger: the device's timer was set anew, its ticks
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One number beside its truth.
+    """One number and its truth.
 
     `truth_sigma` is how well the truth itself is one number: how late a busy host stamps changes during
     the run.

@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def write_files(files: list[ExportFile], output: Path) -> list[Path]:
-    """Write the main file to `output` and the others beside it; into a folder under their usual names.
+    """Write the main file to `output` and the others next to it; into a folder under their usual names.
 
     Raises:
         CliError: The folder is missing.

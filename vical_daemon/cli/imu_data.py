@@ -82,7 +82,7 @@ def at_rest(samples: EvenSamples) -> tuple[EvenSamples, str]:
     """Return the longest part in which the imu rests, and a remark for people; empty where it never moves.
 
     Judged second by second, against the quietest quarter of them: warming up and noise stay far below the
-    limits, a touch does not. A second beside one that moved does not count as rest.
+    limits, a touch does not. A second next to one that moved does not count as rest.
 
     Raises:
         CliError: It never rests for long enough.
@@ -101,10 +101,10 @@ def at_rest(samples: EvenSamples) -> tuple[EvenSamples, str]:
         moved |= (np.abs(means - np.median(means[quiet], axis=0)) > limit).any(axis=1)
     if not moved.any():
         return samples, ""
-    beside = moved.copy()
-    beside[1:] |= moved[:-1]
-    beside[:-1] |= moved[1:]
-    edges = np.flatnonzero(np.diff(np.concatenate(([1], beside.astype(np.int64), [1]))))
+    unrest = moved.copy()
+    unrest[1:] |= moved[:-1]
+    unrest[:-1] |= moved[1:]
+    edges = np.flatnonzero(np.diff(np.concatenate(([1], unrest.astype(np.int64), [1]))))
     begins, ends = edges[::2], edges[1::2]  # of the runs that rest
     longest = int(np.argmax(ends - begins)) if len(begins) else 0
     if not len(begins) or ends[longest] - begins[longest] < LEAST_REST_S:

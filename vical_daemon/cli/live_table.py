@@ -87,7 +87,7 @@ def picture(
         f"  {estimate.duration_s:.1f} s, {estimate.frames} frames, {estimate.imu_samples} imu samples, "
         f"NIS/dof {estimate.nis_per_dof:.2f}",
     )
-    # padded, it ends its line: what follows would stand beside it, cut off
+    # padded, it ends its line: what follows would stand on the same line, cut off
     bar = Padding(ProgressBar(total=1.0, completed=min(max(estimate.progress, 0.0), 1.0), width=40), 0)
     advice = Text(estimate.guidance or estimate.reason, style="yellow")
     return Group(head, bar, advice, table, *(Text(line, style="dim") for line in health))

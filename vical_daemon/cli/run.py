@@ -72,7 +72,7 @@ def _run_roles(config: Config, roles: list[str], stop: threading.Event) -> int:
     from vical_daemon.service import notify
 
     bus = open_for_roles(config, roles, stop)
-    if bus is None:  # told to stop while waiting for the router
+    if bus is None:  # stopped while waiting for the router
         return 0
     notify.ready(f"starting: {', '.join(roles)}")  # not later: the roles load large libraries
     threads = RoleThreads(config, bus)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from vical_daemon.estimation.temporal.delay_windows import DelayReport
     from vical_daemon.estimation.temporal.td_icp import TdIcpResult
     from vical_daemon.estimation.temporal.td_icp_joint import JointResult
-    from vical_daemon.estimation.temporal.td_icp_monitor import DelayReport
     from vical_daemon.offline.td_icp.sources import LensUsed
 
 

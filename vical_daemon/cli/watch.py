@@ -119,7 +119,7 @@ class View:
             self._on_verified(parsed.rig, parsed.name, sample)
 
     def all_converged(self) -> bool:
-        """Whether there is a camera and every one has converged, and still says so."""
+        """Whether there is a camera and every one has converged, and is still converged."""
         return (
             bool(self.estimates)
             and all(e.status == "converged" for e in self.estimates.values())

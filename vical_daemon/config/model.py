@@ -1,6 +1,6 @@
 """The one settings file of a rig: typed, strict, every refusal with path, bound, file and line.
 
-Defaults stand here and beside the algorithms; `examples/vical.yaml` shows every key.
+Defaults stand here and next to the algorithms; `examples/vical.yaml` shows every key.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The estimator as the roles see it: measurements in, calibration out. No clock, no thread, no I/O.
 
 Flow: `starting` collects until a start succeeds -> filter everything collected -> follow the stream behind a
-short lag (so that inertial data always bracket each image) -> `judge` says how far to trust it.
+short lag (so that inertial data always bracket each image) -> `evaluator` says how far to trust it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from vical_daemon.estimation.measurements import (
     PointsFrame,
 )
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.plausible import usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
-from vical_daemon.estimation.selection import clock_drift
-from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
@@ -41,7 +41,6 @@ from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
-_STEPPED_SIGMAS = 5.0  # of the fit that found a step: the images count again by 4 % at most
 _STEPPED_LEAST_S = 1e-3
 _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
@@ -68,17 +67,17 @@ class Calibrator:
             raise ValueError("target-free calibration needs TargetFreeCalibrator")
         self.options = options
         self.rig = RigModel(options, cameras, np.asarray(target_points_m, dtype=np.float64))
-        self.judge = StatusEvaluator(options, self.rig.layout)
+        self.evaluator = StatusEvaluator(options, self.rig.layout)
         self.filter: CalibrationFilter | None = None
         self._intake = SensorIntake()
         self._pending = FrameQueue(list(cameras))
-        self._starting = self._new_starting()
+        self._initializer = self._new_initializer()
         self.watch = ChangeWatch()
         self._stale: CalibrationFilter | None = None
         self._lost: MotionRestart | None = None
         self._used_ns: dict[str, int] = {}  # stamp of the last image used, by camera
         self._held_back = HoldoutCheck()
-        self._beyond_doubt = ModelAcceptance()
+        self._acceptance = ModelAcceptance()
         self._past = RecentPast()
         # A step of the time shift, until images confirm it: when to announce it, camera, shift before, s.
         self._unproven: tuple[float, str, float] | None = None
@@ -86,8 +85,8 @@ class Calibrator:
         self._seek_shift: set[str] = set()  # cameras whose time shift is to be found before the motion
         self._reports: list[FrameReport] = []  # of the images of a start
 
-    def _new_starting(self, off: Collection[str] = ()) -> Initializer:
-        """For a rig of which it is known what is not as stated."""
+    def _new_initializer(self, off: Collection[str] = ()) -> Initializer:
+        """For a rig of which it is known what is not as specified."""
         options = replace(self.options, estimate=self.options.estimate | set(off))
         return Initializer(options, self.rig.layout, self.rig.target, self._step)
 
@@ -100,8 +99,8 @@ class Calibrator:
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
-            self.judge.saw_imu(*reading)
-        self.judge.announce_all(self._intake.imu_news())
+            self.evaluator.saw_reading(*reading)
+        self.evaluator.announce_all(self._intake.imu_news())
 
     @property
     def _buffer(self) -> ImuBuffer | None:
@@ -118,13 +117,13 @@ class Calibrator:
             sigma = None if frame.sigma_px is None else frame.sigma_px[ok]
             frame = PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[ok], frame.uv_px[ok], sigma)
         t_cam_s = self._intake.take_image(frame)
-        self.judge.announce_all(self._intake.image_news())
+        self.evaluator.announce_all(self._intake.image_news())
         if t_cam_s is None:
             self._intake.images_ignored += 1
             return
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
-        self.judge.saw_points(t_cam_s, len(frame.ids))
+        self.evaluator.saw_points(t_cam_s, len(frame.ids))
         self._pending.push(t_cam_s, frame)
 
     def _clock_was_set(self, camera: str) -> None:
@@ -149,7 +148,7 @@ class Calibrator:
         """Do what can be done with what has arrived."""
         if self._buffer is None:
             return []
-        if self.filter is None or self.filter.unshown is not None:
+        if self.filter is None or self.filter.unobservable is not None:
             self._maybe_start()
         return self._follow(flush=False)
 
@@ -165,25 +164,25 @@ class Calibrator:
         """Collect while there is no filter, and try to start one; a partial one gives way to a full one."""
         assert self._buffer is not None
         if self.filter is None:
-            self._starting.take(self._pending.take_all())
+            self._initializer.take(self._pending.take_all())
             self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
-            self._buffer.trim(self._starting.oldest_s - _KEEP_S)
-        if not (at_end or self._starting.due(self._buffer.newest_s)):
+            self._buffer.trim(self._initializer.oldest_s - _KEEP_S)
+        if not (at_end or self._initializer.due(self._buffer.newest_s)):
             return
         found = self._attempt(self._buffer)
         if found.filter is None:
             if self.filter is None:
-                self.judge.waiting(found.reason, found.motion_missing)
+                self.evaluator.waiting(found.reason, found.motion_missing)
             return
         if self.rig.size != 1.0:
             event = Event(EventKind.TARGET_SIZE, value=self.rig.size - 1.0)
-            self.judge.announce(event, once=hypotheses.SIZE)
+            self.evaluator.announce(event, once=model_selection.SIZE)
         self._begin(found.filter, found)
 
     def _attempt(self, buffer: ImuBuffer) -> Attempt:
         """Try to start; where the data contradict the model of the rig, change that and try again."""
         may_be_partial = self.filter is None
-        found = self._starting.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+        found = self._initializer.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
         for _ in range(_MOST_CHANGES):
             if found.rolling is not None:
                 self._estimate_readout(*found.rolling)
@@ -191,7 +190,7 @@ class Calibrator:
                 self._resize(found.size)
             else:
                 break
-            found = self._starting.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+            found = self._initializer.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
         return found
 
     def _begin(self, f: LinearisedFilter, found: Attempt) -> None:
@@ -203,9 +202,9 @@ class Calibrator:
             self._kept_until_s = f.state.t_s + _PROVEN_S
         self._stale = None
         self._held_back, self._lost, self._past = HoldoutCheck(), None, RecentPast()
-        self.judge.started(f.state.t_s, found.reason)
+        self.evaluator.started(f.state.t_s, found.reason)
         self.watch.started(f.state.t_s)
-        self._starting.anew()
+        self._initializer.anew()
         left = self._take_start(f, found.frames)
         self.filter = f.plain()
         for t, frame in [*left, *later]:
@@ -221,9 +220,9 @@ class Calibrator:
             if report is None:
                 self._intake.images_ignored += 1
                 continue
-            if f.unshown is not None:
-                self._starting.take([(t_cam_s, frame)])
-                f.unshown.follow(f)
+            if f.unobservable is not None:
+                self._initializer.take([(t_cam_s, frame)])
+                f.unobservable.follow(f)
             now = f.plain()
             self._ask_held_back(now, frame, t_cam_s)
             self._note(now, report, frame, t_cam_s)
@@ -233,15 +232,15 @@ class Calibrator:
     def _estimate_readout(self, camera: str, axis: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self.rig.estimate_readout(camera, axis)
-        self.judge.layout = self.rig.layout
-        self._starting.go_on_with(self.rig.layout, self.rig.target)
-        self.judge.announce(Event(ROLLING[axis], camera))
+        self.evaluator.layout = self.rig.layout
+        self._initializer.go_on_with(self.rig.layout, self.rig.target)
+        self.evaluator.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
-        """The target is by far not as large as stated: go on with one that is; its size is asked for."""
+        """The target is far from the size in its file: go on with the size found, and estimate it."""
         self.rig.resize(size)
-        self.judge.layout = self.rig.layout
-        self._starting.go_on_with(self.rig.layout, self.rig.target, {hypotheses.SIZE})
+        self.evaluator.layout = self.rig.layout
+        self._initializer.go_on_with(self.rig.layout, self.rig.target, {model_selection.SIZE})
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
@@ -306,10 +305,10 @@ class Calibrator:
         if report is None:
             self._intake.images_ignored += 1
             return []
-        if f.unshown is not None:
-            self._starting.take([(t_cam_s, frame)])
-            f.unshown.follow(f)
-        needed_s = min(f.state.t_s, self._starting.oldest_s)
+        if f.unobservable is not None:
+            self._initializer.take([(t_cam_s, frame)])
+            f.unobservable.follow(f)
+        needed_s = min(f.state.t_s, self._initializer.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
         self._ask_held_back(f, frame, t_cam_s)
         if not f.plausible():
@@ -320,8 +319,8 @@ class Calibrator:
         if self._unproven is not None and f.state.t_s > self._unproven[0]:
             self._announce_step(f, *self._unproven[1:])
             self._unproven = None
-        for block, event in self._beyond_doubt.look(f).items():
-            self.judge.announce(event, once=block)
+        for block, event in self._acceptance.look(f).items():
+            self.evaluator.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
         return [report]
 
@@ -329,14 +328,14 @@ class Calibrator:
         """Take an image and its verdict into what is remembered and reported."""
         self._used_ns[frame.camera] = frame.t_cam_ns
         self._past.saw(f, report, frame, t_cam_s)
-        self.judge.saw_frame(report, f)
+        self.evaluator.saw_frame(report, f)
 
     def _ask_held_back(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
         """Judge how well an image was predicted that the held-back copy of the filter has not used."""
         assert self._buffer is not None
         ratio = self._held_back.follow(f, frame, t_cam_s, self.rig.target, self._buffer)
         if ratio is not None:
-            self.judge.held_back(ratio, f.consistency[frame.camera].scale)
+            self.evaluator.held_back(ratio, f.consistency[frame.camera].scale)
 
     def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""
@@ -347,11 +346,11 @@ class Calibrator:
             return
         if action is Action.POSE:
             self._lose_motion()
-            self.judge.announce(Event(EventKind.POSE_LOST))
+            self.evaluator.announce(Event(EventKind.POSE_LOST))
         elif action in (Action.SKEW, Action.WANDER):
             anew = action is Action.WANDER
             once = f"wander {frame.camera}" if anew else ""
-            self.judge.announce(clock_drift.let_drift(f, frame.camera, anew=anew), once=once)
+            self.evaluator.announce(clock_drift.let_drift(f, frame.camera, anew=anew), once=once)
         elif action is Action.RESTART:
             self._restart(f)
 
@@ -362,7 +361,7 @@ class Calibrator:
         its lens, until the misfit is no longer one of the time shift alone.
         """
         assert self._buffer is not None
-        if self.rig.layout.cameras[camera].timeshift is None or f.unshown is not None:
+        if self.rig.layout.cameras[camera].timeshift is None or f.unobservable is not None:
             return False
         before = self._past.filter(f)
         fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
@@ -376,7 +375,7 @@ class Calibrator:
 
     def _announce_step(self, f: CalibrationFilter, camera: str, before_s: float) -> None:
         step_s = f.state.cameras[camera].timeshift_s - before_s
-        self.judge.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
+        self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
         """Take a time shift as found anew, all else as it is known; the step, s."""
@@ -384,9 +383,9 @@ class Calibrator:
         assert index is not None
         step_s = fit.timeshift_s - known.timeshift_s
         known.timeshift_s = fit.timeshift_s
-        f.forget(index, max(_STEPPED_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
+        f.forget(index, max(AGAIN_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
         self.watch.shift_reopened()
-        self.judge.reopened(f.state.t_s)
+        self.evaluator.reopened(f.state.t_s)
         return step_s
 
     def _restart(self, f: CalibrationFilter) -> None:
@@ -394,18 +393,18 @@ class Calibrator:
 
         Where what was kept soon turns out not to fit either, nothing is.
         """
-        if f.unshown is not None:  # nothing has changed: the guesses were wrong
+        if f.unobservable is not None:  # nothing has changed: the guesses were wrong
             self.filter = None
-            self._starting.anew()
+            self._initializer.anew()
             return
         before = self._past.filter(f)
         sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
         if sound is not None:
             self.rig.start_from_lenses_of(sound.state)
         self._unproven = None
-        self.judge.changed(self.watch.why)
+        self.evaluator.changed(self.watch.why)
         self._stale, self.filter = sound, None
-        self._starting = self._new_starting(sound.off if sound else ())
+        self._initializer = self._new_initializer(sound.off if sound else ())
 
     def _seek(self, f: CalibrationFilter, lost: MotionRestart, camera: str) -> MotionRestart:
         """After the clock of a camera was set: find its time shift from the images collected."""
@@ -426,7 +425,7 @@ class Calibrator:
     @property
     def can_go_on(self) -> bool:
         """Whether another recording can go on with this calibration: its start left no direction unknown."""
-        return self.filter is not None and self.filter.unshown is None
+        return self.filter is not None and self.filter.unobservable is None
 
     def next_recording(self, *, common_clock: bool = True) -> None:
         """What comes from now on is another recording of the same rig; call `finish` first.
@@ -451,7 +450,7 @@ class Calibrator:
         self._past, self._unproven = RecentPast(), None
         self._used_ns.clear()
         self._seek_shift.clear()
-        self._starting.anew()
+        self._initializer.anew()
         self._held_back, self._lost = HoldoutCheck(), None
         if f is not None:
             self.watch.shift_reopened()
@@ -463,21 +462,21 @@ class Calibrator:
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
-        self.judge.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
-        return self._intake.by_present_stamps(self.judge.estimate(self.filter, self._stale))
+        self.evaluator.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
+        return self._intake.by_present_stamps(self.evaluator.estimate(self.filter, self._stale))
 
     def _in_doubt(self, f: CalibrationFilter) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
-        converged = self.judge.status == Status.CONVERGED
+        converged = self.evaluator.status == Status.CONVERGED
         drifts = (clock_drift.in_doubt(f, name, converged=converged) for name in self.rig.priors)
         if self.watch.doubtful or any(drifts):
             return clock_drift.CLOCKS_IN_DOUBT
-        return hypotheses.IN_DOUBT.get(hypotheses.in_doubt(f, converged=converged), "")
+        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, converged=converged), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""
-        return self._intake.trace_by_present_stamps(self.judge.trace(camera), camera)
+        return self._intake.trace_by_present_stamps(self.evaluator.trace(camera), camera)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return how well the IMU alone predicted images before they were used, oldest first."""
-        return list(self.judge.held_out)
+        return list(self.evaluator.held_out)

@@ -36,8 +36,9 @@ JUMP_SIGMAS = 6.0
 """2e-9: a time shift that `td_icp` follows has jumped; asked at every window."""
 RATE_SIGMAS = 6.0
 """2e-9: two clocks do not run at one rate, so that a recording is refused."""
-DISAGREEMENT_SIGMAS = 4.0
-"""6e-5: `td_icp` and the filter disagree about the time shift; several times in a row are needed."""
+
+EVERY_S = 1.0
+"""Decisions that need not follow every image are made this often, s."""
 
 # Medians, for standard deviations that outliers do not move.
 MEDIAN_ABSOLUTE = 0.6745

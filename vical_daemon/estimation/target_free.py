@@ -1,6 +1,6 @@
 """Calibration without a target: tracks of unknown points and an IMU in, calibration out. No clock, no I/O.
 
-Flow: buffer -> `free.starter.Starter` (rotations and delay from the epipolar constraint, then speed, gravity
+Flow: buffer -> `TargetFreeInitializer` (rotations and delay from the epipolar constraint, then speed, gravity
 and structure linearly) -> one inertial bundle adjustment per window of a few seconds, grown as images arrive
 -> what the window knows is carried into the next as a prior on tilt, speed, biases and calibration. How far a
 window's own data moved the calibration, against how far they may, says whether to believe it.
@@ -22,7 +22,10 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
+from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
+from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
+from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
     FULL,
     LENS,
@@ -30,12 +33,9 @@ from vical_daemon.estimation.smoother.carry import (
     MarginalPrior,
     calibration_difference,
 )
-from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
-from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
-from vical_daemon.estimation.smoother.judge import TargetFreeStatus
 from vical_daemon.estimation.smoother.reports import window_reports
-from vical_daemon.estimation.smoother.starter import Starter
+from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
 from vical_daemon.estimation.smoother.window import Window
@@ -77,8 +77,8 @@ class TargetFreeCalibrator:
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         self.active[LENS] = "intrinsics" not in options.fix
         rolling = "readout" in options.estimate or prior.readout_s != 0.0
-        self.judge = TargetFreeStatus(options, self.camera, self.active, rolling=rolling)
-        self._first = FirstWindow(options, prior, self.active, self.judge)
+        self.evaluator = TargetFreeStatus(options, self.camera, self.active, rolling=rolling)
+        self._first = FirstWindow(options, prior, self.active, self.evaluator)
         self.window: Window | None = None
         self.carry: MarginalPrior | None = None  # before the window
         self.latest: MarginalPrior | None = None  # after its last adjustment
@@ -99,18 +99,18 @@ class TargetFreeCalibrator:
     def stamps_known_to(self, sigma_s: float) -> None:
         """Take how well the imu's driver knows its device's clock now, one sigma, s; nonsense is ignored."""
         if self._intake.stamps_known_to(sigma_s):
-            self.judge.doubts.stamp_sigma_s = sigma_s
+            self.evaluator.doubts.stamp_sigma_s = sigma_s
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
-            self.judge.saw_imu(reading.t_imu_ns, reading.gyro_rps)
-        self.judge.announce_all(self._intake.imu_news())
+            self.evaluator.saw_imu(reading.t_imu_ns, reading.gyro_rps)
+        self.evaluator.announce_all(self._intake.imu_news())
 
     @property
-    def starter(self) -> Starter:
+    def initializer(self) -> TargetFreeInitializer:
         """What tries to start."""
-        return self._first.starter
+        return self._first.initializer
 
     @property
     def _buffer(self) -> ImuBuffer | None:
@@ -124,7 +124,7 @@ class TargetFreeCalibrator:
             self._intake.images_ignored += 1
             return
         t_cam_s = self._intake.take_image(frame)
-        self.judge.announce_all(self._intake.image_news())
+        self.evaluator.announce_all(self._intake.image_news())
         if t_cam_s is None or t_cam_s <= self._newest_s:
             self._intake.images_ignored += 1
             return
@@ -133,7 +133,7 @@ class TargetFreeCalibrator:
         self._newest_s = t_cam_s
         if not self._thinning.takes(t_cam_s):
             return
-        self.judge.saw_points(t_cam_s, len(frame.ids))
+        self.evaluator.saw_points(t_cam_s, len(frame.ids))
         if len(frame.ids) >= 4:
             self._pending.append((t_cam_s, frame))
 
@@ -142,7 +142,7 @@ class TargetFreeCalibrator:
         self._pending.clear()
         if self.latest is not None:
             self._lost(Cause.CLOCK_SET, keep=True)
-            self.judge.contradicted(0.0)
+            self.evaluator.contradicted(0.0)
         self._seek_shift = self.latest is not None
 
     @property
@@ -211,12 +211,12 @@ class TargetFreeCalibrator:
         known = self.latest
         self._buffer.cut(self._intake.gap_end_s)  # a start needs motion in one piece
         hint = None if self._anew else known
-        frames = self.starter.stretch(self._buffer, self._pending, end, hint, last=flush)
+        frames = self.initializer.stretch(self._buffer, self._pending, end, hint, last=flush)
         if frames is None:
             return False
         begun = frames if isinstance(frames, str) else self._begin(self._buffer, frames, known)
         if isinstance(begun, str):
-            self.judge.waiting(begun, self.starter.motion_missing)
+            self.evaluator.waiting(begun, self.initializer.motion_missing)
             return False
         window, fit = begun.bundle.window, begun.fit
         self._fitted_s = last = window.frames[-1][0]
@@ -224,9 +224,9 @@ class TargetFreeCalibrator:
         self.window, self.carry, self.latest = window, begun.bundle.carry, fit.carry
         self._noise = Noise.of(fit)
         self._anew = False
-        self.judge.held = self.starter.held
-        self.judge.started(window.frames[0][0])
-        self.judge.saw_fit(fit, last + window.shift_s)
+        self.evaluator.held = self.initializer.held
+        self.evaluator.started(window.frames[0][0])
+        self.evaluator.saw_fit(fit, last + window.shift_s)
         if _full(window):
             self._close(fit, begun.bundle)
         return True
@@ -247,16 +247,16 @@ class TargetFreeCalibrator:
         if isinstance(begun, Begun):
             return begun
         if begun is DOES_NOT_FIT:
-            self.judge.contradicted(frames[-1][0] - frames[0][0])
-        if self.judge.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
-            held, anew = self.starter.held, self._first.begin(buffer, frames, None, self._noise)
+            self.evaluator.contradicted(frames[-1][0] - frames[0][0])
+        if self.evaluator.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
+            held, anew = self.initializer.held, self._first.begin(buffer, frames, None, self._noise)
             if isinstance(anew, Begun):
                 self._closed, self._confirmed, self._seek_shift = 0, False, False
-                self.judge.changed()
+                self.evaluator.changed()
             else:
-                self.starter.held = held
+                self.initializer.held = held
             return anew
-        window = self.starter.window_anew(buffer, frames, known)
+        window = self.initializer.window_anew(buffer, frames, known)
         if isinstance(window, str):
             return begun
         free = self._first.adjusted(buffer, window, known, self._noise, BOTH)
@@ -270,11 +270,11 @@ class TargetFreeCalibrator:
             found.calibration(),
             known.calibration(),
             self.active,
-            lambda square, dof: self.judge.excess(square, dof, change),
+            lambda square, dof: self.evaluator.excess(square, dof, change),
         )
         if self._seek_shift:
             reopened = tuple({*reopened, *CLOCK})
-        if MOUNTING[0] in reopened and not self.judge.proven:
+        if MOUNTING[0] in reopened and not self.evaluator.proven:
             self._forget(known)
             return begun
         ended = self._first.adjusted(buffer, window, known, self._noise, reopened)
@@ -283,9 +283,9 @@ class TargetFreeCalibrator:
         change = calibration_difference(window, known)
         change[[k for k in BOTH if k not in reopened]] = 0.0
         if MOUNTING[0] in reopened:
-            self.judge.changed(change)
+            self.evaluator.changed(change)
         elif reopened and not self._seek_shift:
-            self.judge.stepped(float(change[SHIFT]))
+            self.evaluator.stepped(float(change[SHIFT]))
         self._seek_shift = self._confirmed = False
         return ended
 
@@ -312,10 +312,10 @@ class TargetFreeCalibrator:
             if _full(window):
                 self._lost(Cause.FEATURES_CONTRADICT, against_s=against_s)
             return
-        if not self.judge.fits(fit):
-            self._lost(*self.judge.misfit, against_s=against_s)
+        if not self.evaluator.fits(fit):
+            self._lost(*self.evaluator.misfit, against_s=against_s)
             return
-        if self.starter.held is not None and has_turned(window.R, self.starter.held):
+        if self.initializer.held is not None and has_turned(window.R, self.initializer.held):
             self._start_whole()
             return
         if self._closed and not self._agrees(fit, self.carry, complete=_full(window)):
@@ -323,7 +323,7 @@ class TargetFreeCalibrator:
             return
         self.latest, self._noise = fit.carry, Noise.of(fit)
         self._fitted_s = window.frames[-1][0]
-        self.judge.saw_fit(fit, self._fitted_s + window.shift_s)
+        self.evaluator.saw_fit(fit, self._fitted_s + window.shift_s)
         if _full(window):
             self._close(fit, bundle)
 
@@ -332,7 +332,7 @@ class TargetFreeCalibrator:
         if fit.parallax_deg < _MIN_PARALLAX_DEG:
             return True
         stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise.jitter_s
-        return self.judge.agrees(fit, carry, complete=complete) and not stepped
+        return self.evaluator.agrees(fit, carry, complete=complete) and not stepped
 
     def _close(self, fit: Fit, bundle: Bundle) -> None:
         """Carry what the window knows into the next."""
@@ -344,10 +344,10 @@ class TargetFreeCalibrator:
             self._lost(Cause.NO_PARALLAX)
             return
         self._closed += 1
-        self.judge.closed()
+        self.evaluator.closed()
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
-        drifting, noise = self.judge.doubts.drifting, self.options.imu_noise
+        drifting, noise = self.evaluator.doubts.drifting, self.options.imu_noise
         self.carry = with_process_noise(fit.carry, noise, self.active, window.span_s, drifting=drifting)
         self.window = next_window(window, self.carry)
 
@@ -356,15 +356,15 @@ class TargetFreeCalibrator:
         self._first.guess_from(known)
         self.latest = None
         self._closed, self._confirmed = 0, False
-        self.judge.changed()
+        self.evaluator.changed()
         self.window = self.carry = None
 
     def _start_whole(self) -> None:
         """After a partial start, the rig turns about a second axis: all of the calibration will show."""
         self.window = self.carry = self.latest = None
         self._closed = 0
-        self.starter.again()
-        self.judge.lost(Cause.SECOND_AXIS, None, None)
+        self.initializer.again()
+        self.evaluator.lost(Cause.SECOND_AXIS, None, None)
 
     def _lost(
         self, why: Cause, value: float | None = None, *, keep: bool = False, against_s: float = 0.0
@@ -377,27 +377,27 @@ class TargetFreeCalibrator:
             keep: The window as adjusted last was good.
             against_s: For how long images have contradicted the calibration, s; 0: they do not.
         """
-        window, unproven = self.window, against_s > 0.0 and not self.judge.proven
+        window, unproven = self.window, against_s > 0.0 and not self.evaluator.proven
         self.window = None
-        if window is not None and against_s and self.judge.against_s:
+        if window is not None and against_s and self.evaluator.against_s:
             self._confirmed = True
             self._pending = [*window.frames, *self._pending]  # all of them after the change
         if window is not None and self.carry is not None:
             if keep and window.span_s > _LEAST_S:
                 self._closed += 1
-                self.judge.closed()
+                self.evaluator.closed()
             else:
                 self.latest = self.carry if self._closed else None
         if unproven:  # one window stands against one: neither is known to be right
             self.latest, self._closed, self._confirmed = None, 0, False
         self.carry = None
-        self.starter.again()
-        self.judge.lost(why, value, self.latest, against_s)
+        self.initializer.again()
+        self.evaluator.lost(why, value, self.latest, against_s)
 
     @property
     def can_go_on(self) -> bool:
         """Whether another recording can continue this calibration: no direction of it is unknown."""
-        return self.latest is not None and self.starter.held is None
+        return self.latest is not None and self.initializer.held is None
 
     def next_recording(self, *, common_clock: bool = True) -> None:
         """What comes from now on is another recording of the same rig; see `Calibrator.next_recording`."""
@@ -410,8 +410,8 @@ class TargetFreeCalibrator:
             camera, offset_s = self.latest.camera, self._intake.offset_s(self.camera)
             self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + offset_s)
         self._anew = self.latest is not None
-        self.starter.again()
-        self.judge.next_recording()
+        self.initializer.again()
+        self.evaluator.next_recording()
         self._stepped_s = abs(self._intake.imu_stepped_s)
         self._intake.next_recording()
         self._pending = []
@@ -425,7 +425,7 @@ class TargetFreeCalibrator:
         known = self.latest
         if known is not None and self._buffer is not None:
             known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
-        estimate = self.judge.estimate(known, running=self.window is not None, gravity=gravity)
+        estimate = self.evaluator.estimate(known, running=self.window is not None, gravity=gravity)
         return self._intake.by_present_stamps(estimate)
 
     def held_out(self) -> list[HeldOutCheck]:
@@ -436,7 +436,7 @@ class TargetFreeCalibrator:
         """Return how the calibration developed."""
         if camera != self.camera:
             return []
-        return self._intake.trace_by_present_stamps(self.judge.trace(), camera)
+        return self._intake.trace_by_present_stamps(self.evaluator.trace(), camera)
 
 
 def _full(window: Window) -> bool:

@@ -390,7 +390,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.TARGET_SHAPE: (
         "",
         lambda e: (
-            f"the target is not as stated, by {_of(e, 1e3, 'mm', '.2f')} at its edges: "
+            f"the target differs from its file by {_of(e, 1e3, 'mm', '.2f')} at its edges: "
             "its shape is estimated from now on"
         ),
     ),

@@ -116,19 +116,19 @@ class Recording(ABC):
         return (max(stream.end_ns for stream in self.streams) - self.begin_ns) * 1e-9
 
     def messages(
-        self, streams: Iterable[Stream] | None = None, beside: Iterable[str] = ()
+        self, streams: Iterable[Stream] | None = None, also: Iterable[str] = ()
     ) -> Iterator[tuple[str, bytes]]:
         """Yield (key, payload) in order of the stamps; at equal stamps imus first, then by key.
 
         Args:
             streams: Those to take; None: every imu and, of each camera, its stream in `cameras`.
-            beside: Keys of status messages to take, too, where the recording holds them.
+            also: Keys of status messages to take, too, where the recording holds them.
 
         Raises:
             RecordingError: The disk refuses.
         """
         chosen = streams if streams is not None else [*self.imus.values(), *self.cameras.values()]
-        return self._messages({stream.key for stream in chosen} | set(beside))
+        return self._messages({stream.key for stream in chosen} | set(also))
 
     @abstractmethod
     def _messages(self, keys: set[str]) -> Iterator[tuple[str, bytes]]: ...
@@ -178,7 +178,7 @@ class Stamped(NamedTuple):
 
 
 class OutOfReach:
-    """Tells whether `in_stamp_order` would give a message too late, without doing it.
+    """Checks whether `in_stamp_order` would give a message too late, without doing it.
 
     Attributes:
         found: It would.

@@ -1,6 +1,6 @@
 """What a calibration claims about a camera: values and one joint covariance, wherever it comes from.
 
-A file without covariances (Kalibr's camchain, OpenVINS) gets assumed ones, and says so in `notes`.
+A file without covariances (Kalibr's camchain, OpenVINS) gets assumed ones; `notes` says which.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Where the points of a flat board appear: a homography and one lens coefficient, fitted to what was seen.
 
 Good to a pixel or so with any common lens and needs no calibration: it predicts corners that were not found
-yet, tells neighbours apart, and shows which detections do not belong. Undistorted and distorted image points
+yet, separates neighbours, and shows which detections do not belong. Undistorted and distorted image points
 are related by the division model q_u = q_d / (1 + lens |q_d|^2), q from the image centre in half widths.
 """
 

@@ -1,4 +1,4 @@
-"""Image folders as a camera: the ASL layout (``data.csv`` beside ``data/``), as EuRoC's ``mav0/cam0``.
+"""Image folders as a camera: the ASL layout (``data.csv`` next to ``data/``), as EuRoC's ``mav0/cam0``.
 
 A folder behaves as a camera does: a frame comes when its time has come, and its stamp is CLOCK_MONOTONIC.
 """
@@ -32,7 +32,7 @@ class ImageFolder(Closing):
     The first frame is dated by the first `read`; the others follow it as far apart as they were recorded.
 
     Args:
-        path: Folder with ``data.csv`` (``timestamp [ns], file name``); images in ``data/`` or beside it.
+        path: Folder with ``data.csv`` (``timestamp [ns], file name``); images in ``data/`` or next to it.
         settings: `decoder` decompresses the files; `encoding` is mono8 or bgr8.
 
     Raises:

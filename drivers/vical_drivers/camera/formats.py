@@ -289,10 +289,10 @@ def bayer_to_bgr(mosaic: Image, order: str) -> npt.NDArray[np.uint8]:
         here = (slice(r, None, 2), slice(c, None, 2))
         colour = order[place]
         if colour == "G":
-            beside = order[2 * r + (1 - c)]  # the colour of the neighbours in this row
+            in_row = order[2 * r + (1 - c)]  # the colour of the neighbours in this row
             bgr[..., 1][here] = centre[here]
-            bgr[..., "BGR".index(beside)][here] = across[here]
-            bgr[..., "BGR".index("R" if beside == "B" else "B")][here] = down[here]
+            bgr[..., "BGR".index(in_row)][here] = across[here]
+            bgr[..., "BGR".index("R" if in_row == "B" else "B")][here] = down[here]
         else:
             bgr[..., "BGR".index(colour)][here] = centre[here]
             bgr[..., 1][here] = cross[here]

@@ -25,7 +25,7 @@ PARAMETERS = ("px", "py", "pz", "rx", "ry", "rz", "td", "fx", "fy", "cx", "cy", 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What an estimator said at one time, beside the truth.
+    """What an estimator reported at one time, and the truth.
 
     Attributes:
         t_s: When (imu time since the start).
@@ -246,7 +246,7 @@ class CalibratorSubject:
         if inner is None:
             return claimed
         rows, places = self._rows(inner.layout.cameras[CAMERA])
-        joint = self.calibrator.judge.weighed(inner).covariance(rows)
+        joint = self.calibrator.evaluator.weighed(inner).covariance(rows)
         spread = np.sqrt(np.diag(joint))
         spread[spread == 0.0] = 1.0  # a fixed lens that is surely right
         correlation = joint / np.outer(spread, spread)

@@ -19,11 +19,11 @@ pytestmark = pytest.mark.system
 
 
 class Heard:
-    """What the bus carried, in order: serial numbers as they were told, and a dot for each sample."""
+    """What the bus carried, in order: serial numbers as they were announced, and a dot for each sample."""
 
     def __init__(self, bus: LocalBus) -> None:
         self.story: list[str] = []
-        self.told: list[str] = []
+        self.announced: list[str] = []
         bus.subscribe(topics.IMU.key("rig0", "imu0"), lambda _: self._add("."))
         bus.subscribe(topics.STATUS.key("rig0", "imu"), self._status)
 
@@ -38,7 +38,7 @@ class Heard:
 
     def event(self, name: str, text: str, **_: object) -> None:
         """Stands in for the journal."""
-        self.told.append(f"{name}: {text}")
+        self.announced.append(f"{name}: {text}")
         if name == "device_replaced":
             self._add("replaced")
 
@@ -69,5 +69,5 @@ def test_its_serial_number_is_told_before_its_first_sample(emulate, monkeypatch)
     at = heard.story.index("replaced")
     assert "." in heard.story[:at] and "B" not in heard.story[:at]
     assert heard.story[at + 1] == "B" and "A" not in heard.story[at:]
-    (replaced,) = [text for text in heard.told if text.startswith("device_replaced")]
+    (replaced,) = [text for text in heard.announced if text.startswith("device_replaced")]
     assert replaced.endswith("is another device now: 3DM-GX3-25 serial B, not 3DM-GX3-25 serial A")

@@ -113,7 +113,7 @@ def test_four_hundred_half_open_connections_shut_nobody_out(served):
         assert time.monotonic() - begin_s < IDLE_S + 10
         assert until(lambda: int(counters(served)["connections_refused"]) >= 400 - CONNECTIONS_LIMIT)
         assert until(lambda: int(counters(served)["connections"]) == 0, IDLE_S + 30)
-        for connection in held:  # the other side is told
+        for connection in held:  # the other side is notified
             connection.settimeout(10)
             try:
                 assert connection.recv(10) == b""

@@ -108,8 +108,8 @@ def test_a_lost_device_is_reported_and_comes_back_by_itself(stop) -> None:
 
 
 def test_another_device_is_opened_from_scratch_and_told_in_the_journal(stop, monkeypatch) -> None:
-    told: list[tuple[str, str]] = []
-    monkeypatch.setattr(notify, "event", lambda name, text, **_: told.append((name, text)))
+    events: list[tuple[str, str]] = []
+    monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append((name, text)))
     lost = DeviceLostError("unplugged")
     sources = [
         ScriptedSource([[1], lost, DeviceReplacedError("another device came back")], serial_number="S1"),
@@ -122,7 +122,7 @@ def test_another_device_is_opened_from_scratch_and_told_in_the_journal(stop, mon
     assert sources[0].closed and not sources[1].closed and loop.openings == 2
     info = loop.health().info
     assert info is not None and info.serial_number == "S2"
-    replaced = [text for name, text in told if name == "device_replaced"]
+    replaced = [text for name, text in events if name == "device_replaced"]
     assert replaced == ["imu/imu0 is another device now: scripted serial S2, not scripted serial S1"]
 
 
@@ -160,15 +160,15 @@ def test_a_silent_device_is_opened_again(stop) -> None:
 
 
 def test_a_recording_at_its_end_is_neither_lost_nor_opened_again(stop, monkeypatch) -> None:
-    told: list[str] = []
-    monkeypatch.setattr(notify, "event", lambda name, text, **_: told.append(name))
+    events: list[str] = []
+    monkeypatch.setattr(notify, "event", lambda name, text, **_: events.append(name))
     source = ScriptedSource([[1], DataEndedError("run.mcap has ended")])
     got: list[int] = []
     loop = _loop(lambda: source, got, stop, silence_s=0.05)
     _wait_for(lambda: loop.health().state == "ended")
     time.sleep(0.2)  # longer than a silent device is waited for
     health = loop.health()
-    assert health.openings == 1 and health.loop_age_s < STUCK_S and told == ["recording_ended"]
+    assert health.openings == 1 and health.loop_age_s < STUCK_S and events == ["recording_ended"]
     outbox = PublishQueue(LocalBus(), 4, "out")
     status = device_status("imu/imu0", health, outbox, 100.0)
     assert status.level is Level.WARN and status.message == "run.mcap has ended"

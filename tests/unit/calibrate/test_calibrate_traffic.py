@@ -37,7 +37,7 @@ def config() -> Config:
 
 
 class Recorded:
-    """An estimator that takes everything, and fails or waits when told to."""
+    """An estimator that takes everything, and fails or waits on request."""
 
     def __init__(self) -> None:
         self.frames = self.imu_samples = 0
@@ -163,7 +163,6 @@ class Service:
             return self.made[-1]
 
         patch.setattr(estimate, "make_estimator", make)
-        patch.setattr(estimate, "make_watch", lambda _: None)
         patch.setattr(notify, "event", lambda name, text, **_: self.events.append((name, text)))
         self.thread = threading.Thread(
             target=estimate.run, args=(config, self.bus, self.stop), kwargs={"clock": private_clock()}

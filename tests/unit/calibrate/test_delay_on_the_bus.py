@@ -1,9 +1,8 @@
-"""Temporal calibration over a LocalBus: it starts the estimator and then watches the filter's delay."""
+"""The estimator on a LocalBus starts without knowing delay or mounting."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -12,24 +11,14 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.rotations import log_so3
 
 from vical_daemon.bus import topics
-from vical_daemon.bus.interface import Bus, LocalBus, Sample
-from vical_daemon.bus.messages import (
-    DiagnosticStatus,
-    Level,
-    decode_calibration,
-    decode_diagnostics,
-    encode_imu,
-    encode_points,
-)
+from vical_daemon.bus.interface import Bus, LocalBus
+from vical_daemon.bus.messages import decode_calibration, encode_imu, encode_points
 from vical_daemon.calibrate.worker import EstimateRole
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.geometry.so3 import matrix_from_quat
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
-from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
-from vical_daemon.service.health import StatusSender
-from vical_daemon.service.wall_clock import WallClock
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
+from vical_daemon.estimation.result import Status
 
 CONFIG = loads(
     "rig: rover\nimus: {imu0: {port: /dev/x, rate_hz: 100}}\n"
@@ -83,86 +72,3 @@ def test_the_estimator_starts_without_knowing_delay_or_mounting(shift: float) ->
     assert abs(camera.timeshift_cam_imu_s - shift) < 5 * camera.timeshift_sigma_s < 2.5e-3
     turn = log_so3(matrix_from_quat(np.array(camera.T_imu_cam.q_wxyz)).T @ rig.R_imu_cam)
     assert np.linalg.norm(turn) < 0.01
-
-
-class Believer:
-    """An estimator that knows everything, and the delay as it is told to."""
-
-    left_out: ClassVar[dict[str, int]] = {}
-
-    def __init__(self, run: SimulatedRun, wrong_s: float) -> None:
-        rig, lens = run.rig, run.rig.lens
-        pose = PoseEstimate([0.0] * 3, [1.0, 0.0, 0.0, 0.0], (np.eye(6) * 1e-8).tolist())
-        shift, unsure = rig.timeshift_cam_imu_s + wrong_s, [0.0] * 4
-        self.camera = CameraEstimate(
-            pose, shift, 2e-5, list(lens.intrinsics), unsure, lens.model, list(lens.distortion), unsure, 0.2
-        )
-
-    def add_imu(self, *_: Any) -> None: ...
-
-    def add_points(self, frame: PointsFrame) -> None: ...
-
-    waiting = 0
-
-    def process(self) -> list[Any]:
-        return []
-
-    def finish(self) -> list[Any]:
-        return []
-
-    def estimate(self) -> CalibrationEstimate:
-        cameras = {"cam0": self.camera}
-        return CalibrationEstimate(
-            0, Status.CONVERGED, "", 1.0, "", 1.0, 2, 3, cameras, None, [0.0, 0.0, -9.8], 1.0, 0.0
-        )
-
-    def trace(self, camera: str) -> list[Any]:
-        return []
-
-
-@pytest.fixture(scope="module")
-def recording() -> SimulatedRun:
-    return simulate(5, 18.0, timeshift_cam_imu_s=0.02, camera_rate_hz=8.0, corner_sigma_px=0.3)
-
-
-def _watched(run: SimulatedRun, wrong_s: float) -> DiagnosticStatus:
-    """What the role's status says on the bus after a recording that the filter judged `wrong_s` off."""
-    watch = DelayWatch(board_points(), ["cam0"], window_s=6.0, every_s=7.0)
-    role = EstimateRole(CONFIG, Believer(run, wrong_s), watch=watch)
-    bus = LocalBus()
-    heard: list[Sample] = []
-    bus.subscribe(topics.STATUS.key("rover", "estimate"), heard.append)
-    _play(bus, run, role)
-    StatusSender("rover", "estimate", bus, WallClock(0)).tick(role.statuses, force=True)
-    by_name = {s.name: s for s in decode_diagnostics(heard[-1].payload).statuses}
-    return by_name["cam0 delay"]
-
-
-def test_the_watch_agrees_with_a_filter_that_is_right(recording: SimulatedRun) -> None:
-    status = _watched(recording, 0.0)
-    assert status.level is Level.OK and "from rotations alone" in status.message
-    values = status.values
-    assert int(values["windows"]) == 2 and values["against"] == "0"
-    error = float(values["timeshift_s"]) - 0.02
-    assert abs(error) < 4 * float(values["timeshift_sigma_s"]) < 2e-3
-    assert float(values["filter_timeshift_s"]) == pytest.approx(0.02)
-    assert abs(float(values["drift_ppm"])) < 4 * float(values["drift_sigma_ppm"])
-
-
-def test_the_watch_warns_of_a_filter_that_is_three_milliseconds_off(recording: SimulatedRun) -> None:
-    status = _watched(recording, 3e-3)
-    assert status.level is Level.WARN and "stamps" in status.message
-    assert int(status.values["against"]) == 2
-    assert abs(float(status.values["timeshift_s"]) - 0.02) < 1e-3
-
-
-def test_a_rig_at_rest_costs_nothing_and_warns_of_nothing(recording: SimulatedRun) -> None:
-    watch = DelayWatch(board_points(), ["cam0"], window_s=6.0, every_s=7.0)
-    estimate = Believer(recording, 0.0).estimate()
-    for k in range(1500):
-        watch.add_imu(k * 10_000_000, (0.01, 0.0, 0.0))
-        if k % 10 == 0:
-            watch.add_points(PointsFrame("cam0", k * 10_000_000, np.arange(48), recording.frames[0].uv_px))
-        watch.look(estimate)
-    verdict = watch.verdicts["cam0"]
-    assert verdict.windows == verdict.refused == 0 and not verdict.warning

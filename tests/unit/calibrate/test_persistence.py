@@ -133,9 +133,9 @@ def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config:
     np.testing.assert_array_equal(prior.T_imu_cam[1], [0.5, 0.0, 0.0])
     assert persistence.stored == ["cam0"] and not persistence.replaced
     assert persistence.devices == {**of_c1, "camera/cam0": "C2"}
-    told = persistence.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
+    events = persistence.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
     assert (
-        event_text(told[0])
+        event_text(events[0])
         == "camera/cam0 is another device now (serial C2, not C1): the calibration begins anew"
     )
     persistence.close(None)

@@ -78,8 +78,8 @@ def test_what_the_driver_said_of_its_stamps_counts_as_it_does_live(shortest: Pat
             stamp_ns = stamp_of(payload)
             writer.write(key, payload, stamp_ns)
             if n % 200 == 0:
-                told = encode_diagnostics(stamp_ns, "imu", [status])
-                writer.write("vical/rig0/status/imu", told, stamp_ns)
+                message = encode_diagnostics(stamp_ns, "imu", [status])
+                writer.write("vical/rig0/status/imu", message, stamp_ns)
     plain = _calibrate(shortest, capsys)["cameras"]["cam0"]["timeshift_sigma_s"]
     more = _arguments(shortest, "--json", "--accept", "converging")[2:]
     assert main(["calibrate", str(log), *more]) == 0

@@ -47,7 +47,7 @@ def _write(folder: Path, runs: dict[str, SimulatedRun]) -> Path:
 
 @pytest.fixture(scope="module")
 def stereo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, SimulatedRun]]:
-    """Two cameras with rolling shutters, of which nobody tells the readout."""
+    """Two cameras with rolling shutters, whose readout is not given."""
     left = reference_rig(12, timeshift_cam_imu_s=0.015, readout_s=READOUT_S)
     right = replace(
         left,

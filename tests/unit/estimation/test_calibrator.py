@@ -88,11 +88,11 @@ def test_a_lens_that_needs_one_term_more_is_told_once():
     zeros, good = np.zeros_like(frame.uv_px), np.ones(len(frame.ids), bool)
     report = FrameReport(0, "cam0", frame.ids, frame.uv_px, zeros, good, True, 1.0, 1, 0.5)
     c.estimate()
-    c.judge.saw_frame(report, f)
+    c.evaluator.saw_frame(report, f)
     assert c.estimate().events == []
     f.agreement["cam0"].moved[4] = 0.01
     for _ in range(2):
-        c.judge.saw_frame(report, f)
+        c.evaluator.saw_frame(report, f)
     (event,) = c.estimate().events
     assert event.kind is EventKind.LENS_TERM_MISSING and event.camera == "cam0"
 
@@ -103,13 +103,13 @@ def test_runs_are_bit_identical(run, done):
 
 
 def test_a_doubt_of_a_second_does_not_take_convergence_back(done):
-    judge = deepcopy(done.judge)
-    assert judge.estimate(done.filter).status == Status.CONVERGED
-    judge.in_doubt = "a doubt"
-    short = judge.estimate(done.filter)
+    evaluator = deepcopy(done.evaluator)
+    assert evaluator.estimate(done.filter).status == Status.CONVERGED
+    evaluator.in_doubt = "a doubt"
+    short = evaluator.estimate(done.filter)
     assert (short.status, short.reason, short.progress) == (Status.CONVERGED, "", 1.0)
-    judge.saw_imu(judge._in.newest_ns + 3_000_000_000, np.zeros(3), np.zeros(3))
-    lasting = judge.estimate(done.filter)
+    evaluator.saw_reading(evaluator.newest_ns + 3_000_000_000, np.zeros(3), np.zeros(3))
+    lasting = evaluator.estimate(done.filter)
     assert (lasting.status, lasting.reason) == (Status.CONVERGING, "a doubt")
 
 

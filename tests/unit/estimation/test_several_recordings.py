@@ -151,7 +151,7 @@ def test_clocks_need_not_have_anything_to_do_with_each_other(first, second, afte
     feed(c, items(second, later_s=later_s))
     error, covariance = error_and_covariance(c.estimate(), first)
     assert nees(error, covariance, 7) < chi2.isf(1e-3, 7)
-    assert c.judge.frames > 0.9 * (len(first.frames) + len(second.frames))
+    assert c.evaluator.frames > 0.9 * (len(first.frames) + len(second.frames))
 
 
 def test_images_that_come_before_the_first_reading_do_no_harm(first, second, after_first) -> None:

@@ -22,8 +22,8 @@ from vical_mocks.trajectory import one_axis, still
 
 from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.smoother.carry import FULL
-from vical_daemon.estimation.smoother.judge import TargetFreeStatus
+from vical_daemon.estimation.smoother.marginal_prior import FULL
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 
@@ -42,7 +42,7 @@ def simulated(seed=4, seconds=12.0, shift_s=-0.03, **options):
 
 
 def looking(seed, motion, *arguments):
-    """A rig that moves as told while its camera looks into the room."""
+    """A rig that moves as given while its camera looks into the room."""
     plain = reference_rig(seed)
     return replace(plain, trajectory=motion(*arguments, T_imu_cam=(plain.R_imu_cam, plain.p_imu_cam)))
 
@@ -78,13 +78,17 @@ def test_stamps_that_jitter_are_noticed_and_allowed_for(jitter_s):
     for shot in record.snapshots:
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s
     # 0.2 ms are less than one image shows here: seen or not, they do no harm
-    assert (0.65 if jitter_s > 5e-4 else 0.0) * jitter_s <= subject.calibrator.judge.jitter_s < 1.5 * jitter_s
+    assert (
+        (0.65 if jitter_s > 5e-4 else 0.0) * jitter_s
+        <= subject.calibrator.evaluator.jitter_s
+        < 1.5 * jitter_s
+    )
     assert len([e for _, e in record.events if e.kind is EventKind.STAMP_JITTER]) == (jitter_s == 1e-3)
 
 
 def test_good_stamps_are_believed(followed):
     _, subject, record = followed
-    assert subject.calibrator.judge.jitter_s == 0.0
+    assert subject.calibrator.evaluator.jitter_s == 0.0
     assert not [e for _, e in record.events if e.kind is EventKind.STAMP_JITTER]
 
 
@@ -107,8 +111,8 @@ def test_starts_while_three_tenths_of_the_features_move(seed):
 
 
 def test_a_window_far_from_settled_throws_no_good_observations_out():
-    # a lens that nearly folds at the corners, told roughly: windows stop far from the truth with a quarter of
-    # the good observations refused, and small sigmas (seed 2 of `benchmarks zoo --target-free`)
+    # a lens that nearly folds at the corners, roughly known: windows stop far from the truth with a quarter
+    # of the good observations refused, and small sigmas (seed 2 of `benchmarks zoo --target-free`)
     run, _ = draw(2, 25.0, target_free=True)
     run.frames[:] = [f for f in run.frames if f.t_s < 4.7]
     prior = camera_prior(run, 2, StartErrors(0.03, 0.01 * run.rig.lens.resolution[0]), exact_lens=False)
@@ -207,10 +211,10 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 
 
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
-    judge = TargetFreeStatus(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
-    judge.doubts.drifting = True
-    judge.changed()
-    assert not judge.doubts.drifting
+    evaluator = TargetFreeStatus(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
+    evaluator.doubts.drifting = True
+    evaluator.changed()
+    assert not evaluator.doubts.drifting
 
 
 def test_a_drifting_clock_is_followed_also_over_darkness():

@@ -9,13 +9,13 @@ from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.smoother.carry import IMU, LAG
+from vical_daemon.estimation.smoother.marginal_prior import IMU, LAG
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 from vical_daemon.estimation.wording import event_text
 
 
 def followed(seed, estimate, *, seconds=9.0, dark=None, accel_lag_s=0.0, rate_hz=10.0, **changes):
-    """A recording of a rig with these changes, and the calibration that finds `estimate` beside the usual."""
+    """A recording of a rig with these changes, and the calibration that finds `estimate`, too."""
     shift_s = float(np.random.default_rng([seed, 92]).uniform(-0.05, 0.05))
     rig = reference_rig(seed, timeshift_cam_imu_s=shift_s, **changes)
     run = simulate_tracks(seed, seconds, rig=rig, camera_rate_hz=rate_hz, accel_lag_s=accel_lag_s)
@@ -72,7 +72,7 @@ def test_scale_and_misalignment_of_the_imu_are_found():
 @pytest.mark.parametrize("size", [1e-3, 3e-3, 1e-2])
 def test_untold_matrices_are_noticed_and_no_answer_is_sure_and_wrong(size):
     # until two windows can be compared, at some 12 s, it may as well be the images
-    # what is told is the mounting in the frame in which the gyro's matrix is symmetric
+    # what is reported is the mounting in the frame in which the gyro's matrix is symmetric
     rng = np.random.default_rng(4)
     G, A = rng.standard_normal((2, 3, 3))
     off = {"gyro_matrix": np.eye(3) + 0.5 * size * (G + G.T), "accel_matrix": np.eye(3) + size * A}
@@ -87,10 +87,10 @@ def test_untold_matrices_are_noticed_and_no_answer_is_sure_and_wrong(size):
 
 def test_an_imu_that_is_true_pays_nothing():
     _, _, record = followed(4, set(), seconds=12.0)
-    _, _, beside = followed(4, {"imu_intrinsics"}, seconds=12.0)
+    _, _, imu_asked = followed(4, {"imu_intrinsics"}, seconds=12.0)
     assert not any(e.kind is EventKind.IMU_INTRINSICS for _, e in record.events)
     assert nees(record.snapshots[-1].error, record.snapshots[-1].covariance, 7) < chi2.isf(1e-3, 7)
-    sigma, asked = (np.sqrt(np.diag(r.snapshots[-1].covariance))[3:6] for r in (record, beside))
+    sigma, asked = (np.sqrt(np.diag(r.snapshots[-1].covariance))[3:6] for r in (record, imu_asked))
     assert sigma.max() < 0.6 * asked.max()
 
 

@@ -1,4 +1,4 @@
-"""Boards that are not as large as stated: a page fitted to the paper, a slip in a file."""
+"""Boards that have not the size in their file: a page fitted to the paper, a slip in a file."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from vical_daemon.estimation.measurements import CalibrationOptions
 
 
 def calibrated(seed, size, *, seconds=12.0, lens_known=False, estimate=frozenset()):
-    """What is told of a rig whose board is `size` times as large as stated."""
+    """What is reported of a rig whose board is `size` times as large as in its file."""
     rig = reference_rig(seed, timeshift_cam_imu_s=0.01)
     run = simulate(seed, seconds, rig=rig)
     options = CalibrationOptions(
@@ -23,7 +23,7 @@ def calibrated(seed, size, *, seconds=12.0, lens_known=False, estimate=frozenset
     return feed(run, subject), subject.calibrator
 
 
-def told(record):
+def announced(record):
     """Announced size, percent; every announcement is about the size."""
     (event,) = (event for _, event in record.events)
     assert event.kind is EventKind.TARGET_SIZE
@@ -38,9 +38,9 @@ def told(record):
     ],
 )
 def test_it_is_told_and_every_answer_is_right(seed, size, lens_known):
-    # taken as stated: 3 to 8 mm off in a lever arm, `converged`, NEES/7 up to 15 at 3 %, 58 at 10 %
+    # with the file's size: 3 to 8 mm off in a lever arm, `converged`, NEES/7 up to 15 at 3 %, 58 at 10 %
     record, _ = calibrated(seed, size, lens_known=lens_known)
-    assert told(record) == pytest.approx(100.0 * (size - 1.0), abs=1.0 + 10.0 * abs(size - 1.0))
+    assert announced(record) == pytest.approx(100.0 * (size - 1.0), abs=1.0 + 10.0 * abs(size - 1.0))
     for shot in record.snapshots:
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s
     assert record.started_s() <= 6.0
@@ -49,7 +49,7 @@ def test_it_is_told_and_every_answer_is_right(seed, size, lens_known):
 
 def test_half_a_percent_is_found_within_half_a_minute():
     record, calibrator = calibrated(2, 0.995, seconds=30.0)
-    assert told(record) == pytest.approx(-0.5, abs=0.4)
+    assert announced(record) == pytest.approx(-0.5, abs=0.4)
     assert calibrator.filter.state.target_scale == pytest.approx(0.995, abs=3e-3)
 
 
@@ -57,5 +57,5 @@ def test_a_board_as_stated_is_believed():
     record, calibrator = calibrated(1, 1.0)
     _, asked = calibrated(1, 1.0, estimate=frozenset({"target_scale"}))
     assert record.events == []
-    focal, beside = (c.estimate().cameras["cam0"].intrinsics_sigma[0] for c in (calibrator, asked))
-    assert focal < 0.85 * beside
+    focal, focal_asked = (c.estimate().cameras["cam0"].intrinsics_sigma[0] for c in (calibrator, asked))
+    assert focal < 0.85 * focal_asked

@@ -79,7 +79,7 @@ class Host:
         return fields[1][1] if len(fields) > 1 else b""
 
     def begin(self) -> set[int]:
-        """What every example does first; returns the descriptors that the device tells of."""
+        """What every example does first; returns the descriptors that the device lists."""
         self.do(0x01, 0x01)
         self.do(0x01, 0x02)
         info = self.do(0x01, 0x03)

@@ -41,11 +41,11 @@ def test_all_that_was_announced_on_the_way_is_told_at_the_end(
         target=str(shortest / "target.yaml"),
     )
     outcome = calibrate.run_job(job, lambda share, estimate: None)
-    told = outcome.estimate.events
-    assert len(told) > 2
-    assert [event.said for event in told] == [f"event {k + 1}" for k in range(len(told))]
+    events = outcome.estimate.events
+    assert len(events) > 2
+    assert [event.said for event in events] == [f"event {k + 1}" for k in range(len(events))]
     text = calibration_text.describe(calibrate.document(job, outcome))
-    assert all(event.said in text for event in told)
+    assert all(event.said in text for event in events)
 
 
 def test_the_roles_add_nothing_to_what_the_estimator_is_fed(

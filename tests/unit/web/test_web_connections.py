@@ -128,7 +128,7 @@ def test_half_open_and_sleeping_connections_end(gate):
     gate.now_s = UNSENT_S + 0.1
     gate.sweep()
     assert unsent.closed
-    slow.connection_lost(None)  # the loop tells later
+    slow.connection_lost(None)  # the loop reports it later
     gate.idle(slow._inner)
     gate.sweep()
     assert gate.open == 0

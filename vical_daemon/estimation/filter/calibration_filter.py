@@ -1,7 +1,7 @@
 """The filter: square-root sigma-point propagation with the IMU and update with the points of one image.
 
 Equations and derivation: docs/math/filter.md. Nothing here decides *whether* to believe a result; that is
-`judge`. The filter never raises on data: each update returns a verdict.
+`StatusEvaluator`. The filter never raises on data: each update returns a verdict.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from vical_daemon.estimation.filter import noise_updates as lessons
+from vical_daemon.estimation.filter import noise_updates
 from vical_daemon.estimation.filter.image_update import (
     ImageFit,
     corner_gate,
@@ -30,6 +30,7 @@ from vical_daemon.estimation.filter.linearise import (
 )
 from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
@@ -53,7 +54,6 @@ from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 
-_EYE = np.eye(3)
 _TINY = 1e-30 * np.eye(9)  # noise densities may be given as zero
 _TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
@@ -74,11 +74,10 @@ class CalibrationFilter:
         consistency: Measured consistency, by camera.
         agreement: How far stretches of the data agree about the lens, by camera.
         shared: Measured errors that the corners of an image share, by camera.
-        unshown: After a partial start: axes along which lever arms are not known.
+        unobservable: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
-        off: What is known not to be as stated, as in `CalibrationOptions.estimate` (see `hypotheses`).
+        off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
         rates: Rates at the state's instant.
-        nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
     """
@@ -92,11 +91,10 @@ class CalibrationFilter:
     consistency: dict[str, Consistency] = field(default_factory=dict)
     agreement: dict[str, LensAgreement] = field(default_factory=dict)
     shared: dict[str, SharedErrors] = field(default_factory=dict)
-    unshown: UnobservableDirections | None = None
+    unobservable: UnobservableDirections | None = None
     drifting: set[str] = field(default_factory=set)
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
-    nis_level: float = 4.0
     stamp_sigma_s: float = 0.0
     began_s: float = 0.0
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
@@ -159,17 +157,15 @@ class CalibrationFilter:
         if keep.sum() < 4:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
-        level = fit.nis / max(fit.dof, 1)
-        if self._surprising(fit):
-            self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
+        if self._misses_gate(fit):
+            level = fit.nis / max(fit.dof, 1)
             return self._refused(
                 image,
                 innovation,
                 predicted,
                 f"innovation of the image is {level:.1f} times what it should be",
             )
-        self.nis_level += 0.05 * (level - self.nis_level)
-        lessons.learn(self, image, lin, fit)
+        noise_updates.learn(self, image, lin, fit)
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
@@ -192,7 +188,7 @@ class CalibrationFilter:
         )
 
     def _by_held(self, lin: Linear) -> FloatArray:
-        """What residuals gain where lenses that are held are taken as stated, px, shape (n, 2), or 0."""
+        """What residuals gain where lenses that are held are taken as given, px, shape (n, 2), or 0."""
         if not self.layout.held:
             return np.zeros(())
         lenses = self.layout.held.items()
@@ -211,9 +207,9 @@ class CalibrationFilter:
         """Which corners are where they may be expected, shape (n,)."""
         return corner_gate(image, innovation, lin)
 
-    def _surprising(self, fit: ImageFit) -> bool:
+    def _misses_gate(self, fit: ImageFit) -> bool:
         """Whether a whole image is not where it may be expected."""
-        return fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level)
+        return fit.nis > frame_limit(fit.dof)
 
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
         """The linearised image with the noise that its corners share."""
@@ -235,7 +231,7 @@ class CalibrationFilter:
             image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why, predicted
         )
 
-    def surprise(self, image: Image) -> float | None:
+    def prediction_nis(self, image: Image) -> float | None:
         """Mean squared innovation of an image in the smooth modes, over its prediction."""
         lin = self._linearise(image)
         keep = lin.valid & corner_gate(image, image.uv - lin.z, lin)
@@ -333,8 +329,8 @@ class CalibrationFilter:
         """Columns that biases and what else wanders gain in `dt` seconds, shape (n, k)."""
         drift = np.flatnonzero(self.walk)
         columns = np.zeros((self.layout.size, 6 + len(drift)))
-        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * _EYE
-        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * _EYE
+        columns[GYRO_BIAS, :3] = self.imu_noise.gyro_walk * np.sqrt(dt) * so3.IDENTITY
+        columns[ACCEL_BIAS, 3:6] = self.imu_noise.accel_walk * np.sqrt(dt) * so3.IDENTITY
         columns[drift, 6 + np.arange(len(drift))] = np.sqrt(self.walk[drift] * dt)
         return columns
 

@@ -29,7 +29,7 @@ from vical_daemon.estimation.model.target_view import view
 
 _FLAT = 0.02  # second-order part over corner noise below which the model is straight
 _GROWN = 1.5  # a sigma this many times larger than when it was measured: measure again
-_FAR_PX = 1e5  # pixels of a point beside the camera, not before it
+_FAR_PX = 1e5  # pixels of a point that is not in front of the camera
 _STEP = 1e-3  # of a sigma: so small that differences are derivatives
 _TRUST = 100  # images for which a measurement of the second-order part holds
 

@@ -42,7 +42,7 @@ class Instant(NamedTuple):
 
 @dataclass(slots=True)
 class LinearisedFilter(CalibrationFilter):
-    """A filter whose `state` is the reference about which it is linearised; its mean is beside it.
+    """A filter whose `state` is the reference about which it is linearised; its mean is stored apart.
 
     Attributes:
         offset: The mean, as errors of `state`, shape (n,).
@@ -136,7 +136,7 @@ class LinearisedFilter(CalibrationFilter):
         by_mean = (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
         return corner_gate(image, innovation + by_mean, lin)
 
-    def _surprising(self, fit: ImageFit) -> bool:  # noqa: ARG002
+    def _misses_gate(self, fit: ImageFit) -> bool:  # noqa: ARG002
         """Corners have been compared with the reference; errors over a hole in the images are no news."""
         return False
 

@@ -47,7 +47,7 @@ def _ask_lens(
     rows: tuple[FloatArray, FloatArray],
     by_lens: FloatArray,
 ) -> None:
-    """What an image would have the lens be: with the target as stated until it is known not to be."""
+    """What an image would have the lens be: with the target as in its file until it is known not to be."""
     ways, innovation = rows
     shape = f.layout.target_shape
     if shape is not None and "target_shape" not in f.off:

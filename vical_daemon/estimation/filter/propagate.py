@@ -27,7 +27,6 @@ from vical_daemon.estimation.model.state import (
 )
 
 _BIASES = slice(GYRO_BIAS.start, ACCEL_BIAS.stop)
-_EYE = np.eye(3)
 
 
 class Propagated(NamedTuple):
@@ -92,8 +91,8 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
     tilt = -hats[2] @ state.tilt
     F[ATTITUDE, ATTITUDE] = dR.T
     F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ hats[:2]
-    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = _EYE
-    F[POSITION, VELOCITY] = T * _EYE
+    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = so3.IDENTITY
+    F[POSITION, VELOCITY] = T * so3.IDENTITY
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         bias = np.concatenate([state.gyro_bias, state.accel_bias])

@@ -66,9 +66,9 @@ def _calibration_covariance(
     if free:
         lens = slice(7, None)
         out[lens, lens] += np.diag(np.maximum(lens_sigma**2 - np.diag(out)[lens], 0.0))
-    if f.unshown is not None:
-        out[:6, :6] += f.unshown.covariance()
-        out[6, 6] += f.unshown.timeshift_sigma_s**2
+    if f.unobservable is not None:
+        out[:6, :6] += f.unobservable.covariance()
+        out[6, 6] += f.unobservable.timeshift_sigma_s**2
     return out
 
 
@@ -91,7 +91,8 @@ def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
 def _timeshift_sigma(f: CalibrationFilter, sigma: FloatArray, where: CameraSlices) -> float:
     if where.timeshift is None:
         return 0.0
-    return float(np.hypot(sigma[where.timeshift], f.unshown.timeshift_sigma_s if f.unshown else 0.0))
+    hidden_s = 0.0 if f.unobservable is None else f.unobservable.timeshift_sigma_s
+    return float(np.hypot(sigma[where.timeshift], hidden_s))
 
 
 def imu_estimate(f: CalibrationFilter, *, matrices: bool) -> ImuEstimate:
@@ -116,6 +117,6 @@ def pose_covariance(f: CalibrationFilter, where: CameraSlices) -> FloatArray:
         *range(where.rotation.start, where.rotation.stop),
     ]
     covariance = f.covariance(rows)
-    if f.unshown is not None:
-        covariance += f.unshown.covariance()
+    if f.unobservable is not None:
+        covariance += f.unobservable.covariance()
     return covariance

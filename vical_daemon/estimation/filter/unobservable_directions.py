@@ -21,6 +21,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import POSITION, CameraSlices
+from vical_daemon.estimation.significance import EVERY_S
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
@@ -39,7 +40,6 @@ UNKNOWN_S = 0.3
 UNKNOWN_RAD = float(np.pi / np.sqrt(3.0))
 """Sigma of an angle that nothing is known of: any is as likely."""
 _HELD_S, _HELD_SKEW, _HELD_RAD = 1e-6, 1e-9, 1e-6
-_EVERY_S = 1.0
 
 
 @dataclass(slots=True)
@@ -86,7 +86,7 @@ class UnobservableDirections:
         self._mean += (f.state.R_world_imu - self._mean) / self._count
         if f.state.t_s < self._next_s:
             return
-        self._next_s = f.state.t_s + _EVERY_S
+        self._next_s = f.state.t_s + EVERY_S
         length = np.linalg.norm(self._mean @ self.axes.T, axis=0)
         turned = 1.0 - length**2 > STILL_RAD**2
         for axis in self.axes[turned]:

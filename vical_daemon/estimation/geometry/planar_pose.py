@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH, SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -26,7 +26,6 @@ _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / 
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4
 _HOPELESS_CHI2 = 100.0
-_UNDECIDED_CHI2 = 25.0  # five sigma between the two solutions
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,5 +310,5 @@ def _rank(
     )
     ambiguous = False
     if len(order) == 2:
-        ambiguous = bool(2 * n * (rms[order[1]] ** 2 - best**2) < _UNDECIDED_CHI2 * noise**2)
+        ambiguous = bool(2 * n * (rms[order[1]] ** 2 - best**2) < SURE_SIGMAS**2 * noise**2)
     return PlanarPoses(candidates, ambiguous)

@@ -15,6 +15,8 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
+IDENTITY = np.eye(3)
+"""The identity, not to be written to."""
 _NO_ANGLE = 1e-40  # rad^2: keeps sin(a)/a defined at zero, and changes no digit of it anywhere
 _SERIES_BELOW_RAD = 0.3  # below it the closed forms lose digits, and five terms of the series are exact
 

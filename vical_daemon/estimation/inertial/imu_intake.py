@@ -69,7 +69,7 @@ class ImuIntake:
         self._clips = 0  # readings left out since the newest
         self._clipping: tuple[float, int, int] | None = None  # since when, and counts then
         self._news: list[Event] = []
-        self._gap: Event | None = None  # forwards, until an image tells whether the clock was set
+        self._gap: Event | None = None  # forwards, until an image shows whether the clock was set
 
     @property
     def left_out(self) -> dict[str, int]:

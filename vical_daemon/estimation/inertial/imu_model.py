@@ -17,8 +17,6 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
-_EYE = np.eye(3)
-
 
 class Motion(NamedTuple):
     """Attitude, position and velocity of the imu in the world, a batch of S; and the two rates at the end.
@@ -108,7 +106,7 @@ def strapdown(
 def _products(steps: FloatArray) -> FloatArray:
     """Products of the first 0, 1, 2, ... rotation steps; shape (S, K, 3, 3) -> (S, K + 1, 3, 3)."""
     dR = np.empty((len(steps), steps.shape[1] + 1, 3, 3))
-    dR[:, 0] = _EYE
+    dR[:, 0] = so3.IDENTITY
     if len(steps) == 1:  # of two matrices, dot takes half as long as matmul
         for k, step in enumerate(steps[0]):
             np.dot(dR[0, k], step, out=dR[0, k + 1])

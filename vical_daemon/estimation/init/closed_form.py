@@ -192,7 +192,7 @@ def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift
 
 
 def _attitude_sigmas(poses: list[TargetPose], lens: Lens) -> FloatArray:
-    """Of the poses as stated, but at least a fifth of a pixel, rad, shape (n,)."""
+    """Of the poses as reported, but at least a fifth of a pixel, rad, shape (n,)."""
     return np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0]))
 
 

@@ -64,10 +64,10 @@ def initial_filter(
     walk = np.zeros(layout.size)
     off = {IMU, LAG, SIZE, TARGET} & options.estimate
     root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, off=off))
-    unshown = None if still_axes is None else UnobservableDirections(still_axes, turn_axis_cam)
-    if unshown is not None:
+    unobservable = None if still_axes is None else UnobservableDirections(still_axes, turn_axis_cam)
+    if unobservable is not None:
         for where in layout.cameras.values():
-            unshown.hold(root, where)
+            unobservable.hold(root, where)
     agreement = {name: LensAgreement(state.cameras[name].distortion_model) for name in layout.cameras}
     shared = {name: SharedErrors() for name in layout.cameras}
     return CalibrationFilter(
@@ -80,7 +80,7 @@ def initial_filter(
         consistency,
         agreement,
         shared,
-        unshown,
+        unobservable,
         off=off,
     )
 

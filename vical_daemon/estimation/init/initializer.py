@@ -163,7 +163,7 @@ class Initializer:
         return Attempt(found.filter, frames, result.reason)
 
     def go_on_with(self, layout: Layout, target: FloatArray, off: Collection[str] = ()) -> None:
-        """Keep what was seen, for another target or with other unknowns; `off`: known not to be as stated."""
+        """Keep what was seen, for another target or with other unknowns; `off`: known to be off."""
         self._layout, self._target = layout, target
         self._options = replace(self._options, estimate=self._options.estimate | set(off))
         self._caches.clear()

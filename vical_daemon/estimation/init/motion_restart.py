@@ -16,6 +16,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import integrate_twice
 from vical_daemon.estimation.init.target_poses import Lens, TargetPose, pose_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.model.state import (
     ATTITUDE,
     POSITION,
@@ -34,7 +35,6 @@ _WIDE_SHARE = 0.03
 """Likewise of position, of the distance to the target."""
 _BLIND_S = 0.5  # without a usable image before sigmas are looked at
 _WIDE_MPS = 0.3  # of velocity: ten times what the images give
-_CALIBRATION = 5.0  # sigmas of the calibration the pose is made with: the data count again by 4 % at most
 
 
 class Poses(NamedTuple):
@@ -146,9 +146,9 @@ class MotionRestart:
         turn = float(sigmas[where.rotation].max()) if where.rotation is not None else 0.0
         arm = float(sigmas[where.position].max()) if where.position is not None else 0.0
         out = np.empty(9)
-        out[ATTITUDE] = max(_WIDE_RAD, _CALIBRATION * turn)
-        out[POSITION] = max(_WIDE_SHARE * _distance_m(seen.p_target_cam), _CALIBRATION * arm)
-        out[VELOCITY] = max(_WIDE_MPS, _CALIBRATION * arm / span_s)
+        out[ATTITUDE] = max(_WIDE_RAD, AGAIN_SIGMAS * turn)
+        out[POSITION] = max(_WIDE_SHARE * _distance_m(seen.p_target_cam), AGAIN_SIGMAS * arm)
+        out[VELOCITY] = max(_WIDE_MPS, AGAIN_SIGMAS * arm / span_s)
         return out
 
 

@@ -69,7 +69,7 @@ def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> F
     log(dR_gyro' dR_seen) = -integral of dR(t)' b dt, with dR from t to the end of each interval.
     """
     zero = np.zeros((1, 3))
-    rows, misses = [], []  # unknown beside the bias: the error of the first attitude
+    rows, misses = [], []  # unknown as well as the bias: the error of the first attitude
     for k in range(1, len(t_s)):
         segment = buffer.segment(float(t_s[0]), float(t_s[k]))
         if segment is None:

@@ -19,7 +19,7 @@ class RigModel:
     Args:
         options: Switches.
         cameras: What is known about each camera.
-        target_points_m: Points of the target as stated, m, shape (n, 3).
+        target_points_m: Points of the target as in its file, m, shape (n, 3).
 
     Attributes:
         priors: What is known about each camera.

@@ -35,7 +35,7 @@ class StartResult:
             delay and the mounting about this axis are guessed, too; None: not so.
         poses: Of all images used, by camera and in order.
         size: True size of the target over the stated one, where it is surely and by far another; None: it may
-            be as stated.
+            be as in its file.
     """
 
     state: State | None

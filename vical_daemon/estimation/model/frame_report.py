@@ -1,4 +1,4 @@
-"""The verdict on one image, as the judge, the recorder and the page see it."""
+"""The verdict on one image, as the status, the recorder and the page see it."""
 
 from __future__ import annotations
 

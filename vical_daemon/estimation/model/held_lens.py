@@ -26,9 +26,9 @@ class FixedLens:
     """What is known of a lens that is held: fx fy cx cy (px), distortion.
 
     Attributes:
-        values: As stated, shape (n,).
-        sigma: How well they are known, as stated; zeros: exactly; shape (n,).
-        off_sigma: By how much a lens is off that is not as stated, one sigma, shape (n,).
+        values: As given, shape (n,).
+        sigma: How well they are known, as given; zeros: exactly; shape (n,).
+        off_sigma: By how much a lens is off that is not as given, one sigma, shape (n,).
     """
 
     values: FloatArray

@@ -21,7 +21,6 @@ from vical_daemon.estimation.model.unscented import solve_lower
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
 _ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
-_EYE = np.eye(3)
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 
 
@@ -97,11 +96,11 @@ def _integrated(
     """Motion over a segment, what errors do to its end, and its derivatives by bias and numbers."""
     if not len(numbers):
         motion = strapdown(segment, bias[None, :3], bias[None, 3:])
-        errors = influence(_EYE, motion)
+        errors = influence(so3.IDENTITY, motion)
         return motion, errors, errors.by_bias()
     M_g, M_a = matrices(numbers)
     motion = strapdown(segment, bias[None, :3], bias[None, 3:], M_g[None], M_a[None], numbers[ENTRIES:])
-    errors = influence(_EYE, motion)
+    errors = influence(so3.IDENTITY, motion)
     slope = np.zeros_like(segment.accel) if segment.accel_slope is None else segment.accel_slope
     by_lag = errors.by_force(slope @ M_a.T)
     by_imu = np.column_stack([by_entries(errors, segment, bias, M_g, M_a), by_lag])

@@ -23,11 +23,11 @@ KNOWN_OFF_SIGMA = 1e-2
 LAG_SIGMA_S = 3e-4
 """By how much the delays of accelerometer and gyro differ in an IMU where they do, s."""
 SIZE_SIGMA = 0.02
-"""Of a target that is not as large as stated, relative; pages fitted to the paper: 3 to 6 %."""
+"""Of a target that has not the size in its file, relative; pages fitted to the paper: 3 to 6 %."""
 KNOWN_SIZE_SIGMA = 0.1
 """Of the size of a target that is known to be off, or where it is asked for, relative."""
 OFF = 0.05
-"""Share of rigs of which any one thing is not as stated, clocks that do not run alike included."""
+"""Share of rigs of which any one thing is not as specified, clocks that do not run alike included."""
 SURE = 0.99
 """Probability from which on something is known, and announced."""
 
@@ -58,6 +58,8 @@ class StartSigmas(NamedTuple):
     readout_s: float
 
 
+AGAIN_SIGMAS = 5.0
+"""Prior over sigma of what was found from data that are used once more: they count again by 4 % at most."""
 FILTER_START = StartSigmas(0.1, 0.5, 0.15, 0.1, 5e-3, 0.05, 0.05, 0.1, 0.1, 0.01)
 """With a target: the closed form has found all of it, to about a fifth of these."""
 PARTIAL_START_RAD = 0.03

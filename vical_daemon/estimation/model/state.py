@@ -57,7 +57,7 @@ class Layout:
         accel_lag: How late the accelerometer's readings are against the gyro's, s, index or None.
         cameras: By name.
         target_scale: Relative size of the board, index or None.
-        target_shape: How far the board is off in each of its modes, m; None: as stated.
+        target_shape: How far the board is off in each of its modes, m; None: as in its file.
         target_modes: The ways in which it may be off; None: no target.
         held: Lenses that are held and whose errors are states all the same, by camera.
     """

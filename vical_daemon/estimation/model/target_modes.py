@@ -1,7 +1,7 @@
 """The ways in which a printed target is wrong as a whole: narrow, skew, bowed, bent, twisted.
 
 A board printed 0.3 % narrower than tall, or bent by half a millimetre, is taken for another lens and another
-mounting, for it is wrong in the same way in every image. So its shape can be estimated beside them: a
+mounting, for it is wrong in the same way in every image. So its shape can be estimated with them: a
 displacement of second order in both coordinates of the print. What is left, corner by corner, is too rough to
 be mistaken for a lens. Turn, shift and size are no modes: they are the world frame and `target_scale`.
 [Strobl & Hirzinger, "More accurate pinhole camera calibration with imperfect planar target", 2011;

@@ -62,7 +62,7 @@ class SharedErrors:
     def stamps_jitter(self) -> bool:
         """Whether what looks like a jitter of the stamps is one: images are late independently of each other.
 
-        A lens, a board or an imu that is not as stated makes images look late or early, too, but neighbours
+        A lens, a board or an imu that is off makes images look late or early, too, but neighbours
         alike. False as well while too few images are known.
         """
         n = min(self.images, _MEMORY)

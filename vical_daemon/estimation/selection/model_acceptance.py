@@ -25,8 +25,8 @@ from vical_daemon.estimation.selection.model_selection import (
     not_zero,
     weights,
 )
+from vical_daemon.estimation.significance import EVERY_S
 
-_EVERY_S = 1.0
 _MEASURED = 400  # images
 _SEEN = 100  # images, as many as `consistency` wants
 _KINDS = {
@@ -38,7 +38,7 @@ _KINDS = {
 
 
 def known_off(block: str, values: FloatArray, sigmas: FloatArray) -> Event:
-    """The announcement for a block of `hypotheses` that is off, with the entry that is most surely so.
+    """The announcement for a block of `model_selection` that is off, with the entry that is most surely so.
 
     Args:
         block: Its name.
@@ -71,7 +71,7 @@ _KNOWN_SIGMA = {IMU: KNOWN_OFF_SIGMA, SIZE: KNOWN_SIZE_SIGMA}
 
 @dataclass(slots=True)
 class ModelAcceptance:
-    """Asks once a second what is known not to be as stated."""
+    """Asks once a second what is known not to be as specified."""
 
     _next_s: float = -np.inf
 
@@ -79,7 +79,7 @@ class ModelAcceptance:
         """Return what is to be announced, by the name of the block."""
         if f.state.t_s < self._next_s:
             return {}
-        self._next_s = f.state.t_s + _EVERY_S
+        self._next_s = f.state.t_s + EVERY_S
         shares = weights(f)
         every, images = blocks(f), max(c.images for c in f.consistency.values())
         known = [
@@ -117,7 +117,7 @@ def _off(f: CalibrationFilter, name: str) -> Event:
         return Event(EventKind.FIXED_LENS, camera, off_px, sigma_px)
     if name in _KNOWN_SIGMA:
         _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
-    if name == TARGET:  # what stretches said of the lens, they said with the target as stated
+    if name == TARGET:  # what stretches said of the lens, they said with the target as in its file
         f.agreement = {camera: LensAgreement(agreement.model) for camera, agreement in f.agreement.items()}
     block = blocks(f)[name]
     return known_off(name, block.values, np.sqrt(factor(f)) * f.sigmas()[block.where])

@@ -32,18 +32,18 @@ IN_DOUBT = {
 }
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
-_RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as stated has none
+_RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as given has none
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """States that are zero where what they describe is as stated.
+    """States that are zero where what they describe is as specified.
 
     Attributes:
         where: Among the errors.
         values: As estimated, shape (n,).
         sigma: Of their prior, shape (n,).
-        stated: How well they are known where what they describe is as stated, shape (n,); zeros: exactly.
+        stated: How well they are known where what they describe is as specified, shape (n,); zeros: exactly.
         held: They are reported as zero in any case.
     """
 
@@ -55,7 +55,7 @@ class Block:
 
     @classmethod
     def of(cls, where: slice, values: FloatArray, sigma: float) -> Block:
-        """Make one of values that are exactly zero where all is as stated."""
+        """Make one of values that are exactly zero where all is as specified."""
         return cls(where, values, np.full(len(values), sigma), np.zeros(len(values)))
 
     @property
@@ -75,7 +75,7 @@ def lens_block(camera: str) -> str:
 
 
 def blocks(f: CalibrationFilter) -> dict[str, Block]:
-    """What a filter estimates beside the calibration, by its name in `CalibrationOptions.estimate`."""
+    """What a filter estimates apart from the calibration, by its name in `CalibrationOptions.estimate`."""
     layout, state = f.layout, f.state
     found: dict[str, Block] = {}
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
@@ -157,7 +157,7 @@ def misfit(f: CalibrationFilter) -> float:
 
 
 def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
-    """Probability of each hypothesis; a hypothesis is named by the blocks that are as stated."""
+    """Probability of each hypothesis; a hypothesis is named by the blocks that are as specified."""
     doubtful = {name: block for name, block in blocks(f).items() if name not in f.off}
     if not doubtful:
         return {(): 1.0}
@@ -240,7 +240,7 @@ def in_doubt(f: CalibrationFilter, *, converged: bool = False) -> str:
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
     """Return the filter to be reported: mean and covariance over all models.
 
-    Where a lens is held the mean is that of the hypotheses with this lens exactly as stated; the covariance
+    Where a lens is held the mean is that of the hypotheses with this lens exactly as given; the covariance
     is about that mean, of all that may be.
     """
     every = blocks(f)
@@ -269,7 +269,7 @@ def averaged(f: CalibrationFilter) -> CalibrationFilter:
 def _given(
     f: CalibrationFilter, every: Mapping[str, Block], true: Collection[str], exactly: Collection[str] = ()
 ) -> tuple[FloatArray, FloatArray]:
-    """Square root of the covariance given that some blocks are as stated, and the mean's step, negated.
+    """Square root of the covariance given that some blocks are as specified, and the mean's step, negated.
 
     With E the rows of these blocks, R the noise with which they are said to be zero, L L' = E S S' E' + R and
     U = L^-1 [E S, R^1/2], that takes [S 0] U' U [S 0]' off P and moves the mean by -d, d = [S 0] U' L^-1 x.
@@ -277,8 +277,8 @@ def _given(
     Args:
         f: The filter.
         every: Its blocks.
-        true: Those that are as stated.
-        exactly: Those of them that are exactly zero, however well they are stated.
+        true: Those that are as specified.
+        exactly: Those of them that are exactly zero, whatever their stated sigma.
     """
     n = f.layout.size
     if not true:

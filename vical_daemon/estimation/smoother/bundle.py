@@ -19,7 +19,8 @@ from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.retract import orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.inertial import links_left
+from vical_daemon.estimation.smoother.marginal_prior import (
     FULL,
     INERTIAL,
     MarginalPrior,
@@ -27,7 +28,6 @@ from vical_daemon.estimation.smoother.carry import (
     carried_out,
     moved,
 )
-from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.normal import Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window

@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.smoother.carry import FULL, SHIFT
+from vical_daemon.estimation.smoother.marginal_prior import FULL, SHIFT
 
 MOUNTING: tuple[int, ...] = tuple(range(6))
 CLOCK: tuple[int, ...] = (SHIFT,)
@@ -63,7 +63,7 @@ def _square(
     found: FloatArray, P: FloatArray, known: FloatArray, kept: Sequence[int], rest: Sequence[int]
 ) -> float:
     """The sum of squares of the test above, with as many degrees of freedom as `kept` is long."""
-    scale = np.sqrt(np.diag(known))  # pixels beside microseconds
+    scale = np.sqrt(np.diag(known))  # pixels and microseconds
     scale = np.where(scale > 0.0, scale, 1.0)
     whole, P, d = known / np.outer(scale, scale), P / np.outer(scale, scale), found / scale
     K = np.linalg.solve(whole[np.ix_(rest, rest)], whole[np.ix_(rest, kept)]).T

@@ -7,7 +7,7 @@ import numpy as np
 from vical_daemon.estimation.events import ROLLING, Event, EventKind
 from vical_daemon.estimation.measurements import ROWS, FloatArray
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, LAG_SIGMA_S, OFF, SURE
-from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection import model_selection
 from vical_daemon.estimation.selection.clock_drift import (
     CLOCKS_IN_DOUBT,
     doubtful,
@@ -17,12 +17,20 @@ from vical_daemon.estimation.selection.clock_drift import (
 )
 from vical_daemon.estimation.selection.model_acceptance import known_off
 from vical_daemon.estimation.significance import SURE_SIGMAS
-from vical_daemon.estimation.smoother.carry import DRIFT, FULL, IMU, INERTIAL, LAG, READOUT, MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import (
+    DRIFT,
+    FULL,
+    IMU,
+    INERTIAL,
+    LAG,
+    READOUT,
+    MarginalPrior,
+)
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
-_WHERE = {hypotheses.IMU: np.arange(FULL)[IMU], hypotheses.LAG: np.arange(FULL)[LAG]}
-_SIGMA = {hypotheses.IMU: ENTRY_SIGMA, hypotheses.LAG: LAG_SIGMA_S}
+_WHERE = {model_selection.IMU: np.arange(FULL)[IMU], model_selection.LAG: np.arange(FULL)[LAG]}
+_SIGMA = {model_selection.IMU: ENTRY_SIGMA, model_selection.LAG: LAG_SIGMA_S}
 
 Weights = dict[tuple[str, ...], float]
 
@@ -46,7 +54,7 @@ class TargetFreeDoubts:
     def __init__(self, camera: str, *, asked: frozenset[str], rolling: bool) -> None:
         self._camera = camera
         self._off = asked & set(_WHERE)
-        self.imu_asked = hypotheses.IMU in asked
+        self.imu_asked = model_selection.IMU in asked
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
         self.drifting = False
         self.rolling = rolling
@@ -75,7 +83,7 @@ class TargetFreeDoubts:
                 events.append(Event(kind, self._camera, float(readout_s), sigma_s))
         if compared:
             weights = self._weights(carry, factor)
-            known = {name for name in _WHERE if hypotheses.not_zero(weights, name) > SURE}
+            known = {name for name in _WHERE if model_selection.not_zero(weights, name) > SURE}
             news = [(name, _WHERE[name]) for name in sorted(known - self._off)]
             events += [known_off(name, _numbers(carry)[at], sigmas[at]) for name, at in news]
             self._off |= known
@@ -84,11 +92,11 @@ class TargetFreeDoubts:
     def reason(self, carry: MarginalPrior, factor: float, *, converged: bool) -> str:
         """What may not be as it is taken to be, in words; empty where nothing speaks for it.
 
-        For `converged` see `hypotheses.in_doubt`.
+        For `converged` see `model_selection.in_doubt`.
         """
-        imu, enough = hypotheses.IMU, 0.5 if converged else OFF
-        if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > enough:
-            return hypotheses.IN_DOUBT[imu]
+        imu, enough = model_selection.IMU, 0.5 if converged else OFF
+        if imu not in self._off and model_selection.not_zero(self._weights(carry, factor), imu) > enough:
+            return model_selection.IN_DOUBT[imu]
         if not self.drifting and doubtful(self._drift(carry, factor), converged=converged):
             return CLOCKS_IN_DOUBT
         return ""
@@ -116,7 +124,7 @@ class TargetFreeDoubts:
         return evidence(carry.camera.skew, variance)
 
     def _weights(self, carry: MarginalPrior, factor: float) -> Weights:
-        """Probability of each hypothesis about the imu, named by what is as stated.
+        """Probability of each hypothesis about the imu, named by what is as specified.
 
         Where windows disagree although all is free, it is the images, and what they say about the imu is
         worth less by as much again.
@@ -129,11 +137,11 @@ class TargetFreeDoubts:
         sigma = np.concatenate([np.full(len(_WHERE[name]), _SIGMA[name]) for name in doubtful])
         covariance = carry.calibration()[np.ix_(at, at)] / np.outer(sigma, sigma)
         values = {name: numbers[_WHERE[name]] / _SIGMA[name] for name in doubtful}
-        return hypotheses.posterior(values, covariance, factor**2)
+        return model_selection.posterior(values, covariance, factor**2)
 
 
 def _numbers(carry: MarginalPrior) -> FloatArray:
-    """What is not as stated of the imu, at its place among the errors, shape (FULL,)."""
+    """Errors of the imu's scale, alignment and lag, at their place among the errors, shape (FULL,)."""
     out = np.zeros(FULL)
     out[INERTIAL] = carry.imu
     return out

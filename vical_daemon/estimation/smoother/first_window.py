@@ -9,11 +9,11 @@ from typing import NamedTuple
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
-from vical_daemon.estimation.smoother.carry import MarginalPrior
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
-from vical_daemon.estimation.smoother.judge import TargetFreeStatus
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
-from vical_daemon.estimation.smoother.starter import Starter
+from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
 
@@ -57,20 +57,20 @@ class FirstWindow:
         status: Says whether a window fits, and agrees with what was known.
 
     Attributes:
-        starter: Finds rotations, delay and structure.
+        initializer: Finds rotations, delay and structure.
     """
 
     def __init__(
         self, options: CalibrationOptions, prior: CameraPrior, active: BoolArray, status: TargetFreeStatus
     ) -> None:
         self._options, self._prior, self._active, self._status = options, prior, active, status
-        self.starter = Starter(options, prior)
+        self.initializer = TargetFreeInitializer(options, prior)
 
     def begin(
         self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None, noise: Noise
     ) -> Begun | str:
         """Start a window from a stretch, with the calibration of before where there is one; or why not."""
-        window = self.starter.window(buffer, frames, known)
+        window = self.initializer.window(buffer, frames, known)
         if isinstance(window, str):
             return window
         return self.adjusted(buffer, window, known, noise) or DOES_NOT_FIT
@@ -79,11 +79,11 @@ class FirstWindow:
         self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior, stepped_s: float
     ) -> MarginalPrior | str:
         """What was known, with the biases by the first images of another recording; or why there are none."""
-        window = self.starter.window(buffer, frames, None)
+        window = self.initializer.window(buffer, frames, None)
         if isinstance(window, str):
             return window
-        if self.starter.held is not None:
-            self.starter.held = None
+        if self.initializer.held is not None:
+            self.initializer.held = None
             return "the rig turns about one axis only so far: turn it about a second one"
         return of_another_recording(known, window, stepped_s)
 
@@ -108,7 +108,7 @@ class FirstWindow:
             return None
         if seek_axis:
             axis = bundle.window.camera.readout_axis
-            self._prior = self.starter.prior = replace(self._prior, readout_axis=axis)
+            self._prior = self.initializer.prior = replace(self._prior, readout_axis=axis)
         return Begun(bundle, fit)
 
     def _solved(
@@ -121,7 +121,7 @@ class FirstWindow:
     ) -> tuple[Bundle, MarginalPrior, Fit | None]:
         """Adjust a window with what is known but for some errors."""
         imu_sigma = self._status.doubts.imu_sigma
-        carry = initial_prior(window, known, self._active, self.starter.held, imu_sigma, reopened)
+        carry = initial_prior(window, known, self._active, self.initializer.held, imu_sigma, reopened)
         bundle = Bundle(window, carry, *noise)
         return bundle, carry, bundle.solve(buffer, _STEPS)
 
@@ -135,4 +135,4 @@ class FirstWindow:
             T_imu_cam=None if self._active[0] else self._prior.T_imu_cam,
             readout_s=lens.readout_s,
         )
-        self.starter = Starter(self._options, self._prior)
+        self.initializer = TargetFreeInitializer(self._options, self._prior)

@@ -10,7 +10,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.selection.clock_drift import SKEW_WALK
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     BIASES,
     CALIBRATION,
@@ -21,7 +21,7 @@ from vical_daemon.estimation.smoother.carry import (
     held_along,
     root_of,
 )
-from vical_daemon.estimation.smoother.starter import start_sigmas
+from vical_daemon.estimation.smoother.target_free_initializer import start_sigmas
 from vical_daemon.estimation.smoother.window import KNOT_S, Landmarks, Window
 
 _SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
@@ -42,7 +42,7 @@ def initial_prior(
         window: As the start left it; takes the known time shift along.
         known: What was known, or None.
         active: Which calibration errors are estimated, shape (FULL,).
-        held: Axis along which the lever arm is held, see `Starter`.
+        held: Axis along which the lever arm is held, see `TargetFreeInitializer`.
         imu_sigma: Of the entries of the imu's matrices, where nothing is known.
         reopened: Errors of the calibration of which nothing is known any more; of mounting and time shift.
     """

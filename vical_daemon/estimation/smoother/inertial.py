@@ -94,7 +94,7 @@ def add_links(
 
 
 def _add_side(H: FloatArray, rows: IntArray, columns: IntArray, block: FloatArray) -> None:
-    """Add a block beside the diagonal, and its mirror image."""
+    """Add an off-diagonal block, and its transpose."""
     H[rows[:, None], columns] += block
     H[columns[:, None], rows] += block.T
 

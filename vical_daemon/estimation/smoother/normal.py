@@ -15,7 +15,9 @@ from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.noise.stamp_jitter import excess
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
+from vical_daemon.estimation.smoother.jitter import first_guess
+from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     DRIFT,
     INERTIAL,
@@ -26,8 +28,6 @@ from vical_daemon.estimation.smoother.carry import (
     MarginalPrior,
     calibration_difference,
 )
-from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
-from vical_daemon.estimation.smoother.jitter import first_guess
 from vical_daemon.estimation.smoother.window import IntArray, Seen, Window
 
 HUBER = 2.5  # sigmas (of the two axes together)

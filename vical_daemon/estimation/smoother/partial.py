@@ -13,7 +13,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart, NoStartError
+from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError, TrackStart
 from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
 
 _STEP_RAD = float(np.deg2rad(15.0))
@@ -35,7 +35,7 @@ def still_axis(t_s: FloatArray, gyro_rps: FloatArray, bias_rps: FloatArray) -> F
     return axes[0] if len(axes) == 1 else None
 
 
-def mounting_about(start: LinearStart, axis: FloatArray, R_imu_cam: FloatArray, arm: ArmPrior) -> FloatArray:
+def mounting_about(start: TrackStart, axis: FloatArray, R_imu_cam: FloatArray, arm: ArmPrior) -> FloatArray:
     """Find the mounting among those turned about an axis.
 
     Args:

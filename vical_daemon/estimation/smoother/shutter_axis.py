@@ -6,17 +6,18 @@ from copy import deepcopy
 from dataclasses import replace
 
 from vical_daemon.estimation.measurements import COLUMNS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.window import Window
 
-_WORTH_A_FIT = 25.0  # chi-square: a readout by columns stands out by five sigmas, as one by rows must
-
 
 def shows_columns(bundle: Bundle, fit: Fit) -> bool:
-    """Whether what rows leave over looks like a readout by columns, so that they are worth an adjustment."""
-    return bundle.seen is not None and bundle.problem.late_by_columns(bundle.seen) > _WORTH_A_FIT * max(
-        fit.squares / fit.dof, 1.0
-    )
+    """Whether what rows leave over looks like a readout by columns, so that they are worth an adjustment.
+
+    It must stand out by five sigmas, as one by rows must.
+    """
+    least = SURE_SIGMAS**2 * max(fit.squares / fit.dof, 1.0)
+    return bundle.seen is not None and bundle.problem.late_by_columns(bundle.seen) > least
 
 
 def read_by_columns(window: Window) -> Window:

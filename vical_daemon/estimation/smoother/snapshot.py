@@ -16,7 +16,7 @@ from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.clock_drift import evidence, probability
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     DRIFT,
     FULL,
@@ -39,7 +39,7 @@ class Doubts(NamedTuple):
     Attributes:
         factor: Measured variance over the stated one; multiplies the reported covariance.
         drifting: The camera's clock is known to run apart from the imu's.
-        stated: Probabilities, each with the errors that are zero then: what of the imu is as stated.
+        stated: Probabilities, each with the errors that are zero then: what of the imu is as specified.
         gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
         rolling: The shutter is known to be a rolling one: its readout is reported.
     """
@@ -95,7 +95,7 @@ def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatA
 
 
 def _over_imu(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
-    """Camera, what is not as stated of the imu, and covariance over the hypotheses about these."""
+    """Camera, errors of the imu, and covariance over the hypotheses about these."""
     P, numbers = carry.calibration() * doubts.factor, np.zeros(FULL)
     numbers[INERTIAL] = carry.imu
     mean, mixed = np.zeros(FULL), np.zeros((FULL, FULL))

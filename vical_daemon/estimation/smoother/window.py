@@ -86,7 +86,7 @@ class Window:
         landmarks: What has been placed so far.
         gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
-        imu: What is not as stated of the imu (`imu_scale`) where it is estimated, shape (16,); else empty.
+        imu: Errors of scale, alignment, lag (`imu_scale`) where they are estimated, shape (16,); else empty.
     """
 
     camera: CameraState
@@ -181,7 +181,7 @@ class Window:
         return True
 
     def last_at(self, shift_s: float) -> tuple[FloatArray, FloatArray]:
-        """Attitude and velocity at the last image for a time shift a little beside that of the links."""
+        """Attitude and velocity at the last image for a time shift a little off that of the links."""
         d = shift_s - self.shift_s
         if len(self.frames) < 2:
             return self.R[-1].copy(), self.v[-1].copy()

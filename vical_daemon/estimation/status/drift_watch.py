@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vical_daemon.estimation.significance import DRIFT_DOUBT_SIGMAS, DRIFT_SIGMAS
+from vical_daemon.estimation.significance import DRIFT_DOUBT_SIGMAS, DRIFT_SIGMAS, EVERY_S
 
-_EVERY_S = 1.0
 _SPAN = 20
 
 
@@ -33,7 +32,7 @@ class DriftWatch:
 
     def due(self, t_s: float) -> bool:
         """Whether it is time for the next estimate; more would only be more of the same."""
-        return not self._past or t_s >= self._past[-1][0] + _EVERY_S
+        return not self._past or t_s >= self._past[-1][0] + EVERY_S
 
     def drifts(self, t_s: float, value: float, variance: float, factor: float) -> bool:
         """Take the estimate at `t_s`; True when it has left where an earlier one said it would be.

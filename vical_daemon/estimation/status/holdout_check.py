@@ -52,7 +52,7 @@ class HoldoutCheck:
         if segment is None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
             return None
         held.predict(segment)
-        return held.surprise(held.image(frame, t_cam_s, target[frame.ids]))
+        return held.prediction_nis(held.image(frame, t_cam_s, target[frame.ids]))
 
 
 def imu_noise_error(ratios: Sequence[float], scale: float) -> float | None:

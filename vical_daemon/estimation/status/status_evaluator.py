@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -26,25 +25,23 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
-from vical_daemon.estimation.selection import clock_drift
-from vical_daemon.estimation.selection import model_selection as hypotheses
-from vical_daemon.estimation.status.excitation import ALL_WAYS, excitation_advice, weak_directions
+from vical_daemon.estimation.selection import clock_drift, model_selection
+from vical_daemon.estimation.status.evaluator import LOST, PATIENCE_S, Evaluator, lacking_verdict
+from vical_daemon.estimation.status.excitation import ALL_WAYS
 from vical_daemon.estimation.status.holdout_check import imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
-from vical_daemon.estimation.status.incoming import LOST, PATIENCE_S, Incoming, lacking_verdict
-from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
+from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
 from vical_daemon.estimation.wording import direction_line, direction_sigma, guidance_text
 
 _ENOUGH_FRAMES = 60
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _EVERY_READINGS = 16  # the size of one in so many is kept
 _NIS_BAD = 4.0
-_HELD_BACK_BAD = 9.0
 _RECENT = 60
 _KEPT_CHECKS = 2400  # one every 1.5 s: an hour
 
 
-class StatusEvaluator:
+class StatusEvaluator(Evaluator):
     """Watches what goes in and out of the filter.
 
     Args:
@@ -53,17 +50,13 @@ class StatusEvaluator:
     """
 
     def __init__(self, options: CalibrationOptions, layout: Layout) -> None:
-        self.options = options
+        super().__init__(options, "the target has not been seen yet: show the whole board to the camera")
         self.layout = layout
         self._imu_asked = "imu_intrinsics" in options.estimate
-        self._in = Incoming("the target has not been seen yet: show the whole board to the camera")
         self.frames = 0
-        self._steady = SteadyStatus()
         self.bumped = Cause.NONE
         self.in_doubt = ""
-        self._ever_converged = False
         self._partial = ""
-        self._started_s: float | None = None
         self._reopened_s = -np.inf
         self._points = [0, 0]
         self._nis: deque[tuple[float, int]] = deque(maxlen=300)
@@ -76,23 +69,15 @@ class StatusEvaluator:
         self._cover = Cover()
 
     # ------------------------------------------------------------------ what happens
-    def saw_imu(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
-        """Count one inertial reading."""
-        self._in.saw_imu(t_ns, gyro)
-        if self._in.imu_samples % _EVERY_READINGS == 1:
+    def saw_reading(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
+        """Count one inertial reading, and keep the size of some."""
+        self.saw_imu(t_ns, gyro)
+        if self.imu_samples % _EVERY_READINGS == 1:
             self._size.append(float(np.sqrt(accel @ accel)))
-
-    def saw_points(self, t_s: float, count: int) -> None:
-        """Count one image with `count` points in it."""
-        self._in.saw_points(t_s, count)
-
-    def waiting(self, why: str, motion_missing: bool = False) -> None:
-        """The start is not possible yet; `motion_missing`: more motion, not more time, would help."""
-        self._in.reason, self._in.motion_missing = why, motion_missing
 
     def started(self, t_s: float, partial: str = "") -> None:
         """The filter runs from `t_s` on; `partial`: what the motion did not show, and was guessed."""
-        self._in.reason, self._started_s, self._partial = "", t_s, partial
+        self.reason, self._started_s, self._partial = "", t_s, partial
         self._recent_used.clear()
         self._nis.clear()
         self._held_back.clear()
@@ -105,14 +90,6 @@ class StatusEvaluator:
         self._reopened_s = t_s
         self._steady.reset(min(self.status, Status.CONVERGING, key=list(Status).index))
 
-    def announce(self, event: Event, once: str = "") -> None:
-        """Put an event into the next estimate; of those with the same `once` only the first."""
-        self._in.announce(event, once)
-
-    def announce_all(self, events: Iterable[Event]) -> None:
-        """Put events into the next estimate."""
-        self._in.announce_all(events)
-
     def changed(self, why: Cause) -> None:
         """The rig is not what it was: the calibration is being taken anew."""
         self.bumped = why
@@ -120,11 +97,6 @@ class StatusEvaluator:
         self.announce(Event(kind, cause=why))
         self._started_s = None
         self._steady.reset(Status.INCONSISTENT)
-
-    @property
-    def status(self) -> Status:
-        """Where the calibration stands, as of the last estimate."""
-        return self._steady.status
 
     def held_back(self, ratio: float, scale: float) -> None:
         """Take in how well the imu alone predicted an image.
@@ -134,7 +106,7 @@ class StatusEvaluator:
             scale: `Consistency.scale` of the camera.
         """
         self._held_back.append(ratio)
-        self.held_out.append(HeldOutCheck(self._in.elapsed_s, ratio))
+        self.held_out.append(HeldOutCheck(self.elapsed_s, ratio))
         error = imu_noise_error(self._held_back, scale)
         if error is not None:
             self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
@@ -188,38 +160,37 @@ class StatusEvaluator:
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
         verdict = self._decide(f, missing)
-        if verdict.guidance and f is not None:
+        if f is None:
+            reported = self._published(verdict)
+        else:
             first = next(iter(f.state.cameras.values()))
-            advice = excitation_advice(self._in.motion, first.R_imu_cam, f.state.gyro_bias)
-            verdict = verdict._replace(guidance=advice or verdict.guidance)
-        reported = self._steady.follow(verdict, self._in.elapsed_s)
+            reported = self._followed(verdict, first.R_imu_cam, f.state.gyro_bias)
         advice = reported.guidance
         if not advice and f is not None and self.status != Status.INCONSISTENT:
             advice = self._cover.advice()
-        self._ever_converged |= self.status == Status.CONVERGED
-        if f is not None and (self.status == Status.DEGENERATE or f.unshown is not None):
+        if f is not None and (self.status == Status.DEGENERATE or f.unobservable is not None):
             cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
         return CalibrationEstimate(
-            self._in.newest_ns,
+            self.newest_ns,
             self.status,
             reported.reason,
-            self._in.progress(self.status, bool(missing), [g for gs in missing.values() for g in gs]),
+            self._progress(self.status, bool(missing), [g for gs in missing.values() for g in gs]),
             guidance_text(advice),
-            self._in.elapsed_s,
+            self.elapsed_s,
             self.frames,
-            self._in.imu_samples,
+            self.imu_samples,
             cameras,
             None if shown is None else imu_estimate(shown, matrices=self._imu_asked),
             [] if shown is None else shown.state.gravity.tolist(),
             self.nis_per_dof(),
             self._points[0] / max(self._points[1], 1),
-            self._in.take_events(),
+            self._events.take(),
             advice,
         )
 
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter to be reported: mean and covariance over all models of imu, target and clocks."""
-        f = hypotheses.averaged(f)
+        f = model_selection.averaged(f)
         return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
@@ -232,10 +203,7 @@ class StatusEvaluator:
         where = self.layout.cameras[name]
         if where.position is None and where.timeshift is None:
             return []
-        covariance, R = np.array(e.T_imu_cam.covariance), f.state.cameras[name].R_imu_cam
-        return weak_directions(
-            covariance, R, e.timeshift_sigma_s, self._in.motion, self.options.targets, f.state.gyro_bias
-        )
+        return self._weak(e, f.state.cameras[name].R_imu_cam, f.state.gyro_bias)
 
     @staticmethod
     def _withheld(e: CameraEstimate, missing: list[WeakDirection]) -> CameraEstimate:
@@ -245,7 +213,7 @@ class StatusEvaluator:
     def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[WeakDirection]]) -> Verdict:
         """Status, reason and guidance by the data up to now."""
         if f is None:
-            return self._in.before_start(self.bumped, self._unit_trouble())
+            return self._before_start(self.bumped, self._unit_trouble())
         trouble = self._trouble()
         if trouble:
             return Verdict(Status.INCONSISTENT, trouble)
@@ -259,10 +227,6 @@ class StatusEvaluator:
                 return Verdict(Status.CONVERGING, CONFIRMING)
             if self.in_doubt:
                 return Verdict(Status.CONVERGING, self.in_doubt)
-            if not self._held_back_fine():
-                return Verdict(
-                    Status.CONVERGING, "images predicted by the IMU alone do not fit well enough yet"
-                )
             return Verdict(Status.CONVERGED)
         lens = self._lens_to_blame(f, missing)
         if lens:
@@ -272,11 +236,11 @@ class StatusEvaluator:
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
         """What is wrong with a lens that is held, if nothing were missing but for that; else empty."""
-        known = replace(f, S=hypotheses.lenses_known(f)) if f.layout.held else f
+        known = replace(f, S=model_selection.lenses_known(f)) if f.layout.held else f
         if known is f or any(self._missing(self._camera(n, known), n, known) for n in self.layout.cameras):
             return ""
         name = max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
-        how = "not this camera's" if hypotheses.lens_block(name) in f.off else "not known better"
+        how = "not this camera's" if model_selection.lens_block(name) in f.off else "not known better"
         return f"the fixed lens of {name} is {how}"
 
     def _unit_trouble(self) -> str:
@@ -297,6 +261,3 @@ class StatusEvaluator:
         if len(self._nis) >= 40 and self.nis_per_dof() > _NIS_BAD:
             return f"innovations are {self.nis_per_dof():.1f} times what they should be"
         return ""
-
-    def _held_back_fine(self) -> bool:
-        return len(self._held_back) >= 2 and float(np.median(self._held_back)) < _HELD_BACK_BAD

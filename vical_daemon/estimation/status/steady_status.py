@@ -1,4 +1,4 @@
-"""The status as it is published: what the judges decide, without flicker."""
+"""The status as it is published: what the evaluators decide, without flicker."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vical_daemon.estimation.result import Status
 
 _STANDS_S = 2.0
 """For so long the data must speak against a converged calibration before it is called converging again, s of
-data: twice the second over which noise moves what the judges look at."""
+data: twice the second over which noise moves what the evaluators look at."""
 _HYSTERESIS = 2.0
 """Sigma over its limit up to which a direction that was known well enough still is."""
 CONFIRMING = "sigmas are small; waiting for more data to confirm them"

@@ -6,7 +6,7 @@ for each way in which the accelerometer's axes may be permuted and signed; the o
 
 Mirrored images of a board (u -> -u) give the poses D R D', D p with two reflections. The rotations then fit a
 mounting that is turned by half a turn, and the accelerations are those of a negated accelerometer. Only the
-side from which the board is seen tells the two apart.
+side from which the board is seen distinguishes the two.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.temporal.epipolar_errors import (
     Effects,
     TrackNoise,
@@ -31,7 +32,6 @@ from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
 from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
 
 _ITERATIONS = 18
-_BIAS_SIGMA_RPS = 0.02  # of a gyro that was not zeroed
 # What a lens may be off by: focal length and its ratio (relative), centre (of the focal length), distortion.
 _FOCAL_SIGMA, _RATIO_SIGMA, _CENTRE_SIGMA = 0.1, 0.003, 0.03
 _DISTORTION_SIGMA = {"radtan": (0.1, 0.1, 0.005, 0.005), "equidistant": (0.05, 0.05, 0.05, 0.05)}
@@ -121,7 +121,7 @@ class _Fit:
 
     Errors are angles: a longer focal length makes those of the same pixels smaller, and would be preferred
     without any reason in the scene. What that adds to the gradient of fx and fy (`shrinking`) is taken out;
-    on a cart, where nothing else tells fy, it had come out 60 % too long.
+    on a cart, where nothing else shows fy, it had come out 60 % too long.
     """
 
     def __init__(
@@ -200,8 +200,8 @@ class _Fit:
 
     def _prior(self, H: FloatArray, g: FloatArray, bias: FloatArray) -> None:
         """Add what is known before: of the bias, and of the lens where it is among the unknowns."""
-        H[range(4, 7), range(4, 7)] += _BIAS_SIGMA_RPS**-2
-        g[4:7] += bias / _BIAS_SIGMA_RPS**2
+        H[range(4, 7), range(4, 7)] += GYRO_BIAS_SIGMA_RPS**-2
+        g[4:7] += bias / GYRO_BIAS_SIGMA_RPS**2
         if len(g) == 7:
             return
         f = self.given[0][0]

@@ -165,7 +165,7 @@ def _moving(t_cam_s: FloatArray, turns: Turns, noise_rad: float) -> BoolArray:
 def without_long_rest(t_s: FloatArray, q: FloatArray) -> BoolArray:
     """Which orientations to register: all, or where rest prevails those that move and half as many at rest.
 
-    Rest tells the gyro's bias and nothing else, and the residuals at rest, which know no error of the stamps
+    Rest shows the gyro's bias and nothing else, and the residuals at rest, which know no error of the stamps
     or of the gyro's scale, would set the scale by which those in motion are judged.
 
     Args:

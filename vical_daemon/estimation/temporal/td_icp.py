@@ -193,7 +193,6 @@ def _result(
         iterations=rough.iterations + fit.rounds,
         camera_noise_rad=noise,
         slow_noise_ratio=float(np.exp(sensor.log_slow)),
-        gyro_noise_ratio=float(np.exp(fit.log_gyro_scale)),
         used=used,
         stamp_rate=float(fit.stamp_rate[0]),
         stamp_rate_sigma=float(fit.stamp_rate_sigma[0]),

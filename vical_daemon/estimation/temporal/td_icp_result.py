@@ -65,7 +65,6 @@ class TdIcpResult:
         iterations: Rounds of both iterative phases.
         camera_noise_rad: Measured noise of one orientation, rms per axis, rad (from tracks: of one feature).
         slow_noise_ratio: Measured slow error that a second brings over the noise of one orientation.
-        gyro_noise_ratio: Measured drift of the gyro over the stated one.
         used: Which of the given orientations took part, shape (n,).
         stamp_rate: By how much the delay grows with time in these data, s/s (1e-6: one microsecond a second);
             near zero where both clocks are sound. The shift above is that in the middle of the data.
@@ -89,7 +88,6 @@ class TdIcpResult:
     iterations: int = 0
     camera_noise_rad: float = float("nan")
     slow_noise_ratio: float = float("nan")
-    gyro_noise_ratio: float = float("nan")
     used: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     stamp_rate: float = float("nan")
     stamp_rate_sigma: float = float("nan")

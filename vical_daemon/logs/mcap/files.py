@@ -19,7 +19,7 @@ class LockedFile:
     """An exclusively created, locked file that an MCAP writer can use.
 
     The lock says "still being written": it dies with the process, so that a file left by a killed
-    recorder can be told from one that another recorder is writing. Errors are kept as well as raised,
+    recorder differs from one that another recorder is writing. Errors are kept as well as raised,
     because a native writer that calls back may swallow them.
     """
 

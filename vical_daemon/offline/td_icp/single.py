@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
-from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
-from vical_daemon.estimation.temporal.td_icp_monitor import DelayMonitor, DelayReport
+from vical_daemon.estimation.temporal.delay_windows import DelayReport, delay_windows
+from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.track_registration import track_registration
 from vical_daemon.logs import Recording
 from vical_daemon.offline.errors import InputError, OptionError
@@ -61,10 +60,11 @@ def register_camera(request: TdIcpRequest, watch_s: float | None = None) -> Sing
             raise OptionError("--watch needs a board: tracks of unknown points are fitted as a whole")
         return SingleResult(imu, camera, result, used)
     found, used = camera_stream(recording, stream, prior, request.target, base, request.warn)
-    result = td_icp(t_imu, gyro, found.t_s, found.R_world_sensor, found.rotation_sigma, options)
+    poses = found.t_s, found.R_world_sensor, found.rotation_sigma
+    result = td_icp(t_imu, gyro, *poses, options)
     watch = []
     if watch_s is not None and result.status != REFUSED:
-        watch = _watch(t_imu, gyro, found, options, watch_s)
+        watch = delay_windows(t_imu, gyro, *poses, options, watch_s)
     return SingleResult(imu, camera, result, used, watch)
 
 
@@ -81,22 +81,3 @@ def _choose_camera(recording: Recording, name: str | None) -> str:
     if camera not in cameras:
         raise OptionError(f"{recording.path} holds no camera {camera!r}, only {', '.join(cameras)}")
     return camera
-
-
-def _watch(
-    t_imu: FloatArray, gyro: FloatArray, stream: OrientationStream, options: TdIcpOptions, window_s: float
-) -> list[DelayReport]:
-    """Replay the streams through the monitor in order of their stamps."""
-    monitor = DelayMonitor(options, window_s, window_s / 2.0)
-    sigma = np.asarray(stream.rotation_sigma)
-    reports, k = [], 0
-    ahead = options.search_s  # imu data beyond the camera's stamp, so that a positive delay finds its samples
-    for i, t in enumerate(stream.t_s):
-        while k < len(t_imu) and t_imu[k] <= t + ahead:
-            monitor.add_gyro(float(t_imu[k]), gyro[k])
-            k += 1
-        covariance = sigma[i] if sigma.ndim == 3 else np.eye(3) * float(sigma.mean()) ** 2
-        report = monitor.add_orientation(float(t), stream.R_world_sensor[i], covariance)
-        if report is not None:
-            reports.append(report)
-    return reports

@@ -16,7 +16,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.results.report.residuals import CameraResiduals, CellMap, per_point_rms
 
-# Okabe and Ito: told apart by the colour-blind, and in grey.
+# Okabe and Ito: distinct for the colour-blind, and in grey.
 X, Y, Z = "#d55e00", "#009e73", "#0072b2"
 AXES, INK, SOFT = (X, Y, Z), "#1d2433", "#8a93a6"
 WIDTH = 9.6  # inches

@@ -157,7 +157,7 @@ def limits(result: Mapping[str, Any], camera: Mapping[str, Any]) -> list[tuple[s
     nis = result.get("nis_per_dof")
     if nis:
         rows.append(
-            ("model", f"NIS {float(nis):.2f}", "1 where every error is as large as stated, below: cautious")
+            ("model", f"NIS {float(nis):.2f}", "1 where errors are as large as their sigmas, below: cautious")
         )
     return rows
 

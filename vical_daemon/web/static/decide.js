@@ -1,5 +1,5 @@
 "use strict";
-// Decide: the result beside the stored one, accept, discard, reset, recording, exports, the log. All need the token.
+// Decide: the result next to the stored one, accept, discard, reset, recording, exports, the log. All need the token.
 
 const FORMATS = ["kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json"];
 const QUESTIONS = {

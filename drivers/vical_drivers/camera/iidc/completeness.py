@@ -1,4 +1,4 @@
-"""Tells a complete FireWire image from one that a lost packet has shifted.
+"""Distinguishes a complete FireWire image from one that a lost packet has shifted.
 
 The kernel's isochronous reception knows packets, not images. A buffer waits for the packet that begins an
 image (its sy bit), then takes packet after packet until it is full. When one is lost, the rest of the image

@@ -25,7 +25,7 @@ def kernel_stamp(
     ``clock=REALTIME`` sets the same flag) is moved by the offset of the clocks now. Anything else is
     dated by its arrival. The uvcvideo driver always claims "start of exposure", but stamps the first
     packet that arrives: it is taken for that, unless its hwtimestamps=1 is on (then it dates the capture by
-    an interpolation of its own, and the rule says so).
+    an interpolation of its own, which the rule names).
 
     Args:
         buffer: With stamp and flags.

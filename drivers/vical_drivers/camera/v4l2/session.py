@@ -57,7 +57,7 @@ class V4l2Session:
             raise
 
     def _watch_exposure(self) -> None:
-        """Ask to be told when somebody else changes the exposure; not every driver can."""
+        """Ask to be notified when somebody else changes the exposure; not every driver can."""
         for control_id in (abi.CID_EXPOSURE_ABSOLUTE, abi.CID_EXPOSURE_AUTO):
             if self.controls.find(control_id) is not None:
                 try:

@@ -1,4 +1,4 @@
-"""The metadata node of a USB camera, read beside its pictures."""
+"""The metadata node of a USB camera, read together with its images."""
 
 from __future__ import annotations
 

@@ -67,13 +67,13 @@ def test_a_partial_start_gives_way_to_a_full_one_as_soon_as_the_rig_turns():
 
     def each(c):
         c.estimate()  # as a daemon does: the status at the end is that of a calibration that is followed
-        partial.append(c.filter is not None and c.filter.unshown is not None)
+        partial.append(c.filter is not None and c.filter.unobservable is not None)
 
     c = calibrate(run, each=each)
     assert any(partial)
     estimate = c.estimate()
     assert estimate.status == Status.CONVERGED
-    assert c.filter.unshown is None
+    assert c.filter.unobservable is None
     x, sigma = errors(estimate, run)
     assert np.abs(x / sigma).max() < 4.0
     assert sigma[:3].max() < 2e-3
@@ -135,7 +135,7 @@ def test_a_rig_that_has_turned_at_one_rate_is_known_as_soon_as_it_turns_otherwis
     partial, statuses = [], []
 
     def look(c):
-        partial.append(c.filter is not None and c.filter.unshown is not None)
+        partial.append(c.filter is not None and c.filter.unobservable is not None)
         statuses.append(c.estimate().status)
 
     c = calibrate(run, each=look)
@@ -151,13 +151,13 @@ def test_a_rig_that_has_turned_at_one_rate_is_known_as_soon_as_it_turns_otherwis
 def test_an_axis_that_begins_to_turn_is_released():
     run = run_of(trajectory.pure_translation(4, T_imu_cam=MOUNT), seconds=10.0)
     f = calibrate(run).filter
-    assert len(f.unshown.axes) == 3
+    assert len(f.unobservable.axes) == 3
     before = pose_covariance(f, f.layout.cameras["cam0"])[:3, :3]
     for angle in np.linspace(0.0, 1.0, 2000):  # 57 degrees about z: x and y turn, z does not
         f.state.R_world_imu = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() @ f.state.R_world_imu
         f.state.t_s += 0.05
-        f.unshown.follow(f)
-    assert len(f.unshown.axes) < 3
+        f.unobservable.follow(f)
+    assert len(f.unobservable.axes) < 3
     after = pose_covariance(f, f.layout.cameras["cam0"])[:3, :3]
     assert np.linalg.eigvalsh(after - before).min() > -1e-6  # released, not made known
 

@@ -121,11 +121,11 @@ def test_a_filter_about_another_reference_ends_at_the_same_place(given):
     instants = [(found.state.t_s, found.state.R_world_imu, found.state.p_world_imu, found.state.v_world_imu)]
     shift = 0.05 * found.sigmas()
     shift[:9] = 0.0
-    beside = retract(found.state, found.layout, 0.02 * shift)
+    elsewhere = retract(found.state, found.layout, 0.02 * shift)
     known = found.plain()
     instants = [type(found.instants[0])(*instants[0]), *found.instants]
     ends = []
-    for reference in (found.state, beside):
+    for reference in (found.state, elsewhere):
         prior = make(state)
         prior.state, prior.S = known.state, known.S.copy()
         f = LinearisedFilter.about(reference, instants, prior)

@@ -20,8 +20,7 @@ from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.selection import clock_drift
-from vical_daemon.estimation.selection import model_selection as hypotheses
+from vical_daemon.estimation.selection import clock_drift, model_selection
 
 NAME = "cam0"
 HELD = CalibrationOptions(fix=frozenset({"intrinsics"}))
@@ -31,12 +30,12 @@ STATED = (0.4, 0.4, 0.3, 0.3)
 class Linear:
     """Measurements of all errors of a filter whose lens lies `off` times its prior's sigma off."""
 
-    def __init__(self, off: float, told: bool = False):
+    def __init__(self, off: float, given: bool = False):
         rng = np.random.default_rng(3)
         self.lens = FixedLens.of(
             CameraPrior(
                 (640, 480), (460.0, 455.0, 325.0, 238.0), "radtan", (-0.2, 0.1, 0.0, 0.0),
-                intrinsics_sigma=STATED if told else None, distortion_sigma=(1e-3,) * 4 if told else None,
+                intrinsics_sigma=STATED if given else None, distortion_sigma=(1e-3,) * 4 if given else None,
             )
         )  # fmt: skip
         self.layout = make_layout(
@@ -84,49 +83,49 @@ def arm_of(problem: Linear, x):
 
 def test_a_lens_that_is_as_stated_costs_nothing_and_is_known_exactly():
     problem = Linear(off=0.0)
-    told = hypotheses.averaged(problem.filter())
+    shown = model_selection.averaged(problem.filter())
     x, P = problem.posterior(np.zeros(8))
-    np.testing.assert_allclose(told.state.cameras[NAME].p_imu_cam, arm_of(problem, x), atol=1e-8)
+    np.testing.assert_allclose(shown.state.cameras[NAME].p_imu_cam, arm_of(problem, x), atol=1e-8)
     rest = np.ones(problem.layout.size, dtype=bool)
     rest[problem.where] = False
-    np.testing.assert_allclose((told.S @ told.S.T)[np.ix_(rest, rest)], P[np.ix_(rest, rest)], rtol=0.01)
-    assert told.sigmas()[problem.where].max() < 0.02 * problem.lens.off_sigma.max()
+    np.testing.assert_allclose((shown.S @ shown.S.T)[np.ix_(rest, rest)], P[np.ix_(rest, rest)], rtol=0.01)
+    assert shown.sigmas()[problem.where].max() < 0.02 * problem.lens.off_sigma.max()
 
 
 def test_a_wrong_lens_keeps_the_answer_of_the_stated_one_and_widens_it_by_what_the_lens_does():
     problem = Linear(off=1.0)
     f = problem.filter()
-    assert hypotheses.off(f, hypotheses.lens_block(NAME)) > 0.99
-    told = hypotheses.averaged(f)
+    assert model_selection.off(f, model_selection.lens_block(NAME)) > 0.99
+    shown = model_selection.averaged(f)
     x, _ = problem.posterior(np.zeros(8))
     free, P = problem.posterior(problem.lens.off_sigma)
     position = problem.layout.cameras[NAME].position
-    np.testing.assert_allclose(told.state.cameras[NAME].p_imu_cam, arm_of(problem, x), atol=1e-6)
+    np.testing.assert_allclose(shown.state.cameras[NAME].p_imu_cam, arm_of(problem, x), atol=1e-6)
     away = x - free
     expected = P + np.outer(away, away)
     np.testing.assert_allclose(
-        (told.S @ told.S.T)[position, position], expected[position, position], rtol=1e-3
+        (shown.S @ shown.S.T)[position, position], expected[position, position], rtol=1e-3
     )
-    camera = camera_estimate(told, NAME, 0.3)
+    camera = camera_estimate(shown, NAME, 0.3)
     assert camera.intrinsics == problem.lens.values[:4].tolist()
     lens_sigma = np.sqrt(np.diag(expected)[problem.where])
     np.testing.assert_allclose([*camera.intrinsics_sigma, *camera.distortion_sigma], lens_sigma, rtol=1e-3)
 
 
 def test_a_stated_sigma_is_allowed_for_even_where_nothing_contradicts_the_lens():
-    problem = Linear(off=0.0, told=True)
-    told = hypotheses.averaged(problem.filter())
+    problem = Linear(off=0.0, given=True)
+    shown = model_selection.averaged(problem.filter())
     held, _ = problem.posterior(np.zeros(8))
     best, P = problem.posterior(problem.lens.sigma)
     position = problem.layout.cameras[NAME].position
-    np.testing.assert_allclose(told.state.cameras[NAME].p_imu_cam, arm_of(problem, held), atol=1e-6)
+    np.testing.assert_allclose(shown.state.cameras[NAME].p_imu_cam, arm_of(problem, held), atol=1e-6)
     away = held - best
     expected = P + np.outer(away, away)
     np.testing.assert_allclose(
-        (told.S @ told.S.T)[position, position], expected[position, position], rtol=0.02
+        (shown.S @ shown.S.T)[position, position], expected[position, position], rtol=0.02
     )
     np.testing.assert_allclose(
-        told.sigmas()[problem.where], np.sqrt(np.diag(expected)[problem.where]), rtol=0.02
+        shown.sigmas()[problem.where], np.sqrt(np.diag(expected)[problem.where]), rtol=0.02
     )
 
 
@@ -139,13 +138,13 @@ def test_the_odds_of_a_stated_sigma_are_those_of_two_priors():
         multivariate_normal(np.zeros(9), H @ np.diag(s**2) @ H.T + 0.09 * np.eye(9)).logpdf(z)
         for s in (np.ones(4), share)
     ]
-    found = hypotheses.log_bayes_factor(P @ H.T @ z / 0.09, P, 1.0, share)
+    found = model_selection.log_bayes_factor(P @ H.T @ z / 0.09, P, 1.0, share)
     assert found == pytest.approx(by_priors[0] - by_priors[1], abs=1e-6)
 
 
 def test_what_is_said_of_the_clocks_does_not_move_a_lens_that_is_held():
-    told = clock_drift.averaged(hypotheses.averaged(Linear(off=1.0).filter()))
-    values = np.concatenate([told.state.cameras[NAME].intrinsics, told.state.cameras[NAME].distortion])
+    shown = clock_drift.averaged(model_selection.averaged(Linear(off=1.0).filter()))
+    values = np.concatenate([shown.state.cameras[NAME].intrinsics, shown.state.cameras[NAME].distortion])
     np.testing.assert_allclose(values, Linear(off=1.0).lens.values, rtol=1e-6, atol=1e-9)
 
 

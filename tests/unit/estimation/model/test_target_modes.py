@@ -76,7 +76,7 @@ def test_a_crooked_board_is_found_and_the_lens_with_it(crooked):
     camera = estimate.cameras["cam0"]
     off = np.array(camera.intrinsics) - run.rig.lens.intrinsics
     assert np.abs(off / camera.intrinsics_sigma).max() < 3.5
-    # beside what each corner has for itself, and a plane of its own: the world frame is free
+    # in addition to what each corner has for itself, and a plane of its own: the world frame is free
     f = c.filter
     found = c.rig.layout.target_modes.fields(BOARD) @ f.state.target_shape
     left = crooked_board(seed) - BOARD - found
@@ -98,10 +98,10 @@ def test_a_crooked_board_is_noticed_announced_and_from_then_on_allowed_for(crook
             far.append(np.abs(x / sigma).max())
 
     c = calibrate(run, each=each)
-    told = [(t, e) for t, e in events if e.kind is EventKind.TARGET_SHAPE]
-    assert len(told) == 1
-    assert told[0][0] < 10.0
-    assert told[0][1].value > 4.0 * told[0][1].sigma
+    announced = [(t, e) for t, e in events if e.kind is EventKind.TARGET_SHAPE]
+    assert len(announced) == 1
+    assert announced[0][0] < 10.0
+    assert announced[0][1].value > 4.0 * announced[0][1].sigma
     # which had been suspected in its place
     assert EventKind.IMU_INTRINSICS not in {e.kind for _, e in events}
     assert c.estimate().status == Status.CONVERGED
@@ -128,12 +128,12 @@ def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypat
     assert not {EventKind.TARGET_SHAPE, EventKind.TARGET_SIZE} & {e.kind for e in estimate.events}
     assert estimate.status == Status.CONVERGED
     assert off(c.filter, TARGET) < 0.01
-    sigma, beside = (np.array(e.cameras["cam0"].intrinsics_sigma) for e in (estimate, asked.estimate()))
-    assert sigma[2:].max() < 0.75 * beside[2:].max()  # image centre
+    sigma, asked_sigma = (np.array(e.cameras["cam0"].intrinsics_sigma) for e in (estimate, asked.estimate()))
+    assert sigma[2:].max() < 0.75 * asked_sigma[2:].max()  # image centre
     monkeypatch.setattr(
         "vical_daemon.estimation.selection.model_selection.in_doubt", lambda _, **_how: TARGET
     )
-    c.judge._steady.reset(Status.CONVERGING)  # a converged status would stand for two seconds
+    c.evaluator._steady.reset(Status.CONVERGING)  # a converged status would stand for two seconds
     assert c.estimate().status == Status.CONVERGING
     assert (
         c.estimate().reason

@@ -59,7 +59,7 @@ def test_a_jump_is_an_alarm_within_half_a_second():
 
 
 def test_the_larger_the_misfit_the_more_it_takes_to_alarm():
-    """Half a board at the edge of a badly fitting lens is no knock; a jump of two sigmas still is one."""
+    """Half a board at the edge of a badly fitting lens is no bump; a jump of two sigmas still is one."""
     c, rng = Consistency(), np.random.default_rng(0)
     feed(c, rng, 1500, size=2.0)
     c.alarm = 1.9 * consistency._CUSUM_LIMIT

@@ -103,9 +103,9 @@ def test_a_lens_with_one_more_coefficient_is_known_as_well_as_that_leaves_it(rea
     error, sigma = P @ weighted, np.sqrt(np.diag(P))
     radial = np.abs(error / sigma)[[4, 5]]
     assert (radial > 5.0).all()  # four coefficients alone are far from the truth, sure of themselves
-    told = np.hypot(np.sqrt(agreement.factors) * sigma, agreement.moved)
-    assert (np.abs(error) < 3.0 * told).all()
-    size = told[[4, 5]] / np.abs(error)[[4, 5]]
+    reported = np.hypot(np.sqrt(agreement.factors) * sigma, agreement.moved)
+    assert (np.abs(error) < 3.0 * reported).all()
+    size = reported[[4, 5]] / np.abs(error)[[4, 5]]
     assert ((size > 0.6) & (size < 1.6)).all()  # of the size that the error has
 
 

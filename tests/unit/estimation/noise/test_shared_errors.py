@@ -1,4 +1,4 @@
-"""Late stamps and shifted images: found at their size, told apart, used; nothing found where nothing is."""
+"""Late stamps and shifted images: found at their size, separated, used; nothing found where nothing is."""
 
 import numpy as np
 import pytest
@@ -121,7 +121,7 @@ def test_a_jittering_camera_is_calibrated_with_the_weight_it_deserves():
 
 
 def one_late(late_s, size):
-    """An image that tells nothing but how late it is, with a variance of 1 / size^2."""
+    """An image that shows nothing but how late it is, with a variance of 1 / size^2."""
     return np.array([late_s * size]), np.array([[size, 0.0, 0.0]]), np.zeros((3, 1))
 
 

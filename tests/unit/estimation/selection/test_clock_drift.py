@@ -82,14 +82,14 @@ def test_odds_and_moments_are_those_of_the_mixture(factor):
     assert (q / (1 - q)) / (norm.pdf(0.0, 0.0, SKEW_SIGMA) / norm.pdf(0.0, 1e-5, sigma)) == pytest.approx(
         ratio
     )
-    told = averaged(f)
+    reported = averaged(f)
     gain = P[:, index] / P[index, index]
     closed = 0.004 - 4e-5 * gain[shift]
     mean = p * 0.004 + (1 - p) * closed
     variance = p * P[shift, shift] + (1 - p) * (P[shift, shift] - gain[shift] * P[index, shift])
     variance += p * (1 - p) * (0.004 - closed) ** 2
-    assert told.state.cameras[NAME].timeshift_s == pytest.approx(mean, rel=1e-12)
-    assert factor * float(told.S[shift] @ told.S[shift]) == pytest.approx(variance, rel=1e-9)
+    assert reported.state.cameras[NAME].timeshift_s == pytest.approx(mean, rel=1e-12)
+    assert factor * float(reported.S[shift] @ reported.S[shift]) == pytest.approx(variance, rel=1e-9)
 
 
 def test_odds_go_the_way_of_the_evidence():

@@ -19,8 +19,8 @@ def surest(values, P, where):
 def test_an_imu_announced_gives_the_answer_of_a_wide_prior():
     f, _, _, dense = some_filter(3.0)
     beyond = ModelAcceptance()
-    told = beyond.look(f)
-    assert list(told) == [IMU]
+    events = beyond.look(f)
+    assert list(events) == [IMU]
     assert off(f, IMU) == pytest.approx(1.0, abs=1e-12)
     assert off(f, TARGET) < 0.05
     f.state.t_s += 2.0
@@ -32,7 +32,7 @@ def test_an_imu_announced_gives_the_answer_of_a_wide_prior():
     np.testing.assert_allclose(imu_entries(f.state), x[entries], atol=1e-8)
     value, sigma = surest(x, P, entries)
     assert f"scale or alignment of the imu is off, by {1e2 * value:.2f} ± {1e2 * sigma:.2f} %" in event_text(
-        told[IMU]
+        events[IMU]
     )
 
 
@@ -40,15 +40,15 @@ def test_an_imu_announced_gives_the_answer_of_a_wide_prior():
 def test_a_target_announced_is_left_as_it_was_found(factor):
     f, x, P, dense = some_filter(0.0, 4.0, factor=factor)
     agreement = f.agreement[NAME]
-    told = ModelAcceptance().look(f)
-    assert list(told) == [TARGET]
+    events = ModelAcceptance().look(f)
+    assert list(events) == [TARGET]
     assert off(f, TARGET) == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-9, atol=1e-15)
     value, sigma = surest(x, P, dense.where[TARGET])
     assert f"by {1e3 * value:.2f} ± {1e3 * np.sqrt(factor) * sigma:.2f} mm at its edges" in event_text(
-        told[TARGET]
+        events[TARGET]
     )
-    # what stretches had said of the lens was said with the target as stated
+    # what stretches had said of the lens was said with the target as in its file
     assert f.agreement[NAME] is not agreement
 
 
@@ -63,21 +63,21 @@ def test_it_is_asked_once_a_second():
     assert list(beyond.look(f)) == [IMU]
 
 
-@pytest.mark.parametrize(("lag", "told"), [(6.0, "behind"), (-6.0, "ahead of")])
-def test_a_lag_is_announced_once_it_is_measured_how_well_images_fit(lag, told):
+@pytest.mark.parametrize(("lag", "word"), [(6.0, "behind"), (-6.0, "ahead of")])
+def test_a_lag_is_announced_once_it_is_measured_how_well_images_fit(lag, word):
     f, x, P, dense = some_filter(0.0, lag=lag)
     assert ModelAcceptance().look(f) == {}
     f.consistency[NAME].images = 400
     events = ModelAcceptance().look(f)
     assert list(events) == [LAG]
     value, sigma = surest(x, P, dense.where[LAG])
-    assert f"is {1e3 * value:.2f} ± {1e3 * sigma:.2f} ms {told} the gyro" in event_text(events[LAG])
+    assert f"is {1e3 * value:.2f} ± {1e3 * sigma:.2f} ms {word} the gyro" in event_text(events[LAG])
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-9, atol=1e-15)
     assert off(f, LAG) == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize(("size", "told"), [(6.0, "larger"), (-6.0, "smaller")])
-def test_a_size_announced_gives_the_answer_of_a_wide_prior(size, told):
+@pytest.mark.parametrize(("size", "word"), [(6.0, "larger"), (-6.0, "smaller")])
+def test_a_size_announced_gives_the_answer_of_a_wide_prior(size, word):
     f, _, _, dense = some_filter(0.0, size=size)
     events = ModelAcceptance().look(f)
     assert list(events) == [SIZE]
@@ -88,6 +88,6 @@ def test_a_size_announced_gives_the_answer_of_a_wide_prior(size, told):
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-6, atol=1e-12)
     assert f.state.target_scale - 1.0 == pytest.approx(x[where][0], abs=1e-8)
     value, sigma = surest(x, P, where)
-    assert f"the target is {1e2 * value:.2f} ± {1e2 * sigma:.2f} % {told} than stated" in event_text(
+    assert f"the target is {1e2 * value:.2f} ± {1e2 * sigma:.2f} % {word} than stated" in event_text(
         events[SIZE]
     )

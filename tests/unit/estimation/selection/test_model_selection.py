@@ -29,7 +29,7 @@ EVERY = [true for n in range(5) for true in combinations((IMU, LAG, SIZE, TARGET
 
 
 def conditioned(x, P, dense, true):
-    """Mean and covariance if the blocks named are as stated."""
+    """Mean and covariance if the blocks named are as specified."""
     if not true:
         return x, P
     zero = np.concatenate([dense.where[name] for name in true])
@@ -110,7 +110,7 @@ def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_le
     assert off(misfit, name) == pytest.approx(off(long, name), rel=1e-12)
     assert 0.05 < off(misfit, name) < off(doubted(lasting), name)
     assert in_doubt(long) == name
-    assert not in_doubt(misfit)  # such images may never decide it: what is told covers both
+    assert not in_doubt(misfit)  # such images may never decide it: what is reported covers both
     misfit.off.add(name)
     assert off(misfit, name) == pytest.approx(1.0)
 
@@ -125,14 +125,14 @@ def test_what_is_told_has_the_moments_of_the_mixture(factor, sizes):
     covariance = sum(
         shares[true] * (factor * C + np.outer(m - mean, m - mean)) for true, (m, C) in parts.items()
     )
-    told = averaged(f)
-    np.testing.assert_allclose(factor * told.S @ told.S.T, covariance, rtol=1e-6, atol=1e-13)
+    reported = averaged(f)
+    np.testing.assert_allclose(factor * reported.S @ reported.S.T, covariance, rtol=1e-6, atol=1e-13)
     shift = f.layout.cameras[NAME].timeshift
-    assert told.state.cameras[NAME].timeshift_s == pytest.approx(0.004 + mean[shift], rel=1e-8)
-    np.testing.assert_allclose(imu_entries(told.state), mean[dense.where[IMU]], atol=1e-12)
-    assert told.state.accel_lag_s == pytest.approx(mean[dense.where[LAG]][0], abs=1e-12)
-    assert told.state.target_scale == pytest.approx(1.0 + mean[dense.where[SIZE]][0], abs=1e-12)
-    np.testing.assert_allclose(told.state.target_shape, mean[dense.where[TARGET]], atol=1e-12)
+    assert reported.state.cameras[NAME].timeshift_s == pytest.approx(0.004 + mean[shift], rel=1e-8)
+    np.testing.assert_allclose(imu_entries(reported.state), mean[dense.where[IMU]], atol=1e-12)
+    assert reported.state.accel_lag_s == pytest.approx(mean[dense.where[LAG]][0], abs=1e-12)
+    assert reported.state.target_scale == pytest.approx(1.0 + mean[dense.where[SIZE]][0], abs=1e-12)
+    np.testing.assert_allclose(reported.state.target_shape, mean[dense.where[TARGET]], atol=1e-12)
     assert f.state.cameras[NAME].timeshift_s == pytest.approx(
         0.004 + x[shift], rel=1e-9
     )  # it goes on as it was

@@ -12,9 +12,9 @@ from vical_mocks.tracks import room_landmarks, simulate_tracks
 from benchmarks import gaps
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.smoother.carry import FULL
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
 from vical_daemon.estimation.smoother.jitter import StampOffsets
+from vical_daemon.estimation.smoother.marginal_prior import FULL
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
 DISTURBANCES = {
@@ -44,9 +44,9 @@ def undisturbed():
 @pytest.mark.parametrize("case", [c for c in gaps.CASES if "clock" in c])
 def test_a_clock_that_is_set_moves_the_time_shift_alone(case, undisturbed):
     record = recorded(case, 1)
-    told = kinds_after(record)
-    assert sum(kind in DISTURBANCES for kind in told) == 1, told
-    assert not BUMPS & set(told)
+    kinds = kinds_after(record)
+    assert sum(kind in DISTURBANCES for kind in kinds) == 1, kinds
+    assert not BUMPS & set(kinds)
     judged = gaps.judged(record, case)
     assert judged["was_converged"]
     assert judged["lies"] == []

@@ -1,4 +1,4 @@
-"""What is told without a target is the mixture over what may not be as stated."""
+"""What is reported without a target is the mixture over the alternative models."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ from scipy.stats import multivariate_normal
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.marginal_prior import (
     CALIBRATION,
     FULL,
     IMU,
@@ -16,7 +17,6 @@ from vical_daemon.estimation.smoother.carry import (
     MarginalPrior,
     root_of,
 )
-from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.snapshot import camera_estimate
 
 PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])
@@ -81,14 +81,14 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     x[NUMBERS] = known.imu
     doubts = TargetFreeDoubts("cam0", asked=frozenset(), rolling=True)
     doubts.drifting = True
-    told = camera_estimate(
+    reported = camera_estimate(
         known, doubts.weighed(known, 1.0, compared=True)._replace(gyro_frame=False), 0.5, 0.5
     )
     mean, covariance = mixture(P, x)
-    assert np.array(told.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(mean[:3], abs=1e-9)
-    assert told.timeshift_cam_imu_s - 0.01 == pytest.approx(mean[6], abs=1e-12)
-    assert np.array(told.T_imu_cam.covariance) == pytest.approx(covariance[:6, :6], rel=1e-6, abs=1e-13)
-    assert told.timeshift_sigma_s == pytest.approx(np.sqrt(covariance[6, 6]), rel=1e-6)
+    assert np.array(reported.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(mean[:3], abs=1e-9)
+    assert reported.timeshift_cam_imu_s - 0.01 == pytest.approx(mean[6], abs=1e-12)
+    assert np.array(reported.T_imu_cam.covariance) == pytest.approx(covariance[:6, :6], rel=1e-6, abs=1e-13)
+    assert reported.timeshift_sigma_s == pytest.approx(np.sqrt(covariance[6, 6]), rel=1e-6)
 
 
 def test_what_is_asked_for_is_never_taken_as_stated():

@@ -14,7 +14,7 @@ from vical_mocks.tracks import simulate_tracks
 from tests.unit.estimation.test_target_free import subject_for
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
-from vical_daemon.estimation.smoother.start import ArmPrior, NoStartError
+from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError
 
 MOUNT = (NOMINAL_R_IMU_CAM, NOMINAL_P_IMU_CAM)
 
@@ -84,7 +84,7 @@ def test_a_second_axis_makes_it_whole():
     ordinary = subject.look
 
     def look(*arguments):
-        held.append(subject.calibrator.judge.held is not None)
+        held.append(subject.calibrator.evaluator.held is not None)
         return ordinary(*arguments)
 
     subject.look = look

@@ -15,7 +15,9 @@ from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_link
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
-from vical_daemon.estimation.smoother.carry import (
+from vical_daemon.estimation.smoother.inertial import Order
+from vical_daemon.estimation.smoother.jitter import StampOffsets
+from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
     FULL,
     INERTIAL,
@@ -24,11 +26,9 @@ from vical_daemon.estimation.smoother.carry import (
     later,
     moved,
 )
-from vical_daemon.estimation.smoother.inertial import Order
-from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.quality import correlation
-from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart
-from vical_daemon.estimation.smoother.starter import start_sigmas
+from vical_daemon.estimation.smoother.target_free_initializer import start_sigmas
+from vical_daemon.estimation.smoother.track_start import ArmPrior, TrackStart
 from vical_daemon.estimation.temporal.epipolar_fit import epipolar_fit
 
 SHIFT_S = 0.013
@@ -68,7 +68,7 @@ class Scene:
         start = moved(self.camera, np.zeros(FULL))
         start.p_imu_cam = np.zeros(3)
         imu = np.concatenate([self.rig.gyro_bias.value(0.0), np.zeros(3 + numbers)])
-        linear = LinearStart(self.buffer, self.frames, start, imu, self.noise, 9.80665)
+        linear = TrackStart(self.buffer, self.frames, start, imu, self.noise, 9.80665)
         return linear.window(ArmPrior(np.zeros(3)))
 
 

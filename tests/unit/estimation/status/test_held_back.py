@@ -34,6 +34,6 @@ def events_with(density_factor):
 def test_wrong_noise_densities_are_told_once(factor, said):
     events, estimate = events_with(factor)
     assert estimate.nis_per_dof > 0.5
-    told = [event_text(e) for e in events if e.kind is EventKind.IMU_NOISE]
-    assert len(told) == (1 if said else 0)
-    assert all(said in e and "vical allan" in e for e in told)
+    announced = [event_text(e) for e in events if e.kind is EventKind.IMU_NOISE]
+    assert len(announced) == (1 if said else 0)
+    assert all(said in e and "vical allan" in e for e in announced)

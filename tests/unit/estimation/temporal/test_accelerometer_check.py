@@ -49,14 +49,14 @@ def test_the_mistake_is_named_with_what_undoes_it(seed: int, mapping: np.ndarray
 @pytest.mark.parametrize("seed", range(3))
 def test_mirrored_images_look_like_a_negated_accelerometer_but_for_the_side_of_the_board(seed: int) -> None:
     t_imu_s, force, t_s, R, p, mounting = data(seed)
-    told = explain_accelerometer(t_imu_s, -force, t_s, R, p, mounting, front_is_up=False)
-    assert told.endswith("negate all three of its axes")
+    reason = explain_accelerometer(t_imu_s, -force, t_s, R, p, mounting, front_is_up=False)
+    assert reason.endswith("negate all three of its axes")
     board, image = np.diag([1.0, 1.0, -1.0]), np.diag([-1.0, 1.0, 1.0])
     as_fitted = mounting @ np.diag([1.0, -1.0, -1.0])
-    told = explain_accelerometer(
+    reason = explain_accelerometer(
         t_imu_s, force, t_s, board @ R @ image, p @ board, as_fitted, front_is_up=False
     )
-    assert told.startswith("the images are mirrored")
+    assert reason.startswith("the images are mirrored")
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 30])

@@ -1,4 +1,4 @@
-"""Parts around td_icp: lens refinement, rotations from tracks, the monitor, curves."""
+"""Parts around td_icp: lens refinement, rotations from tracks, windows, curves."""
 
 import numpy as np
 import pytest
@@ -9,9 +9,9 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.temporal.delay_windows import delay_windows
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, cumulative_product
 from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
-from vical_daemon.estimation.temporal.td_icp_monitor import DelayMonitor
 from vical_daemon.estimation.temporal.track_orientations import relative_rotations, track_orientations
 
 
@@ -126,23 +126,16 @@ def test_tracks_become_chains_that_end_where_features_do():
     np.testing.assert_allclose(step, so3.log(so3.exp(np.array([0, 0.11, 0.055]))), atol=1e-6)
 
 
-def test_the_monitor_follows_the_delay_and_announces_a_jump():
+def test_windows_follow_the_delay_and_announce_a_jump():
     rng = np.random.default_rng(3)
     t_imu = np.arange(0.0, 24.0, 0.01)
     gyro = _rate(t_imu) + rng.normal(0, 5.2e-3, (len(t_imu), 3))
     truth = GyroCurve.integrate(t_imu, _rate(t_imu), np.zeros(3))
-    monitor = DelayMonitor(TdIcpOptions(search_s=0.5), window_s=6.0, every_s=6.0)
-    reports, k = [], 0
-    for t in np.arange(1.0, 20.0, 0.1):
-        shift = 0.010 if t < 7.5 else 0.030
-        while t_imu[k] < t + 0.7:
-            monitor.add_gyro(float(t_imu[k]), gyro[k])
-            k += 1
-        R = truth.at(np.array([t + shift]))[0][0] @ so3.exp(rng.normal(0, 1.7e-3, 3))
-        report = monitor.add_orientation(float(t), R, 1.7e-3**2 * np.eye(3))
-        if report is not None:
-            reports.append(report)
-    assert len(reports) >= 2
+    t = np.arange(1.0, 20.0, 0.1)
+    shift = np.where(t < 7.5, 0.010, 0.030)
+    R = truth.at(t + shift)[0] @ so3.exp(rng.normal(0, 1.7e-3, (len(t), 3)))
+    reports = delay_windows(t_imu, gyro, t, R, 1.7e-3, TdIcpOptions(search_s=0.5), 6.0)
+    assert [r.t_s for r in reports] == pytest.approx([4.0, 7.0, 10.0, 13.0, 16.0], abs=0.1)
     assert abs(reports[0].timeshift_s - 0.010) < 5 * reports[0].timeshift_sigma_s
     assert any(r.jumped for r in reports)
     assert abs(reports[-1].timeshift_s - 0.030) < 5 * reports[-1].timeshift_sigma_s

@@ -296,7 +296,7 @@ def test_every_file_says_how_good_it_is(rig, name):
 def test_what_the_motion_did_not_determine_needs_force(rig, name):
     camera = replace(rig.cameras["cam0"], unobservable=("lever arm along the optical axis",))
     rig = replace(rig, cameras={"cam0": camera})
-    if name == "json":  # says so itself
+    if name == "json":  # names its format itself
         assert json.loads(export(rig, name)[0].text)["cameras"]["cam0"]["unobservable"]
         return
     with pytest.raises(ExportError, match=r"cam0: lever arm along the optical axis.*--force"):

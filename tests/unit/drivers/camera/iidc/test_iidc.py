@@ -106,7 +106,7 @@ CAMERA, ADAPTER = 0x00B09D0100A1B2C3, 0x0012345678ABCDEF
 
 
 def closed_bus(tmp_path: Path, monkeypatch, units: dict[str, tuple[int, str]]) -> tuple[Path, Path]:
-    """Nodes that nobody may open, and what sysfs tells everybody of them."""
+    """Nodes that nobody may open, and what sysfs shows everybody of them."""
     dev, sysfs = tmp_path / "dev", tmp_path / "sys"
     dev.mkdir()
     for name, (guid, text) in units.items():
@@ -135,9 +135,9 @@ def test_a_closed_camera_is_named_and_nothing_else(tmp_path, monkeypatch) -> Non
     there = {"fw0": (ADAPTER, ""), "fw1": (CAMERA, "0x00a02d:0x000102")}
     dev, sysfs = closed_bus(tmp_path, monkeypatch, there)
     for asked in (CAMERA, None):
-        with pytest.raises(errors.DevicePermissionError, match="group 'video'") as told:
+        with pytest.raises(errors.DevicePermissionError, match="group 'video'") as raised:
             firewire.find_node(asked, dev, sysfs)
-        assert "fw1" in str(told.value) and "fw0" not in str(told.value)
+        assert "fw1" in str(raised.value) and "fw0" not in str(raised.value)
     (sysfs / "bus/firewire/devices/fw1/guid").unlink()  # no sysfs: it may be the camera
     with pytest.raises(errors.DevicePermissionError):
         firewire.find_node(CAMERA, dev, sysfs)

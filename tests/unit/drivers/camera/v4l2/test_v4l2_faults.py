@@ -49,11 +49,11 @@ def test_an_unplug_is_called_an_unplug_whatever_was_asked_then(open_fake, kernel
     source.read(1.0)
     kernel._plugged[str(kernel.dev / "video0")].events.append(CID_EXPOSURE_AUTO)
     camera.request_errno[DQEVENT] = code
-    with pytest.raises(errors.DeviceLostError) as told:
+    with pytest.raises(errors.DeviceLostError) as raised:
         read_on(source)
     said = {errno.ENODEV: "the camera went away", errno.EIO: "the camera fails to report changes"}[code]
-    assert str(told.value).startswith(f"{kernel.dev}/video0: {said}")
-    assert "check its cable" in str(told.value)
+    assert str(raised.value).startswith(f"{kernel.dev}/video0: {said}")
+    assert "check its cable" in str(raised.value)
 
 
 def test_another_camera_in_the_same_place_is_not_taken_for_the_lost_one(open_fake, kernel) -> None:
@@ -108,7 +108,7 @@ def test_frames_that_never_leave_the_camera_are_found_by_the_stamps(open_fake) -
         (37, 1),
         (57, 2),  # two with one frame in between
         (73, 1),  # the driver's count, at once
-        (74, 1),  # beside it
+        (74, 1),  # next to it
     ]
     stats = source.stats()
     assert (stats.lost, stats.extra["lost_in_camera"]) == (19, 17)

@@ -1,4 +1,4 @@
-"""Temporal calibration when something is wrong, and beside a running filter."""
+"""Temporal calibration when something is wrong."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ import time
 
 import numpy as np
 import numpy.typing as npt
-from vical_mocks.points import board_points, simulate
-from vical_mocks.rig import reference_rig
 from vical_mocks.rotations import exp_so3
 from vical_mocks.trajectory import hand_motion
 
 from benchmarks.td_icp_trials import DEG, GYRO, IMU_HZ, WALK, simulate_gyro
-from vical_daemon.estimation.measurements import PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, td_icp
-from vical_daemon.estimation.temporal.td_icp_watch import DelayWatch
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -88,57 +83,3 @@ def study_wrong(trials: int) -> None:
         expected = f"`{words.split('|')[0]}`" if words else "solved"
         right = f"{named}" if words else ""
         print(f"| {what} | {expected} | {solved} | {refused} | {right} | {slowest:.2f} |", flush=True)
-
-
-def _believed(rig_seed: int, shift_s: float) -> CalibrationEstimate:
-    """A converged calibration with the true lens and this time shift."""
-    lens = reference_rig(rig_seed).lens
-    pose = PoseEstimate([0.0] * 3, [1.0, 0.0, 0.0, 0.0], (np.eye(6) * 1e-8).tolist())
-    unsure = [0.0] * 4
-    camera = CameraEstimate(
-        pose, shift_s, 2e-5, list(lens.intrinsics), unsure, lens.model, list(lens.distortion), unsure, 0.2
-    )
-    return CalibrationEstimate(
-        0, Status.CONVERGED, "", 1.0, "", 1.0, 2, 3, {"cam0": camera}, None, [0.0, 0.0, -9.8], 1.0, 0.0
-    )
-
-
-def study_online(seconds: float = 150.0) -> None:
-    """The watch beside a filter: what it costs, what it sees of a delay that drifts or that is wrong."""
-    print(
-        f"\n### Monitor of a running filter, {seconds:.0f} s, board at 20 Hz, a window of 10 s in every 30\n"
-    )
-    print("| imu Hz | drift ppm | filter off by ms | windows | drift found ppm | warns | % of a core |")
-    print("|---|---|---|---|---|---|---|")
-    for hz, ppm, wrong_ms in ((100.0, 0, 0.0), (100.0, 0, 1.0), (100.0, 50, 0.0), (1000.0, 0, 0.0)):
-        run = simulate(2, seconds, rig=reference_rig(2), camera_rate_hz=20.0, imu_rate_hz=hz)
-        start = int(run.t_imu_ns[0])
-        watch = DelayWatch(
-            board_points(), ["cam0"], TdIcpOptions(gyro_density=GYRO, gyro_walk=WALK, gyro_log_sigma=0.7)
-        )
-        frames = [
-            # the camera's clock loses `ppm` microseconds a second: its delay grows
-            PointsFrame("cam0", f.t_cam_ns - round(1e-6 * ppm * (f.t_cam_ns - start)), f.ids, f.uv_px)
-            for f in run.frames
-        ]
-        imu = [(int(t), tuple(map(float, w))) for t, w in zip(run.t_imu_ns, run.gyro_rps, strict=True)]
-        estimate = _believed(2, run.rig.timeshift_cam_imu_s + 1e-3 * wrong_ms)
-        cpu, k, next_ns = time.process_time(), 0, start
-        for frame in frames:
-            while k < len(imu) and imu[k][0] <= frame.t_cam_ns:
-                watch.add_imu(*imu[k])
-                k += 1
-            watch.add_points(frame)
-            if frame.t_cam_ns >= next_ns:
-                next_ns += 200_000_000
-                watch.look(estimate)
-        share = (time.process_time() - cpu) / seconds
-        verdict = watch.verdicts["cam0"]
-        report = verdict.report
-        drift = "" if report is None else f"{1e6 * report.drift:+.1f} +- {1e6 * report.drift_sigma:.1f}"
-        warns = "yes" if verdict.warning else "no"
-        print(
-            f"| {hz:.0f} | {ppm} | {wrong_ms:.1f} | {verdict.windows} | {drift} | {warns} | "
-            f"{100 * share:.1f} |",
-            flush=True,
-        )

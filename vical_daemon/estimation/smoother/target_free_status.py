@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -20,12 +19,11 @@ from vical_daemon.estimation.result import (
 )
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Fit
-from vical_daemon.estimation.smoother.carry import CALIBRATION, DRIFT, FULL, MarginalPrior
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, DRIFT, FULL, MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.status.excitation import excitation_advice, weak_directions
-from vical_daemon.estimation.status.incoming import LOST, PATIENCE_S, Incoming, lacking_verdict
-from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
+from vical_daemon.estimation.status.evaluator import LOST, PATIENCE_S, Evaluator, lacking_verdict
+from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
 from vical_daemon.estimation.wording import cause_text, direction_line, guidance_text
 
 _ENOUGH_WINDOWS = 2
@@ -40,7 +38,7 @@ _PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
-class TargetFreeStatus:
+class TargetFreeStatus(Evaluator):
     """Watches what goes in and out of the windows.
 
     Args:
@@ -53,12 +51,10 @@ class TargetFreeStatus:
     def __init__(
         self, options: CalibrationOptions, camera: str, active: BoolArray, *, rolling: bool = False
     ) -> None:
-        self.options, self.camera, self.active = options, camera, active
-        self._in = Incoming("no features have been followed yet: is the picture dark or blurred?")
-        self._steady = SteadyStatus()
+        super().__init__(options, "no features have been followed yet: is the picture dark or blurred?")
+        self.camera, self.active = camera, active
         self.misfit: tuple[Cause, float] = Cause.NONE, 0.0
         self._against_since_s: float | None = None  # images contradict what is known since then
-        self._started_s: float | None = None
         self._now_s = 0.0
         self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
         self._growing = 0.0, 0  # the same of the window that is not complete yet
@@ -68,7 +64,6 @@ class TargetFreeStatus:
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
         self._sigma_px = self.jitter_s = 0.0
         self._trace = Trace()
-        self._ever_converged = False
         self._bumped = Cause.NONE
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
@@ -76,22 +71,14 @@ class TargetFreeStatus:
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
-    def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
-        """Count one inertial reading."""
-        self._in.saw_imu(t_ns, gyro)
-
-    def saw_points(self, t_s: float, count: int) -> None:
-        """Count one image with `count` tracks."""
-        self._in.saw_points(t_s, count)
-
-    def waiting(self, why: str, motion_missing: bool) -> None:
-        """No start yet; `motion_missing`: more motion, not more time, would help."""
+    def waiting(self, why: str, motion_missing: bool = False) -> None:
+        """See `Evaluator`; also why the calibration before was given up."""
         before = "" if motion_missing or not self._given_up[0] else f"{cause_text(*self._given_up)}; "
-        self._in.reason, self._in.motion_missing = before + why, motion_missing
+        super().waiting(before + why, motion_missing)
 
     def started(self, t_s: float) -> None:
         """A window runs from `t_s` on."""
-        self._in.reason = ""
+        self.reason = ""
         if self._started_s is None:
             self._started_s = t_s
         if self._bumped:
@@ -117,7 +104,7 @@ class TargetFreeStatus:
             self.contradicted(against_s)
         if kept is None and against_s and self._growing[1]:
             self._withdrawn.append(self._growing)
-        self._in.reason, self._in.motion_missing = cause_text(why, value), False
+        self.reason, self.motion_missing = cause_text(why, value), False
         if kept is not None and not self._quiet[0]:
             self._quiet = why, value
         if kept is None:
@@ -133,12 +120,12 @@ class TargetFreeStatus:
     def contradicted(self, against_s: float) -> None:
         """Images of the last `against_s` seconds contradict the calibration: not known yet why."""
         if self._against_since_s is None:
-            self._against_since_s = self._in.elapsed_s - against_s
+            self._against_since_s = self.elapsed_s - against_s
 
     @property
     def against_s(self) -> float:
         """For how long images have contradicted the calibration, s; 0: they do not."""
-        return 0.0 if self._against_since_s is None else self._in.elapsed_s - self._against_since_s
+        return 0.0 if self._against_since_s is None else self.elapsed_s - self._against_since_s
 
     @property
     def proven(self) -> bool:
@@ -162,10 +149,6 @@ class TargetFreeStatus:
         self._announce(EventKind.TIMESHIFT_STEPPED, step_s)
         self._quiet, self._against_since_s = (Cause.NONE, None), None
 
-    def announce_all(self, events: Iterable[Event]) -> None:
-        """Put events into the next estimate."""
-        self._in.announce_all(events)
-
     def _announce(
         self,
         kind: EventKind,
@@ -176,12 +159,7 @@ class TargetFreeStatus:
         cause_value: float | None = None,
     ) -> None:
         event = Event(kind, self.camera, value, cause=cause, cause_value=cause_value)
-        self._in.announce(event, once)
-
-    @property
-    def status(self) -> Status:
-        """Where the calibration stands, as of the last estimate."""
-        return self._steady.status
+        self.announce(event, once)
 
     # ------------------------------------------------------------------ windows
     def fits(self, fit: Fit, *, first: bool = False) -> bool:
@@ -293,34 +271,35 @@ class TargetFreeStatus:
     ) -> CalibrationEstimate:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
-        missing = [] if camera is None or carry is None else self._missing(camera, carry)
+        missing = []
+        if camera is not None and carry is not None:
+            missing = self._weak(camera, carry.camera.R_imu_cam, carry.bias[:3])
         converged = self.status == Status.CONVERGED
         doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), converged=converged)
         verdict = self._decide(camera is not None, running, missing, doubt)
-        if verdict.guidance and carry is not None:
-            advice = excitation_advice(self._in.motion, carry.camera.R_imu_cam, carry.bias[:3])
-            verdict = verdict._replace(guidance=advice or verdict.guidance)
-        reported = self._steady.follow(verdict, self._in.elapsed_s)
-        self._ever_converged |= self.status == Status.CONVERGED
+        if carry is None:
+            reported = self._published(verdict)
+        else:
+            reported = self._followed(verdict, carry.camera.R_imu_cam, carry.bias[:3])
         if camera is not None and self.status == Status.DEGENERATE:
             camera.withheld.extend(m for m in missing if m.excess > LOST)
             camera.unobservable.extend(direction_line(m) for m in camera.withheld)
         refused, seen = (sum(x) for x in zip(*self._refused, strict=True)) if self._refused else (0, 0)
         return CalibrationEstimate(
-            self._in.newest_ns,
+            self.newest_ns,
             self.status,
             reported.reason,
-            self._in.progress(self.status, camera is not None, missing),
+            self._progress(self.status, camera is not None, missing),
             guidance_text(reported.guidance),
-            self._in.elapsed_s,
-            self._in.frames_seen,
-            self._in.imu_samples,
+            self.elapsed_s,
+            self.frames_seen,
+            self.imu_samples,
             {} if camera is None else {self.camera: camera},
             None if carry is None else imu_estimate(carry, matrices_asked=self.doubts.imu_asked),
             gravity,
             self.nis_per_dof(),
             refused / max(seen, 1),
-            self._in.take_events(),
+            self._events.take(),
             reported.guidance,
         )
 
@@ -330,21 +309,15 @@ class TargetFreeStatus:
         doubts = self.doubts.weighed(carry, self._reported_factor(), bool(self._agreement))
         return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
-    def _missing(self, e: CameraEstimate, carry: MarginalPrior) -> list[WeakDirection]:
-        covariance, R = np.array(e.T_imu_cam.covariance), carry.camera.R_imu_cam
-        return weak_directions(
-            covariance, R, e.timeshift_sigma_s, self._in.motion, self.options.targets, carry.bias[:3]
-        )
-
     def _decide(self, known: bool, running: bool, missing: list[WeakDirection], doubt: str) -> Verdict:
         """By the data up to now; `doubt`: what may not be as it is taken to be, or nothing."""
         if not known:
-            return self._in.before_start(self._bumped)
+            return self._before_start(self._bumped)
         if not running and self._windows == 0:
-            return Verdict(Status.INITIALISING, self._in.reason)
+            return Verdict(Status.INITIALISING, self.reason)
         if self._against_since_s is not None:
             return Verdict(Status.CONVERGING, LOOKING_AGAIN, against_s=self.against_s)
-        pause = "" if running else f" (paused: {self._in.reason or cause_text(*self._quiet)})"
+        pause = "" if running else f" (paused: {self.reason or cause_text(*self._quiet)})"
         missing = self._steady.counted(missing)
         if not missing:
             if self._windows < _ENOUGH_WINDOWS:

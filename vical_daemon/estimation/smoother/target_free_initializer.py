@@ -16,9 +16,9 @@ from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
 from vical_daemon.estimation.model.priors import EQUIDISTANT_SIGMA, LAG_SIGMA_S, SKEW_SIGMA, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
-from vical_daemon.estimation.smoother.start import ArmPrior, LinearStart, NoStartError
+from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError, TrackStart
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.temporal.camera_orientations import Orientations as CameraOrientations
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
@@ -54,7 +54,7 @@ _MAX_HOLE_S = 0.5
 _STILL_PX = 1.0  # median travel of a feature over half a second
 
 
-class Starter:
+class TargetFreeInitializer:
     """Decides when to try, and tries.
 
     Args:
@@ -170,7 +170,7 @@ class Starter:
         held = self.held if found.about is None else found.about
         arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, held)
         try:
-            start = LinearStart(buffer, frames, camera, found.imu, noise, gravity)
+            start = TrackStart(buffer, frames, camera, found.imu, noise, gravity)
             if found.about is not None:
                 camera.R_imu_cam = mounting_about(start, found.about, camera.R_imu_cam, arm)
             window = start.window(arm)

@@ -43,7 +43,7 @@ class MarginalPrior:
         root: W with W^T W = information of the errors, shape (d, d).
         active: Which of the calibration errors are estimated, shape (FULL,).
         t_cam_s: Stamp of that image, s.
-        imu: What is not as stated of the imu, see `Window`.
+        imu: Errors of the imu, see `Window`.
     """
 
     R: FloatArray
@@ -170,6 +170,6 @@ def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Ma
 
 def root_of(covariance: FloatArray) -> FloatArray:
     """W with W^T W = inverse of a covariance."""
-    scale = np.sqrt(np.diag(covariance))  # pixels beside microseconds
+    scale = np.sqrt(np.diag(covariance))  # pixels and microseconds
     root = np.linalg.cholesky(covariance / np.outer(scale, scale) + 1e-14 * np.eye(len(scale)))
     return np.asarray(np.linalg.inv(root) / scale)

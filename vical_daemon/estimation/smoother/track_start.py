@@ -21,7 +21,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLink, make_link
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.carry import HELD_M
+from vical_daemon.estimation.smoother.marginal_prior import HELD_M
 from vical_daemon.estimation.smoother.window import Landmarks, Window, rays_of
 
 _ROUNDS = 8
@@ -64,7 +64,7 @@ class _Linear(NamedTuple):
     misfit: float  # median angle by which rays miss their points, rad
 
 
-class LinearStart:
+class TrackStart:
     """A stretch of tracks whose rotations are known, ready to be solved for one mounting or many.
 
     Args:

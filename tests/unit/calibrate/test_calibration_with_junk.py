@@ -1,4 +1,4 @@
-"""A calibration beside junk on all keys: the same answer, and logs that everybody can open.
+"""A calibration with junk on all keys: the same answer, and logs that everybody can open.
 
 The large version, with processes of their own and 10^5 messages: `python -m benchmarks bus_faults`.
 """
@@ -56,7 +56,7 @@ class Rig:
         self.bus.subscribe(f"vical/{RIG}/**", record)
 
     def run(self, run: Any, junk: Junk | None) -> None:
-        """Publish a recording, with junk beside it or without."""
+        """Publish a recording, with junk or without."""
         number = 0
         for stamp_ns, key, payload in good_messages(run, BEGIN_NS):
             if junk is not None and "image" in key:

@@ -1,18 +1,22 @@
-"""What came in so far, and what is said of a calibration that is not there yet."""
+"""What both evaluators share, and what is said of a calibration that is not there yet."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from vical_daemon.estimation.events import Cause, Event, EventLog
 from vical_daemon.estimation.guidance import WeakDirection
-from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.status.excitation import ALL_WAYS, RunningMotion, excitation_advice
-from vical_daemon.estimation.status.steady_status import Verdict
+from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.result import CameraEstimate, Status
+from vical_daemon.estimation.status.excitation import (
+    ALL_WAYS,
+    RunningMotion,
+    excitation_advice,
+    weak_directions,
+)
+from vical_daemon.estimation.status.steady_status import SteadyStatus, Verdict
 from vical_daemon.estimation.wording import cause_text, direction_sigma
 
 PATIENCE_S = 15.0
@@ -21,12 +25,14 @@ LOST = 3.0
 """A direction whose sigma is this many times its limit after the patience is called unobservable."""
 
 
-@dataclass(slots=True)
-class Incoming:
-    """Counts readings and images, follows the motion and collects events.
+class Evaluator:
+    """What evaluators with a target and without share: counts of what came in, events, the steady status.
+
+    Args:
+        options: Switches and targets.
+        nothing_seen: What is said while no image shows anything.
 
     Attributes:
-        nothing_seen: What is said while no image shows anything.
         imu_samples: Readings so far.
         frames_seen: Images with points so far.
         newest_ns: Stamp of the newest reading.
@@ -36,16 +42,16 @@ class Incoming:
         motion: What the gyro shows of the motion.
     """
 
-    nothing_seen: str
-    imu_samples: int = 0
-    frames_seen: int = 0
-    newest_ns: int = 0
-    first_frame_s: float | None = None
-    reason: str = ""
-    motion_missing: bool = False
-    motion: RunningMotion = field(default_factory=RunningMotion)
-    _events: EventLog = field(default_factory=EventLog)
-    _first_ns: int = 0
+    def __init__(self, options: CalibrationOptions, nothing_seen: str) -> None:
+        self.options, self._nothing_seen = options, nothing_seen
+        self.imu_samples = self.frames_seen = 0
+        self.newest_ns = self._first_ns = 0
+        self.first_frame_s: float | None = None
+        self.reason, self.motion_missing = "", False
+        self.motion = RunningMotion()
+        self._events, self._steady = EventLog(), SteadyStatus()
+        self._started_s: float | None = None
+        self._ever_converged = False
 
     def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
         """Count one inertial reading."""
@@ -68,6 +74,15 @@ class Incoming:
         """Time of the data since the first reading, s."""
         return (self.newest_ns - self._first_ns) * 1e-9
 
+    @property
+    def status(self) -> Status:
+        """Where the calibration stands, as of the last estimate."""
+        return self._steady.status
+
+    def waiting(self, why: str, motion_missing: bool = False) -> None:
+        """There is no start yet; `motion_missing`: more motion, not more time, would help."""
+        self.reason, self.motion_missing = why, motion_missing
+
     def announce(self, event: Event, once: str = "") -> None:
         """Put an event into the next estimate; of those with the same `once` only the first."""
         self._events.add(event, once)
@@ -77,11 +92,24 @@ class Incoming:
         for event in events:
             self._events.add(event)
 
-    def take_events(self) -> list[Event]:
-        """Events since the last call."""
-        return self._events.take()
+    def _weak(self, e: CameraEstimate, R_imu_cam: FloatArray, gyro_bias: FloatArray) -> list[WeakDirection]:
+        """Directions of a camera's pose, and its time shift, that are not known well enough."""
+        covariance, targets = np.array(e.T_imu_cam.covariance), self.options.targets
+        return weak_directions(covariance, R_imu_cam, e.timeshift_sigma_s, self.motion, targets, gyro_bias)
 
-    def before_start(self, changed: Cause, trouble: str = "") -> Verdict:
+    def _followed(self, verdict: Verdict, R_imu_cam: FloatArray, gyro_bias: FloatArray) -> Verdict:
+        """Return what is published of a verdict; where motion is missing, with the motion to make now."""
+        if verdict.guidance:
+            advice = excitation_advice(self.motion, R_imu_cam, gyro_bias)
+            verdict = verdict._replace(guidance=advice or verdict.guidance)
+        return self._published(verdict)
+
+    def _published(self, verdict: Verdict) -> Verdict:
+        reported = self._steady.follow(verdict, self.elapsed_s)
+        self._ever_converged |= self.status == Status.CONVERGED
+        return reported
+
+    def _before_start(self, changed: Cause, trouble: str = "") -> Verdict:
         """What is said before there is a calibration.
 
         Args:
@@ -95,13 +123,13 @@ class Incoming:
         if trouble:
             return Verdict(Status.INCONSISTENT, trouble)
         if self.first_frame_s is None:
-            return Verdict(Status.WAITING, self.nothing_seen)
+            return Verdict(Status.WAITING, self._nothing_seen)
         if self.motion_missing and self.elapsed_s - self.first_frame_s > PATIENCE_S:
             advice = excitation_advice(self.motion, None) or ALL_WAYS
             return Verdict(Status.DEGENERATE, self.reason, advice)
         return Verdict(Status.INITIALISING, self.reason or "collecting the first seconds")
 
-    def progress(self, status: Status, known: bool, weak: list[WeakDirection]) -> float:
+    def _progress(self, status: Status, known: bool, weak: list[WeakDirection]) -> float:
         """How far the calibration is, 0 to 1: logarithmic in the largest sigma over its limit."""
         if status == Status.CONVERGED:
             return 1.0

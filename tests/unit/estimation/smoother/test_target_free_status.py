@@ -1,0 +1,71 @@
+"""Before a second window confirms an answer, its sigmas include what windows disagree by."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation.events import Cause
+from vical_daemon.estimation.measurements import CalibrationOptions
+from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, FULL, MarginalPrior, root_of
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
+
+SIGMA = np.array(
+    [1e-2] * 3 + [1e-3] * 3 + [1e-4] + [2.0] * 4 + [1e-3] * 4 + [1e-5, 1e-4] + [1e-3] * (FULL - 17)
+)
+LENS = CameraState(
+    np.eye(3), np.zeros(3), 0.01, np.array([500.0, 500.0, 320.0, 240.0]), np.zeros(4), "radtan", (640, 480)
+)
+
+
+def carry(shrunk=1.0):
+    whole = np.eye(CALIBRATION + FULL)
+    whole[CALIBRATION:, CALIBRATION:] = shrunk * np.diag(SIGMA**2)
+    active = np.ones(FULL, dtype=bool)
+    return MarginalPrior(
+        np.eye(3), np.zeros(3), np.zeros(6), LENS, root_of(whole), active, 0.0, np.zeros(FULL - 17)
+    )
+
+
+def fit(times):
+    """A window that halves the variance, and moves the calibration by `times` what it should."""
+    return SimpleNamespace(change=times * np.sqrt(0.5) * SIGMA, carry=carry(0.5))
+
+
+def focal_sigma(status):
+    return status._camera(carry(0.5)).intrinsics_sigma[0]
+
+
+@pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (4.0, 4.0), (30.0, 30.0)])
+def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(times, wider):
+    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0)
+    status.closed()
+    status.agrees(fit(times), carry(), complete=False)
+    assert focal_sigma(status) == pytest.approx(wider * np.sqrt(0.5) * 2.0, rel=1e-6)
+    status.agrees(fit(1.0), carry(), complete=False)  # as it grows, it turns out to agree
+    assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0, rel=1e-6)
+
+
+def test_what_contradicted_an_answer_that_was_withdrawn_widens_the_next_one():
+    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    status.closed()
+    status.agrees(fit(30.0), carry(), complete=False)
+    status.lost(Cause.WINDOW_CONTRADICTED, None, None, 2.0)
+    assert focal_sigma(status) > 20.0 * np.sqrt(0.5) * 2.0
+    for _ in range(2):
+        status.closed()
+    assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0)
+
+
+def test_two_windows_that_agree_are_believed_again():
+    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    status.closed()
+    status.agrees(fit(1.5), carry(), complete=True)
+    status.closed()
+    before = focal_sigma(status)
+    status.agrees(
+        fit(4.0), carry(), complete=False
+    )  # of a third one nothing is believed until it is complete
+    assert focal_sigma(status) == before
