@@ -3,8 +3,9 @@
 python -m benchmarks verify --trials 40                 rigs of the zoo, a board, 5 s
 python -m benchmarks verify --trials 20 --target-free   without a board, 20 s
 
-Every rig is calibrated once (`--stored` seconds), then verified with a recording of another day: motion, biases
-and noise are its own. Half of the rigs have changed in between, one block each, by what counts as a change.
+Every rig is calibrated once (`--stored` seconds), then verified with a recording of another day: motion,
+biases and noise are its own. Half of the rigs have changed in between, one block each, by what counts as a
+change.
 """
 
 from __future__ import annotations
