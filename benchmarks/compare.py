@@ -14,7 +14,7 @@ from vical_mocks.harness.feed import CAMERA, StartErrors, camera_prior
 from vical_mocks.random_rigs import draw
 
 from benchmarks import runner
-from benchmarks.verify import again, estimate
+from benchmarks.verify import estimate
 from vical_daemon.results.compare import FALSE_ALARM, judge
 from vical_daemon.results.difference import difference
 from vical_daemon.results.export import rig_from_estimate
@@ -22,13 +22,12 @@ from vical_daemon.results.known import keys, known_cameras
 
 
 def trial(target_free: bool, seconds: float, seed: int) -> runner.Result:
-    """One rig, calibrated twice with independent noise."""
-    run, _ = draw(seed, seconds, target_free=target_free)
+    """One rig, calibrated on two days: motion, biases and noise are independent."""
     known = []
-    for which in (run, again(run, run.rig, seed, seconds, target_free=target_free)):
-        last = estimate(
-            which, camera_prior(run, seed, StartErrors(), exact_lens=True), target_free=target_free
-        )
+    for day in (0, 1):
+        run, _ = draw(seed, seconds, target_free=target_free, day=day)
+        prior = camera_prior(run, seed, StartErrors(), exact_lens=True)
+        last = estimate(run, prior, target_free=target_free)
         if not last.cameras:
             return {"z": None}
         camera = known_cameras(rig_from_estimate(last), "half")[CAMERA]

@@ -8,6 +8,7 @@ off.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from vical_mocks.lens import Lens
 from vical_mocks.points import SimulatedRun, board_points, simulate
-from vical_mocks.rig import NOMINAL_R_IMU_CAM, STANDARD_GRAVITY_MPS2, ImuDensities, reference_rig
+from vical_mocks.rig import NOMINAL_R_IMU_CAM, STANDARD_GRAVITY_MPS2, ImuDensities, Rig, reference_rig
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 from vical_mocks.trajectory import hand_motion
 
 _SIZES = ((320, 240), (640, 480), (752, 480), (1280, 720), (1920, 1080))
+_DAYS_APART = 100_000  # between the seeds of one rig's recordings; a study has fewer rigs
 
 
 def draw_lens(rng: np.random.Generator) -> Lens:
@@ -72,9 +74,26 @@ def draw_matrices(seed: int) -> dict[str, Any]:
     return {"gyro_matrix": np.eye(3) + 0.5 * (G + G.T), "accel_matrix": np.eye(3) + A}
 
 
-def draw(seed: int, seconds: float, *, target_free: bool, imu_off: bool = False) -> tuple[SimulatedRun, bool]:
-    """A recording of the rig of this seed, and whether its lens is given."""
-    rng = np.random.default_rng([seed, 71])
+def draw(
+    seed: int,
+    seconds: float,
+    *,
+    target_free: bool,
+    imu_off: bool = False,
+    day: int = 0,
+    change: Callable[[Rig], Rig] | None = None,
+) -> tuple[SimulatedRun, bool]:
+    """A recording of the rig of this seed, and whether its lens is given.
+
+    Args:
+        seed: Of the rig: devices, mounting, board, the kind of motion.
+        seconds: Length, s.
+        target_free: Unknown landmarks instead of a board.
+        imu_off: See `draw_matrices`.
+        day: Recordings of other days have motion, biases and noise of their own.
+        change: What has happened to the rig before this recording.
+    """
+    rng, own = np.random.default_rng([seed, 71]), seed + _DAYS_APART * day
     lens, densities, sampling = draw_lens(rng), draw_densities(rng), draw_sampling(rng)
     columns, rows = int(rng.integers(5, 13)), int(rng.integers(4, 10))
     spacing_m = float(rng.choice([0.02, 0.03, 0.05, 0.08, 0.12]))
@@ -84,7 +103,7 @@ def draw(seed: int, seconds: float, *, target_free: bool, imu_off: bool = False)
     R = Rotation.random(rng=rng).as_matrix() if rng.random() < 0.7 else NOMINAL_R_IMU_CAM
     p = rng.standard_normal(3) / np.sqrt(3.0) * np.exp(rng.uniform(np.log(0.01), np.log(0.4)))
     motion = hand_motion(
-        seed,
+        own,
         float(np.exp(rng.uniform(np.log(15.0), np.log(100.0)))),
         T_imu_cam=(R, p),
         board_size_m=size_m,
@@ -93,7 +112,7 @@ def draw(seed: int, seconds: float, *, target_free: bool, imu_off: bool = False)
     )
     down = rng.standard_normal(3)
     rig = reference_rig(
-        seed,
+        own,
         trajectory=motion,
         densities=densities,
         timeshift_cam_imu_s=float(rng.uniform(-0.15, 0.15)),
@@ -103,12 +122,13 @@ def draw(seed: int, seconds: float, *, target_free: bool, imu_off: bool = False)
         lens=lens,
         **(draw_matrices(seed) if imu_off else {}),
     )
+    rig = rig if change is None else change(rig)
     lens_given = bool(rng.random() < 0.3)
     if not target_free:
         points = board_points(columns, rows, spacing_m)
-        return simulate(seed, seconds, rig=rig, points_m=points, **sampling), lens_given
+        return simulate(own, seconds, rig=rig, points_m=points, **sampling), lens_given
     near_m, far_m = rng.uniform([0.4, 2.0], [1.5, 8.0])
     marks = room_landmarks(seed, int(rng.integers(120, 300)), near_m=near_m, far_m=far_m)
     features = int(rng.integers(30, 120))
-    run = simulate_tracks(seed, seconds, rig=rig, landmarks_m=marks, max_features=features, **sampling)
+    run = simulate_tracks(own, seconds, rig=rig, landmarks_m=marks, max_features=features, **sampling)
     return run, lens_given

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vical_daemon.cli.calibrate import finite
@@ -15,12 +17,14 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 sources: a result (.json), a log with calibrations in it (.mcap or folder), a file of the store,
-`store` (the latest), Kalibr's camchain (.yaml), OpenVINS's kalibr_imucam_chain.yaml
+`store` (the latest), Kalibr's camchain (.yaml), OpenVINS's kalibr_imucam_chain.yaml or estimator_config.yaml,
+ROS: CameraInfo and static transforms (.yaml, or a bag)
 
 examples:
   vical compare monday.json today.json
   vical compare result.json camchain-imucam.yaml --map
   vical compare store result.json --distance 0.5 --distance 20
+  vical compare monday.json today.json --report difference.html
   vical compare a.json b.json c.json --matrix
 
 exit code: 0 same; 4 changed; 5 not comparable; 1 a source cannot be read; 2 bad usage
@@ -42,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="distance of the points of the map, m (default: 1 and 10); may be repeated",
     )
+    parser.add_argument("--report", metavar="F.html", help="write a page with pictures, one HTML file")
     parser.add_argument("--matrix", action="store_true", help="compare every pair")
     add_json(parser)
 
@@ -54,6 +59,9 @@ def run(args: argparse.Namespace) -> int:
         raise CliError(
             f"two calibrations are compared, {len(args.sources)} are named (more: --matrix)", EXIT_USAGE
         )
+    if args.report and (args.matrix or not Path(args.report).absolute().parent.is_dir()):
+        why = "not with --matrix" if args.matrix else f"the folder of {args.report} does not exist"
+        raise CliError(f"--report: {why}", EXIT_USAGE)
     if args.matrix:
         return _matrix(args)
     comparison = _compare(args, *args.sources)
@@ -63,7 +71,18 @@ def run(args: argparse.Namespace) -> int:
         from vical_daemon.cli.compare_text import describe
 
         print(describe(comparison, with_map=args.map))
+    if args.report:
+        _report(args, comparison)
     return _code([comparison])
+
+
+def _report(args: argparse.Namespace, comparison: Comparison) -> None:
+    from vical_daemon.results.report import collect
+    from vical_daemon.results.report.comparison import write_comparison
+
+    made = collect(" ".join(sys.argv), [Path(source) for source in args.sources if Path(source).is_file()])
+    write_comparison(Path(args.report), comparison.document(), comparison.sources, made)
+    print(f"report: {args.report}", file=sys.stderr)
 
 
 def _matrix(args: argparse.Namespace) -> int:

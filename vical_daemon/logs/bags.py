@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bz2
 import io
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -126,21 +126,30 @@ class _Zstd:
         return _spend(self._budget, unpacked)
 
 
+def bag_messages(path: Path, types: Collection[str]) -> Iterator[RawMessage]:
+    """Yield all messages of a bag, see `open_bag`; of ROS 1 those of some types as CDR, and others empty.
+
+    Raises:
+        RecordingError: It cannot be read.
+    """
+    with open_bag(path) as reader:
+        for connection, log_time_ns, data in reader.messages():
+            payload = bytes(data) if reader.is2 else _to_cdr(data, connection.msgtype, types)
+            yield RawMessage(connection.topic, connection.msgtype, log_time_ns, payload)
+
+
 class BagRecording(LogRecording):
     """A ``.bag`` file of ROS 1, or a folder with ``metadata.yaml`` of ROS 2."""
 
     def _raw(self) -> Iterator[RawMessage]:
-        with open_bag(self.path) as reader:
-            for connection, log_time_ns, data in reader.messages():
-                payload = bytes(data) if reader.is2 else _to_cdr(data, connection.msgtype)
-                yield RawMessage(connection.topic, connection.msgtype, log_time_ns, payload)
+        return bag_messages(self.path, _WANTED)
 
 
 _WANTED = frozenset({IMU_TYPE, IMAGE_TYPE, COMPRESSED_IMAGE_TYPE, POINTS_TYPE, TRACKS_TYPE})
 
 
-def _to_cdr(data: bytes, type_name: str) -> bytes:
+def _to_cdr(data: bytes, type_name: str, types: Collection[str]) -> bytes:
     """Return a ROS 1 message as CDR (its header loses `seq`); None for types that are not used."""
-    if type_name not in _WANTED:
+    if type_name not in types:
         return b""
     return bytes(typestore().ros1_to_cdr(data, type_name))

@@ -52,8 +52,26 @@ _STAMP = struct.Struct("<iI")
 # Offsets of rates and forces from the end of a sensor_msgs/Imu.
 _GYRO, _FORCE = slice(-192, -168), slice(-96, -72)
 _IMU_NUMBERS = 37 * 8
-_PLAIN_WORDS = {"image_raw", "image_mono", "image", "data", "data_raw", "raw", "compressed", "camera", "imu"}
+_PLAIN_WORDS = {
+    "image_raw",
+    "image_mono",
+    "image",
+    "data",
+    "data_raw",
+    "raw",
+    "compressed",
+    "camera",
+    "camera_info",
+    "imu",
+}
 _RIG = "rig0"
+
+
+def name_of_topic(topic: str, kind: str) -> str:
+    """Make a name of a foreign topic (`kind` imu or cam): /cam0/image_raw is cam0, /imu/data becomes imu0."""
+    words = [word for word in topic.strip("/").split("/") if word not in _PLAIN_WORDS]
+    name = re.sub(r"[^A-Za-z0-9_]", "_", "_".join(words))[:60]
+    return name if re.match(r"[A-Za-z]", name) else kind + (name or "0")
 
 
 class RawMessage(NamedTuple):
@@ -163,11 +181,8 @@ class LogRecording(Recording):
         return channel
 
     def _name(self, topic: str, kind: Kind) -> str:
-        """Make a name of a foreign topic: /cam0/image_raw is cam0, /imu/data becomes imu0."""
-        words = [word for word in topic.strip("/").split("/") if word not in _PLAIN_WORDS]
-        name = re.sub(r"[^A-Za-z0-9_]", "_", "_".join(words))[:60]
-        if not re.match(r"[A-Za-z]", name):
-            name = ("imu" if kind == "imu" else "cam") + (name or "0")
+        """Make a name of a foreign topic that no other of its kind has."""
+        name = name_of_topic(topic, "imu" if kind == "imu" else "cam")
         taken = {c.name for c in self._channels.values() if c.kind == kind}
         number, free = 2, name
         while free in taken:

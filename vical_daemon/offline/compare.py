@@ -10,7 +10,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.offline.errors import InputError
 from vical_daemon.offline.sources import read_known
-from vical_daemon.results.compare import FALSE_ALARM, Verdict, judge
+from vical_daemon.results.compare import FALSE_ALARM, Verdict, directions, judge
 from vical_daemon.results.difference import Difference, NotComparableError, difference
 from vical_daemon.results.export import Rig
 from vical_daemon.results.known import LENS, KnownCamera, keys
@@ -188,6 +188,17 @@ def _camera_document(camera: CameraComparison) -> dict[str, Any]:
     out |= {"chi_square": v.chi_square, "dof": v.dof, "probability": v.probability, "changed": list(v.blocks)}
     out |= {"common_s": camera.difference.common_s, "lens_models_unlike_px": camera.difference.unlike_px}
     out["lens_held_by"] = camera.held
+    out["directions"] = [
+        {
+            "name": one.name,
+            "unit": one.unit,
+            "axis": None if one.axis is None else one.axis.tolist(),
+            "value": one.value,
+            "sigma": one.sigma,
+            "z": one.z,
+        }
+        for one in directions(camera.difference)
+    ]
     if camera.lens_px is not None:
         out |= dict(zip(("lens_px", "lens_px_sigma"), camera.lens_px, strict=True))
     out["maps"] = [

@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vical_daemon.bus.messages import (
+    CALIBRATION_TYPE,
+    CAMERA_INFO_TYPE,
+    IMU_TYPE,
+    POSE_TYPE,
+    TF_TYPE,
+    CameraInfoMessage,
+    MessageError,
+    Transform,
+    decode_calibration,
+    decode_camera_info,
+    decode_imu,
+    decode_pose,
+    decode_transforms,
+    merge_calibrations,
+)
+from vical_daemon.bus.topics import parse_key
+from vical_daemon.logs import RecordingError
+from vical_daemon.logs.bags import bag_messages
+from vical_daemon.logs.mcap import LogError, LogReader
+from vical_daemon.logs.recorded_logs import RawMessage, name_of_topic
 from vical_daemon.offline.errors import InputError
 
 if TYPE_CHECKING:
     from vical_daemon.results.export import Rig
     from vical_daemon.results.known import KnownCamera
+
+_ROS_TYPES = (CALIBRATION_TYPE, CAMERA_INFO_TYPE, IMU_TYPE, POSE_TYPE, TF_TYPE)
 
 
 def read_known(source: str) -> tuple[dict[str, KnownCamera], Rig | None]:
@@ -44,56 +69,101 @@ def read_source(source: str) -> Rig:
         return _from_store()
     if not path.exists():
         raise InputError(f"{source}: no such file")
-    if path.is_dir() or path.suffix == ".mcap" or path.name.endswith(".mcap.part"):
+    if path.is_dir() or path.suffix in (".mcap", ".bag") or path.name.endswith(".mcap.part"):
         return _from_log(path)
     return read_rig(path)
 
 
 def _from_log(path: Path) -> Rig:
-    """Read the last calibration of every camera, and image sizes, from our own log."""
-    from vical_daemon.bus.messages import (
-        CALIBRATION_TYPE,
-        CAMERA_INFO_TYPE,
-        POSE_TYPE,
-        decode_calibration,
-        decode_camera_info,
-        decode_pose,
-        merge_calibrations,
-    )
-    from vical_daemon.logs.mcap import LogReader
-    from vical_daemon.results.export import rig_from_estimate
+    """Read the last calibration of every camera; from a log without one, CameraInfo and static transforms."""
+    found = _Found()
+    try:
+        for message in _messages(path):
+            found.take(message)
+    except (MessageError, RecordingError, LogError) as error:
+        raise InputError(f"{path}: {error}") from None
+    return found.rig(path)
 
-    last: dict[str, bytes] = {}
-    sizes: dict[str, tuple[int, int]] = {}
-    devices: dict[str, str] = {}
-    frames: set[str] = set()
+
+def _messages(path: Path) -> Iterator[RawMessage]:
+    """Yield the messages of a log or bag as CDR; metadata of MCAP files come as messages without a type."""
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    if path.suffix == ".bag" or (not files and (path / "metadata.yaml").is_file()):
+        yield from bag_messages(path, _ROS_TYPES)
+        return
     for file in files:
         reader = LogReader(file)
-        for message in reader.messages():
-            if message.channel.type_name == CALIBRATION_TYPE:
-                last[message.channel.topic] = message.payload
-            elif message.channel.type_name == POSE_TYPE:
-                frames.add(decode_pose(message.payload).frame_id)
-            elif message.channel.type_name == CAMERA_INFO_TYPE:
-                info = decode_camera_info(message.payload)
-                sizes[info.frame_id] = (info.width, info.height)
+        for m in reader.messages():
+            if m.channel.encoding == "cdr":
+                yield RawMessage(m.channel.topic, m.channel.type_name, m.log_time_ns, m.payload)
         for name, values in reader.metadata:
-            devices |= values if name == "devices" else {}
-    if not last:
+            yield RawMessage(name, "", 0, json.dumps(values).encode())
+
+
+@dataclass(slots=True)
+class _Found:
+    """What a log says of a calibration."""
+
+    last: dict[str, bytes] = field(default_factory=dict)
+    infos: dict[str, CameraInfoMessage] = field(default_factory=dict)
+    transforms: list[Transform] = field(default_factory=list)
+    devices: dict[str, str] = field(default_factory=dict)
+    parents: set[str] = field(default_factory=set)
+    imu_frames: set[str] = field(default_factory=set)
+    imu_topics: set[str] = field(default_factory=set)
+
+    def take(self, m: RawMessage) -> None:
+        """Take one message.
+
+        Raises:
+            MessageError: It is damaged.
+        """
+        if m.type_name == CALIBRATION_TYPE:
+            self.last[m.topic] = m.payload
+        elif m.type_name == POSE_TYPE:
+            self.parents.add(decode_pose(m.payload).frame_id)
+        elif m.type_name == CAMERA_INFO_TYPE:
+            self.infos[m.topic] = decode_camera_info(m.payload)
+        elif m.type_name == TF_TYPE and m.topic.endswith("tf_static"):
+            self.transforms += decode_transforms(m.payload)
+        elif m.type_name == IMU_TYPE and m.topic not in self.imu_topics:
+            self.imu_topics.add(m.topic)
+            self.imu_frames.add(decode_imu(m.payload).frame_id)
+        elif (m.topic, m.type_name) == ("devices", ""):
+            self.devices |= json.loads(m.payload)
+
+    def rig(self, path: Path) -> Rig:
+        """Return the rig.
+
+        Raises:
+            InputError: There is none.
+            ExportError: ROS's messages are not complete.
+        """
+        from vical_daemon.results.export import rig_from_estimate
+        from vical_daemon.results.export.from_ros import rig_from_ros
+
+        if self.last:
+            estimate = merge_calibrations(decode_calibration(data) for data in self.last.values())
+            sizes = {info.frame_id: (info.width, info.height) for info in self.infos.values()}
+            rig = rig_from_estimate(estimate, sizes, note=f"vical, from {path.name}")
+            frame = next(iter(self.parents)) if len(self.parents) == 1 else rig.imu_frame
+            return replace(rig, devices=self.devices, imu_frame=frame)
+        if self.infos or self.transforms:
+            lenses = {_camera_name(topic): info for topic, info in self.infos.items()}
+            return rig_from_ros(lenses, self.transforms, sorted(self.imu_frames), str(path))
         raise InputError(
-            f"{path}: no calibration in this log; run `vical calibrate {path} --target FILE -o result.json` "
-            "and export result.json"
+            f"{path}: no calibration in this log, and no CameraInfo with static transforms; run "
+            f"`vical calibrate {path} --target FILE -o result.json` and give result.json"
         )
-    estimate = merge_calibrations(decode_calibration(data) for data in last.values())
-    rig = rig_from_estimate(estimate, sizes, note=f"vical, from {path.name}")
-    return replace(rig, devices=devices, imu_frame=frames.pop() if len(frames) == 1 else rig.imu_frame)
+
+
+def _camera_name(topic: str) -> str:
+    parsed = parse_key(topic.strip("/"))
+    return name_of_topic(topic, "cam") if parsed is None else parsed.name
 
 
 def _from_store() -> Rig:
     """Read the newest stored calibration of every camera."""
-    from dataclasses import replace as with_changes
-
     from vical_daemon.config.paths import state_directory
     from vical_daemon.results.export import rig_from_estimate
     from vical_daemon.results.store import CalibrationStore
@@ -103,6 +173,6 @@ def _from_store() -> Rig:
     if not stored:
         raise InputError(f"no calibration is stored in {folder}: nothing has converged on this machine yet")
     cameras = {entry.camera: entry.known for entry in stored}
-    estimate = with_changes(stored[-1].estimate, cameras=cameras)
+    estimate = replace(stored[-1].estimate, cameras=cameras)
     devices = {"imu": stored[-1].imu_serial} | {f"camera/{e.camera}": e.camera_serial for e in stored}
     return replace(rig_from_estimate(estimate, note="vical, from the store"), devices=devices)

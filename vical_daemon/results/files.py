@@ -1,4 +1,4 @@
-"""Reads a calibration from a file: a result of ours, a file of the store, Kalibr's or OpenVINS's camchain."""
+"""Reads a calibration from a file: of ours, Kalibr's, OpenVINS's, or messages of ROS."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 from vical_drivers.user_files import read_text
 
 from vical_daemon.config.priors import read_initial
-from vical_daemon.config.strict_yaml import ConfigError
+from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError
 from vical_daemon.results.export import ExportError, Rig, rig_from_json
+from vical_daemon.results.export.from_ros import looks_like_ros, read_ros_yaml
 from vical_daemon.results.export.kalibr import read_camchain
 from vical_daemon.results.known import KnownCamera, known_cameras, known_prior
 
@@ -26,7 +27,8 @@ def read_rig(path: Path) -> Rig:
     if not path.exists():
         raise ExportError(f"{path}: no such file")
     if path.suffix in (".yaml", ".yml"):
-        return read_camchain(path)
+        text = _read_yaml(path)
+        return read_ros_yaml(text, path) if looks_like_ros(text) else read_camchain(path)
     document = _read_json(path)
     note = f"vical, from {path.name}"
     if isinstance(document.get("estimate"), dict):  # a file of the store
@@ -71,6 +73,15 @@ def _known_without_lens(path: Path) -> dict[str, KnownCamera] | None:
     if not known:
         raise ExportError(f"{path}: no camera with T_cam_imu in it")
     return known
+
+
+def _read_yaml(path: Path) -> str:
+    try:
+        return read_text(path, MAX_BYTES)
+    except OSError as error:
+        raise ExportError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise ExportError(f"{path}: not a text file") from None
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from vical_daemon.cli import main
 from vical_daemon.results.export import export
 
 EUROC = Path(__file__).parents[4] / "shared" / "data" / "euroc_imu_april"
+OPENVINS = Path(__file__).parents[4] / "shared" / "data" / "openvins_sim_tum"
+needs_openvins = pytest.mark.skipif(not OPENVINS.is_dir(), reason="no OpenVINS simulation in ../shared/data")
 needs_euroc = pytest.mark.skipif(not EUROC.is_dir(), reason="no EuRoC corners in ../shared/data")
 
 
@@ -67,6 +70,22 @@ def test_compare_reads_other_software(write, capsys, form):
     assert "chain.yaml: no sigma given, assumed: position 1 mm" in out
 
 
+def test_compare_report_shows_what_the_json_says(write, tmp_path, capsys):
+    a, c, page = write("a.json"), write("c.json", 0.1), tmp_path / "page.html"
+    assert run(capsys, "compare", a, c, "--report", str(page))[0] == 4
+    document = json.loads(run(capsys, "compare", a, c, "--json")[1])
+    camera, text = document["cameras"]["cam0"], page.read_text()
+    along = [np.multiply(row["value"], row["axis"]) for row in camera["directions"][:3]]
+    assert np.sum(along, axis=0) == pytest.approx([0.1, 0.0, 0.0], abs=1e-12)
+    sigmas = [row["sigma"] for row in camera["directions"][:3]]
+    assert sigmas == sorted(sigmas, reverse=True)
+    assert "differs in position" in text
+    assert text.count("<svg") == 1 + 2 * len(camera["maps"])
+    largest = np.max(camera["maps"][0]["apart_px"])
+    assert f"{largest:.2f} at most apart" in text
+    assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", text)
+
+
 def test_compare_matrix_of_three(write, capsys):
     files = [write("a.json"), write("b.json"), write("c.json", 0.1)]
     code, out, _ = run(capsys, "compare", *files, "--matrix")
@@ -90,6 +109,7 @@ def test_compare_other_cameras_cannot_be_compared(tmp_path, rig, write, capsys):
     ("args", "code", "line"),
     [
         (["compare", "one.json"], 2, "two calibrations are compared, 1 are named"),
+        (["compare", "a", "b", "--report", "none/p.html"], 2, "--report: the folder of none/p.html does not"),
         (["compare", "none.json", "none.json"], 1, "none.json: no such file"),
         (["compare", "a", "b", "--distance", "-1"], 2, "--distance must be above 0 m"),
         (["verify", "log", "--against", "none.json"], 1, "none.json: no such file"),
@@ -130,3 +150,27 @@ def test_euroc_mounting_without_lens_needs_the_lens(capsys):
     )
     assert code == 2
     assert "give it with --initial" in err
+
+
+@needs_openvins
+def test_openvins_config_is_asked_with_the_files_that_it_names(tmp_path, capsys):
+    """Its start values are 11 mm and 5.5 ms off: 20 s of walking show it, without a board."""
+    from vical_daemon.offline.sources import read_source
+
+    rig = read_source(str(OPENVINS / "initial.yaml"))
+    config = '%YAML:1.0\nrelative_config_imu: "imu.yaml"\nrelative_config_imucam: "chain.yaml"\n'
+    (tmp_path / "estimator_config.yaml").write_text(config)
+    chain, imu = export(rig, "openvins")
+    (tmp_path / "chain.yaml").write_text(chain.text)
+    (tmp_path / "imu.yaml").write_text(imu.text)
+    asked = str(tmp_path / "estimator_config.yaml")
+    code, out, _ = run(capsys, "compare", str(OPENVINS / "reference.yaml"), asked, "--json")
+    assert code == 4
+    moved = json.loads(out)["differences"]["cam0"]
+    assert np.linalg.norm([moved[f"p_{k}_m"] for k in "xyz"]) == pytest.approx(0.0109, abs=2e-4)
+    code, out, _ = run(
+        capsys, "verify", str(OPENVINS / "mav0"), "--against", asked, "--seconds", "20", "--json"
+    )
+    document = json.loads(out)
+    assert code == 4, document
+    assert "time shift" in {change["what"] for change in document["changes"]}

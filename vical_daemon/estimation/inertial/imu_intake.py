@@ -170,7 +170,7 @@ class ImuIntake:
 
     def _bridged(self, buffer: ImuBuffer, interval_s: float) -> bool:
         """Whether a reading follows the newest so closely that interpolation will do."""
-        if interval_s <= 0.0:
+        if self.between or interval_s <= 0.0:
             return False
         return interval_s <= GAP_S or len(buffer) < LEARN or interval_s <= buffer.usual_gap_s
 

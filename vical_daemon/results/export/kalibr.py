@@ -66,15 +66,12 @@ def read_camchain(path: Path) -> Rig:
     Raises:
         ExportError: Not such a file; the message says which key is missing or wrong.
     """
-    try:
-        text = read_text(path, MAX_BYTES).removeprefix("%YAML:1.0")  # OpenCV's first line, in OpenVINS's file
-        refuse_hostile(text, path.name)
-        document = yaml.safe_load(text)
-    except OSError as error:
-        raise ExportError(f"{path}: {error.strerror or error}") from None
-    except (ConfigError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ExportError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
-    blocks = document if isinstance(document, dict) else {}
+    blocks, imu = _mapping(path), None
+    if isinstance(named := blocks.get("relative_config_imucam"), str):  # OpenVINS's estimator_config.yaml
+        if isinstance(blocks.get("relative_config_imu"), str):
+            imu = _mapping(_named_by(path, blocks["relative_config_imu"]))
+        path = _named_by(path, named)
+        blocks = _mapping(path)
     names = sorted(k for k in blocks if isinstance(k, str) and k.startswith("cam"))
     if not names:
         raise ExportError(f"{path}: no camera (cam0: …) in it; is it a Kalibr camchain?")
@@ -84,7 +81,26 @@ def read_camchain(path: Path) -> Rig:
         camera = _read_camera(name, blocks[name], before, path)
         cameras[name] = camera
         before = camera.T_cam_imu
-    return Rig(cameras, noise=_noise_in(blocks), note=f"from {path.name} (Kalibr)")
+    return Rig(cameras, noise=_noise_in(imu or blocks), note=f"from {path.name} (Kalibr)")
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    try:
+        text = read_text(path, MAX_BYTES).removeprefix("%YAML:1.0")  # OpenCV's first line, in OpenVINS's file
+        refuse_hostile(text, path.name)
+        document = yaml.safe_load(text)
+    except OSError as error:
+        raise ExportError(f"{path}: {error.strerror or error}") from None
+    except (ConfigError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ExportError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
+    return document if isinstance(document, dict) else {}
+
+
+def _named_by(path: Path, name: str) -> Path:
+    named = path.parent / name
+    if not named.is_file():
+        raise ExportError(f"{path}: it names {name}, which is not next to it")
+    return named
 
 
 def _read_camera(name: str, block: Any, T_before_imu: FloatArray | None, path: Path) -> RigCamera:
@@ -112,7 +128,7 @@ def _read_camera(name: str, block: Any, T_before_imu: FloatArray | None, path: P
         name=name,
         R_imu_cam=T_cam_imu[:3, :3].T,
         p_imu_cam=-T_cam_imu[:3, :3].T @ T_cam_imu[:3, 3],
-        timeshift_cam_imu_s=float(block.get("timeshift_cam_imu", 0.0)),
+        timeshift_cam_imu_s=_number(block, "timeshift_cam_imu", name, path),
         intrinsics=(fx, fy, cx, cy),
         distortion_model=model,
         distortion=distortion,
@@ -144,6 +160,14 @@ def _numbers(block: dict[str, Any], key: str, count: int, name: str, path: Path)
     return numbers
 
 
+def _number(block: dict[str, Any], key: str, name: str, path: Path) -> float:
+    value = block.get(key, 0.0)
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise ExportError(f"{path}: {name}.{key} must be a number") from None
+
+
 def _noise_in(blocks: dict[str, Any]) -> ImuNoise:
     """Read imu0 where the file has it (some tools join both files)."""
     imu = blocks.get("imu0")
@@ -157,4 +181,7 @@ def _noise_in(blocks: dict[str, Any]) -> ImuNoise:
         "update_rate": "rate_hz",
         "rate_hz": "rate_hz",
     }
-    return ImuNoise(**{ours: float(imu[key]) for key, ours in names.items() if key in imu})
+    try:
+        return ImuNoise(**{ours: float(imu[key]) for key, ours in names.items() if key in imu})
+    except (TypeError, ValueError):
+        raise ExportError("imu0: noise densities and rates must be numbers") from None

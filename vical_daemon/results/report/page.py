@@ -44,9 +44,9 @@ def document(title: str, body: Iterable[str]) -> str:
     )
 
 
-def head(title: str, status: str, said: Verdict, facts: Sequence[str]) -> str:
-    """Return the head of the page: the verdict, what to do, and a line of facts."""
-    kind = status if status.isalpha() else "unknown"
+def head(title: str, status: str, said: Verdict, facts: Sequence[str], kind: str = "") -> str:
+    """Return the head of the page: verdict, what to do, and a line of facts; `kind` chooses its colour."""
+    kind = kind or (status if status.isalpha() else "unknown")
     known = "".join(f'<p class="known">{escape(line)}</p>' for line in said.known)
     advice = "".join(f"<li>{escape(line)}</li>" for line in said.advice)
     return (

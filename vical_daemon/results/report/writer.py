@@ -114,7 +114,7 @@ def write_report(
         rows = values.event_rows(result.get("events") or [])
         if rows:
             body.append(page.section("What was announced, when", page.table(("time", "event"), rows, 9)))
-        body.append(_provenance_section(provenance or collect()))
+        body.append(provenance_section(provenance or collect()))
         path.write_text(page.document(title, body), encoding="utf-8")
     except OSError as error:
         raise ReportError(f"{path}: cannot write the report: {error.strerror or error}") from error
@@ -186,7 +186,8 @@ def _clock_section(clocks: Sequence[ClockSeries], gallery: Gallery) -> list[str]
     return [page.section("Clocks", *drawn)] if drawn else []
 
 
-def _provenance_section(provenance: Provenance) -> str:
+def provenance_section(provenance: Provenance) -> str:
+    """Return what is needed to make a page again."""
     parts = []
     if provenance.command:
         parts.append(page.preformatted(provenance.command))
