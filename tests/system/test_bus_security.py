@@ -145,7 +145,7 @@ def test_what_a_certificate_names_can_be_given_rights(certificates, tmp_path, ca
     assert until(lambda: robot.publish(COMMAND, encode_string("start")) or commands)
     robot.publish(KEY, b"forged")
     assert router.latest(KEY) == []
-    assert any("tls 127.0.0.1:" in m and m.endswith("user robot") for m in caplog.messages)
+    assert until(lambda: any("tls 127.0.0.1:" in m and m.endswith("user robot") for m in caplog.messages))
     journal.close()
     for bus in (robot, router):
         bus.close()
