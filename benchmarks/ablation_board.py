@@ -344,12 +344,6 @@ BOARD: dict[str, Mechanism] = {
         lambda: [(FixedLens, "of", staticmethod(gives(None)))],
         faults=("lens held, not this camera's",),
     ),
-    "held lens: as the data say": Mechanism(
-        SMALL,
-        "a lens that is held counts as wrong only as far as data speak for it",
-        lambda: [(model_selection, "_beyond_prior", lambda shares, _name: shares)],
-        faults=("lens held, not this camera's",),
-    ),
     "stamp jitter": Mechanism(
         SMALL,
         "late and early images as noise common to all corners",

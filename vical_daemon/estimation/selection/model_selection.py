@@ -164,23 +164,7 @@ def weights(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
     rows = np.concatenate([f.S[b.where] / b.sigma[:, None] for b in doubtful.values()])
     values = {name: b.values / b.sigma for name, b in doubtful.items()}
     shares = {name: b.share for name, b in doubtful.items() if b.stated.any()}
-    found = posterior(values, rows @ rows.T, factor(f) * misfit(f), shares)
-    for name, block in doubtful.items():
-        if block.held:
-            found = _beyond_prior(found, name)
-    return found
-
-
-def _beyond_prior(shares: dict[tuple[str, ...], float], name: str) -> dict[tuple[str, ...], float]:
-    """Count that a block is not zero by so much only as the data speak for it.
-
-    The prior alone, one fixed lens in twenty, would widen every result. It counts only where data support it.
-    """
-    p = not_zero(shares, name)
-    if p in (0.0, 1.0):
-        return shares
-    q = max(0.0, (p - OFF) / (1.0 - OFF))
-    return {true: x * ((1.0 - q) / (1.0 - p) if name in true else q / p) for true, x in shares.items()}
+    return posterior(values, rows @ rows.T, factor(f) * misfit(f), shares)
 
 
 def posterior(
