@@ -1,8 +1,9 @@
-"""Role detect: images in, target points or feature tracks out. A slow detector skips to the newest image."""
+"""Role detect: images in, target points or feature tracks out. Images that wait too long are skipped."""
 
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vical_daemon.bus import topics
-from vical_daemon.bus.interface import Bus, Sample, Subscription
+from vical_daemon.bus.interface import Bus, Sample, SampleQueue, Subscription
 from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
@@ -31,7 +32,9 @@ from vical_daemon.service import notify
 from vical_daemon.service.health import StatusSender
 from vical_daemon.service.wall_clock import WallClock, service_clock
 
-QUEUE_DEPTH = 2
+QUEUE_BYTES = 32 * 2**20
+"""Of the images that wait for the detector of one camera: five seconds of 640x480 at 20 Hz, 0.8 s of
+1280x1024 at 30 Hz. A small computer falls behind while the estimator starts, and catches up later."""
 _NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 JOIN_S = 3.0
 STUCK_S = 20.0
@@ -217,6 +220,7 @@ class _Worker:
         self._key = topics.IMAGE.key(config.rig, camera)
         self._dropped = 0
         self._images: Subscription | None = None
+        self._queue = _image_queue()
         self._wanted: WantedImages | None = None
         if config.mode == "verify":
             self._wanted = WantedImages(bus, topics.VERIFY.key(config.rig, camera))
@@ -234,17 +238,20 @@ class _Worker:
     def status(self) -> DiagnosticStatus:
         since_s, images = self._since_s, self._images
         busy_s = 0.0 if since_s is None else time.monotonic() - since_s
-        return self._role.status(self._dropped + (images.dropped if images else 0), busy_s)
+        before = self._dropped + self._queue.dropped
+        return self._role.status(before + (images.dropped if images else 0), busy_s)
 
     def _open(self) -> None:
-        self._images = self._bus.subscribe(self._key, depth=QUEUE_DEPTH, newest_wins=True)
+        self._images = self._bus.subscribe(self._key, self._queue.put)
         self._aid = attach_aid(self._bus, self._role)
 
     def _shut(self) -> None:
         images, self._images = self._images, None
         if images is not None:
-            self._dropped += images.dropped
+            self._dropped += images.dropped + self._queue.dropped
             images.close()
+            self._queue.close()
+            self._queue = _image_queue()
         for subscription in self._aid:
             subscription.close()
         self._aid = []
@@ -253,8 +260,7 @@ class _Worker:
         while not self._stop.is_set():
             if self._wanted is not None and not self._follow(self._wanted):
                 continue
-            images = self._images
-            sample = images.recv(0.2) if images is not None else None
+            sample = self._queue.recv(0.2)
             if sample is not None:
                 self._since_s = time.monotonic()  # stays set if the thread ends or hangs
                 publish(self._bus, self._role.points(sample))
@@ -272,3 +278,8 @@ class _Worker:
             self._shut()
         wanted.wait(0.2)
         return False
+
+
+def _image_queue() -> SampleQueue:
+    """The queue between the bus and the detector of one camera; a full one drops the oldest image."""
+    return SampleQueue(sys.maxsize, newest_wins=True, most_bytes=QUEUE_BYTES)

@@ -93,6 +93,35 @@ class TestDetect:
         stop.set()
         worker.close()
 
+    def test_images_that_come_while_it_is_busy_wait_within_the_memory_they_may_have(
+        self, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        begin, stop, bus, seen = threading.Event(), threading.Event(), LocalBus(), list[int]()
+        monkeypatch.setattr(detect, "QUEUE_BYTES", 40 * len(image(NOW).payload))
+
+        def busy(picture: Any, t_ns: int) -> None:
+            assert begin.wait(60)
+            seen.append(t_ns)
+
+        monkeypatch.setattr(detect, "make_detector", lambda *_: busy)
+        worker = detect._Worker(config, "cam0", bus, stop)
+        worker.thread.start()
+        stamps = [NOW + k * 50 * MS for k in range(60)]
+        for k, t_ns in enumerate(stamps):
+            bus.publish(IMAGE, image(t_ns).payload)
+            end_s = time.monotonic() + 30
+            while k == 0 and worker._since_s is None:  # it works on the first
+                assert time.monotonic() < end_s
+                time.sleep(0.01)
+        begin.set()
+        while len(seen) < 41:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        assert seen == [stamps[0], *stamps[-40:]]  # the oldest of those that waited are lost, and counted
+        assert worker.status().values["dropped"] == "19"
+        stop.set()
+        worker.close()
+
     def test_with_mode_verify_it_works_only_while_images_are_wanted(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
     ) -> None:
