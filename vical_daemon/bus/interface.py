@@ -106,18 +106,11 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
 
 
 class SampleQueue:
-    """A bounded queue between the bus and a reader. Drops and counts what does not fit.
+    """A bounded queue between the bus and a reader. Drops and counts what does not fit."""
 
-    Args:
-        depth: Samples it holds.
-        newest_wins: A full queue drops the oldest instead of the newest.
-        most_bytes: Of all payloads it holds, but one sample always fits; 0: no limit.
-    """
-
-    def __init__(self, depth: int, newest_wins: bool, most_bytes: int = 0) -> None:
+    def __init__(self, depth: int, newest_wins: bool) -> None:
         self._depth = depth
         self._newest_wins = newest_wins
-        self._most_bytes, self._bytes = most_bytes, 0
         self._queue: deque[Sample] = deque()
         self._ready = threading.Condition()
         self._closed = False
@@ -125,31 +118,20 @@ class SampleQueue:
 
     def put(self, sample: Sample) -> None:
         """Append a sample; a full queue drops the oldest or this one. Never waits."""
-        size = len(sample.payload)
         with self._ready:
-            while self._queue and self._full(size):
+            if len(self._queue) >= self._depth:
                 self.dropped += 1
                 if not self._newest_wins:
                     return
-                self._pop()
+                self._queue.popleft()
             self._queue.append(sample)
-            self._bytes += size
             self._ready.notify()
-
-    def _full(self, more_bytes: int) -> bool:
-        too_large = self._most_bytes > 0 and self._bytes + more_bytes > self._most_bytes
-        return too_large or len(self._queue) >= self._depth
-
-    def _pop(self) -> Sample:
-        sample = self._queue.popleft()
-        self._bytes -= len(sample.payload)
-        return sample
 
     def recv(self, timeout_s: float | None = None) -> Sample | None:
         """Return the next sample, or None after the timeout or once closed and empty."""
         with self._ready:
             self._ready.wait_for(lambda: self._queue or self._closed, timeout_s)
-            return self._pop() if self._queue else None
+            return self._queue.popleft() if self._queue else None
 
     def close(self) -> None:
         """Wake the waiting readers; queued samples can still be taken."""

@@ -1,9 +1,8 @@
-"""Role detect: images in, target points or feature tracks out. Images that wait too long are skipped."""
+"""Role detect: images in, target points or feature tracks out. A slow detector skips the oldest images."""
 
 from __future__ import annotations
 
 import logging
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vical_daemon.bus import topics
-from vical_daemon.bus.interface import Bus, Sample, SampleQueue, Subscription
+from vical_daemon.bus.interface import Bus, Sample, Subscription
 from vical_daemon.bus.messages import (
     DiagnosticStatus,
     Level,
@@ -26,15 +25,13 @@ from vical_daemon.config.model import Config
 from vical_daemon.config.priors import camera_prior
 from vical_daemon.detect.detectors import Detect, make_detector
 from vical_daemon.detect.flow_aid import GyroAid
+from vical_daemon.detect.waiting_images import WaitingImages
 from vical_daemon.detect.wanted import WantedImages
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.service import notify
 from vical_daemon.service.health import StatusSender
 from vical_daemon.service.wall_clock import WallClock, service_clock
 
-QUEUE_BYTES = 32 * 2**20
-"""Of the images that wait for the detector of one camera: five seconds of 640x480 at 20 Hz, 0.8 s of
-1280x1024 at 30 Hz. A small computer falls behind while the estimator starts, and catches up later."""
 _NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 JOIN_S = 3.0
 STUCK_S = 20.0
@@ -220,7 +217,7 @@ class _Worker:
         self._key = topics.IMAGE.key(config.rig, camera)
         self._dropped = 0
         self._images: Subscription | None = None
-        self._queue = _image_queue()
+        self._waiting = WaitingImages()
         self._wanted: WantedImages | None = None
         if config.mode == "verify":
             self._wanted = WantedImages(bus, topics.VERIFY.key(config.rig, camera))
@@ -238,20 +235,20 @@ class _Worker:
     def status(self) -> DiagnosticStatus:
         since_s, images = self._since_s, self._images
         busy_s = 0.0 if since_s is None else time.monotonic() - since_s
-        before = self._dropped + self._queue.dropped
-        return self._role.status(before + (images.dropped if images else 0), busy_s)
+        dropped = self._dropped + self._waiting.dropped + (images.dropped if images else 0)
+        return self._role.status(dropped, busy_s)
 
     def _open(self) -> None:
-        self._images = self._bus.subscribe(self._key, self._queue.put)
+        self._images = self._bus.subscribe(self._key, self._waiting.put)
         self._aid = attach_aid(self._bus, self._role)
 
     def _shut(self) -> None:
         images, self._images = self._images, None
         if images is not None:
-            self._dropped += images.dropped + self._queue.dropped
+            self._dropped += images.dropped
             images.close()
-            self._queue.close()
-            self._queue = _image_queue()
+            self._dropped += self._waiting.dropped
+            self._waiting = WaitingImages()
         for subscription in self._aid:
             subscription.close()
         self._aid = []
@@ -260,7 +257,7 @@ class _Worker:
         while not self._stop.is_set():
             if self._wanted is not None and not self._follow(self._wanted):
                 continue
-            sample = self._queue.recv(0.2)
+            sample = self._waiting.take(0.2)
             if sample is not None:
                 self._since_s = time.monotonic()  # stays set if the thread ends or hangs
                 publish(self._bus, self._role.points(sample))
@@ -278,8 +275,3 @@ class _Worker:
             self._shut()
         wanted.wait(0.2)
         return False
-
-
-def _image_queue() -> SampleQueue:
-    """The queue between the bus and the detector of one camera; a full one drops the oldest image."""
-    return SampleQueue(sys.maxsize, newest_wins=True, most_bytes=QUEUE_BYTES)
