@@ -1,4 +1,4 @@
-"""Role detect: images in, target points or feature tracks out. A slow detector skips the oldest images."""
+"""Role detect: images in, target points or feature tracks out. A slow detector skips to the newest image."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from vical_daemon.config.model import Config
 from vical_daemon.config.priors import camera_prior
 from vical_daemon.detect.detectors import Detect, make_detector
 from vical_daemon.detect.flow_aid import GyroAid
-from vical_daemon.detect.waiting_images import WaitingImages
 from vical_daemon.detect.wanted import WantedImages
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.service import notify
 from vical_daemon.service.health import StatusSender
 from vical_daemon.service.wall_clock import WallClock, service_clock
 
+QUEUE_DEPTH = 2
 _NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 JOIN_S = 3.0
 STUCK_S = 20.0
@@ -217,7 +217,6 @@ class _Worker:
         self._key = topics.IMAGE.key(config.rig, camera)
         self._dropped = 0
         self._images: Subscription | None = None
-        self._waiting = WaitingImages()
         self._wanted: WantedImages | None = None
         if config.mode == "verify":
             self._wanted = WantedImages(bus, topics.VERIFY.key(config.rig, camera))
@@ -235,11 +234,10 @@ class _Worker:
     def status(self) -> DiagnosticStatus:
         since_s, images = self._since_s, self._images
         busy_s = 0.0 if since_s is None else time.monotonic() - since_s
-        dropped = self._dropped + self._waiting.dropped + (images.dropped if images else 0)
-        return self._role.status(dropped, busy_s)
+        return self._role.status(self._dropped + (images.dropped if images else 0), busy_s)
 
     def _open(self) -> None:
-        self._images = self._bus.subscribe(self._key, self._waiting.put)
+        self._images = self._bus.subscribe(self._key, depth=QUEUE_DEPTH, newest_wins=True)
         self._aid = attach_aid(self._bus, self._role)
 
     def _shut(self) -> None:
@@ -247,8 +245,6 @@ class _Worker:
         if images is not None:
             self._dropped += images.dropped
             images.close()
-            self._dropped += self._waiting.dropped
-            self._waiting = WaitingImages()
         for subscription in self._aid:
             subscription.close()
         self._aid = []
@@ -257,7 +253,8 @@ class _Worker:
         while not self._stop.is_set():
             if self._wanted is not None and not self._follow(self._wanted):
                 continue
-            sample = self._waiting.take(0.2)
+            images = self._images
+            sample = images.recv(0.2) if images is not None else None
             if sample is not None:
                 self._since_s = time.monotonic()  # stays set if the thread ends or hangs
                 publish(self._bus, self._role.points(sample))

@@ -16,7 +16,7 @@ from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.messages import Level
 from vical_daemon.config.model import Config, loads
 from vical_daemon.detect import role as detect
-from vical_daemon.detect import waiting_images, wanted
+from vical_daemon.detect import wanted
 from vical_daemon.detect.role import DetectRole
 from vical_daemon.service import notify
 
@@ -92,29 +92,6 @@ class TestDetect:
             time.sleep(0.01)
         stop.set()
         worker.close()
-
-    def test_images_wait_for_a_busy_detector_but_not_for_long(
-        self, config: Config, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        now_s = 100.0
-        monkeypatch.setattr(waiting_images.time, "monotonic", lambda: now_s)
-        queue = waiting_images.WaitingImages()
-        for k in range(30):  # 20 per second
-            queue.put(image(NOW + k * 50 * MS))
-            now_s += 0.05
-        taken = [queue.take(0.0) for _ in range(15)]
-        stamps = [m.decode_image(sample.payload).stamp_ns for sample in taken if sample is not None]
-        assert stamps == [NOW + k * 50 * MS for k in range(15, 30)]  # 0.7 s
-        assert queue.dropped == 15
-        for k in range(4):  # a slow camera: two, however long they wait
-            queue.put(image(NOW + k * 1000 * MS))
-            now_s += 1.0
-        assert queue.dropped == 17
-        monkeypatch.setattr(waiting_images, "MOST_BYTES", 4 * len(image(NOW).payload))
-        for k in range(8):
-            queue.put(image(NOW + k * MS))
-        assert queue.dropped == 17 + 6
-        assert [bool(queue.take(0.0)) for _ in range(5)] == [True] * 4 + [False]
 
     def test_with_mode_verify_it_works_only_while_images_are_wanted(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
