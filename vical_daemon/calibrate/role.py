@@ -36,6 +36,9 @@ Until = Callable[[CalibrationEstimate | None, set[str]], bool]
 _log = logging.getLogger(__name__)
 QUEUE_LIMIT = 20_000  # samples: 20 s at 1000 Hz, which may arrive while the estimator starts
 _BACKLOG_S = 1.0  # images sometimes wait this long
+_STEP_STUCK_S = 60.0
+"""No step takes so long: a start takes 0.3 to 2.4 s of CPU time on a current core, and a small computer is
+four to five times slower and does other things as well."""
 _OURS = "vical_daemon/"  # in the path of our code
 
 
@@ -86,6 +89,7 @@ def calibrate(
     publish(bus, persistence.stored_messages())
     commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
     status = StatusSender(config.rig, "estimate", bus, clock)
+    status.repeat_while_busy(_STEP_STUCK_S)
     while not stop.is_set():
         queue.wait(PUBLISH_S / 2)
         words = _commands(commands)
@@ -116,7 +120,7 @@ def calibrate(
     if role.latest is not None and role.latest.cameras:
         publish(bus, supervisor.finish())  # without a solution it would search for one again, for seconds
     persistence.close(role.latest)
-    status.tick(lambda: supervisor.statuses(queue.dropped, time.monotonic()), force=True)
+    status.finish(lambda: supervisor.statuses(queue.dropped, time.monotonic()))
 
 
 class _Supervisor:

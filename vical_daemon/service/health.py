@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus
@@ -28,16 +29,48 @@ class StatusSender:
         self._key = topics.STATUS.key(rig, role)
         self._role, self._bus, self._clock = role, bus, clock
         self._next_s = 0.0
+        self._last: list[DiagnosticStatus] = []
+        self._ticked_s = 0.0
+        self._finished = threading.Event()
 
     def tick(self, statuses: Callable[[], list[DiagnosticStatus]], *, force: bool = False) -> None:
         """Publish if a second has passed; call it from the role's own loop."""
-        now_s = time.monotonic()
+        now_s = self._ticked_s = time.monotonic()
         if now_s < self._next_s and not force:
             return
         self._next_s = now_s + STATUS_PERIOD_S
+        self._last = statuses()
+        self._publish(self._last)
+
+    def _publish(self, statuses: list[DiagnosticStatus]) -> None:
         clock = DiagnosticStatus(Level.OK, "clock", values=self._clock.status_values())
-        payload = encode_diagnostics(self._clock.now_ns(), self._role, [*statuses(), clock])
-        self._bus.publish(self._key, payload)
+        self._bus.publish(self._key, encode_diagnostics(self._clock.now_ns(), self._role, [*statuses, clock]))
+
+    def finish(self, statuses: Callable[[], list[DiagnosticStatus]]) -> None:
+        """Publish once more; nothing is repeated from then on."""
+        self._finished.set()
+        self.tick(statuses, force=True)
+
+    def repeat_while_busy(self, stuck_s: float) -> None:
+        """Publish the last status again, in a thread, while a turn of the role's loop takes over a second.
+
+        A start takes seconds on a small computer, and the role is alive.
+
+        Args:
+            stuck_s: A turn longer than this is reported as stuck, s.
+        """
+        name = f"status/{self._role}"
+        threading.Thread(target=self._repeat, args=(stuck_s,), name=name, daemon=True).start()
+
+    def _repeat(self, stuck_s: float) -> None:
+        while not self._finished.wait(STATUS_PERIOD_S):
+            busy_s = time.monotonic() - self._ticked_s
+            if not self._last or busy_s < STATUS_PERIOD_S:
+                continue
+            first, *others = self._last
+            if busy_s > stuck_s:
+                first = replace(first, level=Level.STALE, message=f"stuck: at one step for {busy_s:.0f} s")
+            self._publish([first, *others])
 
     def run_until(
         self,

@@ -1,0 +1,35 @@
+"""The status of a role whose loop is busy for seconds."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from vical_daemon.bus.interface import LocalBus
+from vical_daemon.bus.messages import DiagnosticStatus, Level, decode_diagnostics
+from vical_daemon.service import health
+from vical_daemon.service.wall_clock import WallClock
+
+
+def test_a_busy_role_repeats_its_status_until_it_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(health, "STATUS_PERIOD_S", 0.02)
+    bus, heard = LocalBus(), list[DiagnosticStatus]()
+    bus.subscribe("vical/rig0/status/*", lambda s: heard.append(decode_diagnostics(s.payload).statuses[0]))
+    sender = health.StatusSender("rig0", "estimate", bus, WallClock(0))
+    sender.repeat_while_busy(stuck_s=2.0)
+    time.sleep(0.2)
+    assert not heard  # there is nothing to repeat
+    begin_s = time.monotonic()
+    sender.tick(lambda: [DiagnosticStatus(Level.OK, "estimate", "initialising")])
+    while heard[-1].level is not Level.STALE:
+        assert time.monotonic() < begin_s + 30.0
+        time.sleep(0.01)
+    assert time.monotonic() >= begin_s + 2.0
+    assert heard[-1].message.startswith("stuck: at one step for 2 s")
+    assert len(heard) > 3 and {(s.level, s.message) for s in heard[1:3]} == {(Level.OK, "initialising")}
+    sender.finish(lambda: [DiagnosticStatus(Level.OK, "estimate", "converging")])
+    time.sleep(0.2)
+    count = len(heard)
+    time.sleep(0.2)
+    assert len(heard) == count
