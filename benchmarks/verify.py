@@ -2,6 +2,7 @@
 
 python -m benchmarks verify --trials 40                 rigs of the zoo, a board, 5 s
 python -m benchmarks verify --trials 20 --target-free   without a board, 20 s
+python -m benchmarks verify --bound                     only what the best estimator would see
 
 Every rig is calibrated once (`--stored` seconds), then verified with a recording of another day: motion,
 biases and noise are its own. Half of the rigs have changed in between, one block each, by what counts as a
@@ -16,6 +17,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from vical_mocks.cramer_rao.bound import bounds
+from vical_mocks.cramer_rao.information import BoundOptions
 from vical_mocks.harness.feed import (
     CAMERA,
     CalibratorSubject,
@@ -33,7 +36,7 @@ from vical_mocks.rotations import exp_so3
 from benchmarks import runner
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate
-from vical_daemon.results.change_odds import Counts
+from vical_daemon.results.change_odds import Counts, odds
 from vical_daemon.results.export import rig_from_estimate
 from vical_daemon.results.known import KnownCamera, known_cameras
 from vical_daemon.results.verifier import Answer, CameraCheck, Verifier
@@ -94,6 +97,51 @@ def stored_calibration(run: SimulatedRun, seed: int, *, target_free: bool) -> Kn
     return replace(known, begin_ns=0, end_ns=0)  # another day, whatever the simulation's clock says
 
 
+def bound_of(run: SimulatedRun, *, target_free: bool) -> np.ndarray:
+    """Covariance of the best estimate of a calibration from a recording, lens free, shape (15, 15)."""
+    o = run.options
+    options = BoundOptions(
+        corner_sigma_px=o.corner_sigma_px,
+        frame_sigma_px=o.frame_sigma_px,
+        stamp_jitter_s=o.stamp_jitter_s,
+        target_free=target_free,
+    )
+    return bounds(run, options)[-1].block("p_imu_cam", "r_imu_cam", "timeshift", "intrinsics", "distortion")
+
+
+def visible_by_the_bound(stored: np.ndarray, today: SimulatedRun, *, target_free: bool) -> dict[str, bool]:
+    """By block, whether the best estimate would see a change that counts in the whole of a recording."""
+    own = bound_of(today, target_free=target_free)
+    counts = Counts().of_errors(today.rig.lens.intrinsics[0], len(own))
+    best = odds(np.zeros(len(own)), stored + own, stored, counts)
+    return {name: x <= max(1.0, best.floor[name]) for name, x in best.visible.items()}
+
+
+def bound_trial(target_free: bool, stored_s: float, seconds: float, seed: int) -> runner.Result:
+    """What is visible if both recordings of a rig were used by the best estimator; nothing is estimated."""
+    before, today = (
+        draw(seed, s, target_free=target_free, day=day)[0] for day, s in enumerate((stored_s, seconds))
+    )
+    stored = bound_of(before, target_free=target_free)
+    visible = visible_by_the_bound(stored, today, target_free=target_free)
+    counts = Counts().of_errors(today.rig.lens.intrinsics[0], len(stored))
+    floor = odds(np.zeros(len(stored)), stored, stored, counts).floor
+    return {"visible": visible, "left_open": {name: x > 1.0 for name, x in floor.items()}}
+
+
+def print_bound(results: list[runner.Result]) -> None:
+    """Shares of the rigs, by block."""
+    print("| rigs | what counts shows in | what counts is left open by the stored calibration in |")
+    print("|---|---|---|")
+    cells = []
+    for key in ("visible", "left_open"):
+        shares = {b: np.mean([r[key][b] for r in results]) for b in results[0][key]}
+        everything = np.mean([(all if key == "visible" else any)(r[key].values()) for r in results])
+        words = [f"{b} {100 * share:.0f} %" for b, share in shares.items()]
+        cells.append(f"{', '.join(words)}; {'all' if key == 'visible' else 'any'} {100 * everything:.0f} %")
+    print(f"| {len(results)} | {' | '.join(cells)} |")
+
+
 def trial(target_free: bool, stored_s: float, seconds: float, seed: int) -> runner.Result:
     """One rig, stored and verified."""
     way = WAYS[seed % len(WAYS)]
@@ -108,9 +156,12 @@ def trial(target_free: bool, stored_s: float, seconds: float, seed: int) -> runn
     verifier = Verifier({CAMERA: CameraCheck(known, lens_asked=True)})
     estimate(today, prior, target_free=target_free, verifier=verifier)
     document = verifier.document()
+    latest = verifier.latest
     return {
         "way": way,
         "answer": document["verdict"],
+        "status": "" if latest is None else f"{latest.status}: {latest.reason}",
+        "visible": visible_by_the_bound(known.covariance, today, target_free=target_free),
         "document": document,
         "sigma": known.sigma[:7].tolist(),
     }
@@ -118,17 +169,18 @@ def trial(target_free: bool, stored_s: float, seconds: float, seed: int) -> runn
 
 def print_summary(results: list[runner.Result]) -> None:
     """One row for each way."""
-    print("| changed since | rigs | holds | changed | of it the right block | cannot tell, block visible |")
-    print("|---|---|---|---|---|---|")
+    print(
+        "| changed since | rigs | visible by the bound | of these: holds | changed | the right block "
+        "| cannot tell | not visible: holds | changed | cannot tell |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for way in dict.fromkeys(WAYS):
         own = [r for r in results if r["way"] == way and r["answer"] != "not stored"]
-        answers = [r["answer"] for r in own]
-        right = sum(r["answer"] == Answer.CHANGED and _named(r) == {way} for r in own)
-        unsure = [r for r in own if r["answer"] == Answer.CANNOT_TELL and _visible(r, way)]
-        print(
-            f"| {way} | {len(own)} | {answers.count('holds')} | {answers.count('changed')} "
-            f"| {right} | {len(unsure)} |"
-        )
+        seen, unseen = ([r for r in own if _visible(r, way) == which] for which in (True, False))
+        right = sum(r["answer"] == Answer.CHANGED and _named(r) == {way} for r in seen)
+        a, b = ([[r["answer"] for r in some].count(word) for word in Answer] for some in (seen, unseen))
+        cells = [way, len(own), len(seen), a[0], a[1], right, a[2], *b]
+        print("| " + " | ".join(map(str, cells)) + " |")
     times = [r["document"]["seconds_used"] for r in results if r["answer"] in ("holds", "changed")]
     print(f"\nseconds until an answer, median and worst: {np.median(times):.0f}, {np.max(times):.0f}")
 
@@ -138,10 +190,9 @@ def _named(result: runner.Result) -> set[str]:
 
 
 def _visible(result: runner.Result, way: str) -> bool:
-    """Whether a change that counts of this block (of all, where nothing changed) shows in this recording."""
-    blocks = result["document"]["cameras"][CAMERA]["blocks"]
-    asked = blocks if way == "none" else [way]
-    return bool(blocks) and all(blocks[b]["visible_from"] <= blocks[b]["counts_from"] for b in asked)
+    """Whether the bound shows a change that counts of this block (of all, where nothing changed)."""
+    visible = result["visible"]
+    return all(visible.values()) if way == "none" else bool(visible[way])
 
 
 def main(argv: list[str]) -> int:
@@ -152,11 +203,17 @@ def main(argv: list[str]) -> int:
         "--stored", type=float, default=30.0, metavar="S", help="length of the first recording"
     )
     parser.add_argument("--target-free", action="store_true", help="unknown landmarks instead of a board")
+    parser.add_argument("--bound", action="store_true", help="only what the Cramer-Rao bound says is visible")
     args = parser.parse_args(argv)
-    name = f"verify_{'free' if args.target_free else 'board'}_{args.stored:g}_{args.seconds:g}s"
+    kind = f"{'bound_' if args.bound else ''}{'free' if args.target_free else 'board'}"
+    name = f"verify_{kind}_{args.stored:g}_{args.seconds:g}s"
     code = runner.fingerprint("vical_daemon", "benchmarks/verify.py", "mocks/vical_mocks")
-    work = partial(trial, args.target_free, args.stored, args.seconds)
+    chosen = bound_trial if args.bound else trial
+    work = partial(chosen, args.target_free, args.stored, args.seconds)
     results = runner.run_trials(name, work, runner.seeds_of(args), args, code)
+    if args.bound:
+        print_bound(results)
+        return 0
     print_summary(results)
     for seed, r in zip(runner.seeds_of(args), results, strict=True):
         wrong = {"none": "changed"}.get(r["way"], "holds")

@@ -92,6 +92,8 @@ def run(args: argparse.Namespace) -> int:
     from vical_daemon.offline.sources import read_known
 
     known, rig = read_known(args.against)
+    if rig is not None and rig.status == "inconsistent":
+        raise CliError(f"{args.against} is inconsistent: its data contradict each other; calibrate anew")
     if args.target:
         from vical_daemon.vision.target import load_target
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.result import Status
 from vical_daemon.offline.errors import InputError
 from vical_daemon.offline.sources import read_known
 from vical_daemon.results.compare import FALSE_ALARM, Verdict, directions, judge
@@ -123,10 +124,19 @@ def compare(
         InputError: One of them cannot be read, or holds no such camera.
     """
     known, rigs = zip(*(read_known(source) for source in (a, b)), strict=True)
+    wrong = [
+        s
+        for s, rig in zip((a, b), rigs, strict=True)
+        if rig is not None and rig.status == Status.INCONSISTENT
+    ]
     pairs, notes = _pairs(known[0], known[1], camera)
     if camera and not pairs:
         raise InputError(f"no camera {camera!r} in both {a} and {b}")
-    cameras = [_compare(x, y, distances_m) for x, y in pairs]
+    if wrong:
+        why = f"{wrong[0]} is inconsistent: its data contradict each other"
+        cameras = [CameraComparison((x.name, y.name), why) for x, y in pairs]
+    else:
+        cameras = [_compare(x, y, distances_m) for x, y in pairs]
     for x, y in pairs:
         notes += [note for note in (*x.notes, *y.notes) if note not in notes]
     return Comparison((a, b), cameras, _imu(*rigs), notes)

@@ -96,6 +96,18 @@ def test_compare_matrix_of_three(write, capsys):
     assert [pair["verdict"] for pair in json.loads(out)["pairs"]] == ["same", "changed", "changed"]
 
 
+def test_an_inconsistent_result_is_no_calibration(tmp_path, rig, write, capsys):
+    wrong = tmp_path / "wrong.json"
+    only = replace(rig, cameras={"cam0": rig.cameras["cam0"]}, status="inconsistent")
+    wrong.write_text(export(only, "json")[0].text)
+    code, out, _ = run(capsys, "compare", write("a.json"), str(wrong))
+    assert code == 5
+    assert "wrong.json is inconsistent" in out
+    code, _, err = run(capsys, "verify", "log", "--against", str(wrong))
+    assert code == 1
+    assert "wrong.json is inconsistent" in err
+
+
 def test_compare_other_cameras_cannot_be_compared(tmp_path, rig, write, capsys):
     other = tmp_path / "other.json"
     camera = replace(rig.cameras["cam0"], resolution=(640, 480))
