@@ -6,17 +6,21 @@ from copy import deepcopy
 from dataclasses import replace
 
 from vical_daemon.estimation.measurements import COLUMNS
+from vical_daemon.estimation.significance import COLUMNS_TRIED, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.window import Window
 
-_WORTH_A_FIT = 25.0  # chi-square: a readout by columns stands out by five sigmas, as one by rows must
-
 
 def shows_columns(bundle: Bundle, fit: Fit) -> bool:
-    """Whether what rows leave over looks like a readout by columns, so that they are worth an adjustment."""
-    return bundle.seen is not None and bundle.problem.late_by_columns(bundle.seen) > _WORTH_A_FIT * max(
-        fit.squares / fit.dof, 1.0
-    )
+    """Whether what rows leave over looks like a readout by columns, so that they are worth an adjustment.
+
+    The gain is a lower bound: motion, lens and mounting have taken what they could of it. So anything beyond
+    chance is worth it; which axis it is, the two adjustments decide.
+    """
+    if bundle.seen is None:
+        return False
+    chance = chi_square_limit(1, COLUMNS_TRIED) * max(fit.squares / fit.dof, 1.0)
+    return bundle.problem.late_by_columns(bundle.seen) > chance
 
 
 def read_by_columns(window: Window) -> Window:
