@@ -468,9 +468,10 @@ class Calibrator:
 
     def _in_doubt(self, f: CalibrationFilter) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
-        if self.watch.doubtful or any(clock_drift.in_doubt(f, name) for name in self.rig.priors):
-            return clock_drift.CLOCKS_IN_DOUBT
         converged = self.judge.status == Status.CONVERGED
+        drifts = (clock_drift.in_doubt(f, name, converged=converged) for name in self.rig.priors)
+        if self.watch.doubtful or any(drifts):
+            return clock_drift.CLOCKS_IN_DOUBT
         return hypotheses.IN_DOUBT.get(hypotheses.in_doubt(f, converged=converged), "")
 
     def trace(self, camera: str) -> list[TracePoint]:

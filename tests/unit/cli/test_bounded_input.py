@@ -30,7 +30,8 @@ for words in json.load(sys.stdin):
             code = cli.main(words)
         except SystemExit as end:
             code = end.code
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    status = open("/proc/self/status").read()  # ru_maxrss would include the parent, of which this was a copy
+    peak_mb = int(status.split("VmHWM:")[1].split()[0]) / 1024
     print(json.dumps([words, code, out.getvalue(), err.getvalue(), peak_mb]), flush=True)
 """
 # Words of a command and the suffix of the file that stands for FILE.

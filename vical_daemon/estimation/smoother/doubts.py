@@ -10,6 +10,7 @@ from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, L
 from vical_daemon.estimation.selection import model_selection as hypotheses
 from vical_daemon.estimation.selection.clock_drift import (
     CLOCKS_IN_DOUBT,
+    doubtful,
     evidence,
     probability,
     stamps_variance,
@@ -88,10 +89,8 @@ class TargetFreeDoubts:
         imu, enough = hypotheses.IMU, 0.5 if converged else OFF
         if imu not in self._off and hypotheses.not_zero(self._weights(carry, factor), imu) > enough:
             return hypotheses.IN_DOUBT[imu]
-        if not self.drifting:
-            drift = self._drift(carry, factor)
-            if probability(drift) > 0.5 or (drift > 1.0 and not converged):
-                return CLOCKS_IN_DOUBT
+        if not self.drifting and doubtful(self._drift(carry, factor), converged=converged):
+            return CLOCKS_IN_DOUBT
         return ""
 
     def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> Doubts:

@@ -15,7 +15,13 @@ from vical_daemon.estimation.model.priors import SKEW_SIGMA
 from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
-from vical_daemon.estimation.selection.clock_drift import _mixed, apart, averaged, stamps_variance
+from vical_daemon.estimation.selection.clock_drift import (
+    _mixed,
+    apart,
+    averaged,
+    in_doubt,
+    stamps_variance,
+)
 
 NAME = "cam0"
 
@@ -93,6 +99,14 @@ def test_odds_go_the_way_of_the_evidence():
     f.drifting.add(NAME)
     assert apart(f, NAME) == 1.0
     assert averaged(f) is f
+
+
+def test_a_converged_result_is_doubted_later():
+    """4 sigmas of drift keep a result from converging; a converged one is doubted once drift is likelier."""
+    slight, strong = some_filter(3e-5), some_filter(4e-5)
+    assert apart(slight, NAME) < 0.5 < apart(strong, NAME)
+    assert in_doubt(slight, NAME, converged=False) and not in_doubt(slight, NAME, converged=True)
+    assert in_doubt(strong, NAME, converged=True)
 
 
 def calibrated(skew_ppm, seconds=13.0, bumps=()):
