@@ -20,6 +20,8 @@ STRETCHES_DISAGREE = 0.01
 """Stretches of a recording that do agree are taken for some that do not: sigmas grow for nothing."""
 WINDOW_CONTRADICTS = 1e-5
 """A window without a target that does agree is taken for a changed rig."""
+COLUMNS_TRIED = 3e-3
+"""A first window without readout by columns is adjusted once more with it: costs CPU time only."""
 SHIFT_MISFIT = 1e-6
 """Orientations that fit at a time shift are taken for some that do not."""
 CALIBRATIONS_DISAGREE = 1e-3

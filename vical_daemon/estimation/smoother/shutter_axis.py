@@ -6,7 +6,7 @@ from copy import deepcopy
 from dataclasses import replace
 
 from vical_daemon.estimation.measurements import COLUMNS
-from vical_daemon.estimation.significance import SURE_SIGMAS
+from vical_daemon.estimation.significance import COLUMNS_TRIED, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.window import Window
 
@@ -14,10 +14,13 @@ from vical_daemon.estimation.smoother.window import Window
 def shows_columns(bundle: Bundle, fit: Fit) -> bool:
     """Whether what rows leave over looks like a readout by columns, so that they are worth an adjustment.
 
-    It must stand out by five sigmas, as one by rows must.
+    The gain is a lower bound: motion, lens and mounting have taken what they could of it. So anything beyond
+    chance is worth it; which axis it is, the two adjustments decide.
     """
-    least = SURE_SIGMAS**2 * max(fit.squares / fit.dof, 1.0)
-    return bundle.seen is not None and bundle.problem.late_by_columns(bundle.seen) > least
+    if bundle.seen is None:
+        return False
+    chance = chi_square_limit(1, COLUMNS_TRIED) * max(fit.squares / fit.dof, 1.0)
+    return bundle.problem.late_by_columns(bundle.seen) > chance
 
 
 def read_by_columns(window: Window) -> Window:

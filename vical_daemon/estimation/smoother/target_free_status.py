@@ -20,7 +20,7 @@ from vical_daemon.estimation.result import (
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
-from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, DRIFT, FULL, MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, FULL, MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import LOST, PATIENCE_S, Evaluator, lacking_verdict
 from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
@@ -34,7 +34,6 @@ _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
 _MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
 _BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
-_PRIOR_WINDOWS = 4.0  # worth of belief that sigmas are right, in windows
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
@@ -238,23 +237,18 @@ class TargetFreeStatus(Evaluator):
         return limit if self._windows >= _LEARNING else 50.0 * limit
 
     def factor(self) -> float:
-        """Measured variance over the stated one, at least 1 (a prior of a few windows says 1)."""
-        dof = float(np.count_nonzero(self.active)) - float(self.active[DRIFT])
-        total = sum(s for s, _ in self._agreement) + _PRIOR_WINDOWS * dof
-        return max(1.0, total / (sum(n for _, n in self._agreement) + _PRIOR_WINDOWS * dof))
+        """Measured variance over the stated one, at least 1: what windows disagree by counts in full."""
+        return _measured_over_stated(self._agreement)
 
     def _reported_factor(self) -> float:
         """What the variances are multiplied by when they are reported.
 
-        Until a second window has confirmed the answer nothing but the windows themselves says how wrong it
-        may be: what they disagree by counts at once, and in full, without the belief that sigmas are right.
-        What contradicted answers that were withdrawn counts, too.
+        Until a second window has confirmed the answer, the window that still grows and those that
+        contradicted answers that were withdrawn count, too.
         """
         if self.proven:
             return self.factor()
-        seen = [*self._withdrawn, *self._agreement, self._growing]
-        dof = sum(n for _, n in seen)
-        return max(self.factor(), sum(s for s, _ in seen) / dof if dof else 1.0)
+        return max(self.factor(), _measured_over_stated([*self._withdrawn, *self._agreement, self._growing]))
 
     # ------------------------------------------------------------------ what is said
     def trace(self) -> list[TracePoint]:
@@ -331,6 +325,12 @@ class TargetFreeStatus(Evaluator):
             return Verdict(Status.CONVERGED, pause.strip(" ()"))
         patient = self._now_s - (self._started_s or 0.0) > PATIENCE_S
         return lacking_verdict(missing, patient=patient, pause=pause)
+
+
+def _measured_over_stated(windows: Iterable[tuple[float, int]]) -> float:
+    """Sum of the squared changes over that of their degrees of freedom, at least 1."""
+    squares, dof = (sum(x) for x in zip((0.0, 0), *windows, strict=True))
+    return max(1.0, squares / dof) if dof else 1.0
 
 
 def _matters(change: FloatArray) -> bool:

@@ -59,6 +59,16 @@ def test_what_contradicted_an_answer_that_was_withdrawn_widens_the_next_one():
     assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0)
 
 
+@pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (3.0, 3.0)])
+def test_two_complete_windows_widen_the_sigmas_by_all_that_they_disagree_by(times, wider):
+    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    for _ in range(2):
+        status.closed()
+        status.agrees(fit(times), carry(), complete=True)
+    assert status.proven
+    assert focal_sigma(status) == pytest.approx(wider * np.sqrt(0.5) * 2.0, rel=1e-6)
+
+
 def test_two_windows_that_agree_are_believed_again():
     status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
     status.closed()
