@@ -177,6 +177,12 @@ BOARD: dict[str, Mechanism] = {
         lambda: [(CalibrationFilter, "_misses_gate", gives(False))],
         disturbances=(*STEPS, *JUNK[1:3]),
     ),
+    "gate of images: level": Mechanism(
+        WRONG,
+        "the limit of that gate follows the usual level (nis_level)",
+        lambda: [(CalibrationFilter, "nis_level", held_at(1.0))],
+        disturbances=(*STEPS, *JUNK[1:3]),
+    ),
     "refused images counted": Mechanism(
         WRONG,
         "ten refused in a row: pose anew, then calibration anew",

@@ -78,6 +78,7 @@ class CalibrationFilter:
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
         off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
         rates: Rates at the state's instant.
+        nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
     """
@@ -95,6 +96,7 @@ class CalibrationFilter:
     drifting: set[str] = field(default_factory=set)
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
+    nis_level: float = 4.0
     stamp_sigma_s: float = 0.0
     began_s: float = 0.0
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
@@ -157,14 +159,16 @@ class CalibrationFilter:
         if keep.sum() < 4:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
+        level = fit.nis / max(fit.dof, 1)
         if self._misses_gate(fit):
-            level = fit.nis / max(fit.dof, 1)
+            self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
             return self._refused(
                 image,
                 innovation,
                 predicted,
                 f"innovation of the image is {level:.1f} times what it should be",
             )
+        self.nis_level += 0.05 * (level - self.nis_level)
         noise_updates.learn(self, image, lin, fit)
         self._accept(fit.S, fit.dx)
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
@@ -209,7 +213,7 @@ class CalibrationFilter:
 
     def _misses_gate(self, fit: ImageFit) -> bool:
         """Whether a whole image is not where it may be expected."""
-        return fit.nis > frame_limit(fit.dof)
+        return fit.nis > frame_limit(fit.dof) * max(1.0, self.nis_level)
 
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
         """The linearised image with the noise that its corners share."""

@@ -127,6 +127,7 @@ def test_update_equals_the_linear_kalman_update_with_numeric_jacobians(recording
 
 def test_single_wild_corners_are_left_out_and_a_wrong_board_is_refused(recording):
     f, buffer, base = build(recording)
+    f.nis_level = 1.0
     image = one_frame(recording, f, buffer, base)
     image.uv[3] += 15.0
     report = f.update(image)
@@ -134,6 +135,7 @@ def test_single_wild_corners_are_left_out_and_a_wrong_board_is_refused(recording
     assert not report.accepted[3]
     assert report.accepted.sum() == len(image.ids) - 1
     g, buffer, base = build(recording)
+    g.nis_level = 1.0
     image = one_frame(recording, g, buffer, base)
     before = g.state.p_world_imu.copy()
     image.uv[:] += 8.0 * (image.uv - image.uv.mean(0)) / 100.0
