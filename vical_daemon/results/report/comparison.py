@@ -50,7 +50,7 @@ def write_comparison(
         body += _camera(name, camera, gallery)
     if document["imu"] is not None:
         text = page.note("Biases walk from day to day. They are not part of the verdict.")
-        body.append(page.section("IMU biases", page.table(_HEAD, _rows(document["imu"])), text))
+        body.append(page.section("IMU biases", page.table(_HEAD[:-1], _rows(document["imu"])), text))
     if document["notes"]:
         body.append(page.section("Assumed", *(page.note(note) for note in document["notes"])))
     body.append(provenance_section(provenance))
@@ -81,7 +81,7 @@ def _head(document: Mapping[str, Any], sources: tuple[str, str]) -> str:
             advice.append(f"{camera['common_s']:.0f} s of data are in both, and counted once.")
     verdict = document["verdict"]
     said = Verdict(_WORDS[verdict], known, advice)
-    facts = (f"A: {sources[0]}", f"B: {sources[1]}", f"changed below {document['false_alarm']:g}")
+    facts = (f"A: {sources[0]}", f"B: {sources[1]}", f"changed: by chance below {document['false_alarm']:g}")
     return page.head("Two calibrations compared", verdict, said, facts, _KIND.get(verdict, "unknown"))
 
 
@@ -112,8 +112,8 @@ def _camera(name: str, camera: Mapping[str, Any], gallery: Gallery) -> list[str]
     ]
     if maps:
         text = page.note(
-            "How far apart A and B project a point that is fixed to the imu, over the image of A. Right: the "
-            "least difference that the sigmas of both allow; it is 0 everywhere where the verdict is `same`."
+            "First: how far apart A and B project a point that is fixed to the imu, over the image of A. "
+            "Second: the least difference that the sigmas of both allow, 0 if the verdict is `same`."
         )
         sections.append(page.section(f"{name}: in the image", *maps, text))
     return sections
@@ -178,10 +178,15 @@ def _direction_row(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _rows(imu: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    return [
-        (name.replace("_", " "), f"{d:+.5f}", f"{imu['joint_sigma'][name]:.5f}", f"{imu['z'][name]:+.1f}", "")
-        for name, d in imu["differences"].items()
-    ]
+    rows = []
+    for name, d in imu["differences"].items():
+        label, _, unit = name.rpartition("_")
+        unit = {"rps": "rad/s", "mps2": "m/s²"}[unit]
+        values = (f"{d:+.5f}\u00a0{unit}", f"{imu['joint_sigma'][name]:.5f}\u00a0{unit}")
+        rows.append(
+            (label.replace("_", " ").replace("accel ", "accelerometer "), *values, f"{imu['z'][name]:+.1f}")
+        )
+    return rows
 
 
 def _px(values: Sequence[Sequence[float]]) -> str:

@@ -110,7 +110,10 @@ def test_gige_vision_on_loopback(gige_camera: str) -> None:
     with AravisCamera(gige_camera, CameraSettings(rate_hz=30.0, exposure_s=0.003)) as source:
         frames = [source.read(2.0) for _ in range(45)]
         assert source.info.details["transport"] == "GigEVision"
+        unnumbered = source.stats().extra.get("lost_in_camera", 0)  # on a busy machine the camera pauses
     assert all(f is not None for f in frames)
-    steps = [b.sequence - a.sequence for a, b in itertools.pairwise(frames)]
-    assert steps == [f.dropped_before + 1 for f in frames[1:]]
+    skipped = [b.sequence - a.sequence - 1 for a, b in itertools.pairwise(frames)]
+    dropped = [f.dropped_before for f in frames[1:]]
+    assert all(d >= s for d, s in zip(dropped, skipped, strict=True))
+    assert sum(dropped) == sum(skipped) + unnumbered
     assert frames[-1].stamp_rule == "first-packet(device-clock)-exposure/2"
