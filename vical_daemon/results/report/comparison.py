@@ -178,7 +178,7 @@ def _direction_row(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _rows(imu: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, d in imu["differences"].items():
         label, _, unit = name.rpartition("_")
         unit = {"rps": "rad/s", "mps2": "m/s²"}[unit]
