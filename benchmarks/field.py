@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import runner
+
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "euroc_imu_april"
 WIDTH_PX = 752
 BIAS_RPS = np.radians([-0.148, 1.369, 4.364])  # of this gyro, by `vical td-icp`
@@ -50,8 +52,8 @@ def load() -> Data:
     return Data(t_ns, six, points)
 
 
-def write(data: Data, folder: Path) -> None:
-    """Write an ASL folder."""
+def write(data: Data, folder: Path, kind: str = "corners") -> None:
+    """Write an ASL folder; its points are `corners` of a board or `tracks` of unknown points."""
     for name in ("imu0", "cam0"):
         (folder / "mav0" / name).mkdir(parents=True)
     rows = (
@@ -60,7 +62,8 @@ def write(data: Data, folder: Path) -> None:
     (folder / "mav0/imu0/data.csv").write_text("#timestamp [ns],wx,wy,wz,ax,ay,az\n" + "\n".join(rows) + "\n")
     t_ns, ids, uv = (data.points[key].tolist() for key in ("t", "id", "uv"))
     rows = (f"{t},{i},{u!r},{v!r}" for t, i, (u, v) in zip(t_ns, ids, uv, strict=True))
-    (folder / "mav0/cam0/corners.csv").write_text("#timestamp [ns],point_id,u,v\n" + "\n".join(rows) + "\n")
+    name = "point_id" if kind == "corners" else "feature_id"
+    (folder / f"mav0/cam0/{kind}.csv").write_text(f"#timestamp [ns],{name},u,v\n" + "\n".join(rows) + "\n")
 
 
 def _delayed(data: Data, rng: np.random.Generator) -> Data:
@@ -73,7 +76,8 @@ def _bursts(data: Data, rng: np.random.Generator) -> Data:  # noqa: ARG001
     return replace(data, t_ns=data.t_ns[last])
 
 
-def _clipped(data: Data, columns: slice, most: float) -> Data:
+def clipped(data: Data, columns: slice, most: float) -> Data:
+    """Readings that stop at the rails of some axes."""
     six = data.six.copy()
     six[:, columns] = np.clip(six[:, columns], -most, most)
     return replace(data, six=six)
@@ -126,10 +130,10 @@ FAULTS: dict[str, tuple[str, Callable[[Data, np.random.Generator], Data]]] = {
     "bursts": ("IMU stamped on arrival, four readings at once", _bursts),
     "clip_gyro": (
         "gyro clipped at 1 rad/s (30 % of the readings)",
-        lambda d, _: _clipped(d, slice(0, 3), 1.0),
+        lambda d, _: clipped(d, slice(0, 3), 1.0),
     ),
-    "clip_gyro_2": ("gyro clipped at 2 rad/s", lambda d, _: _clipped(d, slice(0, 3), 2.0)),
-    "clip_accel": ("accelerometer clipped at 10 m/s^2 (10 %)", lambda d, _: _clipped(d, slice(3, 6), 10.0)),
+    "clip_gyro_2": ("gyro clipped at 2 rad/s", lambda d, _: clipped(d, slice(0, 3), 2.0)),
+    "clip_accel": ("accelerometer clipped at 10 m/s^2 (10 %)", lambda d, _: clipped(d, slice(3, 6), 10.0)),
     "spikes": ("40 gyro spikes of one reading each", _spikes),
     "twice": ("10 % of the images delivered twice", _twice),
     "rest": ("60 s at rest before", _rest),
@@ -172,7 +176,15 @@ def main(argv: list[str]) -> int:
     """Print a row for each fault."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks field", description=__doc__)
     parser.add_argument("--fault", action="append", choices=FAULTS, help="only this one; may be repeated")
+    parser.add_argument("--rigs", action="store_true", help="simulated rigs instead: see `field_rigs`")
+    parser.add_argument("--target-free", action="store_true", help="simulated rigs without a board")
+    parser.add_argument("--zoo", action="store_true", help="random rigs instead of the reference rig")
+    runner.add_arguments(parser, trials=20, seconds=25.0)
     args = parser.parse_args(argv)
+    if args.rigs or args.target_free or args.zoo:
+        from benchmarks.field_rigs import study
+
+        return study(args)
     if not FOLDER.is_dir():
         print(f"no {FOLDER}: the recording is not part of the repository", file=sys.stderr)
         return 1

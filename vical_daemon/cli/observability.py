@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
             imu_matrix="imu_matrix" in blocks,
             target_scale="target_scale" in blocks,
             readout="readout" in blocks,
+            target_free=setup.seen is not None,
+            gravity="free" if setup.seen is None else "magnitude",
         )
     )
     missing = _missing(result, motion, setup)
@@ -152,8 +154,18 @@ def _document(
         "rate_rms_rps": rates.tolist(),
         "seconds": float(motion.t_s[-1] - motion.t_s[0]),
         "frames": frames,
-        "model": {"rank": model.rank, "unknowns": model.unknowns},
+        "model": _of_calibration(model),
     }
+
+
+def _of_calibration(model: ModelRank) -> dict[str, int]:
+    """Rank and unknowns of a model, of its calibration and motion.
+
+    Without a target the points do not count, nor place and orientation of the world, which are a choice.
+    """
+    points = sum(name == "landmark" for name in model.names)
+    chosen = 6 if points else 0
+    return {"rank": model.rank - points, "unknowns": model.unknowns - points - chosen}
 
 
 def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:

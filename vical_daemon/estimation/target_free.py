@@ -9,7 +9,7 @@ window's own data moved the calibration, against how far they may, says whether 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -94,6 +94,7 @@ class TargetFreeCalibrator:
         self._reports: list[FrameReport] = []
         self._stepped_s = 0.0  # by how much the imu's stamps were moved in the recording before
         self._anew = False  # another recording begins: its biases are not known
+        self.window_closed: Callable[[Window, Fit], None] | None = None  # is given each complete window
 
     # ------------------------------------------------------------------ input
     def stamps_known_to(self, sigma_s: float) -> None:
@@ -345,6 +346,8 @@ class TargetFreeCalibrator:
             return
         self._closed += 1
         self.evaluator.closed()
+        if self.window_closed is not None:
+            self.window_closed(window, fit)
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
         drifting, noise = self.evaluator.doubts.drifting, self.options.imu_noise

@@ -22,6 +22,8 @@ from vical_daemon.offline.calibration_job import Job, input_key, keys_of, noise_
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.model.frame_report import FrameReport
+    from vical_daemon.estimation.smoother.bundle import Fit
+    from vical_daemon.estimation.smoother.window import Window
 
 Progress = Callable[[float, CalibrationEstimate | None], None]
 PUBLISH_EVERY_S = 1.0  # of the data: often enough for a progress bar
@@ -82,6 +84,7 @@ def run_job(
     keep_frames: bool = False,
     only: Sequence[int] | None = None,
     enough: Callable[[CalibrationEstimate], bool] | None = None,
+    closed: Callable[[Window, Fit], None] | None = None,
 ) -> Outcome:
     """Push the recordings through the roles.
 
@@ -91,12 +94,18 @@ def run_job(
         keep_frames: Collect the verdict on every frame.
         only: Numbers of the recordings that are used (`Job.parts`), in this order; None: all.
         enough: Called with each estimate, once a second of data; True: the rest is not needed.
+        closed: Called with each complete window, of one camera without a target.
     """
     frames: list[FrameReport] = []
     player = _Player(job, progress, frames.extend if keep_frames else None, enough)
     parts = job.parts if only is None else [job.parts[k] for k in only]
     player.expected = sum(_expected(part) for part in parts)
     role, estimator = player.role, player.estimator
+    if closed is not None:
+        from vical_daemon.estimation.target_free import TargetFreeCalibrator
+
+        assert isinstance(estimator, TargetFreeCalibrator)
+        estimator.window_closed = closed
     inputs = _play_all(parts, role, player.play, common_clock=job.common_clock)
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}

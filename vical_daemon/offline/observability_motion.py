@@ -1,4 +1,4 @@
-"""The motion of a recording: attitude from the gyro, position from the board."""
+"""The motion of a recording: attitude from the gyro, position from the board, or from tracks without one."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcp
 from vical_daemon.estimation.tools.observability import Motion, Setup
 from vical_daemon.logs import open_recording
 from vical_daemon.offline.errors import InputError, OptionError, Warn, ignore
+from vical_daemon.offline.observability_tracks import MAX_FRAMES, MAX_SECONDS, motion_without_board
 from vical_daemon.offline.td_icp.request import choose_gyro, prior_of
 from vical_daemon.offline.td_icp.sources import board_poses, lens_of, seconds
 
 FloatArray = npt.NDArray[np.float64]
 
-_MAX_SECONDS = 30.0
-_MAX_FRAMES = 150
 _HOLE_S = 0.35
 
 
@@ -36,19 +35,19 @@ def motion_of(
     imu: str | None = None,
     warn: Warn = ignore,
 ) -> tuple[Motion, Setup, npt.NDArray[np.intp]]:
-    """Rebuild the motion of the longest stretch (at most 30 s) in which the board stays in view.
+    """Rebuild the motion of the longest stretch (at most 30 s) in which the board, or tracks, stay in view.
 
     Args:
         path: Recording.
         blocks: Further unknowns, see `Setup`.
-        target: Target file.
+        target: Target file; None: the points are unknown, see `motion_without_board`.
         initial: What is known of the lens and the mounting.
         camera: Which, where there are several.
         imu: Which, where there are several.
         warn: Takes what is unusual.
 
     Raises:
-        InputError: No board, no imu, or no motion to work with.
+        InputError: No imu, no motion to work with, or no calibration without a board.
     """
     recording = open_recording(path, cameras=[camera] if camera else (), check=False)
     cameras = recording.cameras
@@ -58,8 +57,10 @@ def motion_of(
             f"choose one camera of {recording.path} with --camera: {', '.join(cameras) or 'there is none'}"
         )
     stream, prior = cameras[name], prior_of(initial, name)
+    if target is None and stream.kind != "points":
+        return motion_without_board(recording, initial, name, imu, blocks)
     if stream.kind == "tracks":
-        raise InputError(f"{name}: tracks of unknown points do not give the motion; a board is needed")
+        raise InputError(f"{name} holds tracks of unknown points: leave out --target")
     lens = lens_of(stream, prior)
     poses, fit = board_poses(recording, stream, lens, target, warn)
     chosen, t_ns, gyro = choose_gyro(recording, imu)
@@ -131,8 +132,8 @@ def _rebuild(
         force[use],
     )
     frames = np.unique(np.clip(np.searchsorted(times, t), 1, len(times) - 2))
-    if len(frames) > _MAX_FRAMES:
-        frames = frames[np.linspace(0, len(frames) - 1, _MAX_FRAMES).round().astype(int)]
+    if len(frames) > MAX_FRAMES:
+        frames = frames[np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int)]
     return motion, frames
 
 
@@ -145,7 +146,7 @@ def _longest(t: FloatArray) -> slice:
     longest = int(np.argmax([t[b - 1] - t[a] for a, b in pairwise(edges)]))
     a, b = int(edges[longest]), int(edges[longest + 1])
     centre = 0.5 * (t[a] + t[b - 1])
-    inside = np.flatnonzero(np.abs(t[a:b] - centre) <= _MAX_SECONDS / 2)
+    inside = np.flatnonzero(np.abs(t[a:b] - centre) <= MAX_SECONDS / 2)
     return slice(a + int(inside[0]), a + int(inside[-1]) + 1)
 
 

@@ -101,6 +101,26 @@ def test_a_trajectory_file_joins_as_a_sensor(tmp_path, capsys, run):
     assert len(result["pairs"]) == 3
 
 
+def test_a_sensor_that_is_given_twice_is_taken_once(tmp_path, capsys):
+    t_s = np.arange(0.0, 12.0, 0.05)
+    turns = 0.4 * np.stack([np.sin(1.3 * t_s), np.sin(2.1 * t_s), np.sin(0.7 * t_s)], axis=1)
+    rng = np.random.default_rng(1)
+    for name, late_s in (("a.txt", 0.0), ("b.txt", 0.2)):
+        noise = Rotation.from_rotvec(rng.normal(0.0, 1e-3, turns.shape))
+        q = (Rotation.from_rotvec(turns) * noise).as_quat()
+        rows = (
+            f"{t + late_s + 0.001:.6f} 0 0 0 {' '.join(map(str, v))}" for t, v in zip(t_s, q, strict=True)
+        )
+        (tmp_path / name).write_text("\n".join(rows))
+    a, b = (str(tmp_path / name) for name in ("a.txt", "b.txt"))
+    assert main(["td-icp", a, "--sensors", f"{a},{b}", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert list(json.loads(captured.out)["sensors"]) == ["b.txt"]
+    assert f"{a} is given twice, and taken once" in captured.err
+    assert main(["td-icp", a, "--sensors", a]) == 2
+    assert "is INPUT itself" in capsys.readouterr().err
+
+
 def test_what_cannot_work_is_said_in_one_line(tmp_path, capsys, run):
     folder = _write(tmp_path, run)
     assert main(["td-icp", str(folder)]) == 2

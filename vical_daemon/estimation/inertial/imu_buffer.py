@@ -18,6 +18,7 @@ GAP_S = 0.05
 """Between samples further apart than this nothing is known, s. A cubic over 50 ms misses a 3 Hz motion of
 1 rad/s by at most h^4 w^4 / 384 = 2e-3 rad/s, less than 1e-4 rad in all; over 100 ms by 16 times as much."""
 GAP_PERIODS = 4.0  # and than this many usual intervals: a slow IMU has no gap at every sample
+_LEAST_HALF_S = 1e-3
 _USUAL = 201  # samples whose median interval is the usual one
 
 
@@ -159,6 +160,51 @@ class ImuBuffer:
         times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
         gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
         return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:])
+
+    def turning(self, t_s: FloatArray, half_s: float) -> tuple[FloatArray, FloatArray]:
+        """How the imu turns about instants.
+
+        Its turn in a time u is rate u + acceleration u^2 / 2, exactly so at u = +-half_s.
+
+        A single reading is noisy, and differences between images miss what a hand shakes in between.
+
+        Args:
+            t_s: Instants within the readings held, s, shape (m,).
+            half_s: How far around them; less next to the ends of the readings.
+
+        Returns:
+            Measured rate, rad/s, and its derivative, rad/s^2, shapes (m, 3).
+        """
+        rows = self.rows
+        first = max(int(np.searchsorted(rows[:, 0], t_s[0] - half_s)) - 2, 0)
+        rows = rows[first : int(np.searchsorted(rows[:, 0], t_s[-1] + half_s)) + 2]
+        t = rows[:, 0]
+        half = np.clip(np.minimum(t_s - t[0], t[-1] - t_s), _LEAST_HALF_S, half_s)
+        turns = _Turns(rows[:, :4], _slopes(rows, 0, len(rows))[:, :3])
+        before, at, after = turns.at(np.concatenate([t_s - half, t_s, t_s + half])).reshape(3, -1, 3)
+        half = half[:, None]
+        return (after - before) / (2.0 * half), (after - 2.0 * at + before) / half**2
+
+
+class _Turns:
+    """Integral of the rate along the cubics between readings (t_s, gyro xyz) with slopes, (n, 4) and (n, 3)."""
+
+    def __init__(self, rows: FloatArray, slope: FloatArray) -> None:
+        self._t, self._rate, self._slope = rows[:, 0], rows[:, 1:], slope
+        h = np.diff(self._t)[:, None]
+        steps = 0.5 * h * (self._rate[:-1] + self._rate[1:]) + h * h / 12.0 * (slope[:-1] - slope[1:])
+        self._sum = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def at(self, t_s: FloatArray) -> FloatArray:
+        """From the first reading to instants, rad, shape (m, 3)."""
+        k = np.clip(np.searchsorted(self._t, t_s, side="right") - 1, 0, len(self._t) - 2)
+        h = (self._t[k + 1] - self._t[k])[:, None]
+        u = (t_s - self._t[k])[:, None] / h
+        A, B, d = self._slope[k] * h, self._slope[k + 1] * h, self._rate[k + 1] - self._rate[k]
+        mean = self._rate[k] + u * (
+            0.5 * A + u * ((3.0 * d - 2.0 * A - B) / 3.0 + u * (A + B - 2.0 * d) / 4.0)
+        )
+        return np.asarray(self._sum[k] + u * h * mean)
 
 
 def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:

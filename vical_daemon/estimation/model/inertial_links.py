@@ -35,7 +35,6 @@ class PreintegratedLink:
             sixteen numbers of `imu_scale` where they are estimated, shape (9, 6) or (9, 22).
         root_information: W with W^T W = inverse covariance of [rotation, velocity, position], (9, 9).
         imu: Biases (and numbers) for which it was integrated, shape (6,) or (22,).
-        rate_begin, rate_end: Measured rates (bias not removed) at both ends, rad/s.
     """
 
     dt_s: float
@@ -45,8 +44,6 @@ class PreintegratedLink:
     by_imu: FloatArray
     root_information: FloatArray
     imu: FloatArray
-    rate_begin: FloatArray
-    rate_end: FloatArray
 
 
 def make_link(
@@ -85,8 +82,6 @@ def make_link(
         by_imu[_ORDER],
         root,
         imu.copy(),
-        segment.gyro[0],
-        segment.gyro[-1],
     )
 
 

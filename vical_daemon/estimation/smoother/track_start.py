@@ -105,6 +105,7 @@ class TrackStart:
         )
         window.bias[:, :3], window.imu = imu[:3], imu[6:]
         window.fit_knots()
+        window.measure_turning(buffer)
         self._seen = window.observe()
         if len(self._seen.begin) < _MIN_FEATURES:
             raise NoStartError(

@@ -20,12 +20,15 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise
 from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
 from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_link
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 
 KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
 MAX_LANDMARKS = 220
 _MIN_SEEN = 4
 _NEAREST_M, _FARTHEST_M = 0.1, 200.0
+_HALF_S = WINDOW_START.readout_s
+"""Rates hold for so long before and after an image: exact at the first and last row of a readout of 30 ms."""
 
 IntArray = npt.NDArray[np.intp]
 
@@ -87,6 +90,7 @@ class Window:
         gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
         imu: Errors of scale, alignment, lag (`imu_scale`) where they are estimated, shape (16,); else empty.
+        turning: Measured rate (with bias), rad/s, and its derivative, rad/s^2, at each image, (2, F, 3).
     """
 
     camera: CameraState
@@ -102,6 +106,7 @@ class Window:
     gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
     bad: set[tuple[int, int]] = field(default_factory=set)
     imu: FloatArray = field(default_factory=lambda: np.zeros(0))
+    turning: FloatArray = field(default_factory=lambda: np.zeros((2, 0, 3)))
 
     @property
     def span_s(self) -> float:
@@ -123,9 +128,8 @@ class Window:
 
     def rates(self) -> FloatArray:
         """Angular rate at each image, bias removed, rad/s, shape (F, 3)."""
-        raw = np.array([self.links[0].rate_begin, *(x.rate_end for x in self.links)])
         knots = self.knots()
-        rates = np.asarray(raw - self.bias[np.concatenate([knots[:1], knots]), :3])
+        rates = np.asarray(self.turning[0] - self.bias[np.concatenate([knots[:1], knots]), :3])
         return rates @ matrices(self.imu)[0].T if len(self.imu) else rates
 
     def imu_by_link(self) -> FloatArray:
@@ -138,7 +142,8 @@ class Window:
         if len(self.frames) < 2:
             return np.zeros_like(self.v), np.zeros_like(self.v)
         t = np.array([s for s, _ in self.frames])
-        return np.gradient(self.rates(), t, axis=0), np.gradient(self.v, t, axis=0)
+        turning = self.turning[1] @ matrices(self.imu)[0].T if len(self.imu) else self.turning[1]
+        return turning, np.gradient(self.v, t, axis=0)
 
     def extend(self, buffer: ImuBuffer, frames: list[tuple[float, PointsFrame]]) -> int:
         """Add images, carrying the motion on by inertial data; return how many could be added."""
@@ -159,7 +164,13 @@ class Window:
             added += 1
         self.R, self.p, self.v = np.concatenate(R), np.concatenate(p), np.concatenate(v)
         self.fit_knots()
+        self.measure_turning(buffer)
         return added
+
+    def measure_turning(self, buffer: ImuBuffer) -> None:
+        """Take from the readings how the imu turns at each image, at the time shift of the links."""
+        instants = np.array([t for t, _ in self.frames]) + self.shift_s
+        self.turning = np.array(buffer.turning(instants, _HALF_S))
 
     def relink(self, buffer: ImuBuffer) -> bool:
         """Integrate anew at the present time shift and biases; False where inertial data do not reach."""
@@ -178,6 +189,7 @@ class Window:
             t = np.array([s for s, _ in self.frames])
             self.v = self.v + d * np.gradient(self.v, t, axis=0)
         self.links, self.shift_s = links, self.camera.timeshift_s
+        self.measure_turning(buffer)
         return True
 
     def last_at(self, shift_s: float) -> tuple[FloatArray, FloatArray]:

@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
 
 _LOST = 1e-7  # singular value (in the units above, relative to the largest) below which a direction is lost
 
@@ -132,20 +133,69 @@ def gramian(motion: Motion, setup: Setup, frames: Sequence[int] | npt.NDArray[np
     layout = block_layout(setup)
     p = max(s.stop for s in layout.values())
     theta, _, position = pose_sensitivities(motion, layout, p)
+    if setup.seen is not None:
+        rows = [
+            _frame_jacobian(motion, setup, layout, int(k), theta[k], position[k], ids)
+            for k, ids in zip(frames, setup.seen, strict=True)
+        ]
+        return _of_unknown_points(rows, setup, layout)
     information = np.zeros((p, p))
     for k in frames:
-        J = _frame_jacobian(motion, setup, layout, int(k), theta[k], position[k])
+        J = _frame_jacobian(motion, setup, layout, int(k), theta[k], position[k])[1]
         information += J.T @ J
     information /= setup.corner_sigma_px**2
     return judge(information, layout)
 
 
+def _of_unknown_points(
+    rows: list[tuple[IntArray, FloatArray]], setup: Setup, layout: dict[str, slice]
+) -> Observability:
+    """Judge images of points whose places are unknown: points eliminated by the Schur complement.
+
+    Where the first image was taken, and its heading, is the world's choice; so is what gravity does to its
+    tilt. With z up and gravity of known size this leaves all unknowns but attitude, position and gravity's z.
+    """
+    kept = np.concatenate([_horizontal(name, columns) for name, columns in layout.items()])
+    n = len(setup.landmarks_m)
+    H, V, W = np.zeros((len(kept), len(kept))), np.zeros((n, 3, 3)), np.zeros((n, 3, len(kept)))
+    for ids, stacked in rows:
+        J = stacked.reshape(len(ids), 2, -1)
+        by_point = -J[:, :, layout["position"]]  # a point that moves is a camera that moves back
+        J = J[:, :, kept]
+        H += np.einsum("nia,nib->ab", J, J)
+        V[ids] += np.swapaxes(by_point, 1, 2) @ by_point
+        W[ids] += np.swapaxes(by_point, 1, 2) @ J
+    V += (1e-12 * np.trace(V, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)  # seen once, or never
+    information = H - np.einsum("nia,nib->ab", W, np.linalg.solve(V, W))
+    blocks, start = {}, 0
+    for name, columns in layout.items():
+        size = len(_horizontal(name, columns))
+        if size:
+            blocks[name] = slice(start, start + size)
+            start += size
+    return judge(information / setup.corner_sigma_px**2, blocks)
+
+
+def _horizontal(name: str, columns: slice) -> IntArray:
+    """Columns of a block that are no choice of the world."""
+    if name in ("attitude", "position"):
+        return np.zeros(0, np.intp)
+    return np.arange(columns.start, columns.stop - (name == "gravity"))
+
+
 def _frame_jacobian(
-    motion: Motion, setup: Setup, layout: dict[str, slice], k: int, theta: FloatArray, position: FloatArray
-) -> FloatArray:
-    """Derivative of all visible pixels of one image by the unknowns, shape (2 n, p)."""
+    motion: Motion,
+    setup: Setup,
+    layout: dict[str, slice],
+    k: int,
+    theta: FloatArray,
+    position: FloatArray,
+    among: IntArray | None = None,
+) -> tuple[IntArray, FloatArray]:
+    """Points (n,) seen in one image, of those `among` which it shows, and derivatives of pixels (2 n, p)."""
     R, p0 = motion.R_world_imu[k], motion.p_world_imu[k]
-    arm = setup.landmarks_m - p0
+    landmarks = setup.landmarks_m if among is None else setup.landmarks_m[among]
+    arm = landmarks - p0
     in_imu = arm @ R
     in_cam = (in_imu - setup.p_imu_cam) @ setup.R_imu_cam
     uv, J_point, J_lens = project_jacobians(in_cam, setup.intrinsics, setup.distortion, setup.model)
@@ -164,8 +214,8 @@ def _frame_jacobian(
         row = uv[ids, 1] / height - 0.5
         dX[:, :, layout["readout"]] += (flow * row[:, None])[:, :, None]
     if "target_scale" in layout:
-        dX[:, :, layout["target_scale"]] += (setup.landmarks_m[ids] @ R_cam_world.T)[:, :, None]
-    if setup.target_free:
+        dX[:, :, layout["target_scale"]] += (landmarks[ids] @ R_cam_world.T)[:, :, None]
+    if "landmark" in layout:
         first = layout["landmark"].start
         for i, point in enumerate(ids):
             dX[i, :, first + 3 * point : first + 3 * point + 3] += R_cam_world
@@ -173,7 +223,7 @@ def _frame_jacobian(
     if "intrinsics" in layout:
         J[:, :, layout["intrinsics"]] += J_lens[ids, :, :4]
         J[:, :, layout["distortion"]] += J_lens[ids, :, 4:]
-    return np.asarray(J.reshape(2 * len(ids), -1), dtype=np.float64)
+    return ids if among is None else among[ids], np.asarray(J.reshape(2 * len(ids), -1), dtype=np.float64)
 
 
 def judge(information: FloatArray, layout: dict[str, slice], lost: float = _LOST) -> Observability:

@@ -64,6 +64,8 @@ class Setup:
         resolution: width, height, px; points outside are not seen.
         landmarks_m: Points in the world, m, shape (n, 3).
         target_free: The points' places are unknown too.
+        seen: Without a board, in a world with z up: rows of `landmarks_m` that each image shows. Their places
+            are unknown, and eliminated. None: the points inside of the image are seen.
         estimate: Of {"intrinsics", "imu_matrix", "target_scale", "readout"}: further unknowns.
         corner_sigma_px: Noise of a point per axis, px.
     """
@@ -78,6 +80,7 @@ class Setup:
     target_free: bool = False
     estimate: frozenset[str] = frozenset()
     corner_sigma_px: float = 0.5
+    seen: tuple[npt.NDArray[np.intp], ...] | None = None
 
 
 def block_layout(setup: Setup) -> dict[str, slice]:

@@ -36,6 +36,7 @@ def register_sensors(request: TdIcpRequest, names: list[str]) -> tuple[JointResu
         InputError: A name means nothing, or its data cannot be used.
     """
     path, options = request.path, request.options
+    names = _each_once(request, names)
     if is_trajectory(path):
         first, base = trajectory_file(path, None, request.warn)
         others = [trajectory_file(Path(name), base, request.warn)[0] for name in names if _file(name)]
@@ -61,6 +62,22 @@ def register_sensors(request: TdIcpRequest, names: list[str]) -> tuple[JointResu
         imu, t_ns, gyro = choose_gyro(recording, gyros[0])
         return joint_with_gyro(imu, seconds(t_ns, base_ns), gyro, streams, options), lenses
     return joint_of_orientations(streams, options), lenses
+
+
+def _each_once(request: TdIcpRequest, names: list[str]) -> list[str]:
+    """The names without those that were given before; INPUT is the first sensor where it is a trajectory."""
+    known = {request.path.resolve()} if is_trajectory(request.path) else set()
+    kept = []
+    for name in names:
+        place = Path(name).resolve()
+        if place in known:
+            request.warn(f"--sensors: {name} is given twice, and taken once")
+        else:
+            kept.append(name)
+            known.add(place)
+    if names and not kept:
+        raise OptionError(f"--sensors: {names[0]} is INPUT itself; name another sensor to register it with")
+    return kept
 
 
 def _integrated(recording: Recording, name: str, base_ns: int) -> OrientationStream:

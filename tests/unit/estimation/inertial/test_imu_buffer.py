@@ -77,3 +77,22 @@ def test_buffer_refuses_what_is_not_newer_and_stays_bounded_when_trimmed():
     assert len(buffer._rows) <= 4096
     assert not buffer.append(buffer.newest_s, np.zeros(3), np.zeros(3))
     assert buffer.segment(buffer.newest_s - 0.5, buffer.newest_s) is not None
+
+
+def test_turning_gives_the_turn_over_the_reach_exactly_and_shakes_in_between():
+    w, half_s = 2 * np.pi * 8.0, 0.015  # a hand's tremor
+    buffer = ImuBuffer(0)
+    for k in range(120):
+        buffer.append(0.01 * k, np.array([0.02 * np.sin(w * 0.01 * k), 0.3, 0.0]), np.zeros(3))
+    t = np.array([0.0, 0.2137, 0.5, 0.9731])
+    rate, change = buffer.turning(t, half_s)
+
+    def turn(a, b):
+        return np.stack([0.02 / w * (np.cos(w * a) - np.cos(w * b)), 0.3 * (b - a), 0.0 * a], axis=-1)
+
+    for u in (-half_s, -0.6 * half_s, 0.6 * half_s, half_s):
+        found = rate * u + 0.5 * change * u**2
+        assert np.abs((found - turn(t, t + u))[1:]).max() < 2e-5  # of 3e-4: what a readout of 30 ms sees
+    assert np.abs(rate[0] - [0.02 * np.sin(w * 1e-3) * 0.0, 0.3, 0.0]).max() < 2e-3  # at the first reading
+    slow = filled()
+    assert np.abs(slow.turning(np.array([0.7, 2.0]), 0.01)[0] - rates([0.7, 2.0])).max() < 1e-3

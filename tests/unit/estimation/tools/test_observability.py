@@ -324,3 +324,28 @@ def test_a_poor_motion_is_told_as_a_whole(rate, said):
     assert bool(unnamed) == bool(words)
     assert "image" not in unnamed
     assert bool(words) == bool(said)
+
+
+def test_points_of_unknown_place_are_eliminated_as_in_the_full_information():
+    motion, frames = _motion("general", 4.0), FRAMES[:30]
+    full = gramian(motion, _setup(target_free=True), frames)
+    points = len(_setup().landmarks_m)
+    seen = tuple(np.arange(points) for _ in frames)
+    found = gramian(motion, _setup(seen=seen), frames)
+    chosen = [name for name in found.blocks if name != "gravity"]
+    columns = np.concatenate([np.r_[full.blocks[name]] for name in chosen])
+    gravity = np.r_[full.blocks["gravity"]][:2]
+    order = np.concatenate([np.r_[found.blocks[name]] for name in chosen] + [np.r_[found.blocks["gravity"]]])
+    A, marks = full.information, np.r_[full.blocks["landmark"]]
+    at = np.concatenate([columns, gravity])
+    seen_often = np.diag(A)[marks] > 0.0
+    marks = marks[seen_often]
+    H = (
+        A[np.ix_(at, at)]
+        - A[np.ix_(at, marks)]
+        @ np.linalg.lstsq(A[np.ix_(marks, marks)], A[np.ix_(marks, at)], rcond=1e-13)[0]
+    )
+    got = found.information[np.ix_(order, order)]
+    scale = np.sqrt(np.diag(H))
+    assert found.rank == found.unknowns == 18
+    assert np.abs((got - H) / np.outer(scale, scale)).max() < 1e-6
