@@ -74,6 +74,7 @@ class Cause(StrEnum):
     SCENE_MOVES = "scene_moves"
     NO_PARALLAX = "no_parallax"
     SECOND_AXIS = "second_axis"
+    COLUMNS_READ = "columns_read"
     IMAGES_SHIFTED = "images_shifted"
 
 

@@ -344,6 +344,15 @@ class TargetFreeCalibrator:
             self.latest = carry if self._closed else None
             self._lost(Cause.NO_PARALLAX)
             return
+        assert self._buffer is not None
+        anew = self._first.by_columns(self._buffer, bundle, fit)
+        if anew is not None:
+            bundle, fit = anew
+            window, self._closed = bundle.window, 0
+            self.evaluator.lost(Cause.COLUMNS_READ, None, None)
+            self.evaluator.started(window.frames[0][0])
+            self.evaluator.saw_fit(fit, window.frames[-1][0] + window.shift_s)
+            self.latest, self._noise = fit.carry, Noise.of(fit)
         self._closed += 1
         self.evaluator.closed()
         if self.window_closed is not None:

@@ -255,6 +255,9 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.SECOND_AXIS: lambda _: (
         "the rig turns about a second axis now: starting anew, with all of the lever arm"
     ),
+    Cause.COLUMNS_READ: lambda _: (
+        "the images show that columns are read one after the other: starting anew with that"
+    ),
 }
 
 

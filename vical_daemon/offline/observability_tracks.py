@@ -7,6 +7,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from vical_daemon.config.priors import Initial
+from vical_daemon.estimation.measurements import ROWS
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
@@ -104,10 +105,10 @@ def _rebuilt(
         np.array(points),
         camera.distortion_model,
         camera.resolution,
-        target_free=True,
         estimate=blocks,
         corner_sigma_px=max(fit.sigma_px * fit.spread, 0.05),
         seen=tuple(seen[k] for k in chosen),
+        readout_axis=camera.readout_axis or ROWS,
     )
     return motion, setup, frames
 

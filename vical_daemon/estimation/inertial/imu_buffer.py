@@ -187,7 +187,7 @@ class ImuBuffer:
 
 
 class _Turns:
-    """Integral of the rate along the cubics between readings (t_s, gyro xyz) with slopes, (n, 4) and (n, 3)."""
+    """Integral of the rate along cubics between readings: t_s, gyro xyz (n, 4) and slopes (n, 3)."""
 
     def __init__(self, rows: FloatArray, slope: FloatArray) -> None:
         self._t, self._rate, self._slope = rows[:, 0], rows[:, 1:], slope

@@ -76,11 +76,11 @@ class TargetFreeDoubts:
             events.append(Event(EventKind.CLOCK_DRIFT, self._camera, float(carry.camera.skew), sigma))
         sigmas = np.sqrt(factor * np.diag(carry.calibration()))
         if not self.rolling:
-            readout_s, sigma_s = carry.camera.readout_s, float(sigmas[READOUT])
-            self.rolling = abs(readout_s) > max(SURE_SIGMAS * sigma_s, _SHORTEST_S)
+            self.rolling = self.rolls(carry, factor)
             if self.rolling:
                 kind = ROLLING[carry.camera.readout_axis or ROWS]
-                events.append(Event(kind, self._camera, float(readout_s), sigma_s))
+                readout_s = float(carry.camera.readout_s)
+                events.append(Event(kind, self._camera, readout_s, float(sigmas[READOUT])))
         if compared:
             weights = self._weights(carry, factor)
             known = {name for name in _WHERE if model_selection.not_zero(weights, name) > SURE}
@@ -88,6 +88,12 @@ class TargetFreeDoubts:
             events += [known_off(name, _numbers(carry)[at], sigmas[at]) for name, at in news]
             self._off |= known
         return events
+
+    @staticmethod
+    def rolls(carry: MarginalPrior, factor: float = 1.0) -> bool:
+        """Whether a readout is beyond doubt; `factor`: measured variance over the stated one."""
+        sigma_s = float(np.sqrt(factor * carry.calibration()[READOUT, READOUT]))
+        return abs(carry.camera.readout_s) > max(SURE_SIGMAS * sigma_s, _SHORTEST_S)
 
     def reason(self, carry: MarginalPrior, factor: float, *, converged: bool) -> str:
         """What may not be as it is taken to be, in words; empty where nothing speaks for it.

@@ -7,17 +7,22 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, CameraPrior
+from vical_daemon.estimation.measurements import COLUMNS, BoolArray, CalibrationOptions, CameraPrior
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
-from vical_daemon.estimation.smoother.shutter_axis import read_by_columns, shows_columns
+from vical_daemon.estimation.smoother.shutter_axis import (
+    read_by_columns,
+    readout_sigmas,
+    shows_columns,
+)
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
 
 _STEPS = 30  # of the adjustment, at most
+_INDEPENDENT = 2.0  # images; pixel errors that last for more than half a window: its model is wrong
 DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
 
 
@@ -97,12 +102,14 @@ class FirstWindow:
     ) -> Begun | None:
         """Adjust a first window with what is known but for some errors; None where it does not fit."""
         bundle, carry, fit = self._solved(buffer, window, known, noise, reopened)
-        seek_axis = known is None and not (self._prior.readout_axis or self._prior.readout_s)
+        seek_axis = known is None and self._seeks_axis
         if seek_axis and fit is not None and shows_columns(bundle, fit):
             by_columns = self._solved(buffer, read_by_columns(window), known, noise, reopened)
-            if by_columns[2] is not None and by_columns[2].sigma_px < fit.sigma_px:
+            if by_columns[2] is not None and readout_sigmas(by_columns[2].carry) > readout_sigmas(fit.carry):
                 bundle, carry, fit = by_columns
         if fit is None or not (fit.settled and self._status.fits(fit, first=True)):
+            return None
+        if len(bundle.window.frames) < _INDEPENDENT * fit.spread**2:
             return None
         if known is not None and not self._status.agrees(fit, carry, complete=False):
             return None
@@ -110,6 +117,28 @@ class FirstWindow:
             axis = bundle.window.camera.readout_axis
             self._prior = self.initializer.prior = replace(self._prior, readout_axis=axis)
         return Begun(bundle, fit)
+
+    @property
+    def _seeks_axis(self) -> bool:
+        """Whether rows are read one after the other only because nothing else has been seen."""
+        return not (self._prior.readout_axis or self._prior.readout_s)
+
+    def by_columns(self, buffer: ImuBuffer, bundle: Bundle, fit: Fit) -> Begun | None:
+        """Begin anew with a complete window that shows a readout by columns, which is known from then on.
+
+        The first window may have had too little motion, or too much noise, to show it. What was found before,
+        with rows, is not kept.
+        """
+        doubts, factor = self._status.doubts, self._status.factor()
+        if not self._seeks_axis or doubts.rolls(fit.carry, factor) or not shows_columns(bundle, fit):
+            return None
+        found = self._solved(buffer, read_by_columns(bundle.window), None, Noise.of(fit), ())
+        if found[2] is None or not (found[2].settled and self._status.fits(found[2], first=True)):
+            return None
+        if not doubts.rolls(found[2].carry) or readout_sigmas(found[2].carry) < readout_sigmas(fit.carry):
+            return None
+        self._prior = self.initializer.prior = replace(self._prior, readout_axis=COLUMNS)
+        return Begun(found[0], found[2])
 
     def _solved(
         self,

@@ -1,13 +1,16 @@
-"""Whether a rolling shutter reads columns instead of rows: asked of the first window that is adjusted."""
+"""Whether a rolling shutter reads columns instead of rows: asked of first windows and of complete ones."""
 
 from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import replace
 
+import numpy as np
+
 from vical_daemon.estimation.measurements import COLUMNS
 from vical_daemon.estimation.significance import COLUMNS_TRIED, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
+from vical_daemon.estimation.smoother.marginal_prior import READOUT, MarginalPrior
 from vical_daemon.estimation.smoother.window import Window
 
 
@@ -21,6 +24,14 @@ def shows_columns(bundle: Bundle, fit: Fit) -> bool:
         return False
     chance = chi_square_limit(1, COLUMNS_TRIED) * max(fit.squares / fit.dof, 1.0)
     return bundle.problem.late_by_columns(bundle.seen) > chance
+
+
+def readout_sigmas(carry: MarginalPrior) -> float:
+    """By how many sigmas a readout differs from none: the axis of which it does by more explains more.
+
+    Its square is by how much the squared errors, over their noise, grow with a global shutter. [Wald 1943]
+    """
+    return abs(carry.camera.readout_s) / float(np.sqrt(carry.calibration()[READOUT, READOUT]))
 
 
 def read_by_columns(window: Window) -> Window:

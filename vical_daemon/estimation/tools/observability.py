@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.tools.observability_setup import UNITS, Motion, Setup, block_layout
 
 __all__ = [
@@ -211,7 +212,7 @@ def _frame_jacobian(
     flow = by_theta @ (R @ motion.rate_rps[k]) - R_cam_world @ motion.v_world_imu[k]
     dX[:, :, layout["timeshift"]] += flow[:, :, None]
     if "readout" in layout:
-        row = uv[ids, 1] / height - 0.5
+        row = read_share(uv[ids], setup.resolution, setup.readout_axis)
         dX[:, :, layout["readout"]] += (flow * row[:, None])[:, :, None]
     if "target_scale" in layout:
         dX[:, :, layout["target_scale"]] += (landmarks[ids] @ R_cam_world.T)[:, :, None]

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import ROWS
+
 FloatArray = npt.NDArray[np.float64]
 
 # What counts as one step of each parameter: makes metres, radians and seconds comparable
@@ -66,6 +68,7 @@ class Setup:
         target_free: The points' places are unknown too.
         seen: Without a board, in a world with z up: rows of `landmarks_m` that each image shows. Their places
             are unknown, and eliminated. None: the points inside of the image are seen.
+        readout_axis: What a rolling shutter reads one after the other.
         estimate: Of {"intrinsics", "imu_matrix", "target_scale", "readout"}: further unknowns.
         corner_sigma_px: Noise of a point per axis, px.
     """
@@ -81,6 +84,7 @@ class Setup:
     estimate: frozenset[str] = frozenset()
     corner_sigma_px: float = 0.5
     seen: tuple[npt.NDArray[np.intp], ...] | None = None
+    readout_axis: str = ROWS
 
 
 def block_layout(setup: Setup) -> dict[str, slice]:
