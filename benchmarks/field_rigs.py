@@ -54,6 +54,7 @@ class Fault:
         change: Of the recording.
         kinds: Events that report it; empty: none is needed.
         text: Part of a warning or of the error that reports it.
+        counted: What of `left_out` counts it.
         answers: There is to be a calibration; otherwise the error is to name the mistake.
         rest: The rig rests before it moves.
         moving: Share of the landmarks that move.
@@ -62,6 +63,7 @@ class Fault:
     change: Change = lambda data, _: data
     kinds: frozenset[str] = frozenset()
     text: str = ""
+    counted: str = ""
     answers: bool = True
     rest: bool = False
     moving: float = 0.0
@@ -133,11 +135,11 @@ BOTH: dict[str, Fault] = {
     "IMU rows doubled and swapped": Fault(_swapped),
     "gyro clipped (10 % of the readings)": Fault(partial(_clip, slice(0, 3)), _kinds(Kind.IMU_CLIPPED)),
     "accelerometer clipped (10 %)": Fault(partial(_clip, slice(3, 6)), _kinds(Kind.IMU_CLIPPED)),
-    "40 gyro spikes": Fault(FAULTS["spikes"][1]),
+    "40 gyro spikes": Fault(FAULTS["spikes"][1], counted="imu_spikes"),
     "IMU gap of 0.5 s": Fault(_gap, _kinds(Kind.IMU_GAP)),
     "IMU frozen for 1 s": Fault(_frozen, _kinds(Kind.IMU_REPEATED)),
-    "10 % of the images delivered twice": Fault(FAULTS["twice"][1], _kinds(Kind.IMAGE_REPEATED)),
-    "two points with one id": Fault(_recycled, text="one id"),
+    "10 % of the images delivered twice": Fault(FAULTS["twice"][1], counted="images_repeated"),
+    "two points with one id": Fault(_recycled, text="id seen twice"),
     "60 s at rest before": Fault(rest=True),
 }
 BOARD = BOTH | {
@@ -209,7 +211,7 @@ def _calibrate(folder: Path, initial: Initial, target: str | None) -> runner.Res
     result["cpu_s"] = time.process_time() - begin_s
     lost = result["status"] in ("waiting", "initialising", "inconsistent") or not result["cameras"]
     result["said"] = (diagnose_input(job) if lost else "") or result["reason"]
-    kept = ("status", "said", "cameras", "events", "cpu_s", "warnings")
+    kept = ("status", "said", "cameras", "events", "cpu_s", "warnings", "left_out")
     return {key: result[key] for key in kept}
 
 
@@ -228,7 +230,7 @@ def row(name: str, fault: Fault, results: list[runner.Result], undisturbed: list
         ", ".join(f"{status} {count}" for status, count in ends.most_common()),
         f"{sum(d <= 3.0 for d in away)} of {len(away)}",
         f"{np.median(away):.1f} / {max(away):.1f}" if away else "-",
-        f"{reported} of {len(pairs)}" if fault.kinds or fault.text else "(nothing)",
+        f"{reported} of {len(pairs)}" if fault.kinds or fault.text or fault.counted else "(nothing)",
         ", ".join(f"{kind} {count}" for kind, count in others.most_common()) or "-",
         str(bumps),
         f"{np.median(cpu):.1f} / {max(cpu):.1f}" if cpu else "-",
@@ -237,6 +239,8 @@ def row(name: str, fault: Fault, results: list[runner.Result], undisturbed: list
 
 
 def _reported(fault: Fault, result: runner.Result) -> bool:
+    if fault.counted:
+        return bool(result.get("left_out", {}).get(fault.counted))
     texts = [result["said"], *result.get("warnings", []), *(e.get("text", "") for e in result["events"])]
     return bool(
         fault.kinds & {e["kind"] for e in result["events"]}

@@ -33,6 +33,10 @@ def describe(result: dict[str, Any]) -> str:
             )
     if result.get("events"):
         lines += ["", *(f"  {event['text']}" for event in result["events"])]
+    left_out = {name: count for name, count in result.get("left_out", {}).items() if count}
+    if left_out:
+        counts = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in left_out.items())
+        lines += ["", f"  not used: {counts}"]
     if result.get("guidance"):
         lines += ["", f"  what would help: {result['guidance']}"]
     lines += [

@@ -77,7 +77,9 @@ class TargetFreeRig:
     def left_out(self) -> dict[str, int]:
         """Readings (all cameras take the same) and images that were not used, by cause."""
         counts = [part.left_out for part in self.parts.values()]
-        return {**counts[0], "images_ignored": self._strangers + sum(c["images_ignored"] for c in counts)}
+        images = {name: sum(c[name] for c in counts) for name in ("images_ignored", "images_repeated")}
+        images["images_ignored"] += self._strangers
+        return counts[0] | images
 
     def process(self) -> list[FrameReport]:
         """Do what can be done with what has arrived; reports on the images of windows that are complete."""

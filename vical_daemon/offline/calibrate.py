@@ -68,6 +68,7 @@ class Outcome:
         frames: The verdict on every frame, where it was asked for.
         inputs: What became of each recording, where there are several.
         held_out: How well the IMU alone predicted images before they were used, see `HeldOutCheck`.
+        left_out: Readings and images that were not used, by cause, see `Estimator.left_out`.
     """
 
     estimate: CalibrationEstimate
@@ -75,6 +76,7 @@ class Outcome:
     frames: list[FrameReport] = field(default_factory=list)
     inputs: list[InputUse] = field(default_factory=list)
     held_out: list[dict[str, float]] = field(default_factory=list)
+    left_out: dict[str, int] = field(default_factory=dict)
 
 
 def run_job(
@@ -111,7 +113,9 @@ def run_job(
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
     checks = [asdict(check) for check in estimator.held_out()]
     used = inputs if len(parts) > 1 else []
-    return Outcome(replace(role.latest, events=player.events), traces, frames, used, checks)
+    return Outcome(
+        replace(role.latest, events=player.events), traces, frames, used, checks, estimator.left_out
+    )
 
 
 class _Player:
@@ -245,6 +249,7 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     if len(job.cameras) > 1:
         result["traces"] = outcome.traces
     result["held_out"] = outcome.held_out
+    result["left_out"] = outcome.left_out
     result["cpu_s"] = time.process_time()
     return result
 

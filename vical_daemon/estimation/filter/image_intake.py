@@ -63,9 +63,11 @@ class ImageIntake:
 
     Attributes:
         refused: Images left out.
+        repeated: Those of them that were the last one again.
     """
 
     refused: int = 0
+    repeated: int = 0
     _streams: dict[str, _Stream] = field(default_factory=dict)
     _news: list[Event] = field(default_factory=list)
 
@@ -86,6 +88,7 @@ class ImageIntake:
             return t_cam_s
         if _same(stream.newest, frame):
             stream.repeats += 1
+            self.repeated += 1
             self.refused += 1
             return None
         t_s = t_cam_s + stream.offset_s

@@ -62,7 +62,8 @@ class SensorIntake:
     @property
     def left_out(self) -> dict[str, int]:
         """Readings and images that were not used, by cause."""
-        return {**self._imu.left_out, "images_ignored": self.images_ignored}
+        images = {"images_ignored": self.images_ignored, "images_repeated": self._images.repeated}
+        return {**self._imu.left_out, **images}
 
     def take_imu(
         self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]
