@@ -57,7 +57,7 @@ class TargetFreeDoubts:
         self.imu_asked = model_selection.IMU in asked
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
         self.drifting = False
-        self.rolling = rolling
+        self.rolling = self._rolling_known = rolling
         self.stamp_sigma_s = 0.0
         self._began_s = np.inf
 
@@ -88,6 +88,10 @@ class TargetFreeDoubts:
             events += [known_off(name, _numbers(carry)[at], sigmas[at]) for name, at in news]
             self._off |= known
         return events
+
+    def axis_changed(self) -> None:
+        """What was seen of a readout was seen with the wrong axis."""
+        self.rolling = self._rolling_known
 
     @staticmethod
     def rolls(carry: MarginalPrior, factor: float = 1.0) -> bool:

@@ -129,15 +129,16 @@ class FirstWindow:
         The first window may have had too little motion, or too much noise, to show it. What was found before,
         with rows, is not kept.
         """
-        doubts, factor = self._status.doubts, self._status.factor()
-        if not self._seeks_axis or doubts.rolls(fit.carry, factor) or not shows_columns(bundle, fit):
+        if not self._seeks_axis or not shows_columns(bundle, fit):
             return None
         found = self._solved(buffer, read_by_columns(bundle.window), None, Noise.of(fit), ())
         if found[2] is None or not (found[2].settled and self._status.fits(found[2], first=True)):
             return None
-        if not doubts.rolls(found[2].carry) or readout_sigmas(found[2].carry) < readout_sigmas(fit.carry):
+        sure = self._status.doubts.rolls(found[2].carry)
+        if not sure or readout_sigmas(found[2].carry) < readout_sigmas(fit.carry):
             return None
         self._prior = self.initializer.prior = replace(self._prior, readout_axis=COLUMNS)
+        self._status.doubts.axis_changed()
         return Begun(found[0], found[2])
 
     def _solved(
