@@ -92,15 +92,16 @@ class SpikeFilter(Generic[T]):
 
     A straight line through the two readings before predicts each one. A reading that is far from it is held
     until the next one. It was a spike if that is back where the motion was and the other sensor saw nothing:
-    a shock shows in gyro and accelerometer, and a motion goes on.
+    a shock shows in gyro and accelerometer, and a motion goes on. Two in a row that are as far from each other
+    do not support each other: the one after them decides.
 
     Attributes:
-        held: The reading that is held, with whatever was given along; None: none.
+        held: The readings that are held, two at most, with whatever was given along.
         spikes: Readings left out.
     """
 
     def __init__(self) -> None:
-        self.held: tuple[Six, T] | None = None
+        self.held: list[tuple[Six, T]] = []
         self.spikes = 0
         self._last: Six = (math.nan,) * 6
         self._before: Six = (math.nan,) * 6
@@ -110,30 +111,34 @@ class SpikeFilter(Generic[T]):
 
     def restart(self) -> None:
         """Another recording follows: its first readings do not go on from the last ones."""
-        self.held, self._count = None, 0
+        self.held, self._count = [], 0
         self._last = self._before = (math.nan,) * 6
 
     def sift(self, six: Six, item: T) -> list[T]:
         """Take a reading (rad/s, m/s^2) and return the items of those that are good, in order."""
-        if self.held is not None:
-            held_six, held_item = self.held
-            self.held = None
-            back, off = _apart(six, self._last), _apart(held_six, self._last)
+        if self.held:
+            first = self.held[0][0]
+            back, off = _apart(six, self._last), _apart(first, self._last)
             gyro, accel = (x / max(usual, 1e-12) for x, usual in zip(off, self._largest, strict=True))
             which = int(accel > gyro)
             if back[which] < 0.5 * off[which]:
-                self.spikes += 1
+                self.spikes += len(self.held)
+                self.held = []
                 self._note(six, self._missed(six))
                 return [item]
-            self._note(held_six, self._missed(held_six))
-            self._note(six, self._missed(six))
-            return [held_item, item]
+            self.held.append((six, item))
+            if len(self.held) == 2 and _apart(six, first)[which] > 0.5 * off[which]:
+                return []
+            released, self.held = self.held, []
+            for good, _ in released:
+                self._note(good, self._missed(good))
+            return [x for _, x in released]
         missed = self._missed(six)
         if len(self._first) >= _LEARN:
             (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
             gyro_off = gyro > _HARMFUL[0] and gyro > _SPIKE * usual_gyro
             if gyro_off != (accel > _HARMFUL[1] and accel > _SPIKE * usual_accel):
-                self.held = six, item
+                self.held = [(six, item)]
                 return []
         self._note(six, missed)
         return [item]

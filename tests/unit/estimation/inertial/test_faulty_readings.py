@@ -73,6 +73,15 @@ def test_single_spikes_are_left_out_and_nothing_else() -> None:
     assert sifted(six) == np.setdiff1d(np.arange(len(six)), at).tolist()
 
 
+def test_two_spikes_in_a_row_are_left_out_and_hide_no_later_ones() -> None:
+    six = motion()
+    six[300, 0] += 9.0
+    six[301, 1] -= 14.0
+    later = np.arange(320, 700, 20)
+    six[later, 2] += 5.0
+    assert sifted(six) == np.setdiff1d(np.arange(len(six)), [300, 301, *later]).tolist()
+
+
 def test_a_spike_among_the_first_readings_does_not_hide_later_ones() -> None:
     six = motion()
     for at in (0, 5, 18, 60, 100, 140):
