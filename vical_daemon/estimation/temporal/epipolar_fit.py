@@ -194,6 +194,8 @@ class _Fit:
                 self.intrinsics = self.intrinsics + dx[7:11]
                 self.distortion = self.distortion + dx[11:]
                 self._rays()
+                if np.count_nonzero(self.ok) < size:  # the lens has run away: few pixels have a ray
+                    return None
             if step > _LENS_AFTER + 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
                 break
         return self._result(R, shift, bias, weight)
