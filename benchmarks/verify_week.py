@@ -2,8 +2,8 @@
 
 python -m benchmarks verify_week --trials 40            as many robots, every other one without a board
 
-Each robot is a rig of the zoo with a calibration from a minute of hand motion before its board. Then it
-works: it moves calmly before the board, or drives along corridors without one, and rests now and then. The
+Each robot is a rig of the zoo with a calibration from half a minute of hand motion before its board. Then
+it works: it moves calmly before the board, or drives along corridors without one, and rests now and then. The
 checks are those of the daemon (`calibrate/verification.py`, messages in, answers out); pauses cost nothing,
 because the clock is simulated. Each robot makes `--stretches` stretches of data, which are spread over a
 week: biases walk, the temperature follows the day, and with it biases, focal length, mounting and time
@@ -47,7 +47,8 @@ from vical_daemon.results.verifier import Answer
 from vical_daemon.vision.target import Checkerboard
 
 WEEK_S = 7 * 86400.0
-STORED_S = 60.0
+STORED_S = 30.0
+SUSPECTED, NO_START = "changed once", "no start"
 T0_NS = 1_800_000_000 * 10**9
 _RIG, _IMU = "rig0", "imu0"
 _KELVIN = 8.0  # warmer in the afternoon than at night, either way from the mean
@@ -217,19 +218,20 @@ class Work:
         if checks.used_s == 0.0:
             self._note(before)
 
-    def _state(self) -> tuple[int, float]:
-        return self._verification.checks, self._verification.used_s
+    def _state(self) -> tuple[int, float, bool]:
+        checks = self._verification
+        return checks.checks, checks.used_s, checks.probability(CAMERA) is not None
 
-    def _note(self, before: tuple[int, float]) -> None:
+    def _note(self, before: tuple[int, float, bool]) -> None:
         """Note how a check ended."""
-        checks, used_s = self._verification, before[1]
+        checks, (count, used_s, started) = self._verification, before
         self.looks += round(used_s)
         if checks.suspected:
-            self.answers.append("changed once")
-        elif checks.checks > before[0]:
+            self.answers.append(SUSPECTED)
+        elif checks.checks > count:
             self.answers.append(str(checks.answers[CAMERA].verdict))
         else:
-            self.answers.append("cannot tell")
+            self.answers.append(str(Answer.CANNOT_TELL) if started else NO_START)
 
 
 def trial(stretches: int, seed: int) -> runner.Result:
@@ -257,8 +259,8 @@ def trial(stretches: int, seed: int) -> runner.Result:
 
 def print_summary(results: list[runner.Result]) -> None:
     """One row with a board, one without."""
-    words = ("holds", "changed once", str(Answer.CHANGED), "cannot tell")
-    print("| | robots | stretches of data | checks | " + " | ".join(words) + " | CPU s a stretch |")
+    words = (str(Answer.HOLDS), SUSPECTED, str(Answer.CHANGED), str(Answer.CANNOT_TELL), NO_START)
+    print("| | robots | stretches of data | checks ended | " + " | ".join(words) + " | CPU s a stretch |")
     print("|---|---|---|---|" + "---|" * (len(words) + 1))
     for name, free in (("board", False), ("no board", True)):
         own = [r for r in results if r["target_free"] is free and "answers" in r]
@@ -283,7 +285,7 @@ def main(argv: list[str]) -> int:
     results = runner.run_trials(name, partial(trial, args.stretches), runner.seeds_of(args), args, code)
     print_summary(results)
     for seed, r in zip(runner.seeds_of(args), results, strict=True):
-        wrong = [a for a in r.get("answers", []) if a in ("changed once", str(Answer.CHANGED))]
+        wrong = [a for a in r.get("answers", []) if a in (SUSPECTED, str(Answer.CHANGED))]
         if wrong:
             print(f"seed {seed}: {wrong} of {len(r['answers'])} checks")
     return 0
