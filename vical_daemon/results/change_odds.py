@@ -24,8 +24,9 @@ PRIOR = 0.05
 """Probability of a change before the recording, one recording in twenty; for `probability_changed` alone."""
 _SIZES = (1.0, 3.0, 10.0)  # a change, where there is one, is of the order of one of these times what counts
 _DIRECTIONS = 400  # on the sphere; the worst of them is within 6 deg of the worst of all
-_SURE = 1.645  # sigmas: what is called visible is shown by 95 % of recordings
-VISIBLE = _SURE + math.sqrt(_SURE**2 + 2.0 * math.log(1.0 / MISSED))
+SURE = 1.645
+"""Sigmas: what is called visible is shown by 95 % of recordings."""
+VISIBLE = SURE + math.sqrt(SURE**2 + 2.0 * math.log(1.0 / MISSED))
 """Sigmas x from which a change is visible: x^2/2 - 1.645 x = ln(1/MISSED)."""
 
 
