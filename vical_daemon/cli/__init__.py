@@ -111,7 +111,8 @@ def _dispatch(words: list[str]) -> int:
         )
     args, more = parser.parse_known_args(words)
     if more:
-        near, help_of = _nearest_option(parser, selected, more[0]), " ".join(filter(None, ["vical", selected]))
+        near = _nearest_option(parser, selected, more[0])
+        help_of = " ".join(filter(None, ["vical", selected]))
         text = f"{selected or 'vical'}: unexpected argument {more[0]!r}{near} (see `{help_of} --help`)"
         raise errors.CliError(text, errors.EXIT_USAGE)
     if args.version:
