@@ -17,6 +17,7 @@ from vical_daemon.logs.model import ImuArrays
 from vical_daemon.offline.calibrate import run_job
 from vical_daemon.offline.calibration_job import make_job
 from vical_daemon.offline.errors import InputError
+from vical_daemon.offline.td_icp.sources import seconds
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -71,8 +72,12 @@ def _rebuilt(
 ) -> tuple[Motion, Setup, IntArray]:
     """Motion at the imu's readings, points in one world, and who saw what."""
     base_ns = run[0][0].frames[0][1].t_cam_ns + shift_ns
-    t, R, p, points, seen = [], [], [], [], []
-    origin, row_of = np.zeros(3), {}
+    t: list[float] = []
+    R: list[FloatArray] = []
+    p: list[FloatArray] = []
+    points: list[FloatArray] = []
+    seen: list[IntArray] = []
+    origin, row_of = np.zeros(3), dict[int, int]()
     for number, (window, _) in enumerate(run):
         marks = window.landmarks
         places = marks.anchor + marks.bearing / np.maximum(marks.inverse, 1e-3)[:, None]
@@ -117,7 +122,7 @@ def _motion(
     t: FloatArray, R: FloatArray, p: FloatArray, imu: ImuArrays, base_ns: int, gyro_bias: FloatArray
 ) -> Motion:
     """The motion between images: attitude by the gyro from the middle one, position by a spline."""
-    t_imu = (imu.t_ns - base_ns) * 1e-9
+    t_imu = seconds(imu.t_ns, base_ns)
     fresh = np.concatenate(([True], np.diff(t_imu) > 1e-6))
     curve = GyroCurve.integrate(t_imu[fresh], imu.gyro_rps[fresh], gyro_bias)
     middle = len(t) // 2

@@ -92,8 +92,8 @@ class SpikeFilter(Generic[T]):
 
     A straight line through the two readings before predicts each one. A reading that is far from it is held
     until the next one. It was a spike if that is back where the motion was and the other sensor saw nothing:
-    a shock shows in gyro and accelerometer, and a motion goes on. Two in a row that are as far from each other
-    do not support each other: the one after them decides.
+    a shock shows in gyro and accelerometer, and a motion goes on. Two in a row that are far from each other,
+    too, do not support each other: the one after them decides.
 
     Attributes:
         held: The readings that are held, two at most, with whatever was given along.
