@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vical_mocks.points import simulate
 from vical_mocks.rig import reference_rig
+from vical_mocks.tracks import simulate_tracks
 from vical_mocks.trajectory import one_axis
 
 from vical_daemon.cli import main
@@ -20,7 +21,7 @@ colSpacingMeters: 0.05
 """
 
 
-def _write(folder, run, *, gyro_factor=1.0, late_s=0.0, stretch=1.0):
+def _write(folder, run, *, gyro_factor=1.0, late_s=0.0, stretch=1.0, kind="corners"):
     """The recording as an ASL folder; the gyro's unit and the camera's stamps may be spoiled."""
     (folder / "mav0/imu0").mkdir(parents=True)
     (folder / "mav0/cam0").mkdir(parents=True)
@@ -33,7 +34,7 @@ def _write(folder, run, *, gyro_factor=1.0, late_s=0.0, stretch=1.0):
         first = run.frames[0].t_cam_ns
         stamp = first + round(stretch * (frame.t_cam_ns - first) + late_s * 1e9)
         rows += [f"{stamp},{i},{u},{v}" for i, (u, v) in zip(frame.ids, frame.uv_px, strict=True)]
-    (folder / "mav0/cam0/corners.csv").write_text("\n".join(rows))
+    (folder / f"mav0/cam0/{kind}.csv").write_text("\n".join(rows))
     (folder / "mav0/cam0/sensor.yaml").write_text("resolution: [640, 480]\n")
     (folder / "target.yaml").write_text(TARGET)
     lens = run.rig.lens
@@ -141,6 +142,21 @@ def test_watching_follows_the_delay(tmp_path, capsys, run):
     assert code == 0 and len(result["watch"]) >= 2
     assert all(abs(w["timeshift_s"] - 0.012) < 5 * w["timeshift_sigma_s"] for w in result["watch"])
     assert not any(w["jumped"] for w in result["watch"])
+
+
+def test_observability_without_a_board(tmp_path, capsys):
+    run = simulate_tracks(4, 10.0, timeshift_cam_imu_s=0.012, camera_rate_hz=10.0)
+    folder = _write(tmp_path, run, kind="tracks")
+    assert main(["observability", str(folder), "--initial", str(folder / "initial.yaml"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (
+        result["rank"] == result["unknowns"] == result["model"]["rank"] == result["model"]["unknowns"] == 18
+    )
+    assert result["observable"] and not result["missing"]
+    arm = np.array(result["sigma"]["lever_arm"])
+    assert (arm > 1e-5).all() and (arm < 2e-3).all()  # the Cramer-Rao bound of such rigs: 0.3 mm after 10 s
+    assert main(["observability", str(folder), "--target", str(folder / "target.yaml")]) == 1
+    assert "leave out --target" in capsys.readouterr().err
 
 
 def test_observability_names_what_one_axis_does_not_show(tmp_path, capsys):
