@@ -15,14 +15,14 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks import ablation_data as data
-from benchmarks import runner
+from benchmarks import runner, target_free
 from benchmarks.ablation_board import BOARD
 from benchmarks.ablation_disturbances import DISTURBANCES, disturbed
 from benchmarks.ablation_free import FREE
@@ -34,14 +34,20 @@ MECHANISMS = BOARD | FREE
 Trial = tuple[str, str, int, "partial[runner.Result]"]
 """Data, case, seed, and what runs it."""
 _EUROC = {"fixed": 0, "free": 0, "tracks": 0}
-_RIGS, _FREE_RIGS, _OWN, _SEEDS = range(301, 305), range(301, 304), range(2), range(1)
+_RIGS, _FREE_RIGS, _OWN, _SEEDS = range(301, 305), range(301, 311), range(2), range(1)
 
 
-def trials(wanted: set[str], name: str) -> Iterator[Trial]:
-    """What is to be run without a mechanism, or as it is."""
-    mechanism = MECHANISMS.get(name)
-    board = mechanism is None or not mechanism.free
-    free = mechanism is None or mechanism.free or name in SHARED
+def trials(wanted: set[str], name: str, compared: Collection[str] = ()) -> Iterator[Trial]:
+    """What is to be run without a mechanism, or as it is.
+
+    Args:
+        wanted: Kinds of data.
+        name: Of the mechanism, or `NOTHING`.
+        compared: Mechanisms with which the estimation as it is will be compared; none: all.
+    """
+    asked = [name] if name in MECHANISMS else [m for m in MECHANISMS if not compared or m in compared]
+    board = any(not MECHANISMS[m].free for m in asked)
+    free = any(MECHANISMS[m].free or m in SHARED for m in asked)
     if "euroc" in wanted:
         for mode in _EUROC:
             if free if mode == "tracks" else board:
@@ -52,18 +58,20 @@ def trials(wanted: set[str], name: str) -> Iterator[Trial]:
     if "free_rigs" in wanted and free:
         for seed in _FREE_RIGS:
             yield "free_rigs", "", seed, partial(data.random_rig, True, seed)
-    if "faults" in wanted:
-        own = set(data.FAULTS) if mechanism is None else set(mechanism.faults)
-        for fault in data.FAULTS:
-            if fault in own:
-                for seed in _OWN:
-                    yield "faults", fault, seed, partial(data.faulty_rig, fault, seed)
-    cases = set(DISTURBANCES) if mechanism is None else set(mechanism.disturbances)
-    for kind, on, target_free in (("disturbances", board, False), ("free_disturbances", free, True)):
+    if "free_recordings" in wanted and free:
+        for case in target_free.CASES:
+            yield "free_recordings", case, 0, partial(data.recording, case)
+    own = {fault for m in asked for fault in MECHANISMS[m].faults}
+    for fault in data.FAULTS:
+        kind = "free_faults" if fault.startswith("free:") else "faults"
+        for seed in _OWN if kind in wanted and fault in own else ():
+            yield kind, fault, seed, partial(data.faulty_rig, fault, seed)
+    cases = {case for m in asked for case in MECHANISMS[m].disturbances}
+    for kind, on, without_board in (("disturbances", board, False), ("free_disturbances", free, True)):
         for seed in _SEEDS if kind in wanted and on else ():
             for case in DISTURBANCES:
                 if case in cases:
-                    yield kind, case, seed, partial(disturbed, case, name, target_free, seed)
+                    yield kind, case, seed, partial(disturbed, case, name, without_board, seed)
 
 
 SHARED = {
@@ -75,7 +83,10 @@ SHARED = {
     "images repeated",
 }
 """Mechanisms with a board that also serve without."""
-DATA = ("euroc", "rigs", "faults", "disturbances", "free_rigs", "free_disturbances")
+DATA = (
+    *("euroc", "rigs", "faults", "disturbances"),
+    *("free_rigs", "free_recordings", "free_faults", "free_disturbances"),
+)
 
 
 def main(argv: list[str]) -> int:
@@ -110,7 +121,7 @@ def _run(store: Path, wanted: list[str], names: list[str], code: str, accepted: 
             for name in names:
                 begin = time.process_time()
                 with without(MECHANISMS.get(name)):
-                    for which, case, seed, run in trials({kind}, name):
+                    for which, case, seed, run in trials({kind}, name, names):
                         if (name, which, case, seed) in done:
                             continue
                         row = {"mechanism": name, "data": which, "case": case, "seed": seed, "code": code}
