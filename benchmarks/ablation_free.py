@@ -89,7 +89,7 @@ FREE: dict[str, Mechanism] = {
     "free: walk of the delay": Mechanism(
         MOVED,
         "the time shift may wander from window to window",
-        lambda: [(handover, "_SHIFT_WALK", 0.0)],
+        lambda: [(handover, "SHIFT_WALK", 0.0)],
         **_RULE,
     ),
     "free: lasting jitter": Mechanism(
