@@ -4,6 +4,7 @@
     python -m benchmarks ablation --data euroc,rigs            some data
     python -m benchmarks ablation --only "noise scale"         some mechanisms (may be repeated)
     python -m benchmarks ablation --table                      the tables of what has been run
+    python -m benchmarks ablation --firing                     how often target-free rules change a decision
 
 Nothing in the product knows of it: `ablation_patches` changes the estimation while the study runs. It can
 be interrupted; what has been run is in the folder --out.
@@ -15,6 +16,7 @@ import argparse
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Collection, Iterator
 from functools import partial
 from pathlib import Path
@@ -25,6 +27,7 @@ from benchmarks import ablation_data as data
 from benchmarks import runner, target_free
 from benchmarks.ablation_board import BOARD
 from benchmarks.ablation_disturbances import DISTURBANCES, disturbed
+from benchmarks.ablation_firing import counted
 from benchmarks.ablation_free import FREE
 from benchmarks.ablation_patches import without
 from benchmarks.ablation_tables import print_tables
@@ -95,6 +98,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--data", default=",".join(DATA), help=f"which data (default: {','.join(DATA)})")
     parser.add_argument("--only", action="append", help="only this mechanism (may be repeated)")
     parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--firing", action="store_true", help="count decisions that target-free rules change")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/raw"))
     parser.add_argument("--keep-old", action="store_true", help="accept stored results of other code")
     args = parser.parse_args(argv)
@@ -103,6 +107,9 @@ def main(argv: list[str]) -> int:
     unknown = (set(args.data.split(",")) - set(DATA)) | (set(args.only or ()) - set(MECHANISMS))
     if unknown:
         parser.error(f"not known: {', '.join(sorted(unknown))}; mechanisms: {', '.join(MECHANISMS)}")
+    if args.firing:
+        _fire(args.data.split(","), args.only or list(FREE))
+        return 0
     store = args.out / "ablation.jsonl"
     if not args.table:
         if "euroc" in args.data and not data.euroc_halves.FOLDER.is_dir():
@@ -132,6 +139,24 @@ def _run(store: Path, wanted: list[str], names: list[str], code: str, accepted: 
                         file.write(json.dumps(row, default=runner._plain) + "\n")
                         file.flush()
                 print(f"{kind}, without {name}: {time.process_time() - begin:.0f} s", file=sys.stderr)
+
+
+def _fire(wanted: list[str], names: list[str]) -> None:
+    """Count on each piece of data; recordings and rigs without a board."""
+    print("| data | runs | decisions changed by |\n|---|---|---|")
+    for kind in wanted:
+        total: Counter[str] = Counter()
+        runs = 0
+        for which, case, seed, run in trials({kind}, NOTHING, names):
+            if which == "euroc" and case != "tracks":
+                continue
+            with counted() as counts:
+                run()
+            if +counts:
+                print(f"{which} {case} {seed}: {dict(+counts)}", file=sys.stderr, flush=True)
+            runs += 1
+            total.update(dict.fromkeys(+counts, 1))
+        print(f"| {kind} | {runs} | {', '.join(f'{k}: {n} runs' for k, n in total.items())} |", flush=True)
 
 
 def _stored(store: Path, code: str | None) -> list[runner.Result]:

@@ -215,7 +215,7 @@ class TargetFreeInitializer:
             return reason or why
         camera.R_imu_cam, camera.timeshift_s = best.R_imu_cam, best.timeshift_s
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
-        sigma = 0.2
+        sigma = WINDOW_START.lever_arm_m
         if given is not None:
             camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in given)
             sigma = 1e-4

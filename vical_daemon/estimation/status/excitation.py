@@ -22,7 +22,9 @@ from vical_daemon.estimation.wording import ALONG
 
 FloatArray = npt.NDArray[np.float64]
 
-WIDE = ConvergenceTargets(0.005, math.radians(0.5), 0.5e-3)  # beyond: a direction counts as not observed at all
+WIDE = ConvergenceTargets(
+    0.005, math.radians(0.5), 0.5e-3
+)  # beyond: a direction counts as not observed at all
 _SLOW_RPS = math.radians(12.0)
 _ONE_AXIS = (
     0.03  # second over first eigenvalue of the rates' scatter below which the rig turned about one axis

@@ -14,6 +14,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import Lens, pose_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.significance import EVERY_S
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import Orientations, ShiftFit, find_shift, level_at
 

@@ -71,8 +71,8 @@ def refuse_motion(
         )
     if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
         return Refusal(
-            f"it turns at one rate ({np.rad2deg(rate_imu):.0f} deg/s) about one axis all the time: neither delay "
-            "nor mounting about that axis show; turn to and fro, and about other axes"
+            f"it turns at one rate ({np.rad2deg(rate_imu):.0f} deg/s) about one axis all the time: neither "
+            "delay nor mounting about that axis show; turn to and fro, and about other axes"
         )
     return Refusal(_wrong_unit(ratio))
 
