@@ -54,6 +54,8 @@ class CpuQuota:
         """Put the calling process into the group; what it starts belongs to it as well."""
         for folder in self.folders:
             (folder / "cgroup.procs").write_text(str(os.getpid()))
+        if self.folders:
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
     def _remove(self) -> None:
         for folder in self.folders:

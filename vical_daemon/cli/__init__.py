@@ -109,7 +109,12 @@ def _dispatch(words: list[str]) -> int:
             f"{selected!r} is not a command{options.suggest(selected, list(commands))} (see `vical --help`)",
             errors.EXIT_USAGE,
         )
-    args = parser.parse_args(words)
+    args, more = parser.parse_known_args(words)
+    if more:
+        near = _nearest_option(parser, selected, more[0])
+        help_of = " ".join(filter(None, ["vical", selected]))
+        text = f"{selected or 'vical'}: unexpected argument {more[0]!r}{near} (see `{help_of} --help`)"
+        raise errors.CliError(text, errors.EXIT_USAGE)
     if args.version:
         from importlib.metadata import version
 
@@ -120,6 +125,18 @@ def _dispatch(words: list[str]) -> int:
         return 0 if args.help else errors.EXIT_USAGE
     _set_up_logging(args)
     return int(import_module(commands[args._command].module).run(args))
+
+
+def _nearest_option(parser: argparse.ArgumentParser, selected: str | None, word: str) -> str:
+    """Suggest an option of the selected command that is spelt like a word it does not take."""
+    known = [
+        option
+        for action in parser._actions
+        if isinstance(action, argparse._SubParsersAction) and selected in action.choices
+        for leaf in options.leaves(action.choices[selected])
+        for option in leaf._option_string_actions
+    ]
+    return options.suggest(word, known) if word.startswith("-") else ""
 
 
 def _selected(words: list[str]) -> str | None:

@@ -35,18 +35,28 @@ def describe(result: dict[str, Any]) -> str:
         lines += ["", *(f"  {event['text']}" for event in result["events"])]
     if result.get("guidance"):
         lines += ["", f"  what would help: {result['guidance']}"]
-    lines += [
-        "",
-        f"  NIS per degree of freedom {result['nis_per_dof']:.2f} (1 when consistent, less when cautious), "
-        f"{100 * result['rejected_fraction']:.2f} % of the points refused",
-    ]
-    return "\n".join(lines)
+    return "\n".join([*lines, "", f"  {_consistency(result)}"])
+
+
+def _consistency(result: dict[str, Any]) -> str:
+    nis, refused = result["nis_per_dof"], f"{100 * result['rejected_fraction']:.2f} % of the points refused"
+    if _target_free(result):
+        return (
+            f"stretches of the data differ by {nis:.2f} times the variance expected (1 when consistent; "
+            f"more widens the sigmas), {refused}"
+        )
+    return f"NIS per degree of freedom {nis:.2f} (1 when consistent, less when cautious), {refused}"
+
+
+def _target_free(result: dict[str, Any]) -> bool:
+    return result.get("mode") == "target_free"
 
 
 def _headline(result: dict[str, Any]) -> str:
     reason = f": {result['reason']}" if result["reason"] else ""
+    without = "without a target, " if _target_free(result) else ""
     return (
-        f"{result['status']}{reason}  ({result['duration_s']:.1f} s, {result['frames']} frames, "
+        f"{result['status']}{reason}  ({without}{result['duration_s']:.1f} s, {result['frames']} frames, "
         f"{result['imu_samples']} imu samples, {result.get('cpu_s', 0.0):.1f} s of CPU)"
     )
 

@@ -31,7 +31,7 @@ from vical_daemon.estimation.measurements import (
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.plausible import usable_points
-from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, Status, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
@@ -368,7 +368,9 @@ class Calibrator:
         if fit is None or not fit.stepped:
             return False
         self.filter = before
-        step_s = self._set_shift(self.filter, camera, fit)
+        for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
+            self._step(before, kept, t_cam_s)
+        step_s = self._set_shift(before, camera, fit)
         self._unproven = (f.state.t_s + _STANDS_S, camera, fit.timeshift_s - step_s)
         self._lose_motion()
         return True
@@ -463,15 +465,16 @@ class Calibrator:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
         self.evaluator.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
+        self.evaluator.believed &= not self.evaluator.in_doubt
         return self._intake.by_present_stamps(self.evaluator.estimate(self.filter, self._stale))
 
     def _in_doubt(self, f: CalibrationFilter) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
-        converged = self.evaluator.status == Status.CONVERGED
-        drifts = (clock_drift.in_doubt(f, name, converged=converged) for name in self.rig.priors)
+        believed = self.evaluator.believed
+        drifts = (clock_drift.in_doubt(f, name, believed=believed) for name in self.rig.priors)
         if self.watch.doubtful or any(drifts):
             return clock_drift.CLOCKS_IN_DOUBT
-        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, converged=converged), "")
+        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, believed=believed), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

@@ -221,6 +221,7 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     """Return the result as `--json` prints it; `cpu_s` counts from the start of the process."""
     result = outcome.estimate.to_json()
     result["status"] = str(outcome.estimate.status)
+    result["mode"] = job.config.calibration.mode
     result["fixed"] = sorted(job.config.calibration.fix)
     result["duration_s"] = job.duration_s
     if outcome.inputs:

@@ -85,6 +85,8 @@ def test_the_text_names_what_was_found(stereo, capsys: pytest.CaptureFixture[str
         == 0
     )
     text = capsys.readouterr().out
+    assert "(without a target, " in text.splitlines()[0]
+    assert "stretches of the data differ by" in text and "NIS" not in text
     assert "cam1 in the imu frame" in text and "cam0" not in text
     assert "(first row to last)" in text
     assert "gyro matrix x" in text and "accel. matrix z" in text

@@ -133,6 +133,20 @@ def test_bad_option_is_one_line_with_the_help_to_read(command, capsys) -> None:
     assert err.count("\n") == 1 and "vical probe --help" in err
 
 
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["x"], "probe: unexpected argument 'x' (see `vical probe --help`)"),
+        (["--targt", "x"], "probe: unexpected argument '--targt'; did you mean --target?"),
+    ],
+)
+def test_an_argument_too_many_is_named_with_the_help_of_its_command(command, capsys, words, line) -> None:
+    command(lambda args: 0, lambda parser: parser.add_argument("--target"))
+    assert cli.main(["probe", *words]) == 2
+    err = capsys.readouterr().err
+    assert line in err and err.count("\n") == 1
+
+
 def test_wrong_choice_suggests_the_nearest(command, capsys) -> None:
     command(lambda args: 0, lambda parser: parser.add_argument("--format", choices=["kalibr", "ros"]))
     with pytest.raises(SystemExit):

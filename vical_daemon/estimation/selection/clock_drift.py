@@ -67,17 +67,18 @@ def stamps_variance(stamp_sigma_s: float, elapsed_s: float) -> float:
     return (2.0 * stamp_sigma_s / max(elapsed_s, _LEAST_S)) ** 2
 
 
-def doubtful(bayes_factor: float, *, converged: bool) -> bool:
+def doubtful(bayes_factor: float, *, believed: bool) -> bool:
     """Whether the data speak for a drift, though not yet surely: nothing to call converged.
 
-    A converged result stays so until a drift is more likely than none, as in `model_selection.in_doubt`.
+    A result that was believed stays so until a drift is more likely than none, as in
+    `model_selection.in_doubt`.
     """
-    return probability(bayes_factor) > 0.5 or (bayes_factor > 1.0 and not converged)
+    return probability(bayes_factor) > 0.5 or (bayes_factor > 1.0 and not believed)
 
 
-def in_doubt(f: CalibrationFilter, camera: str, *, converged: bool) -> bool:
+def in_doubt(f: CalibrationFilter, camera: str, *, believed: bool) -> bool:
     """Whether the clock of this camera is `doubtful`, and no drift was announced."""
-    return camera not in f.drifting and doubtful(_evidence(f, camera), converged=converged)
+    return camera not in f.drifting and doubtful(_evidence(f, camera), believed=believed)
 
 
 def surely_apart(f: CalibrationFilter, camera: str) -> bool:

@@ -208,16 +208,16 @@ def off(f: CalibrationFilter, name: str) -> float:
     return not_zero(weights(f), name)
 
 
-def in_doubt(f: CalibrationFilter, *, converged: bool = False) -> str:
+def in_doubt(f: CalibrationFilter, *, believed: bool = False) -> str:
     """Name of a block for which the data speak, though not yet surely: they soon will. Empty: none.
 
-    Images that do not fit may never decide it; the reported covariance then covers both. A converged result
-    stays so until the block is more likely off than not: of many looks, one sees 5 % by chance.
+    Images that do not fit may never decide it; the reported covariance then covers both. A result that was
+    believed stays so until the block is more likely off than not: of many looks, one sees 5 % by chance.
     """
     if misfit(f) != 1.0:
         return ""
     doubtful, shares = blocks(f).keys() - f.off, weights(f)
-    enough = 0.5 if converged else OFF
+    enough = 0.5 if believed else OFF
     return next((n for n in IN_DOUBT if n in doubtful and not_zero(shares, n) > enough), "")
 
 

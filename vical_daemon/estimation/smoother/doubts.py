@@ -89,15 +89,15 @@ class TargetFreeDoubts:
             self._off |= known
         return events
 
-    def reason(self, carry: MarginalPrior, factor: float, *, converged: bool) -> str:
+    def reason(self, carry: MarginalPrior, factor: float, *, believed: bool) -> str:
         """What may not be as it is taken to be, in words; empty where nothing speaks for it.
 
-        For `converged` see `model_selection.in_doubt`.
+        For `believed` see `model_selection.in_doubt`.
         """
-        imu, enough = model_selection.IMU, 0.5 if converged else OFF
+        imu, enough = model_selection.IMU, 0.5 if believed else OFF
         if imu not in self._off and model_selection.not_zero(self._weights(carry, factor), imu) > enough:
             return model_selection.IN_DOUBT[imu]
-        if not self.drifting and doubtful(self._drift(carry, factor), converged=converged):
+        if not self.drifting and doubtful(self._drift(carry, factor), believed=believed):
             return CLOCKS_IN_DOUBT
         return ""
 

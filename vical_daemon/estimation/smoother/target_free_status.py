@@ -140,6 +140,7 @@ class TargetFreeStatus(Evaluator):
             self.announce_all(_changes(self.camera, change, self.active))
         self._bumped, self._quiet, self.doubts.drifting = why, (Cause.NONE, None), False
         self._started_s, self._windows, self._against_since_s = None, 0, None
+        self.believed = False
         self._agreement.clear()
         self._growing = 0.0, 0
         self._steady.reset(Status.CONVERGING)
@@ -269,8 +270,8 @@ class TargetFreeStatus(Evaluator):
         missing = []
         if camera is not None and carry is not None:
             missing = self._weak(camera, carry.camera.R_imu_cam, carry.bias[:3])
-        converged = self.status == Status.CONVERGED
-        doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), converged=converged)
+        doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), believed=self.believed)
+        self.believed &= not doubt
         verdict = self._decide(camera is not None, running, missing, doubt)
         if carry is None:
             reported = self._published(verdict)

@@ -40,6 +40,8 @@ class Evaluator:
         reason: Why there is no start yet.
         motion_missing: More motion, not more time, would help.
         motion: What the gyro shows of the motion.
+        believed: It was `converged`, and no data have spoken against its model since. Gaps and steps of a
+            clock leave that as it is.
     """
 
     def __init__(self, options: CalibrationOptions, nothing_seen: str) -> None:
@@ -51,7 +53,7 @@ class Evaluator:
         self.motion = RunningMotion()
         self._events, self._steady = EventLog(), SteadyStatus()
         self._started_s: float | None = None
-        self._ever_converged = False
+        self._ever_converged = self.believed = False
 
     def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
         """Count one inertial reading."""
@@ -106,7 +108,8 @@ class Evaluator:
 
     def _published(self, verdict: Verdict) -> Verdict:
         reported = self._steady.follow(verdict, self.elapsed_s)
-        self._ever_converged |= self.status == Status.CONVERGED
+        if self.status == Status.CONVERGED:
+            self._ever_converged = self.believed = True
         return reported
 
     def _before_start(self, changed: Cause, trouble: str = "") -> Verdict:

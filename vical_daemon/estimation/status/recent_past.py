@@ -16,7 +16,13 @@ from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.significance import EVERY_S
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-from vical_daemon.estimation.temporal.shift_step import Orientations, ShiftFit, find_shift, level_at
+from vical_daemon.estimation.temporal.shift_step import (
+    Orientations,
+    ShiftFit,
+    find_shift,
+    first_after_step,
+    level_at,
+)
 
 _BEFORE_S = 3.0  # a change is noticed within
 _STRETCHES = (10, 15, 30)  # images in which a step is looked for
@@ -61,6 +67,42 @@ class RecentPast:
             if fit is not None and fit.stepped:
                 return fit
         return None
+
+    def before_step(
+        self, f: CalibrationFilter, fit: ShiftFit, camera: str, buffer: ImuBuffer, target: FloatArray
+    ) -> list[tuple[float, PointsFrame]]:
+        """Images that `f`, the filter from before, has not taken yet, and that are surely from before a step.
+
+        Args:
+            f: As `filter` returns it.
+            fit: Of the images after the step.
+            camera: Of which the time shift stepped.
+            buffer: Inertial readings.
+            target: Points of the target, m, shape (n, 3).
+
+        Returns:
+            Stamps, s, and points, of all cameras, oldest first.
+        """
+        shifts_s = {name: f.state.cameras[name].timeshift_s for name in self._frames}
+        newer = [
+            (t + shifts_s[name], t, frame)
+            for name, frames in self._frames.items()
+            for t, frame, _ in frames
+            if t + shifts_s[name] > f.state.t_s
+        ]
+        own = [(t, frame) for _, t, frame in newer if frame.camera == camera]
+        seen, rows = _orientations(own, f, target), buffer.rows
+        if seen is None or len(rows) < 2:
+            return []
+        curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
+        at = first_after_step(
+            curve, seen, f.state.cameras[camera].R_imu_cam, (shifts_s[camera], fit.timeshift_s)
+        )
+        if at is None:
+            return []
+        step_s = float(seen.t_cam_s[at]) + shifts_s[camera]
+        newer.sort(key=lambda x: x[0])
+        return [(t, frame) for t_s, t, frame in newer if t_s < step_s]
 
     def shift_of(
         self,

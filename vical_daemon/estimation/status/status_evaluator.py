@@ -92,7 +92,7 @@ class StatusEvaluator(Evaluator):
 
     def changed(self, why: Cause) -> None:
         """The rig is not what it was: the calibration is being taken anew."""
-        self.bumped = why
+        self.bumped, self.believed = why, False
         kind = EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER
         self.announce(Event(kind, cause=why))
         self._started_s = None

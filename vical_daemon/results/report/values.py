@@ -106,8 +106,14 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
     for name, camera in (result.get("cameras") or {}).items():
         withheld = camera.get("unobservable") or []
         lines += [f"{name}: not revealed by the motion, do not use: {direction}." for direction in withheld]
+    free = result.get("mode") == "target_free"
     nis = float(result.get("nis_per_dof") or 0.0)
-    if nis > 1.5:
+    if nis > 1.5 and free:
+        lines.append(
+            f"Stretches of the data differ by {nis:.2f} times the variance expected. The sigmas "
+            "include that. Check the lens model, the shutter and the stamps."
+        )
+    elif nis > 1.5:
         lines.append(
             f"NIS per degree of freedom is {nis:.2f}: the innovations are larger than the filter "
             "expects; the sigmas may be too small. Check the lens model, the board's size and flatness, "
@@ -115,9 +121,8 @@ def warnings_of(result: dict[str, Any]) -> list[str]:
         )
     rejected = float(result.get("rejected_fraction") or 0.0)
     if rejected > 0.05:
-        lines.append(
-            f"{100 * rejected:.1f} % of the measurements were refused: blur, wrong ids or a wrong board?"
-        )
+        why = "blur, or things that move?" if free else "blur, wrong ids or a wrong board?"
+        lines.append(f"{100 * rejected:.1f} % of the measurements were refused: {why}")
     lines += advice_of(result.get("events") or [])
     if result.get("guidance"):
         lines.append(f"What would help: {result['guidance']}")

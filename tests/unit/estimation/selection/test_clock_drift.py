@@ -105,8 +105,8 @@ def test_a_converged_result_is_doubted_later():
     """4 sigmas of drift keep a result from converging; a converged one is doubted once drift is likelier."""
     slight, strong = some_filter(3e-5), some_filter(4e-5)
     assert apart(slight, NAME) < 0.5 < apart(strong, NAME)
-    assert in_doubt(slight, NAME, converged=False) and not in_doubt(slight, NAME, converged=True)
-    assert in_doubt(strong, NAME, converged=True)
+    assert in_doubt(slight, NAME, believed=False) and not in_doubt(slight, NAME, believed=True)
+    assert in_doubt(strong, NAME, believed=True)
 
 
 def calibrated(skew_ppm, seconds=13.0, bumps=()):

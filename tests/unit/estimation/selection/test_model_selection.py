@@ -104,8 +104,8 @@ def test_odds_go_the_way_of_the_evidence_and_images_that_do_not_fit_speak_the_le
     assert off(doubted(3.0), name) > SURE
     assert in_doubt(doubted(unsure)) == name
     assert off(doubted(unsure), name) < 0.5
-    assert not in_doubt(doubted(unsure), converged=True)
-    assert in_doubt(doubted(unsure * 1.2), converged=True) == name
+    assert not in_doubt(doubted(unsure), believed=True)
+    assert in_doubt(doubted(unsure * 1.2), believed=True) == name
     misfit, long = doubted(lasting, scale=4.0), doubted(lasting, factor=4.0)
     assert off(misfit, name) == pytest.approx(off(long, name), rel=1e-12)
     assert 0.05 < off(misfit, name) < off(doubted(lasting), name)

@@ -187,6 +187,9 @@ def test_warnings_name_what_must_not_be_used(result):
     text = " ".join(warnings_of(result))
     for needed in ("degenerate", "lever arm along cam z", "2.20", "20.0 %", "rotate about the optical axis"):
         assert needed in text
+    assert "sigmas may be too small" in text
+    text = " ".join(warnings_of(result | {"mode": "target_free"}))
+    assert "differ by 2.20 times" in text and "The sigmas include that" in text and "board" not in text
 
 
 def test_cells_equal_a_loop():
