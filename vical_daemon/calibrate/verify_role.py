@@ -14,14 +14,13 @@ from contextlib import suppress
 import numpy as np
 
 from vical_daemon.bus import topics
-from vical_daemon.bus.interface import Bus, Sample
+from vical_daemon.bus.interface import Bus
 from vical_daemon.bus.messages import (
     CheckState,
     DiagnosticStatus,
     Level,
     MessageError,
     VerifyResult,
-    decode_points,
     decode_string,
     encode_verification,
 )
@@ -33,6 +32,7 @@ from vical_daemon.calibrate.motion import LISTEN_S, Motion
 from vical_daemon.calibrate.pause import Pause
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.calibrate.publications import calibration_messages, companion_messages
+from vical_daemon.calibrate.stretch import Stretch
 from vical_daemon.calibrate.verification import Verification
 from vical_daemon.calibrate.verify_words import age, line, status
 from vical_daemon.config.model import Config
@@ -47,10 +47,6 @@ _log = logging.getLogger(__name__)
 _TICK_S = 0.2
 _PUBLISH_S = 1.0
 _QUEUE_LIMIT = 20_000  # samples, as for calibrating
-STRETCH_S = 30.0
-"""Longest stretch of data between two pauses, s: as a check takes at most where the motion shows enough."""
-_BLIND_S = 5.0  # without points a stretch ends: the board is not in view (the first image waits for OpenCV)
-_STILL_S = 3.0  # without motion a stretch ends
 _FINE_S = 60.0
 """Calibrating goes on for this long after convergence at most, s, to get a result that can be verified."""
 
@@ -166,20 +162,14 @@ class _VerifyService:
         return bool(np.isfinite(motion.moved_s))
 
     def _take(self, queue: SubscriberQueue, verification: Verification, motion: Motion) -> None:
-        seen_s, before_s = time.monotonic(), verification.used_s
+        stretch = Stretch(self._imu_key, motion, time.monotonic(), verification.used_s)
         while not self._stop.is_set() and not self._interrupted:
             self._tick(queue.wait(_TICK_S))
             now_s = time.monotonic()
             for sample in queue.take(_QUEUE_LIMIT):
                 verification.take(sample)
-                if sample.key == self._imu_key:
-                    motion.take(sample, now_s)
-                elif _shows_points(sample):
-                    seen_s = now_s
-            if verification.step():
-                return
-            still, blind = now_s - motion.moved_s > _STILL_S, now_s - seen_s > _BLIND_S
-            if still or blind or verification.used_s - before_s >= STRETCH_S:
+                stretch.take(sample, now_s)
+            if verification.step() or stretch.over(now_s, verification.used_s):
                 return
 
     @property
@@ -226,6 +216,7 @@ class _VerifyService:
             return "verify" in words or _verifiable(self._config, estimate) or now_s - converged_s > _FINE_S
 
         calibrate(self._config, self._bus, self._stop, self._clock, until)
+        self._pause.excuse()
         self._words.clear()
         self._persistence.priors(wait_s=0.0)
         self._read_in_use()
@@ -295,16 +286,6 @@ class _VerifyService:
             counters |= self._verification.role.statuses()[0].values
         mine = DiagnosticStatus(Level.OK, "estimate", f"verify: {self._state}", "", counters)
         return [mine, *(status(name, result) for name, result in results.items())]
-
-
-def _shows_points(sample: Sample) -> bool:
-    """Whether it is a message with points in it."""
-    parsed = topics.parse_key(sample.key)
-    if parsed is None or parsed.topic not in (topics.POINTS, topics.TRACKS):
-        return False
-    with suppress(MessageError):
-        return len(decode_points(sample.payload).ids) > 0
-    return False
 
 
 def _verifiable(config: Config, estimate: CalibrationEstimate) -> bool:

@@ -7,7 +7,6 @@ probability of alpha at most, if its denominator is true [Ville 1939]. [docs/mat
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -23,10 +22,11 @@ MISSED = 1e-2
 """Bound of the probability to say `holds` of a calibration of which one block has changed by what counts."""
 PRIOR = 0.05
 """Probability of a change before the recording, one recording in twenty; for `probability_changed` alone."""
-_WIDE = 3.0  # a change, where there is one, is of the order of this many times what counts
+_SIZES = (1.0, 3.0, 10.0)  # a change, where there is one, is of the order of one of these times what counts
 _DIRECTIONS = 400  # on the sphere; the worst of them is within 6 deg of the worst of all
-_SURE = 1.645  # sigmas: what is called visible is shown by 95 % of recordings
-VISIBLE = _SURE + math.sqrt(_SURE**2 + 2.0 * math.log(1.0 / MISSED))
+SURE = 1.645
+"""Sigmas: what is called visible is shown by 95 % of recordings."""
+VISIBLE = SURE + math.sqrt(SURE**2 + 2.0 * math.log(1.0 / MISSED))
 """Sigmas x from which a change is visible: x^2/2 - 1.645 x = ln(1/MISSED)."""
 
 
@@ -105,14 +105,13 @@ def odds(d: FloatArray, S: FloatArray, stored: FloatArray, counts: FloatArray) -
     index = np.arange(len(d))
     present = {name: index[block] for name, block in BLOCKS.items() if len(index[block])}
     hypotheses = [
-        (_log_odds(e, S, places), names, places)
+        _weigh(e, S, names, [present[name] for name in names])
         for count in range(1, len(present) + 1)
         for names in combinations(present, count)
-        for places in [np.concatenate([present[name] for name in names])]
     ]
-    logs = np.array([log for log, _, _ in hypotheses])
-    _, names, places = _fewest(hypotheses)
-    moved, covariance = _moved(e, S, places)
+    logs = np.array([h.log for h in hypotheses])
+    named = _fewest(hypotheses)
+    moved, covariance = _moved(e, S, named.prior)
     stored_information = np.asarray(np.linalg.inv(C))
     holds, visible, floor = {}, {}, {}
     for name, at in present.items():
@@ -126,7 +125,7 @@ def odds(d: FloatArray, S: FloatArray, stored: FloatArray, counts: FloatArray) -
     log_changed = float(np.logaddexp.reduce(logs) - math.log(len(logs)))
     return Odds(
         log_changed,
-        names,
+        named.names,
         moved * counts,
         covariance * np.outer(counts, counts),
         holds,
@@ -135,39 +134,70 @@ def odds(d: FloatArray, S: FloatArray, stored: FloatArray, counts: FloatArray) -
     )
 
 
-def _fewest(
-    hypotheses: list[tuple[float, tuple[str, ...], IntArray]],
-) -> tuple[float, tuple[str, ...], IntArray]:
+@dataclass(frozen=True, slots=True)
+class _Hypothesis:
+    """Some blocks have changed.
+
+    Attributes:
+        log: Log of its odds against `as stored`.
+        names: Of the blocks.
+        prior: Likeliest covariance of the change, in units of what counts, shape (n, n).
+    """
+
+    log: float
+    names: tuple[str, ...]
+    prior: FloatArray
+
+
+def _weigh(e: FloatArray, S: FloatArray, names: tuple[str, ...], places: list[IntArray]) -> _Hypothesis:
+    """Odds of a change of some blocks: small or large, all sizes and kinds of it alike."""
+    kinds = [shape * size**2 for shape in _shapes(len(e), places) for size in _SIZES]
+    logs = [_log_odds(e, S, W) for W in kinds]
+    log = float(np.logaddexp.reduce(logs) - math.log(len(logs)))
+    return _Hypothesis(log, names, kinds[int(np.argmax(logs))])
+
+
+def _shapes(size: int, places: list[IntArray]) -> list[FloatArray]:
+    """Covariances of a change of the size that counts, in units of it, shapes (size, size).
+
+    A lens has changed either in what counts (both focal lengths alike, or its centre: it was focused, or has
+    shifted), or altogether (it is another one).
+    """
+    every = np.zeros(size)
+    every[np.concatenate(places)] = 1.0
+    shapes = [np.diag(every)]
+    lens = BLOCKS["lens"].start
+    if every[lens:].any():
+        ways = np.zeros((3, size))
+        ways[:, lens:] = _ways(size - lens)[:3]
+        every[lens:] = 0.0
+        shapes.append(np.diag(every) + ways.T @ ways)
+    return shapes
+
+
+def _fewest(hypotheses: list[_Hypothesis]) -> _Hypothesis:
     """Return the likeliest of the hypotheses with the fewest blocks that the recording does not rule out.
 
     A block is named only where the recording cannot be explained without it: the odds against every
     hypothesis with fewer blocks exceed the bound of a false alarm.
     """
-    best = max(log for log, _, _ in hypotheses)
-    possible = [h for h in hypotheses if h[0] > best - math.log(1.0 / FALSE_ALARM)]
-    return min(possible, key=lambda h: (len(h[1]), -h[0]))
+    best = max(h.log for h in hypotheses)
+    possible = [h for h in hypotheses if h.log > best - math.log(1.0 / FALSE_ALARM)]
+    return min(possible, key=lambda h: (len(h.names), -h.log))
 
 
-def _log_odds(e: FloatArray, S: FloatArray, places: Iterable[int]) -> float:
-    """Log N(e; 0, S + W) - log N(e; 0, S), where some errors may have changed, N(0, W)."""
-    with_change = S + _wide(len(e), places)
-    root, wider = np.linalg.cholesky(S), np.linalg.cholesky(with_change)
+def _log_odds(e: FloatArray, S: FloatArray, W: FloatArray) -> float:
+    """Log N(e; 0, S + W) - log N(e; 0, S): an error may have changed by N(0, W)."""
+    root, wider = np.linalg.cholesky(S), np.linalg.cholesky(S + W)
     logs = np.log(np.diag(root)).sum() - np.log(np.diag(wider)).sum()
     squares = np.linalg.solve(root, e) @ np.linalg.solve(root, e)
     squares -= np.linalg.solve(wider, e) @ np.linalg.solve(wider, e)
     return float(logs + 0.5 * squares)
 
 
-def _moved(e: FloatArray, S: FloatArray, places: Iterable[int]) -> tuple[FloatArray, FloatArray]:
-    W = _wide(len(e), places)
+def _moved(e: FloatArray, S: FloatArray, W: FloatArray) -> tuple[FloatArray, FloatArray]:
     gain = np.linalg.solve(S + W, W).T
     return gain @ e, W - gain @ W
-
-
-def _wide(size: int, places: Iterable[int]) -> FloatArray:
-    variance = np.zeros(size)
-    variance[list(places)] = _WIDE**2
-    return np.diag(variance)
 
 
 def _least(information: FloatArray, ways: FloatArray) -> float:

@@ -21,7 +21,7 @@ def test_counts_are_in_the_units_of_the_errors():
 
 
 def test_odds_are_ratios_of_gaussians():
-    """All ways alike: the mean of the ratios of densities over the subsets of blocks, by scipy."""
+    """All ways alike: the mean of the ratios of densities over subsets of blocks and sizes, by scipy."""
     rng = np.random.default_rng(3)
     mixed = rng.standard_normal((7, 7))
     P, e = mixed @ mixed.T + np.eye(7), rng.standard_normal(7)  # in units of what counts
@@ -29,9 +29,10 @@ def test_odds_are_ratios_of_gaussians():
     ratios = []
     for k in range(1, 8):
         W = np.zeros(7)
-        W[[i for b, block in enumerate(blocks) if k >> b & 1 for i in block]] = 3.0**2
-        logs = [multivariate_normal.logpdf(e, np.zeros(7), V) for V in (P + np.diag(W), P)]
-        ratios.append(np.exp(logs[0] - logs[1]))
+        W[[i for b, block in enumerate(blocks) if k >> b & 1 for i in block]] = 1.0
+        for size in (1.0, 3.0, 10.0):
+            logs = [multivariate_normal.logpdf(e, np.zeros(7), V) for V in (P + size**2 * np.diag(W), P)]
+            ratios.append(np.exp(logs[0] - logs[1]))
     d, S = e * COUNTS[:7], P * np.outer(COUNTS[:7], COUNTS[:7])
     found = odds(d, S, 0.1 * S, COUNTS[:7])
     assert found.log_changed == pytest.approx(np.log(np.mean(ratios)), rel=1e-6)
@@ -62,6 +63,44 @@ def test_a_block_is_named_only_if_the_recording_cannot_be_explained_without_it()
     assert odds(d, np.diag(sigma**2), 0.1 * np.diag(sigma**2), COUNTS).blocks == ("rotation",)
     d[6] = 8.0 * sigma[6]
     assert odds(d, np.diag(sigma**2), 0.1 * np.diag(sigma**2), COUNTS).blocks == ("rotation", "time shift")
+
+
+def test_a_lens_that_was_focused_is_found_where_a_new_lens_could_not_be():
+    """Odds of a lens are those of a new one, or of a change of what counts alone; both by scipy."""
+    sigma = np.where(np.arange(15) < 11, 1.0 / 7.5, 1.0 / 50.0)  # in units of what counts
+    e = np.zeros(15)
+    e[7:9] = 0.7  # 7.4 sigmas along that direction
+    P = np.diag(sigma**2)
+    ways = np.zeros((3, 15))
+    ways[0, 7:9] = ways[1, 9] = ways[2, 10] = 1.0
+    new = np.diag(np.where(np.arange(15) >= 7, 1.0, 0.0))
+    null = multivariate_normal.logpdf(e, np.zeros(15), P)
+    logs = {
+        kind: np.logaddexp.reduce(
+            [multivariate_normal.logpdf(e, np.zeros(15), P + n**2 * W) - null for n in (1, 3, 10)]
+        )
+        - np.log(3.0)
+        for kind, W in (("focused", ways.T @ ways), ("new", new))
+    }
+    d, S = e * COUNTS, P * np.outer(COUNTS, COUNTS)
+    found = odds(d, S, 0.1 * S, COUNTS)
+    assert logs["new"] < SURE + np.log(15.0) < np.logaddexp(*logs.values()) - np.log(2.0)
+    assert found.log_changed > SURE
+    assert found.blocks == ("lens",)
+    assert found.moved[7:9] == pytest.approx(d[7:9], rel=0.05)
+
+
+@pytest.mark.parametrize("times", [1.0, 10.0, 100.0])
+def test_a_change_of_any_size_is_named_alone(times):
+    """A turn far larger than what counts is not explained by further blocks."""
+    rng = np.random.default_rng(5)
+    mixed = rng.standard_normal((15, 15))
+    S = (mixed @ mixed.T + 3.0 * np.eye(15)) * np.outer(COUNTS, COUNTS) / 30.0**2
+    d = np.zeros(15)
+    d[3:6] = times * COUNTS[3] * np.array([0.6, -0.6, 0.53])
+    found = odds(d, S, 0.1 * S, COUNTS)
+    assert found.blocks == ("rotation",)
+    assert found.moved[3:6] == pytest.approx(d[3:6], rel=0.1)
 
 
 def test_what_is_not_visible_is_not_decided():

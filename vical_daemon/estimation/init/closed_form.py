@@ -26,6 +26,7 @@ from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotatio
 
 _SHIFT_SIGMA_S = 1.0e-3
 _PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
+_LEAST_POSES = 20  # of two seconds at 10 Hz
 _PARTIAL_STRETCH_S = 8.0
 PARTIAL_S = 6.0  # before, a second axis may come yet
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)
@@ -72,8 +73,7 @@ def attempt(data: StartData) -> StartResult:
     rough: dict[str, _Rough] = {}
     for name in data.priors:
         lens, poses = _poses(data, name)
-        needed = 30 if data.layout.lens_free(name) else 20
-        if len(poses) < needed:
+        if len(poses) < _LEAST_POSES:
             return StartResult(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )

@@ -36,6 +36,7 @@ _ITERATIONS = 18
 _FOCAL_SIGMA, _RATIO_SIGMA, _CENTRE_SIGMA = 0.1, 0.003, 0.03
 _DISTORTION_SIGMA = {"radtan": (0.1, 0.1, 0.005, 0.005), "equidistant": (0.05, 0.05, 0.05, 0.05)}
 _LENS_AFTER = 4  # iterations with the lens as given
+_LEAST_RAYS = 0.5  # share of the features; no lens near the given one leaves more of them without a ray
 _GOOD = 0.25  # weight of a feature that fits
 _LEAST_SLOPE = 0.2
 _BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
@@ -194,6 +195,8 @@ class _Fit:
                 self.intrinsics = self.intrinsics + dx[7:11]
                 self.distortion = self.distortion + dx[11:]
                 self._rays()
+                if self.ok.mean() < _LEAST_RAYS:
+                    return None  # the lens has run away
             if step > _LENS_AFTER + 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
                 break
         return self._result(R, shift, bias, weight)

@@ -95,6 +95,14 @@ def test_the_first_lens_is_not_bent_by_outliers(dirty):
     assert focal == pytest.approx([520.0, 520.0], abs=6.0)
 
 
+def test_a_slow_camera_starts_within_five_seconds():
+    """Five images a second: 25 are enough to start from, with the lens estimated as well."""
+    run = simulate(6, 5.0, camera_rate_hz=5.0, corner_sigma_px=0.3)
+    record, _ = answer(run, lens_known=False)
+    assert record.started_s() <= 5.5
+    within(record, 4.5, parameters=15)
+
+
 def test_very_sharp_corners_start_at_once():
     """With 0.01 px a first run, far from straight, refused what followed: 7 s until the first answer."""
     rig = rig_before(APRILGRID, 0.8, 4, timeshift_cam_imu_s=-0.027)

@@ -139,6 +139,18 @@ def test_epipolar_fit_finds_mounting_delay_and_bias_without_knowing_any(scene):
     assert fit.inliers > 0.9
 
 
+@pytest.mark.parametrize("seed", [0, 4, 9])
+def test_features_that_fit_no_motion_give_no_lens_without_an_image(seed):
+    """Points that jump about: the lens ran away until no pixel had a ray, and a matrix was singular."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(-0.5, 4.5, 0.01)
+    gyro = 0.3 * np.stack([np.sin(2.0 * t), np.cos(3.0 * t), np.sin(5.0 * t + 1.0)], axis=1)
+    uv = rng.uniform([0.0, 0.0], [320.0, 240.0], (40, 2)) + np.cumsum(rng.normal(0, 8, (40, 40, 2)), axis=0)
+    frames = [(0.1 * k, PointsFrame("cam0", k * 10**8, np.arange(40), uv[k])) for k in range(40)]
+    lens = (np.array([216.0, 215.0, 158.0, 116.0]), np.array([-0.14, 0.07, 0.0, 0.0]), "radtan")
+    assert epipolar_fit(t, gyro, frames, lens, np.eye(3), 0.0, fit_lens=True) is None
+
+
 def test_start_finds_lever_arm_and_speed_linearly(scene):
     window = scene.window()
     assert np.linalg.norm(window.camera.p_imu_cam - scene.camera.p_imu_cam) < 0.03

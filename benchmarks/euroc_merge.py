@@ -1,0 +1,102 @@
+"""EuRoC's two halves merged, against the whole: what does the cut cost?
+
+Three calibrations of the same corners, lens estimated: the whole; the halves as two recordings of one rig, as
+`vical merge` takes them (motion, biases and gravity anew); and the whole with its motion alone forgotten at
+the cut. What information the cut loses, the filter's own sigmas show: an efficient estimate of less data
+differs from one of more by sqrt(P_less - P_more).
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+
+import numpy as np
+from vical_mocks.harness.recordings import Items, read
+
+from benchmarks.euroc_halves import FOLDER, NOISE, PRIOR, SPLIT_S
+from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
+from vical_daemon.vision.target import load_target
+
+NAMES = ("px", "py", "pz", "rx", "ry", "rz", "shift")
+_APART_NS = 10_000_000_000  # between two recordings, as `vical merge` puts them
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A calibration.
+
+    Attributes:
+        position_m, R_imu_cam, shift_s: Of the camera.
+        stated: Sigmas as stated, shape (7,).
+        own: Sigmas of the filter, if its model were exact, shape (7,).
+    """
+
+    position_m: FloatArray
+    R_imu_cam: FloatArray
+    shift_s: float
+    stated: FloatArray
+    own: FloatArray
+
+    def off(self, whole: Answer) -> FloatArray:
+        """Difference from the whole, in the order of `NAMES`."""
+        turn = so3.log(whole.R_imu_cam.T @ self.R_imu_cam)
+        return np.array([*(self.position_m - whole.position_m), *turn, self.shift_s - whole.shift_s])
+
+
+def calibrate(items: Items, points: FloatArray, at_the_cut: str) -> Answer:
+    """Calibrate the recording; `at_the_cut`: "", "next recording" or "lose motion"."""
+    c = Calibrator(CalibrationOptions(imu_noise=NOISE), {"cam0": PRIOR}, points)
+    later_ns, begin_ns = 0, items[0][0]
+    for t_ns, item in items:
+        if at_the_cut and (t_ns - begin_ns) * 1e-9 > SPLIT_S:
+            if at_the_cut == "next recording":
+                c.finish()
+                c.next_recording()
+                later_ns = _APART_NS
+            else:
+                c._lose_motion()
+            at_the_cut = ""
+        if isinstance(item, PointsFrame):
+            c.add_points(replace(item, camera="cam0", t_cam_ns=item.t_cam_ns + later_ns))
+            c.process()
+        else:
+            c.add_imu(item.stamp_ns + later_ns, item.gyro_rps, item.specific_force_mps2)
+    c.finish()
+    camera, f = c.estimate().cameras["cam0"], c.filter
+    assert f is not None
+    assert camera.calibration_covariance is not None
+    where = f.layout.cameras["cam0"]
+    rows = [
+        *range(where.position.start, where.position.stop),
+        *range(where.rotation.start, where.rotation.stop),
+    ]
+    own = f.covariance([*rows, where.timeshift])
+    return Answer(
+        np.array(camera.T_imu_cam.p_m),
+        so3.matrix_from_quat(np.array(camera.T_imu_cam.q_wxyz)),
+        camera.timeshift_cam_imu_s,
+        np.sqrt(np.diag(np.array(camera.calibration_covariance))[:7]),
+        np.sqrt(np.diag(own)),
+    )
+
+
+def main(argv: list[str]) -> int:
+    """Print the table."""
+    argparse.ArgumentParser(prog="python -m benchmarks euroc_merge", description=__doc__).parse_args(argv)
+    items, points = read(FOLDER), load_target(FOLDER / "target.yaml").points_m
+    whole = calibrate(items, points, "")
+    print("| at the cut | | " + " | ".join(NAMES) + " |")
+    print("|---|---|" + "---|" * len(NAMES))
+    for what in ("next recording", "lose motion"):
+        part = calibrate(items, points, what)
+        lost = np.sqrt(np.maximum((part.own / whole.own) ** 2 - 1.0, 0.0))
+        for name, row in (
+            ("difference from the whole, in its stated sigmas", part.off(whole) / whole.stated),
+            ("expected from what the cut loses (rms)", lost),
+            ("stated sigma over that of the whole", part.stated / whole.stated),
+        ):
+            print(f"| {what} | {name} | " + " | ".join(f"{x:.2f}" for x in row) + " |", flush=True)
+    return 0
