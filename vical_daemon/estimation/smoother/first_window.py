@@ -134,7 +134,7 @@ class FirstWindow:
         found = self._solved(buffer, read_by_columns(bundle.window), None, Noise.of(fit), ())
         if found[2] is None or not (found[2].settled and self._status.fits(found[2], first=True)):
             return None
-        sure = self._status.doubts.rolls(found[2].carry)
+        sure = self._status.doubts.rolls(found[2].carry, self._status.factor())
         if not sure or readout_sigmas(found[2].carry) < readout_sigmas(fit.carry):
             return None
         self._prior = self.initializer.prior = replace(self._prior, readout_axis=COLUMNS)
