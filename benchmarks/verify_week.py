@@ -219,18 +219,18 @@ class Week:
         if checks.used_s == 0.0:
             self._note(before)
 
-    def _state(self) -> tuple[int, float, bool]:
+    def _state(self) -> tuple[int, float, bool, bool]:
         checks = self._verification
-        return checks.checks, checks.used_s, checks.probability(CAMERA) is not None
+        return checks.checks, checks.used_s, checks.suspected, checks.probability(CAMERA) is not None
 
-    def _note(self, before: tuple[int, float, bool]) -> None:
+    def _note(self, before: tuple[int, float, bool, bool]) -> None:
         """Note how a check ended."""
-        checks, (count, used_s, started) = self._verification, before
+        checks, (count, used_s, suspected, started) = self._verification, before
         self.looks += round(used_s)
-        if checks.suspected:
-            self.answers.append(SUSPECTED)
-        elif checks.checks > count:
+        if checks.checks > count:
             self.answers.append(str(checks.answers[CAMERA].verdict))
+        elif checks.suspected and not suspected:
+            self.answers.append(SUSPECTED)
         else:
             self.answers.append(str(Answer.CANNOT_TELL) if started else NO_START)
 
