@@ -7,6 +7,7 @@ BIN := $(VENV)/bin
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
+unexport PYTHONDONTWRITEBYTECODE  # tests start hundreds of processes; each would compile all it imports
 
 .NOTPARALLEL:  # one pip at a time
 .PHONY: demo test check bench docs dist constraints install clean

@@ -4,6 +4,7 @@
     python -m benchmarks ablation --data euroc,rigs            some data
     python -m benchmarks ablation --only "noise scale"         some mechanisms (may be repeated)
     python -m benchmarks ablation --table                      the tables of what has been run
+    python -m benchmarks ablation --firing                     how often target-free rules change a decision
 
 Nothing in the product knows of it: `ablation_patches` changes the estimation while the study runs. It can
 be interrupted; what has been run is in the folder --out.
@@ -15,16 +16,18 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks import ablation_data as data
-from benchmarks import runner
+from benchmarks import runner, target_free
 from benchmarks.ablation_board import BOARD
 from benchmarks.ablation_disturbances import DISTURBANCES, disturbed
+from benchmarks.ablation_firing import counted
 from benchmarks.ablation_free import FREE
 from benchmarks.ablation_patches import without
 from benchmarks.ablation_tables import print_tables
@@ -34,14 +37,20 @@ MECHANISMS = BOARD | FREE
 Trial = tuple[str, str, int, "partial[runner.Result]"]
 """Data, case, seed, and what runs it."""
 _EUROC = {"fixed": 0, "free": 0, "tracks": 0}
-_RIGS, _FREE_RIGS, _OWN, _SEEDS = range(301, 305), range(301, 304), range(2), range(1)
+_RIGS, _FREE_RIGS, _OWN, _SEEDS = range(301, 305), range(301, 311), range(2), range(1)
 
 
-def trials(wanted: set[str], name: str) -> Iterator[Trial]:
-    """What is to be run without a mechanism, or as it is."""
-    mechanism = MECHANISMS.get(name)
-    board = mechanism is None or not mechanism.free
-    free = mechanism is None or mechanism.free or name in SHARED
+def trials(wanted: set[str], name: str, compared: Collection[str] = ()) -> Iterator[Trial]:
+    """What is to be run without a mechanism, or as it is.
+
+    Args:
+        wanted: Kinds of data.
+        name: Of the mechanism, or `NOTHING`.
+        compared: Mechanisms with which the estimation as it is will be compared; none: all.
+    """
+    asked = [name] if name in MECHANISMS else [m for m in MECHANISMS if not compared or m in compared]
+    board = any(not MECHANISMS[m].free for m in asked)
+    free = any(MECHANISMS[m].free or m in SHARED for m in asked)
     if "euroc" in wanted:
         for mode in _EUROC:
             if free if mode == "tracks" else board:
@@ -52,18 +61,20 @@ def trials(wanted: set[str], name: str) -> Iterator[Trial]:
     if "free_rigs" in wanted and free:
         for seed in _FREE_RIGS:
             yield "free_rigs", "", seed, partial(data.random_rig, True, seed)
-    if "faults" in wanted:
-        own = set(data.FAULTS) if mechanism is None else set(mechanism.faults)
-        for fault in data.FAULTS:
-            if fault in own:
-                for seed in _OWN:
-                    yield "faults", fault, seed, partial(data.faulty_rig, fault, seed)
-    cases = set(DISTURBANCES) if mechanism is None else set(mechanism.disturbances)
-    for kind, on, target_free in (("disturbances", board, False), ("free_disturbances", free, True)):
+    if "free_recordings" in wanted and free:
+        for case in target_free.CASES:
+            yield "free_recordings", case, 0, partial(data.recording, case)
+    own = {fault for m in asked for fault in MECHANISMS[m].faults}
+    for fault in data.FAULTS:
+        kind = "free_faults" if fault.startswith("free:") else "faults"
+        for seed in _OWN if kind in wanted and fault in own else ():
+            yield kind, fault, seed, partial(data.faulty_rig, fault, seed)
+    cases = {case for m in asked for case in MECHANISMS[m].disturbances}
+    for kind, on, without_board in (("disturbances", board, False), ("free_disturbances", free, True)):
         for seed in _SEEDS if kind in wanted and on else ():
             for case in DISTURBANCES:
                 if case in cases:
-                    yield kind, case, seed, partial(disturbed, case, name, target_free, seed)
+                    yield kind, case, seed, partial(disturbed, case, name, without_board, seed)
 
 
 SHARED = {
@@ -75,7 +86,10 @@ SHARED = {
     "images repeated",
 }
 """Mechanisms with a board that also serve without."""
-DATA = ("euroc", "rigs", "faults", "disturbances", "free_rigs", "free_disturbances")
+DATA = (
+    *("euroc", "rigs", "faults", "disturbances"),
+    *("free_rigs", "free_recordings", "free_faults", "free_disturbances"),
+)
 
 
 def main(argv: list[str]) -> int:
@@ -84,6 +98,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--data", default=",".join(DATA), help=f"which data (default: {','.join(DATA)})")
     parser.add_argument("--only", action="append", help="only this mechanism (may be repeated)")
     parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--firing", action="store_true", help="count decisions that target-free rules change")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/raw"))
     parser.add_argument("--keep-old", action="store_true", help="accept stored results of other code")
     args = parser.parse_args(argv)
@@ -92,6 +107,9 @@ def main(argv: list[str]) -> int:
     unknown = (set(args.data.split(",")) - set(DATA)) | (set(args.only or ()) - set(MECHANISMS))
     if unknown:
         parser.error(f"not known: {', '.join(sorted(unknown))}; mechanisms: {', '.join(MECHANISMS)}")
+    if args.firing:
+        _fire(args.data.split(","), args.only or list(FREE))
+        return 0
     store = args.out / "ablation.jsonl"
     if not args.table:
         if "euroc" in args.data and not data.euroc_halves.FOLDER.is_dir():
@@ -110,7 +128,7 @@ def _run(store: Path, wanted: list[str], names: list[str], code: str, accepted: 
             for name in names:
                 begin = time.process_time()
                 with without(MECHANISMS.get(name)):
-                    for which, case, seed, run in trials({kind}, name):
+                    for which, case, seed, run in trials({kind}, name, names):
                         if (name, which, case, seed) in done:
                             continue
                         row = {"mechanism": name, "data": which, "case": case, "seed": seed, "code": code}
@@ -121,6 +139,24 @@ def _run(store: Path, wanted: list[str], names: list[str], code: str, accepted: 
                         file.write(json.dumps(row, default=runner._plain) + "\n")
                         file.flush()
                 print(f"{kind}, without {name}: {time.process_time() - begin:.0f} s", file=sys.stderr)
+
+
+def _fire(wanted: list[str], names: list[str]) -> None:
+    """Count on each piece of data; recordings and rigs without a board."""
+    print("| data | runs | decisions changed by |\n|---|---|---|")
+    for kind in wanted:
+        total: Counter[str] = Counter()
+        runs = 0
+        for which, case, seed, run in trials({kind}, NOTHING, names):
+            if which == "euroc" and case != "tracks":
+                continue
+            with counted() as counts:
+                run()
+            if +counts:
+                print(f"{which} {case} {seed}: {dict(+counts)}", file=sys.stderr, flush=True)
+            runs += 1
+            total.update(dict.fromkeys(+counts, 1))
+        print(f"| {kind} | {runs} | {', '.join(f'{k}: {n} runs' for k, n in total.items())} |", flush=True)
 
 
 def _stored(store: Path, code: str | None) -> list[runner.Result]:

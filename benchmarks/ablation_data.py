@@ -5,6 +5,7 @@ Every function takes a seed and gives what is needed to compare two versions of 
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -18,16 +19,18 @@ from vical_mocks.harness.feed import (
     feed,
     imu_noise,
 )
+from vical_mocks.harness.recordings import Items, camera_of, read
 from vical_mocks.points import SimulatedRun
 from vical_mocks.random_rigs import draw
 
-from benchmarks import euroc_halves, montecarlo, runner
+from benchmarks import euroc_halves, montecarlo, runner, target_free
 from benchmarks.gaps import Change
 from vical_daemon.estimation.measurements import CalibrationOptions, PointsFrame
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 from vical_daemon.vision.target import load_target
 
 SECONDS = 25.0
+_DOF = 7
 
 
 # ---------------------------------------------------------------------- real data
@@ -75,6 +78,40 @@ def _tracks(items: list[Any], options: CalibrationOptions) -> Any:
     return c.estimate().cameras["cam0"]
 
 
+@lru_cache(maxsize=2)
+def _recorded(folder: str) -> Items:
+    return read(target_free.DATA / folder)
+
+
+def recording(name: str) -> runner.Result:
+    """One case of `benchmarks target_free`: errors against its reference every second."""
+    case = target_free.CASES[name]
+    items, truth = _recorded(case.folder), camera_of(target_free.DATA / case.folder / case.truth)
+    calibrator = target_free.make_calibrator(case, target_free.DATA)
+    out: runner.Result = {"t_s": [], "error": [], "sigma": [], "nees": [], "status": []}
+    events, begin_s = set[str](), time.process_time()
+    due_ns = begin_ns = items[0][0]
+    for t_ns, item in items:
+        if isinstance(item, PointsFrame):
+            calibrator.add_points(replace(item, camera="cam0"))
+            calibrator.process()
+        else:
+            calibrator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+        if t_ns < due_ns and t_ns != items[-1][0]:
+            continue
+        due_ns += 1_000_000_000
+        estimate = calibrator.estimate()
+        events |= {str(e.kind) for e in estimate.events}
+        found = target_free.errors(estimate, truth)
+        if found is not None:
+            out["t_s"].append(1e-9 * (t_ns - begin_ns))
+            out["error"].append(found.error)
+            out["sigma"].append(found.sigma)
+            out["nees"].append(_DOF * found.nees)
+            out["status"].append(str(estimate.status))
+    return out | {"events": sorted(events), "cpu_s": time.process_time() - begin_s}
+
+
 # ---------------------------------------------------------------------- random rigs
 @lru_cache(maxsize=12)
 def _drawn(target_free: bool, seed: int) -> tuple[SimulatedRun, bool]:
@@ -98,7 +135,7 @@ def kept(record: Record) -> runner.Result:
         "t_s": [s.t_s for s in shots],
         "error": [s.error for s in shots],
         "sigma": [np.sqrt(np.diag(s.covariance)) for s in shots],
-        "nees": [montecarlo.nees(s.error, s.covariance, 7) for s in shots],
+        "nees": [montecarlo.nees(s.error, s.covariance, _DOF) for s in shots],
         "status": [s.status for s in shots],
         "events": sorted({str(e.kind) for _, e in record.events}),
         "cpu_s": record.cpu_s,

@@ -67,6 +67,16 @@ def _both_blocks(*_args: Any) -> tuple[int, ...]:
     return target_free.BOTH
 
 
+_FAULTS = (
+    "free: skew 100 ppm",
+    "free: stamp jitter 1 ms",
+    "free: 3 % outliers",
+    "free: accelerometer 0.3 ms late",
+    "free: imu 0.3 % off",
+)
+_CHANGES = ("nothing", DRIFTS, "5 ms", "20 ms", "0.5 deg", "2 deg", "camera clock +0.5 s")
+_RULE: dict[str, Any] = {"free": True, "faults": _FAULTS, "disturbances": _CHANGES}
+
 FREE: dict[str, Mechanism] = {
     "free: clock drift": Mechanism(
         MOVED,
@@ -79,16 +89,14 @@ FREE: dict[str, Mechanism] = {
     "free: walk of the delay": Mechanism(
         MOVED,
         "the time shift may wander from window to window",
-        lambda: [(handover, "_SHIFT_WALK", 0.0)],
-        free=True,
-        disturbances=("nothing", DRIFTS),
+        lambda: [(handover, "SHIFT_WALK", 0.0)],
+        **_RULE,
     ),
     "free: lasting jitter": Mechanism(
         MOVED,
         "late stamps that follow each other: the clock stepped",
         lambda: [(StampOffsets, "lasts", gives(False))],
-        free=True,
-        disturbances=("5 ms", "20 ms", "camera clock +0.5 s"),
+        **_RULE,
     ),
     "free: what has changed": Mechanism(
         MOVED,
@@ -110,7 +118,7 @@ FREE: dict[str, Mechanism] = {
         disturbances=("20 ms", "2 deg", "30 % junk corners for 3 s"),
     ),
     "free: windows fit, links": Mechanism(
-        WRONG, "only the links", lambda: [(target_free_status, "_MOST_INERTIAL", np.inf)], free=True
+        WRONG, "only the links", lambda: [(target_free_status, "_MOST_INERTIAL", np.inf)], **_RULE
     ),
     "free: windows agree": Mechanism(
         WRONG,
@@ -123,15 +131,13 @@ FREE: dict[str, Mechanism] = {
         WRONG,
         "where the model fits poorly, a small contradiction is no change",
         lambda: [(target_free_status, "_matters", gives(True))],
-        free=True,
-        disturbances=("nothing", "5 ms"),
+        **_RULE,
     ),
     "free: tolerant at first": Mechanism(
         WRONG,
         "fifty times the limit in the first four windows",
         lambda: [(target_free_status, "_LEARNING", 0)],
-        free=True,
-        disturbances=("nothing",),
+        **_RULE,
     ),
     "free: outliers refused": Mechanism(
         WRONG,
@@ -157,13 +163,13 @@ FREE: dict[str, Mechanism] = {
         SMALL,
         "until confirmed, disagreement counts at once and in full",
         lambda: [(TargetFreeStatus, "_reported_factor", _own_factor)],
-        free=True,
+        **_RULE,
     ),
     "free: withdrawn answers": Mechanism(
         SMALL,
         "what contradicted answers given up counts, too",
         lambda: [(TargetFreeStatus, "_withdrawn", held_at([]), True)],
-        free=True,
+        **_RULE,
     ),
     "free: pixel errors last": Mechanism(
         SMALL,
@@ -189,7 +195,6 @@ FREE: dict[str, Mechanism] = {
         SMALL,
         "before windows can be compared the imu is doubted at least by half",
         _compared,
-        free=True,
-        faults=("free: imu 0.3 % off",),
+        **_RULE,
     ),
 }

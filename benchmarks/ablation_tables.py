@@ -22,7 +22,7 @@ def print_tables(rows: list[dict[str, Any]], nothing: str) -> None:
         print(f"\n## {data}\n")
         if data == "euroc":
             _euroc(mechanisms, nothing)
-        elif data == "faults":
+        elif data in ("faults", "free_faults", "free_recordings"):
             for case in dict.fromkeys(c for c, _ in mechanisms[nothing]):
                 part = {m: {k: v for k, v in r.items() if k[0] == case} for m, r in mechanisms.items()}
                 print(f"\n### {case}\n")

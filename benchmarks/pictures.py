@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -47,22 +48,24 @@ def main(argv: list[str]) -> int:
         print("skipped: no Chromium here (apt-get install chromium)", file=sys.stderr)
         return 0
     args.out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as name, closing(browser.Browser(Path(name) / "profile")) as chromium:
         work = Path(name)
-        guidance(work, args.out / "guidance.png")
-        log = live_page(work, args.out, args.seconds)
-        terminal(work, log, args.out / "terminal.png")
+        guidance(chromium, work, args.out / "guidance.png")
+        log = live_page(chromium, work, args.out, args.seconds)
+        terminal(chromium, work, log, args.out / "terminal.png")
         board = ["--target", str(log.with_name("target.yaml"))]
-        report(work, [str(log), *board], args.out / "demo_report.png")
+        report(chromium, work, [str(log), *board], args.out / "demo_report.png")
         if EUROC.is_dir():
             known = ["--target", str(EUROC / "target.yaml"), "--initial", str(EUROC / "initial.yaml")]
             fixed = [*known, "--fix", "intrinsics"]
-            report(work, [str(EUROC), *fixed], args.out / "report.png", args.out / "report_phone.png")
+            report(
+                chromium, work, [str(EUROC), *fixed], args.out / "report.png", args.out / "report_phone.png"
+            )
     print("\n".join(str(path) for path in sorted(args.out.glob("*.png"))))
     return 0
 
 
-def guidance(work: Path, path: Path) -> None:
+def guidance(chromium: browser.Browser, work: Path, path: Path) -> None:
     """Look at the page on a phone while a board is wanted elsewhere, fed by the harness of the tests."""
     bus, stop, rng = LocalBus(), threading.Event(), np.random.default_rng(0)
     board = work / "board.yaml"
@@ -84,13 +87,13 @@ def guidance(work: Path, path: Path) -> None:
         await page.screenshot(path)
 
     try:
-        browser.drive(script, work / "profile")
+        chromium.drive(script)
     finally:
         stop.set()
         thread.join()
 
 
-def live_page(work: Path, out: Path, seconds: float) -> Path:
+def live_page(chromium: browser.Browser, work: Path, out: Path, seconds: float) -> Path:
     """Run the demo, look at its page on a desk and on a phone; return the demo's log."""
     command = [*_VICAL, "demo", "--web", "0", "--seconds", str(seconds), "--out", str(work / "demo")]
     demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -112,14 +115,14 @@ def live_page(work: Path, out: Path, seconds: float) -> Path:
         await page.screenshot(out / "page.png")
 
     try:
-        browser.drive(script, work / "profile")
+        chromium.drive(script)
         demo.communicate(timeout=seconds + 60)
     finally:
         demo.kill()
     return next(iter((work / "demo").glob("*.mcap")))
 
 
-def terminal(work: Path, log: Path, path: Path) -> None:
+def terminal(chromium: browser.Browser, work: Path, log: Path, path: Path) -> None:
     """Draw what `vical watch` showed at the end of the log."""
     from rich.console import Console
 
@@ -130,10 +133,12 @@ def terminal(work: Path, log: Path, path: Path) -> None:
         view.take(Sample(message.channel.topic.removeprefix("/"), message.payload, 0))
     console = Console(record=True, width=104, force_terminal=True, file=io.StringIO())
     console.print(live_table.screen(view.estimates, view.health))
-    browser.draw_svg(console.export_svg(title="vical watch"), work, path)
+    chromium.draw_svg(console.export_svg(title="vical watch"), work, path)
 
 
-def report(work: Path, arguments: list[str], path: Path, phone: Path | None = None) -> None:
+def report(
+    chromium: browser.Browser, work: Path, arguments: list[str], path: Path, phone: Path | None = None
+) -> None:
     """Make the report of a calibration and look at its first page, on a desk and on a phone in the dark."""
     html = work / "report.html"
     command = [*_VICAL, "calibrate", *arguments, "--report", str(html)]
@@ -151,7 +156,7 @@ def report(work: Path, arguments: list[str], path: Path, phone: Path | None = No
             await page.wait("document.readyState === 'complete' && document.querySelector('.known') !== null")
             await page.screenshot(phone)
 
-    browser.drive(script, work / "profile")
+    chromium.drive(script)
 
 
 if __name__ == "__main__":

@@ -38,6 +38,8 @@ JUMP_SIGMAS = 6.0
 """2e-9: a time shift that `td_icp` follows has jumped; asked at every window."""
 RATE_SIGMAS = 6.0
 """2e-9: two clocks do not run at one rate, so that a recording is refused."""
+OUTLIER_SIGMAS = 6.0
+"""2e-9: an error beyond is an outlier; it counts as if it were no larger, and says nothing of a noise."""
 
 EVERY_S = 1.0
 """Decisions that need not follow every image are made this often, s."""

@@ -8,7 +8,9 @@ import json
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -89,45 +91,65 @@ class Page:
 Script = Callable[[Page], Awaitable[Any]]
 
 
-def drive(script: Script, folder: Path) -> Any:
-    """Start a browser, run `await script(page)`, stop it."""
-    chromium = find()
-    assert chromium is not None
-    command = [
-        chromium, "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run",
-        f"--user-data-dir={folder}", "--remote-debugging-port=0", "about:blank",
-    ]  # fmt: skip
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    assert process.stderr is not None
-    try:
-        port = next(m.group(1) for line in process.stderr if (m := re.search(r"ws://127.0.0.1:(\d+)/", line)))
-        return asyncio.run(_run(script, port))
-    finally:
-        process.kill()
-        process.wait()
-        process.stderr.close()
+class Browser:
+    """A running Chromium; each script gets a tab of its own.
 
+    Args:
+        folder: For its profile.
+    """
 
-def draw_svg(svg: str, folder: Path, path: Path) -> None:
-    """Turn an SVG of rich into a PNG, its fonts replaced by the browser's own: nothing is fetched."""
-    html = folder / "terminal.html"
-    svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)
-    html.write_text(f"<body style='margin:0;background:#fff'>{svg}</body>")
+    def __init__(self, folder: Path) -> None:
+        chromium = find()
+        assert chromium is not None
+        command = [
+            chromium, "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+            "--no-first-run", f"--user-data-dir={folder}", "--remote-debugging-port=0", "about:blank",
+        ]  # fmt: skip
+        self._process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        self._port = ""
+        end = time.monotonic() + 60.0
+        while not self._port:
+            if self._process.poll() is not None or time.monotonic() > end:
+                self.close()
+                raise RuntimeError(f"{chromium} does not start")
+            with suppress(FileNotFoundError, IndexError):  # Chromium makes it, then writes into it
+                self._port = (folder / "DevToolsActivePort").read_text().splitlines()[0]
+            time.sleep(0.02)
 
-    async def script(page: Page) -> None:
-        await page.open(html.as_uri(), 1100, 900)
-        await page.wait("!!document.querySelector('svg')")
-        height = await page.evaluate("document.querySelector('svg').getBoundingClientRect().height")
-        await page.open(html.as_uri(), 1100, round(height) + 2)
-        await page.wait("!!document.querySelector('svg')")
-        await page.screenshot(path)
+    def drive(self, script: Script) -> Any:
+        """Run `await script(page)` in a new tab."""
+        return asyncio.run(_run(script, self._port))
 
-    drive(script, folder / "profile")
+    def draw_svg(self, svg: str, folder: Path, path: Path) -> None:
+        """Turn an SVG of rich into a PNG, its fonts replaced by the browser's own: nothing is fetched."""
+        html = folder / "terminal.html"
+        svg = re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL)
+        html.write_text(f"<body style='margin:0;background:#fff'>{svg}</body>")
+
+        async def script(page: Page) -> None:
+            await page.open(html.as_uri(), 1100, 900)
+            await page.wait("!!document.querySelector('svg')")
+            height = await page.evaluate("document.querySelector('svg').getBoundingClientRect().height")
+            await page.open(html.as_uri(), 1100, round(height) + 2)
+            await page.wait("!!document.querySelector('svg')")
+            await page.screenshot(path)
+
+        self.drive(script)
+
+    def close(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.wait()
 
 
 async def _run(script: Script, port: str) -> Any:
+    tabs = f"http://127.0.0.1:{port}/json"
     async with aiohttp.ClientSession() as session:
-        async with session.put(f"http://127.0.0.1:{port}/json/new?about:blank") as answer:
+        async with session.put(f"{tabs}/new?about:blank") as answer:
             target = json.loads(await answer.text())
-        async with session.ws_connect(target["webSocketDebuggerUrl"], max_msg_size=0) as socket:
-            return await script(Page(socket))
+        try:
+            async with session.ws_connect(target["webSocketDebuggerUrl"], max_msg_size=0) as socket:
+                return await script(Page(socket))
+        finally:
+            async with session.get(f"{tabs}/close/{target['id']}"):
+                pass

@@ -19,10 +19,12 @@ def web_feed_module():
 
 
 @pytest.fixture(scope="session", name="browser")
-def browser_module():
+def running_browser(tmp_path_factory):
     if browser.find() is None:
         pytest.skip("no Chromium here (apt-get install chromium)")
-    return browser
+    running = browser.Browser(tmp_path_factory.mktemp("profile"))
+    yield running
+    running.close()
 
 
 class Served:

@@ -64,7 +64,7 @@ def test_report_in_a_browser_and_on_paper(report, browser, keep, tmp_path):
         pdf = await page.call("Page.printToPDF", printBackground=True)
         return broken, outside, wide, page.errors, base64.b64decode(pdf["data"])
 
-    broken, outside, wide, errors, pdf = browser.drive(script, tmp_path / "profile")
+    broken, outside, wide, errors, pdf = browser.drive(script)
     assert (broken, outside, errors) == (0, 0, [])
     assert wide <= 1100
     assert pdf.startswith(b"%PDF")

@@ -11,6 +11,8 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from vical_daemon.estimation.inertial.stamp_steps import LEARN
+
 T = TypeVar("T")
 Six = Sequence[float]
 """One reading in plain numbers, rad/s and m/s^2: of six, numpy takes ten times as long."""
@@ -31,8 +33,6 @@ _HARMFUL = (0.1, 1.0)
 changes the velocity by 10 mm/s, about what one image leaves open."""
 _FADES = 1.0 - 1.0 / 200.0
 """Of that largest error, a reading: some hundred readings are remembered."""
-_LEARN = 20
-"""Readings that show how well the motion is predicted, before any of them can be a spike."""
 _CHANNELS = ((0, 1, 2, 6, 7, 8), (3, 4, 5, 9, 10, 11))
 """Of each sensor, upwards and downwards."""
 
@@ -129,7 +129,7 @@ class SpikeFilter(Generic[T]):
             self._note(six, self._missed(six))
             return [held_item, item]
         missed = self._missed(six)
-        if len(self._first) >= _LEARN:
+        if len(self._first) >= LEARN:
             (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
             gyro_off = gyro > _HARMFUL[0] and gyro > _SPIKE * usual_gyro
             if gyro_off != (accel > _HARMFUL[1] and accel > _SPIKE * usual_accel):
@@ -146,7 +146,7 @@ class SpikeFilter(Generic[T]):
 
     def _note(self, six: Six, missed: tuple[float, float]) -> None:
         if self._count >= 2:
-            if len(self._first) < _LEARN:  # there may be spikes among the first readings
+            if len(self._first) < LEARN:  # there may be spikes among the first readings
                 self._first.append(missed)
                 self._largest = (2.0 * np.median(self._first, axis=0)).tolist()
             else:  # one that was not noticed at most doubles it

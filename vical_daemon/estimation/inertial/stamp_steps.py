@@ -15,7 +15,7 @@ import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
 
-LEARN = 20  # intervals by which the usual one is known
+LEARN = 20  # readings by which the usual interval is known, and how well the motion is predicted
 _LEAST_S = 1e-4  # smaller steps are like jitter
 _EVEN_S = 5e-5  # stamps that deviate by more from an even grid were not made by a device's clock
 _FADES = 1.0 - 1.0 / 500.0  # of the largest deviation, an interval

@@ -25,7 +25,8 @@ from vical_daemon.estimation.measurements import FloatArray
 _COARSE_S, _FINE_S = 0.02, 0.004
 _APART_S = 0.25  # another delay this far away must fit worse by the contrast
 _MIN_CONTRAST = 4.0
-_MAX_ROTATION_SIGMA_RAD = np.deg2rad(1.0)
+ROTATION_SIGMA_RAD = np.deg2rad(1.0)
+"""So well a mounting must be known for a start."""
 _MAX_SHIFT_SIGMA_S = 2e-3
 _DESCENTS = 12
 
@@ -55,7 +56,7 @@ class Alignment:
         """Whether a filter may start from it."""
         return (
             self.contrast > _MIN_CONTRAST
-            and self.rotation_sigma_rad < _MAX_ROTATION_SIGMA_RAD
+            and self.rotation_sigma_rad < ROTATION_SIGMA_RAD
             and self.timeshift_sigma_s < _MAX_SHIFT_SIGMA_S
         )
 

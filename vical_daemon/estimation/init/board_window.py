@@ -28,7 +28,7 @@ from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
-from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH, OUTLIER_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
@@ -38,7 +38,6 @@ _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of o
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
 _RELINK_S = 3e-4  # of change of the time shift: links are integrated between the new instants
 _RATE_S = 0.03  # of readings before an instant: they show its angular acceleration
-_OUTLIER = 6.0  # sigmas at which a corner weighs a quarter
 
 Frames = list[tuple[float, PointsFrame]]
 
@@ -319,7 +318,7 @@ class BoardWindow:
         """Ways and residuals over the noise; corners that do not belong hardly count (Geman and McClure)."""
         sigma = self.sigma_px[view.camera] * view.relative
         far = (view.residual**2).sum(axis=1) / sigma**2
-        weight = np.where(view.seen, 1.0 / (1.0 + far / _OUTLIER**2), 0.0) / sigma
+        weight = np.where(view.seen, 1.0 / (1.0 + far / OUTLIER_SIGMAS**2), 0.0) / sigma
         return view.ways * np.repeat(weight, 2)[:, None], (view.residual * weight[:, None]).ravel()
 
     def _cost(self, now: Present) -> float:
@@ -328,7 +327,7 @@ class BoardWindow:
         for view in now.views:
             far = (view.residual**2).sum(axis=1) / (self.sigma_px[view.camera] * view.relative) ** 2
             # what is lost from sight costs as much as a gross outlier
-            cost += float(np.where(view.seen, far / (1.0 + far / _OUTLIER**2), _OUTLIER**2).sum())
+            cost += float(np.where(view.seen, far / (1.0 + far / OUTLIER_SIGMAS**2), OUTLIER_SIGMAS**2).sum())
         return cost
 
     def _learn_noise(self, views: list[View]) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.accel_alignment import Alignment, align, align_at
+from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD, Alignment, align, align_at
 from vical_daemon.estimation.init.accel_evidence import CameraPath
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.linear_start import still_axes
@@ -26,10 +26,9 @@ from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotatio
 
 _SHIFT_SIGMA_S = 1.0e-3
 _PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
-_ROTATION_SIGMA_RAD = np.deg2rad(1.0)
 _LEAST_POSES = 20  # of two seconds at 10 Hz
 _PARTIAL_STRETCH_S = 8.0
-_PARTIAL_MIN_S = 6.0
+PARTIAL_S = 6.0  # before, a second axis may come yet
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)
 
 
@@ -103,7 +102,7 @@ def partial_attempt(data: StartData, reason: str) -> StartResult:
     refused = StartResult(None, reason, motion_missing=True)
     for name in data.priors:
         lens, poses = _poses(data, name, data.frames[name][-1][0] - _PARTIAL_STRETCH_S)
-        if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < _PARTIAL_MIN_S:
+        if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < PARTIAL_S:
             return refused
         path = CameraPath(
             np.array([p.t_cam_s for p in poses]),
@@ -212,7 +211,7 @@ def _not_sure_yet(result: TdIcpResult, most_s: float) -> str:
     if result.timeshift_sigma_s > most_s:
         known = 1e3 * result.timeshift_sigma_s
         return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
-    if float(np.max(result.rotation_sigma_rad)) > _ROTATION_SIGMA_RAD:
+    if float(np.max(result.rotation_sigma_rad)) > ROTATION_SIGMA_RAD:
         worst = np.rad2deg(float(np.max(result.rotation_sigma_rad)))
         return f"mounting rotation known to {worst:.1f} deg so far: turn the rig about a second axis"
     return ""

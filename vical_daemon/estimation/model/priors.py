@@ -16,6 +16,10 @@ GRAVITY_SIGMA_RAD = 0.1
 """Tilt of gravity in the world of a board that the closed form has found."""
 SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s; two poor crystals."""
+SKEW_WALK = 1e-8
+"""How such a drift wanders (temperature), s/s per sqrt(s)."""
+SHIFT_WALK = 2e-6
+"""How a time shift wanders without a drift, s/sqrt(s): clocks are not quite constant."""
 ENTRY_SIGMA = 2e-3
 """Scale or alignment of an IMU that is not as it says, each entry."""
 KNOWN_OFF_SIGMA = 1e-2

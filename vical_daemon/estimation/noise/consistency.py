@@ -23,7 +23,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.significance import SURE_SIGMAS
+from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 MODES = 8
 _MIN_CORNERS = 8
@@ -32,7 +32,6 @@ _TAPER = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
 _FLOOR = 0.5
 _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 16.0
-_CLIP = 6.0
 _DEAD_BAND = 1.3
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
 _CUSUM_DRIFT = 1.6
@@ -84,7 +83,7 @@ def normalised(
     along = solve_lower(L, along[:, MODES:])  # Q' of ways and innovation
     state = along[:, :-1] @ moves
     out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.einsum("ij,ij->i", state, state))
-    return np.minimum(np.maximum(out, -_CLIP), _CLIP)
+    return np.minimum(np.maximum(out, -OUTLIER_SIGMAS), OUTLIER_SIGMAS)
 
 
 @dataclass(slots=True)

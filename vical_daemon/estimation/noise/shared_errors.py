@@ -17,14 +17,13 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
 from vical_daemon.estimation.noise.variance_components import Observed, variances
-from vical_daemon.estimation.significance import SURE_SIGMAS
+from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 _MEMORY = 400  # images
 _LEAST = 20
 _EVERY = 5  # images between two looks at all that is remembered
 _SELDOM_FROM, _SELDOM = 100, 4  # later it changes little: one look in so many
 _STILL_SIGNIFICANT = 1.0  # to go on with what was found
-_CLIP = 6.0  # standard deviations: one outlier is no correlation
 _FLOOR = np.array([2e-5, 5e-3])  # s, px
 _TELLING = 100  # images; the correlation of neighbours is then known to 0.1
 _PERSISTENT = 0.5  # of the variance: nearer to that of a model error (1) than to that of a jitter (0)
@@ -71,7 +70,8 @@ class SharedErrors:
             return False
         late, usual = self._b[:n, 0] / size, self._C[:n, 0, 0] / size**2
         weight = 1.0 / (usual + self.jitter_s**2)
-        late = np.clip(late, -_CLIP / np.sqrt(weight), _CLIP / np.sqrt(weight))
+        most = OUTLIER_SIGMAS / np.sqrt(weight)  # one outlier is no correlation
+        late = np.clip(late, -most, most)
         pairs = weight[1:] * weight[:-1]
         newest = self.images % _MEMORY  # where the oldest follows the newest
         if self.images > _MEMORY and newest:

@@ -8,9 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import MEDIAN_CHI2, SURE_SIGMAS
+from vical_daemon.estimation.significance import MEDIAN_CHI2, OUTLIER_SIGMAS, SURE_SIGMAS
 
-_CLIP = 36.0  # squared standard deviations: outliers are not jitter
 _FLOOR_S = 2e-5
 _ROUNDS = 8
 ANNOUNCED_S = 3e-4
@@ -24,7 +23,7 @@ def excess(square: FloatArray, usual: FloatArray) -> float:
         square: Squared errors, s^2, shape (n,).
         usual: Their variances without, s^2, shape (n,).
     """
-    ratio = np.minimum(square / usual, _CLIP)
+    ratio = np.minimum(square / usual, OUTLIER_SIGMAS**2)
     telling = 1.0 / np.maximum(usual, np.median(usual))  # images with a wide prior have little to say
     if telling @ (ratio - 1.0) < SURE_SIGMAS * np.sqrt(2.0 * float(telling @ telling)):
         return 0.0
@@ -33,6 +32,6 @@ def excess(square: FloatArray, usual: FloatArray) -> float:
     for _ in range(_ROUNDS):
         expected = usual + variance
         weight = expected**-2
-        excess = np.minimum(square, _CLIP * expected) - usual
+        excess = np.minimum(square, OUTLIER_SIGMAS**2 * expected) - usual
         variance = max(float(weight @ excess / weight.sum()), 0.0)
     return float(np.sqrt(variance)) if variance > _FLOOR_S**2 else 0.0

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
-_CLIP = 40.0  # of a chi-square variable with three degrees of freedom: outliers say nothing of a variance
 _ROUNDS = 10
 _SETTLED = 0.01
 
@@ -95,7 +95,7 @@ def _score(observed: Observed, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     T = A @ PA
     h = np.matmul(b[:, None], PA)[:, 0]
     size = np.einsum("ni,nij,nj->n", b, whiten, b)
-    square = h * h * np.minimum(1.0, _CLIP / np.maximum(size, 1e-30))[:, None]
+    square = h * h * np.minimum(1.0, OUTLIER_SIGMAS**2 / np.maximum(size, 1e-30))[:, None]
     over = square - np.diagonal(T, axis1=1, axis2=2)
     T2 = (T * T).sum(axis=0)
     score = 0.5 * np.array([over[:, 0].sum(), over[:, 1:].sum()])

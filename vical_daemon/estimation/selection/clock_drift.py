@@ -16,13 +16,11 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import OFF, SKEW_SIGMA, SURE
+from vical_daemon.estimation.model.priors import OFF, SKEW_SIGMA, SKEW_WALK, SURE
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.selection.model_selection import lenses_known
 
 CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
-SKEW_WALK = 1e-8
-"""How such a drift wanders (temperature), s/s per sqrt(s)."""
 _LEAST_S = 1.0
 
 

@@ -8,8 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
-from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS
-from vical_daemon.estimation.selection.clock_drift import SKEW_WALK
+from vical_daemon.estimation.model.priors import (
+    ACCEL_BIAS_SIGMA_MPS2,
+    GYRO_BIAS_SIGMA_RPS,
+    SHIFT_WALK,
+    SKEW_WALK,
+)
 from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     BIASES,
@@ -24,7 +28,6 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 from vical_daemon.estimation.smoother.target_free_initializer import start_sigmas
 from vical_daemon.estimation.smoother.window import KNOT_S, Landmarks, Window
 
-_SHIFT_WALK = 2e-6  # s/sqrt(s): clocks and mountings are not quite constant
 _GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2 = 4e-4, 5e-3  # by which biases may have walked while nothing was seen
 
 
@@ -92,7 +95,7 @@ def with_process_noise(
     P = carry.covariance()
     P[range(5, 8), range(5, 8)] += noise.gyro_walk**2 * KNOT_S
     P[range(8, 11), range(8, 11)] += noise.accel_walk**2 * KNOT_S
-    for error, walk in ((SHIFT, _SHIFT_WALK), (DRIFT, SKEW_WALK if drifting else 0.0)):
+    for error, walk in ((SHIFT, SHIFT_WALK), (DRIFT, SKEW_WALK if drifting else 0.0)):
         if active[error]:
             place = CALIBRATION + int(active[:error].sum())
             P[place, place] += walk**2 * span_s

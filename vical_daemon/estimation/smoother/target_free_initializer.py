@@ -12,6 +12,7 @@ from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
 from vical_daemon.estimation.model.priors import EQUIDISTANT_SIGMA, LAG_SIGMA_S, SKEW_SIGMA, WINDOW_START
@@ -41,7 +42,6 @@ class _Found(NamedTuple):
 
 _SPAN_S, _LONG_SPAN_S = 5.0, 8.0
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
-_PARTIAL_S = 6.0  # before, a second axis may come yet
 _EVERY_S, _EVERY_MOST_S = 1.0, 4.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
@@ -190,7 +190,7 @@ class TargetFreeInitializer:
         given = prior.T_imu_cam if "extrinsics" in self.options.fix else None
         inside = (t > frames[0][0]) & (t < frames[-1][0])
         one_axis = still_axis(t[inside], gyro[inside], np.zeros(3)) is not None
-        if one_axis and given is None and frames[-1][0] - frames[0][0] < _PARTIAL_S:
+        if one_axis and given is None and frames[-1][0] - frames[0][0] < PARTIAL_S:
             return "the rig turns about one axis only so far: turn it about a second one"
         gyro_bias = np.zeros(3) if known is None else known.bias[:3]
         seeds, reason = self._seeds(t, gyro - gyro_bias, frames, camera, prior, look_around=not one_axis)
@@ -208,14 +208,14 @@ class TargetFreeInitializer:
         best = min(good, key=_misfit)
         about = None
         why = _not_sure_yet(best, mounting_known=given is not None)
-        if why and frames[-1][0] - frames[0][0] > _PARTIAL_S:
+        if why and frames[-1][0] - frames[0][0] > PARTIAL_S:
             inside = (t > frames[0][0] + best.timeshift_s) & (t < frames[-1][0] + best.timeshift_s)
             about = _only_unsure_about(best, still_axis(t[inside], gyro[inside], best.gyro_bias))
         if why and about is None:
             return reason or why
         camera.R_imu_cam, camera.timeshift_s = best.R_imu_cam, best.timeshift_s
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
-        sigma = 0.2
+        sigma = WINDOW_START.lever_arm_m
         if given is not None:
             camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in given)
             sigma = 1e-4

@@ -20,16 +20,16 @@ import numpy as np
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLink, make_link
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import HELD_M
-from vical_daemon.estimation.smoother.window import Landmarks, Window, rays_of
+from vical_daemon.estimation.smoother.window import FARTHEST_M, NEAREST_M, Landmarks, Window, rays_of
 
 _ROUNDS = 8
 _MIN_FEATURES = 15
-_BIAS_SIGMA, _MAX_ARM_M = 0.2, 1.5
+_MAX_ARM_M = 1.5
 _MOST_BEHIND = 0.3  # share of the observations
 _RAY_SIGMA = 2e-3
-_NEAR, _FAR = 0.1, 100.0
 
 
 class NoStartError(Exception):
@@ -47,12 +47,12 @@ class ArmPrior:
     """
 
     p_imu_cam: FloatArray
-    sigma_m: float = 0.2
+    sigma_m: float = WINDOW_START.lever_arm_m
     held: FloatArray | None = None
 
     def information(self) -> FloatArray:
         """Of z = (v0, gravity, lever arm, accel bias), shape (12, 12)."""
-        out = np.diag([0.0] * 6 + [self.sigma_m**-2] * 3 + [_BIAS_SIGMA**-2] * 3)
+        out = np.diag([0.0] * 6 + [self.sigma_m**-2] * 3 + [ACCEL_BIAS_SIGMA_MPS2**-2] * 3)
         if self.held is not None:
             out[6:9, 6:9] += np.outer(self.held, self.held) / HELD_M**2
         return out
@@ -186,7 +186,7 @@ class TrackStart:
             X = inner[..., -1] + inner[..., :-1] @ y
             away = X[seen.landmark] - q_now[seen.frame] - A_now[seen.frame] @ y
             ahead = (away * d).sum(axis=1)
-            depth = np.clip(ahead, _NEAR, _FAR)
+            depth = np.clip(ahead, NEAREST_M, FARTHEST_M)
             off = np.linalg.norm(np.matmul(P, away[..., None])[..., 0], axis=1) / depth
             spread = 1.4826 * float(np.median(off)) + 1e-6
             # a mounting turned by half a circle sees everything behind itself

@@ -25,7 +25,7 @@ from vical_daemon.estimation.model.state import CameraState
 KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
 MAX_LANDMARKS = 220
 _MIN_SEEN = 4
-_NEAREST_M, _FARTHEST_M = 0.1, 200.0
+NEAREST_M, FARTHEST_M = 0.1, 200.0
 
 IntArray = npt.NDArray[np.intp]
 
@@ -282,7 +282,7 @@ def place(
     # the middle observation gives the bearing of those whose rays hardly cross
     distance = np.linalg.norm(X, axis=1)
     along = (X * d[first]).sum(axis=1) / np.maximum(distance, 1e-9)
-    fine = (along > 0.9) & (distance > _NEAREST_M) & (distance < _FARTHEST_M)
+    fine = (along > 0.9) & (distance > NEAREST_M) & (distance < FARTHEST_M)
     usual = float(np.median(1.0 / distance[fine])) if fine.any() else 0.3
     bearing = np.where(fine[:, None], X / np.maximum(distance, 1e-9)[:, None], d[first])
     return anchor, bearing, np.where(fine, 1.0 / np.maximum(distance, 1e-9), usual)

@@ -8,6 +8,7 @@ ask `weak_directions`. `wording` names directions and motions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,14 +17,15 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, Verb, WeakDirection
 from vical_daemon.estimation.measurements import ConvergenceTargets
+from vical_daemon.estimation.temporal.rotation_turns import MIN_RATE_RPS
 from vical_daemon.estimation.wording import ALONG
 
 FloatArray = npt.NDArray[np.float64]
 
-_DEG = np.pi / 180.0
-WIDE = ConvergenceTargets(0.005, 0.5 * _DEG, 0.5e-3)  # beyond: a direction counts as not observed at all
-_STILL_RPS = 3.0 * _DEG
-_SLOW_RPS = 12.0 * _DEG
+WIDE = ConvergenceTargets(
+    0.005, math.radians(0.5), 0.5e-3
+)  # beyond: a direction counts as not observed at all
+_SLOW_RPS = math.radians(12.0)
 _ONE_AXIS = (
     0.03  # second over first eigenvalue of the rates' scatter below which the rig turned about one axis
 )
@@ -201,7 +203,7 @@ class _Turning:
 
     def too_little(self, axes: tuple[Axis, ...]) -> Guidance:
         """What to do where it hardly turns, or slowly; nothing where it turns fast enough."""
-        if self.rms_rps < _STILL_RPS:
+        if self.rms_rps < MIN_RATE_RPS:
             return Guidance(Verb.TURN, axes, Lack.STILL, rate_rps=self.rms_rps)
         if self.rms_rps < _SLOW_RPS:
             return Guidance(Verb.TURN_FASTER, axes, Lack.SLOW, rate_rps=self.rms_rps)
@@ -226,18 +228,18 @@ class _Turning:
         return self.too_little(others) or Guidance(Verb.TURN, others)
 
     def for_lever_arm(self, axis: FloatArray) -> Guidance:
-        if self.one_axis and self.rms_rps >= _STILL_RPS:
+        if self.one_axis and self.rms_rps >= MIN_RATE_RPS:
             along = abs(float(axis @ self.axis_cam)) > ALONG
             return self.about_another(Verb.TURN if along else Verb.TURN_FASTER)
         return self._about_others(axis)
 
     def for_rotation(self, axis: FloatArray) -> Guidance:
-        if self.one_axis and self.rms_rps >= _STILL_RPS and abs(float(axis @ self.axis_cam)) > _NEAR:
+        if self.one_axis and self.rms_rps >= MIN_RATE_RPS and abs(float(axis @ self.axis_cam)) > _NEAR:
             return self.about_another(Verb.TURN)
         return self._about_others(axis)
 
     def for_timeshift(self, rate_change_rps2: float | None) -> Guidance:
-        if self.rms_rps < _STILL_RPS:
+        if self.rms_rps < MIN_RATE_RPS:
             return Guidance(Verb.TURN_TO_AND_FRO, _GOOD_AXES, Lack.STILL, rate_rps=self.rms_rps)
         if self.steady(rate_change_rps2):
             return Guidance(Verb.TURN_TO_AND_FRO, _GOOD_AXES, Lack.STEADY_RATE)

@@ -14,6 +14,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import Lens, pose_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.significance import EVERY_S
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import (
     Orientations,
@@ -23,7 +24,6 @@ from vical_daemon.estimation.temporal.shift_step import (
     level_at,
 )
 
-_EVERY_S = 1.0
 _BEFORE_S = 3.0  # a change is noticed within
 _STRETCHES = (10, 15, 30)  # images in which a step is looked for
 _LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
@@ -43,9 +43,9 @@ class RecentPast:
         """Remember an image, whether it was used, and once a second the filter."""
         frames = self._frames.setdefault(frame.camera, deque(maxlen=_MOST))
         frames.append((t_cam_s, frame, report.used))
-        while self._copies and self._copies[0].state.t_s < f.state.t_s - _BEFORE_S - _EVERY_S:
+        while self._copies and self._copies[0].state.t_s < f.state.t_s - _BEFORE_S - EVERY_S:
             self._copies.popleft()
-        if not self._copies or f.state.t_s >= self._copies[-1].state.t_s + _EVERY_S:
+        if not self._copies or f.state.t_s >= self._copies[-1].state.t_s + EVERY_S:
             self._copies.append(deepcopy(f))
 
     def filter(self, f: CalibrationFilter) -> CalibrationFilter:

@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA
 from vical_daemon.estimation.significance import JUMP_SIGMAS
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 
 FloatArray = npt.NDArray[np.float64]
 
 _DRIFT_WALK = 1e-6  # how much the drift rate may change, 1/sqrt(s)
-_OFFSET_WALK_S = 2e-6  # wander of the delay itself, s/sqrt(s)
-_DRIFT_SIGMA = 1e-4  # of the drift rate before the second window: two poor crystals
 _SEARCH_S = 0.2  # about the delay of the window before
 
 
@@ -104,7 +103,7 @@ def _tracked(before: _Delay | None, t_s: float, result: TdIcpResult) -> tuple[_D
         result.timeshift_cam_imu_s,
         2.0 * result.timeshift_sigma_s**2,
     )  # two windows share each datum
-    anew = _Delay(t_s, np.array([z, 0.0]), np.diag([variance, _DRIFT_SIGMA**2]))
+    anew = _Delay(t_s, np.array([z, 0.0]), np.diag([variance, SKEW_SIGMA**2]))
     if before is None:
         return anew, False
     x, P = _predicted(before, t_s)
@@ -121,5 +120,5 @@ def _predicted(before: _Delay, t_s: float) -> tuple[FloatArray, FloatArray]:
     dt = max(t_s - before.t_s, 0.0)
     F = np.array([[1.0, dt], [0.0, 1.0]])
     Q = _DRIFT_WALK**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    Q[0, 0] += _OFFSET_WALK_S**2 * dt
+    Q[0, 0] += SHIFT_WALK**2 * dt
     return F @ before.x, F @ before.P @ F.T + Q

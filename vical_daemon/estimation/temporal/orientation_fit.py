@@ -48,7 +48,6 @@ class Fit:
         sensors: With their final registration and gates.
         covariance: Of [R_imu_s (3, local), shift_s] for each sensor in turn, then the bias, (4 S + 3) square.
         bias_rps: Gyro bias in the middle of the data, shape (3,).
-        log_gyro_scale: Log of the factor by which the gyro's drift is larger than stated.
         rounds: Gauss-Newton rounds.
         stamp_rate: By how much the delay of each sensor grows with time, s/s, shape (S,). No part of the
             solution, where delays are constant: a value far from zero says that the stamps are wrong.
@@ -60,7 +59,6 @@ class Fit:
     sensors: tuple[OrientationSensor, ...]
     covariance: FloatArray
     bias_rps: FloatArray
-    log_gyro_scale: float
     rounds: int
     stamp_rate: FloatArray
     stamp_rate_sigma: FloatArray
@@ -108,7 +106,7 @@ def polish(
     widened = widening(scaled(linear, scales), linear.used, S)
     factor = np.concatenate([np.repeat(widened, (3, 1), axis=1).ravel(), np.ones(3)])
     covariance = _wanted(solution.covariance, S) * np.outer(factor, factor)
-    return Fit(sensors, covariance, bias, log_gyro, rounds, *_stamp_rates(linear, S, scales), widened)
+    return Fit(sensors, covariance, bias, rounds, *_stamp_rates(linear, S, scales), widened)
 
 
 def _stamp_rates(linear: Linear, S: int, scales: FloatArray) -> tuple[FloatArray, FloatArray]:

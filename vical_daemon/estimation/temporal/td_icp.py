@@ -43,9 +43,9 @@ __all__ = [
 
 FloatArray = npt.NDArray[np.float64]
 
-_DEG = np.pi / 180.0
 _ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
-_DOUBTFUL_RAD = 0.5 * _DEG  # noise of one orientation above which the usual mistakes are tried out
+# noise of one orientation: above which the usual mistakes are tried out, and of a board as it usually is
+_DOUBTFUL_RAD, _USUAL_RAD = float(np.deg2rad(0.5)), float(np.deg2rad(0.1))
 
 
 def td_icp(
@@ -53,7 +53,7 @@ def td_icp(
     gyro_rps: FloatArray,
     t_cam_s: FloatArray,
     R_world_cam: FloatArray,
-    rotation_sigma: float | FloatArray = 0.1 * _DEG,
+    rotation_sigma: float | FloatArray = _USUAL_RAD,
     options: TdIcpOptions | None = None,
 ) -> TdIcpResult:
     """Find delay, mounting and gyro bias from a gyro and camera orientations.

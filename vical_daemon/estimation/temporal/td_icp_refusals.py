@@ -17,10 +17,9 @@ from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUS
 
 FloatArray = npt.NDArray[np.float64]
 
-_DEG = np.pi / 180.0
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3
-_ROTATION_LOST_RAD = 3.0 * _DEG
+_ROTATION_LOST_RAD = float(np.deg2rad(3.0))
 UNEVEN = 1e-3  # no two crystals are as far apart
 _STRETCHED = 5e-3  # beyond this no delay makes sense
 
@@ -62,7 +61,7 @@ def refuse_motion(
     ratio = rate_imu / max(rate_cam, 1e-9)
     if rate_cam < MIN_RATE_RPS and swing < MIN_RATE_RPS:
         return Refusal(
-            f"no motion: the camera turns at {rate_cam / _DEG:.1f} deg/s (median); "
+            f"no motion: the camera turns at {np.rad2deg(rate_cam):.1f} deg/s (median); "
             "turn the rig to and fro about all axes at 20 to 60 deg/s",
             still=True,
         )
@@ -72,8 +71,8 @@ def refuse_motion(
         )
     if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
         return Refusal(
-            f"it turns at one rate ({rate_imu / _DEG:.0f} deg/s) about one axis all the time: neither delay "
-            "nor mounting about that axis show; turn to and fro, and about other axes"
+            f"it turns at one rate ({np.rad2deg(rate_imu):.0f} deg/s) about one axis all the time: neither "
+            "delay nor mounting about that axis show; turn to and fro, and about other axes"
         )
     return Refusal(_wrong_unit(ratio))
 
@@ -147,8 +146,8 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) ->
     rate, rate_sigma = float(fit.stamp_rate[0]), float(fit.stamp_rate_sigma[0])
     if abs(rate) > max(_STRETCHED, RATE_SIGMAS * rate_sigma):
         return REFUSED, stretched(rate)
-    if noise > 3.0 * _DEG:
-        return REFUSED, f"gyro and camera disagree by {noise / _DEG:.1f} deg (rms) at the best delay"
+    if noise > np.deg2rad(3.0):
+        return REFUSED, f"gyro and camera disagree by {np.rad2deg(noise):.1f} deg (rms) at the best delay"
     reasons = lost_in_words(covariance, fit.sensors[0].R_imu_sensor)
     if abs(rate) > max(UNEVEN, RATE_SIGMAS * rate_sigma):
         reasons.append(stretched(rate))
@@ -170,7 +169,7 @@ def lost_in_words(covariance: FloatArray, R_imu_cam: FloatArray) -> list[str]:
         words = " ".join(f"{a:+.2f}" for a in axis)
         reasons.append(
             f"the mounting about the axis ({words}) of the imu is not determined "
-            f"(sigma {np.sqrt(values[2]) / _DEG:.0f} deg): the motion turned about this axis only; "
+            f"(sigma {np.rad2deg(np.sqrt(values[2])):.0f} deg): the motion turned about this axis only; "
             "turn about another"
         )
     return reasons

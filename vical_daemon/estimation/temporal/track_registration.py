@@ -26,7 +26,7 @@ Frames = list[tuple[float, PointsFrame]]
 Lens = tuple[FloatArray, FloatArray, str]
 
 _WINDOW_S, _LEAST_S = 20.0, 5.0
-_HOLE_S = 0.5
+_HOLE_S = 0.5  # without an image: the same point may have got another id
 _MOST_WINDOWS = 6
 _MOST_STARTS = 3
 _WANTED = [0, 1, 2, 6]  # mounting and delay among the unknowns of a result
@@ -86,7 +86,7 @@ def _windows(frames: Frames) -> list[Frames]:
     for frame in frames:
         if (
             not stretches
-            or frame[0] - stretches[-1][-1][0] > 0.5
+            or frame[0] - stretches[-1][-1][0] > _HOLE_S
             or frame[0] - stretches[-1][0][0] > _WINDOW_S
         ):
             stretches.append([])

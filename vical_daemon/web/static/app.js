@@ -283,6 +283,9 @@ function listen() {
     setText("link", "live");
   };
   source.onerror = () => { $("link").classList.remove("on"); setText("link", "offline, trying again"); };
+  // A page that the browser keeps for its back button would keep its connections, of which there are six a host.
+  window.addEventListener("pagehide", () => { source.close(); camera.source?.close(); });
+  window.addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); });
 }
 
 for (const button of document.querySelectorAll(".range button")) {

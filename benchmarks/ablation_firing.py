@@ -1,0 +1,91 @@
+"""How often rules of the calibration without a board change a decision: `benchmarks ablation --firing`.
+
+A rule that never changes one on some data brings nothing there, and need not be taken away to know it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from typing import Any
+from unittest.mock import patch
+
+from vical_daemon.estimation.smoother import target_free_status
+from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
+from vical_daemon.estimation.target_free import TargetFreeCalibrator
+
+
+def _fired(counts: Counter[str]) -> list[tuple[Any, str, Callable[[Any], Any]]]:
+    def excess(old: Any) -> Any:
+        @wraps(old)
+        def new(self: Any, square: float, dof: int, change: Any) -> float:
+            result = float(old(self, square, dof, change))
+            self.excess_seen = result
+            plain = square / self._limit(dof)
+            counts["small changes"] += result <= 1.0 < plain
+            strict = plain * (50.0 if self._windows < target_free_status._LEARNING else 1.0)
+            counts["tolerant at first"] += plain <= 1.0 < strict
+            return result
+
+        return new
+
+    def agrees(old: Any) -> Any:
+        @wraps(old)
+        def new(self: Any, fit: Any, carry: Any, **how: Any) -> bool:
+            self.evaluator.excess_seen = 0.0
+            result = bool(old(self, fit, carry, **how))
+            counts["lasting jitter"] += not result and self.evaluator.excess_seen <= 1.0
+            return result
+
+        return new
+
+    def fits(old: Any) -> Any:
+        @wraps(old)
+        def new(self: Any, fit: Any, **how: Any) -> bool:
+            result = bool(old(self, fit, **how))
+            counts["windows fit, links"] += self.misfit[0] is target_free_status.Cause.INERTIAL_MISFIT
+            return result
+
+        return new
+
+    def reported(old: Any) -> Any:
+        @wraps(old)
+        def new(self: Any) -> float:
+            result = float(old(self))
+            counts["scatter before two windows"] += result > self.factor()
+            withdrawn, self._withdrawn = self._withdrawn, []
+            counts["withdrawn answers"] += result > old(self)
+            self._withdrawn = withdrawn
+            return result
+
+        return new
+
+    def weighed(old: Any) -> Any:
+        @wraps(old)
+        def new(self: Any, carry: Any, factor: float, compared: bool) -> Any:
+            weights = self._weights(carry, factor)
+            counts["imu before comparison"] += not compared and weights[max(weights, key=len)] < 0.5
+            return old(self, carry, factor, compared)
+
+        return new
+
+    return [
+        (TargetFreeStatus, "excess", excess),
+        (TargetFreeCalibrator, "_agrees", agrees),
+        (TargetFreeStatus, "fits", fits),
+        (TargetFreeStatus, "_reported_factor", reported),
+        (TargetFreeDoubts, "weighed", weighed),
+    ]
+
+
+@contextmanager
+def counted() -> Iterator[Counter[str]]:
+    """Count, while the estimation runs as it is, how often each rule changes what it decides on."""
+    counts: Counter[str] = Counter()
+    with ExitStack() as stack:
+        for owner, name, make in _fired(counts):
+            stack.enter_context(patch.object(owner, name, make(getattr(owner, name))))
+        yield counts
