@@ -1,4 +1,4 @@
-"""`vical td-icp INPUT`: temporal calibration alone, from the rotations of any sensors."""
+"""`vical td-icp INPUT [SENSOR ...]`: temporal calibration alone, from the rotations of any sensors."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input", metavar="INPUT", help="MCAP, ROS 1 or 2 bag, ASL/EuRoC folder, or a trajectory file"
     )
+    parser.add_argument("more", metavar="SENSOR", nargs="*", help="further sensors, as with --sensors")
     parser.add_argument(
         "--target",
         metavar="FILE",
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     initial = read_initial(args.initial) if args.initial else Initial()
     if not Path(args.input).exists():
         raise CliError(f"{args.input} does not exist; check the path")
-    names = [name.strip() for name in (args.sensors or "").split(",") if name.strip()]
+    names = args.more + [name.strip() for name in (args.sensors or "").split(",") if name.strip()]
     request = TdIcpRequest(Path(args.input), initial, args.target, args.camera, args.imu, args.search, warn)
     if names or is_trajectory(request.path):
         return _joint(args, request, names)

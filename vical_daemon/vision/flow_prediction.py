@@ -12,11 +12,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vical_daemon.vision.detection import FloatArray
+from vical_daemon.vision.detection import FloatArray, median
 
 HISTORY_SAMPLES = 400  # two seconds at 200 Hz
 _TOLERATED_PX = 2.0  # translation moves pixels too, and only the flow knows
 _FOLLOW = 0.2
+_LEAST_POINTS = 8  # for an affine flow
+_NEAR_PX = 25.0  # flow farther from the median belongs to things that move
+_ROUND_PX = 1.0  # spread that points have at least: of points on one line the flow across is the mean flow
 
 
 @dataclass(frozen=True)
@@ -121,13 +124,12 @@ class FlowPredictor:
         """Remember the mean (affine) flow of a frame for the next one, and which foretelling was right."""
         self._compare(before_px, now_px, t_before_ns, t_now_ns)
         self._affine = self._turn = None
-        if len(before_px) >= 8:
-            design = np.column_stack([before_px, np.ones(len(before_px))])
+        if len(before_px) >= _LEAST_POINTS:
             flow = now_px - before_px
-            usual = np.median(flow, axis=0)
-            near = np.linalg.norm(flow - usual, axis=1) < 25.0
-            if near.sum() >= 8:
-                self._affine = np.linalg.lstsq(design[near], now_px[near], rcond=None)[0].T
+            off = flow - np.array([median(flow[:, 0]), median(flow[:, 1])])
+            near = np.hypot(off[:, 0], off[:, 1]) < _NEAR_PX
+            if np.count_nonzero(near) >= _LEAST_POINTS:
+                self._affine = _affine(before_px[near], now_px[near])
         if t_before_ns is not None and t_now_ns is not None:
             self._step_s = (t_now_ns - t_before_ns) * 1e-9
 
@@ -186,3 +188,13 @@ class FlowPredictor:
             return uv_px
         fx, fy, cx, cy = self.camera.intrinsics
         return np.asarray(self.camera.rays(uv_px) * np.array([fx, fy]) + np.array([cx, cy]))
+
+
+def _affine(before: FloatArray, now: FloatArray) -> FloatArray:
+    """Least squares fit of now = A (before, 1), shape (2, 3)."""
+    centre, goal = before.mean(axis=0), now.mean(axis=0)
+    apart = before - centre
+    square = apart.T @ apart
+    square[[0, 1], [0, 1]] += _ROUND_PX**2  # points on one line
+    linear = np.eye(2) + np.linalg.solve(square, apart.T @ (now - goal - apart)).T
+    return np.column_stack([linear, goal - linear @ centre])

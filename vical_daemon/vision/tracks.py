@@ -20,6 +20,7 @@ from vical_daemon.vision.patches import Float32, Templates, no_templates
 BoolArray = npt.NDArray[np.bool_]
 
 SMOOTHING_PX = 0.8
+_KERNEL = cv2.getGaussianKernel(5, SMOOTHING_PX, cv2.CV_32F)
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class FeatureTracker:
             ValueError: The picture has a shape or type that no camera of ours gives.
         """
         gray = as_gray(image)
-        smooth = cv2.GaussianBlur(gray, (5, 5), SMOOTHING_PX).astype(np.float32)
+        smooth: Float32 = np.asarray(cv2.sepFilter2D(gray, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
         now = _Picture(gray, cv2.pyrDown(gray), t_ns)
         if self._last is not None and self._last.gray.shape != gray.shape:
             self._features, self._last = _Features(), None

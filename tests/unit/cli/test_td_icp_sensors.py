@@ -211,6 +211,10 @@ def test_trajectory_files_of_both_kinds_join_a_log(tmp_path: Path, capsys: Any) 
     for pair in found.out["pairs"]:
         error = pair["timeshift_s"] - (truth[pair["a"]] - truth[pair["b"]])
         assert abs(error) < 4.5 * pair["timeshift_sigma_s"] < 6e-3
+    assert main(["td-icp", str(path), str(tum), "--json"]) == 0
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert (pair["a"], pair["b"]) == ("imu0", "vicon.txt")
+    assert abs(pair["timeshift_s"] - 0.75) < 4.5 * pair["timeshift_sigma_s"] < 6e-3
 
 
 def test_what_is_no_orientation_is_said(tmp_path: Path, capsys: Any) -> None:

@@ -30,7 +30,7 @@ def register_sensors(request: TdIcpRequest, names: list[str]) -> tuple[JointResu
 
     Args:
         request: What to register.
-        names: Of the sensors.
+        names: Of the sensors. Next to a single one, the imu of the recording is meant.
 
     Raises:
         InputError: A name means nothing, or its data cannot be used.
@@ -42,6 +42,8 @@ def register_sensors(request: TdIcpRequest, names: list[str]) -> tuple[JointResu
         return joint_of_orientations([first, *others], options), {}
     recording = _recording(request, names)
     imus = {} if recording is None else recording.imus
+    if len(names) == 1 and recording is not None and imus and names[0] not in imus:
+        names = [choose_gyro(recording, request.imu)[0], *names]
     gyros = [name for name in names if name in imus]
     base_ns = None if recording is None else recording.begin_ns
     streams, lenses = [], {}
