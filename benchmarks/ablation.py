@@ -134,7 +134,13 @@ def _run(store: Path, wanted: list[str], names: list[str], code: str, accepted: 
                         row = {"mechanism": name, "data": which, "case": case, "seed": seed, "code": code}
                         try:
                             row["result"] = run()
-                        except (np.linalg.LinAlgError, ValueError, AssertionError, OverflowError) as error:
+                        except (
+                            np.linalg.LinAlgError,
+                            ValueError,
+                            AssertionError,
+                            OverflowError,
+                            KeyError,
+                        ) as error:
                             row["result"] = {"failed": f"{type(error).__name__}: {error}"}
                         file.write(json.dumps(row, default=runner._plain) + "\n")
                         file.flush()
