@@ -21,12 +21,14 @@ from vical_daemon.estimation.filter.image_update import (
     rows_of,
     solve,
 )
+from vical_daemon.estimation.filter.lever_arm_score import DRIVEN, LeverArmScore
 from vical_daemon.estimation.filter.linearise import (
     Image,
     Linear,
     LinearityMonitor,
     by_derivatives,
     by_sigma_points,
+    view_derivatives,
 )
 from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives, move_by_sigma_points
 from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
@@ -81,6 +83,7 @@ class CalibrationFilter:
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
+        arm_score: What noise of the gyro does to lever arms; None: not followed yet, or the motion was lost.
     """
 
     state: State
@@ -99,6 +102,7 @@ class CalibrationFilter:
     nis_level: float = 4.0
     stamp_sigma_s: float = 0.0
     began_s: float = 0.0
+    arm_score: LeverArmScore | None = None
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
     _view_straight: dict[str, LinearityMonitor] = field(default_factory=dict)
 
@@ -111,9 +115,16 @@ class CalibrationFilter:
         state = self.state
         moved, Q = self._moved(segment)
         self._grow(moved, Q)
+        self._predict_score(moved, Q)
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         state.t_s = float(segment.t_s[-1])
         self.rates = rates_after(state, segment, self.rates)
+
+    def _predict_score(self, moved: Propagated, Q: FloatArray) -> None:
+        if self.arm_score is not None:
+            noise = self.imu_noise
+            walk = np.repeat([noise.gyro_walk**2, noise.accel_walk**2], 3) * moved.seconds
+            self.arm_score.predict(moved.slopes, Q, walk)
 
     def _moved(self, segment: ImuSegment) -> tuple[Propagated, FloatArray]:
         """The motion at the end of a segment and the covariance of the noise gathered on the way."""
@@ -170,7 +181,9 @@ class CalibrationFilter:
             )
         self.nis_level += 0.05 * (level - self.nis_level)
         noise_updates.learn(self, image, lin, fit)
+        score = self._arm_score(image, lin, fit)
         self._accept(fit.S, fit.dx)
+        self._move_by(self._step_of(score))
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
@@ -274,6 +287,31 @@ class CalibrationFilter:
         self.S = S
         self.state = retract(self.state, self.layout, dx)
 
+    def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
+        """By how much this image pulls lever arms too far, see `lever_arm_score`; shape (3 cameras,)."""
+        if self.arm_score is None:
+            covariance = self.S[:DRIVEN] @ self.S[:DRIVEN].T
+            self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
+        ways, by_error = lin.ways, lin.by_error
+        if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
+            ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
+        kept = ways[rows_of(fit.keep), :6] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
+        at = list(self.layout.cameras).index(image.camera)
+        to_cam = self.state.cameras[image.camera].R_imu_cam.T
+        return self.arm_score.update(kept.T @ kept, by_error[:6, :DRIVEN], to_cam, at)
+
+    def _step_of(self, score: FloatArray) -> FloatArray:
+        """Step of the state by a score of all lever arms, shape (3 cameras,), in the information vector."""
+        information = np.zeros(self.layout.size)
+        for k, where in enumerate(self.layout.cameras.values()):
+            if where.position is not None:
+                information[where.position] = score[3 * k : 3 * k + 3]
+        return np.asarray(self.S @ (self.S.T @ information))
+
+    def _move_by(self, dx: FloatArray) -> None:
+        """Move the mean by a step that is small against its sigmas."""
+        self.state = retract(self.state, self.layout, dx)
+
     def plausible(self) -> bool:
         """Whether the state is one that a rig can have: finite, arm below 3 m, speed below 30 m/s."""
         state = self.state
@@ -324,6 +362,7 @@ class CalibrationFilter:
         A[:new] = 0.0
         A[:new, -new:] = np.diag(sigmas)
         self.S = unscented.lower_root(A)
+        self.arm_score = None
         state.t_s, state.R_world_imu = motion.t_s, motion.R_world_imu
         state.p_world_imu, state.v_world_imu = motion.p_world_imu, motion.v_world_imu
         for consistency in self.consistency.values():

@@ -105,7 +105,9 @@ class LinearisedFilter(CalibrationFilter):
         for where in self.layout.cameras.values():
             if where.timeshift is not None and where.skew is not None:
                 self.offset[where.timeshift] += moved.seconds * self.offset[where.skew]
-        self._grow(moved._replace(linear=moved.linear[:, :d]), self._noise(moved.influence))
+        Q = self._noise(moved.influence)
+        self._grow(moved._replace(linear=moved.linear[:, :d]), Q)
+        self._predict_score(moved, Q)
         state.t_s = float(segment.t_s[-1])
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         while self.instants and self.instants[0].t_s < state.t_s + _SAME_S:
@@ -113,6 +115,10 @@ class LinearisedFilter(CalibrationFilter):
             if there.t_s > state.t_s - _SAME_S:
                 self._go_on_from(there)
         self.rates = rates_after(state, segment, self.rates)
+
+    def _move_by(self, dx: FloatArray) -> None:
+        """See `CalibrationFilter._move_by`; the reference stays."""
+        self.offset = self.offset + dx
 
     def _go_on_from(self, there: Instant) -> None:
         """Take another motion for reference; the mean stays where it is."""

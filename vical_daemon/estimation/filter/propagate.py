@@ -8,7 +8,14 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
-from vical_daemon.estimation.inertial.imu_model import Influence, Motion, compose, influence, strapdown
+from vical_daemon.estimation.inertial.imu_model import (
+    Influence,
+    Motion,
+    Strapdown,
+    compose,
+    influence,
+    strapdown,
+)
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.imu_scale import by_entries
@@ -37,6 +44,7 @@ class Propagated(NamedTuple):
         linear: F S of [attitude, position, velocity], shape (9, d).
         curved: Square root of the second-order covariance, shape (9, k); k = 0 by derivatives.
         influence: What errors of the readings do to it.
+        slopes: Of itself by the motion at the start and constant biases, shape (9, 15).
         seconds: Length of the segment.
     """
 
@@ -46,6 +54,7 @@ class Propagated(NamedTuple):
     linear: FloatArray
     curved: FloatArray
     influence: Influence
+    slopes: FloatArray
     seconds: float
 
 
@@ -65,15 +74,30 @@ def move_by_sigma_points(state: State, layout: Layout, S: FloatArray, segment: I
         [grp_from_rotation(end.R[0].T @ end.R[1:]), end.p[1:] - end.p[0], end.v[1:] - end.v[0]], axis=1
     )
     m = unscented.moments(values)
+    errors = influence(state.R_world_imu, relative)
     return Propagated(
         end.R[0] @ rotation_from_grp(m.shift[ATTITUDE]),
         end.p[0] + m.shift[POSITION],
         end.v[0] + m.shift[VELOCITY],
         m.linear,
         m.curved,
-        influence(state.R_world_imu, relative),
+        errors,
+        motion_slopes(state, relative, errors),
         float(relative.t_s[-1]),
     )
+
+
+def motion_slopes(state: State, relative: Strapdown, errors: Influence) -> FloatArray:
+    """Derivatives of the motion at the end by that at the start and by constant biases, shape (9, 15)."""
+    T = float(relative.t_s[-1])
+    F = np.zeros((9, ACCEL_BIAS.stop))
+    hats = so3.hat(np.array([relative.dp[0, -1], relative.dv[0, -1]]))
+    F[ATTITUDE, ATTITUDE] = relative.dR[0, -1].T
+    F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -state.R_world_imu @ hats
+    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = so3.IDENTITY
+    F[POSITION, VELOCITY] = T * so3.IDENTITY
+    F[:, _BIASES] = errors.by_bias()
+    return F
 
 
 def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: ImuSegment) -> Propagated:
@@ -87,19 +111,13 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
     R, g = state.R_world_imu, state.gravity
     errors = influence(R, relative)
     F = np.zeros((9, len(S)))
-    hats = so3.hat(np.array([dp, dv, g]))
-    tilt = -hats[2] @ state.tilt
-    F[ATTITUDE, ATTITUDE] = dR.T
-    F[POSITION, ATTITUDE], F[VELOCITY, ATTITUDE] = -R @ hats[:2]
-    F[POSITION, POSITION] = F[VELOCITY, VELOCITY] = so3.IDENTITY
-    F[POSITION, VELOCITY] = T * so3.IDENTITY
+    F[:, : ACCEL_BIAS.stop] = motion_slopes(state, relative, errors)
+    tilt = -so3.hat(g) @ state.tilt
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
         bias = np.concatenate([state.gyro_bias, state.accel_bias])
         by = by_entries(errors, segment, bias, state.gyro_matrix, state.accel_matrix)
         F[:, _BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
-    else:
-        F[:, _BIASES] = errors.by_bias()
     if layout.accel_lag is not None and segment.accel_slope is not None:
         F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)
     return Propagated(
@@ -109,5 +127,6 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
         F @ S,
         np.zeros((9, 0)),
         errors,
+        F[:, : ACCEL_BIAS.stop],
         T,
     )

@@ -1,0 +1,81 @@
+"""Noise of the gyro pulls lever arms one way: by how much, and how a filter takes that off.
+
+A lever arm p shows in how the camera moves when the rig turns. How the rig turns is known with noise, and the
+same noise is in the innovations r: their derivative by p is correlated with them. A filter takes its gains as
+given, and so solves sum (dr/dp)' S^-1 r = 0. At the true p, however,
+
+    E[(dr/dp)' S^-1 r] = 1/2 tr(S^-1 dS/dp) = 1/2 d log det S / dp,
+
+as S(p) is the covariance of r(p): errors in variables. Per image this is about the same in fast and in slow
+motion, and it is added to the information vector, so that it moves p by P times its sum: little where motion
+has made P small. It is taken off image by image. [docs/math/filter.md#lever-arms-and-noise-of-the-gyro]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import ACCEL_BIAS, ATTITUDE, MOTION
+
+DRIVEN = ACCEL_BIAS.stop
+"""Attitude, position, velocity, biases: what noise moves from image to image."""
+_STEP_M = 1e-3  # of a lever arm, for differences: log det S is straight over a hundred times that
+
+
+@dataclass(slots=True)
+class LeverArmScore:
+    """Covariances of the motion as they would be for slightly other lever arms, calibration known.
+
+    Attributes:
+        P: As it is, and with each of the three numbers of each lever arm moved by a step, shape
+            (1 + 3 cameras, DRIVEN, DRIVEN).
+    """
+
+    P: FloatArray
+
+    @classmethod
+    def of(cls, covariance: FloatArray, cameras: int) -> LeverArmScore:
+        """Begin with a covariance of the motion and biases, shape (DRIVEN, DRIVEN)."""
+        return cls(np.repeat(covariance[None], 1 + 3 * cameras, axis=0))
+
+    def predict(self, slopes: FloatArray, Q: FloatArray, walk: FloatArray) -> None:
+        """Move on.
+
+        Args:
+            slopes: Of the motion by itself and the biases, shape (9, DRIVEN).
+            Q: Covariance of the noise that the motion gathers, shape (9, 9).
+            walk: Variances that the biases gain, shape (6,).
+        """
+        F = np.eye(DRIVEN)
+        F[MOTION] = slopes
+        self.P = F @ self.P @ F.T
+        self.P[:, MOTION, MOTION] += Q
+        biases = np.arange(MOTION.stop, DRIVEN)
+        self.P[:, biases, biases] += walk
+
+    def update(
+        self, information: FloatArray, by_motion: FloatArray, to_cam: FloatArray, at: int
+    ) -> FloatArray:
+        """Take an image.
+
+        Args:
+            information: What it says about turn and move of its camera, in its frame, shape (6, 6).
+            by_motion: That turn and move by the motion and biases, shape (6, DRIVEN).
+            to_cam: R_imu_cam', shape (3, 3).
+            at: Index of the camera.
+
+        Returns:
+            1/2 d log det S / dp of all lever arms, 1/m, shape (3 cameras,).
+        """
+        T = np.repeat(by_motion[None], len(self.P), axis=0)
+        T[1 + 3 * at : 4 + 3 * at, 3:6, ATTITUDE] -= _STEP_M * to_cam @ so3.hat(so3.IDENTITY)
+        PT = self.P @ np.swapaxes(T, 1, 2)
+        A = np.eye(6) + information @ (T @ PT)
+        self.P = self.P - PT @ np.linalg.solve(A, information @ np.swapaxes(PT, 1, 2))
+        self.P = 0.5 * (self.P + np.swapaxes(self.P, 1, 2))
+        log_det = np.linalg.slogdet(A)[1]
+        return np.asarray((log_det[1:] - log_det[0]) / (2.0 * _STEP_M))
