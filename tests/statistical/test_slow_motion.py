@@ -1,7 +1,7 @@
 """Slow motion before a board: is the lever arm along the optical axis where its sigma says?
 
-Noise of the gyro pulls it one way (see `lever_arm_score`). Chance is taken out: the best estimate that the same
-noise allows, to first order, is subtracted. Without the correction the difference is -0.9, -0.5 and -0.9 sigma.
+Noise of the gyro pulls it one way (see `lever_arm_score`). Chance is taken out: the best estimate that the
+same noise allows, to first order, is subtracted. Without the correction that leaves -0.9, -0.5, -0.9 sigma.
 """
 
 import numpy as np

@@ -181,9 +181,7 @@ class CalibrationFilter:
             )
         self.nis_level += 0.05 * (level - self.nis_level)
         noise_updates.learn(self, image, lin, fit)
-        score = self._arm_score(image, lin, fit)
-        self._accept(fit.S, fit.dx)
-        self._move_by(self._step_of(score))
+        self._accept(fit.S, fit.dx + self._step_by(self._arm_score(image, lin, fit), fit.S))
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
@@ -300,17 +298,13 @@ class CalibrationFilter:
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
         return self.arm_score.update(kept.T @ kept, by_error[:6, :DRIVEN], to_cam, at)
 
-    def _step_of(self, score: FloatArray) -> FloatArray:
-        """Step of the state by a score of all lever arms, shape (3 cameras,), in the information vector."""
+    def _step_by(self, score: FloatArray, S: FloatArray) -> FloatArray:
+        """Step of the state by a score of all lever arms, shape (3 cameras,), with the covariance S S'."""
         information = np.zeros(self.layout.size)
         for k, where in enumerate(self.layout.cameras.values()):
             if where.position is not None:
                 information[where.position] = score[3 * k : 3 * k + 3]
-        return np.asarray(self.S @ (self.S.T @ information))
-
-    def _move_by(self, dx: FloatArray) -> None:
-        """Move the mean by a step that is small against its sigmas."""
-        self.state = retract(self.state, self.layout, dx)
+        return np.asarray(S @ (S.T @ information))
 
     def plausible(self) -> bool:
         """Whether the state is one that a rig can have: finite, arm below 3 m, speed below 30 m/s."""

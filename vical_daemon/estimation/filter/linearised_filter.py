@@ -116,10 +116,6 @@ class LinearisedFilter(CalibrationFilter):
                 self._go_on_from(there)
         self.rates = rates_after(state, segment, self.rates)
 
-    def _move_by(self, dx: FloatArray) -> None:
-        """See `CalibrationFilter._move_by`; the reference stays."""
-        self.offset = self.offset + dx
-
     def _go_on_from(self, there: Instant) -> None:
         """Take another motion for reference; the mean stays where it is."""
         state = self.state

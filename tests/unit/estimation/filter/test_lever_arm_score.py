@@ -25,7 +25,7 @@ def journey(seed):
 
 
 def by_motion(to_cam, arm_m):
-    """Turn and move of a camera, in its frame, by attitude (local) and position, in a world that is the imu."""
+    """Turn and move of a camera, in its frame, by attitude (local) and position; the world is the imu's."""
     out = np.zeros((6, DRIVEN))
     out[:3, :3], out[3:, :3], out[3:, 3:6] = to_cam, -to_cam @ cross_matrix(arm_m), to_cam
     return out
