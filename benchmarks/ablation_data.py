@@ -66,14 +66,19 @@ def euroc(mode: str) -> runner.Result:
     }
 
 
+def _give(calibrator: Any, item: Any) -> None:
+    """An image or a reading of a recording with one camera."""
+    if isinstance(item, PointsFrame):
+        calibrator.add_points(replace(item, camera="cam0"))
+        calibrator.process()
+    else:
+        calibrator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+
+
 def _tracks(items: list[Any], options: CalibrationOptions) -> Any:
     c = TargetFreeCalibrator(options, {"cam0": euroc_halves.PRIOR})
     for _, item in items:
-        if isinstance(item, PointsFrame):
-            c.add_points(replace(item, camera="cam0"))
-            c.process()
-        else:
-            c.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+        _give(c, item)
     c.finish()
     return c.estimate().cameras["cam0"]
 
@@ -92,11 +97,7 @@ def recording(name: str) -> runner.Result:
     events, begin_s = set[str](), time.process_time()
     due_ns = begin_ns = items[0][0]
     for t_ns, item in items:
-        if isinstance(item, PointsFrame):
-            calibrator.add_points(replace(item, camera="cam0"))
-            calibrator.process()
-        else:
-            calibrator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+        _give(calibrator, item)
         if t_ns < due_ns and t_ns != items[-1][0]:
             continue
         due_ns += 1_000_000_000

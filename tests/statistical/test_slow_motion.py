@@ -1,6 +1,6 @@
 """Slow motion before a board: is the lever arm along the optical axis where its sigma says?
 
-Noise of the gyro pulls it one way (see `lever_arm_score`). Chance is taken out: the best estimate that the
+Noise of the gyro biases it (see `lever_arm_score`). To remove chance, the error of the best estimate that the
 same noise allows, to first order, is subtracted. Without the correction that leaves -0.9, -0.5, -0.9 sigma.
 """
 
@@ -31,7 +31,7 @@ def beyond_chance(seed):
     return float(added / np.sqrt(axis @ best.block("p_imu_cam") @ axis))
 
 
-def test_noise_of_the_gyro_does_not_pull_the_lever_arm():
+def test_noise_of_the_gyro_does_not_bias_the_lever_arm():
     added = [beyond_chance(seed) for seed in range(3)]
     assert abs(np.mean(added)) < 0.35, added
     assert np.max(np.abs(added)) < 0.6, added

@@ -21,7 +21,7 @@ from vical_daemon.estimation.filter.image_update import (
     rows_of,
     solve,
 )
-from vical_daemon.estimation.filter.lever_arm_score import DRIVEN, LeverArmScore
+from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, LeverArmScore
 from vical_daemon.estimation.filter.linearise import (
     Image,
     Linear,
@@ -83,7 +83,7 @@ class CalibrationFilter:
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
-        arm_score: What noise of the gyro does to lever arms; None: not followed yet, or the motion was lost.
+        arm_score: Bias of lever arms by noise of the gyro; None: no image yet, or the motion was lost.
     """
 
     state: State
@@ -286,9 +286,9 @@ class CalibrationFilter:
         self.state = retract(self.state, self.layout, dx)
 
     def _arm_score(self, image: Image, lin: Linear, fit: ImageFit) -> FloatArray:
-        """By how much this image pulls lever arms too far, see `lever_arm_score`; shape (3 cameras,)."""
+        """What this image adds wrongly to the information vector at the lever arms, shape (3 cameras,)."""
         if self.arm_score is None:
-            covariance = self.S[:DRIVEN] @ self.S[:DRIVEN].T
+            covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
         ways, by_error = lin.ways, lin.by_error
         if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
@@ -296,7 +296,7 @@ class CalibrationFilter:
         kept = ways[rows_of(fit.keep), :6] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
-        return self.arm_score.update(kept.T @ kept, by_error[:6, :DRIVEN], to_cam, at)
+        return self.arm_score.update(kept.T @ kept, by_error[:6, :MOTION_ERRORS], to_cam, at)
 
     def _step_by(self, score: FloatArray, S: FloatArray) -> FloatArray:
         """Step of the state by a score of all lever arms, shape (3 cameras,), with the covariance S S'."""

@@ -1,14 +1,14 @@
-"""Noise of the gyro pulls lever arms one way: by how much, and how a filter takes that off.
+"""Bias of lever arms by noise of the gyro (errors in variables), predicted and subtracted image by image.
 
-A lever arm p shows in how the camera moves when the rig turns. How the rig turns is known with noise, and the
-same noise is in the innovations r: their derivative by p is correlated with them. A filter takes its gains as
-given, and so solves sum (dr/dp)' S^-1 r = 0. At the true p, however,
+A lever arm p shows in how the camera moves when the rig turns. The turn is measured with noise, and the same
+noise is in the innovations r, so that dr/dp and r are correlated. A filter does not differentiate its gains,
+and solves sum (dr/dp)' S^-1 r = 0. At the true p, however,
 
     E[(dr/dp)' S^-1 r] = 1/2 tr(S^-1 dS/dp) = 1/2 d log det S / dp,
 
-as S(p) is the covariance of r(p): errors in variables. Per image this is about the same in fast and in slow
-motion, and it is added to the information vector, so that it moves p by P times its sum: little where motion
-has made P small. It is taken off image by image. [docs/math/filter.md#lever-arms-and-noise-of-the-gyro]
+because S(p) is the covariance of r(p). Each image adds this to the information vector, and P times the sum is
+the bias. The sum does not depend on how fast the rig moves; P does.
+[docs/math/filter.md, "Lever arms and noise of the gyro"]
 """
 
 from __future__ import annotations
@@ -21,50 +21,50 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ACCEL_BIAS, ATTITUDE, MOTION
 
-DRIVEN = ACCEL_BIAS.stop
-"""Attitude, position, velocity, biases: what noise moves from image to image."""
+MOTION_ERRORS = ACCEL_BIAS.stop
+"""Number of errors of attitude, position, velocity and biases."""
 _STEP_M = 1e-3  # of a lever arm, for differences: log det S is straight over a hundred times that
 
 
 @dataclass(slots=True)
 class LeverArmScore:
-    """Covariances of the motion as they would be for slightly other lever arms, calibration known.
+    """Covariances of motion and biases, calibration known, for the present lever arms and for different ones.
 
     Attributes:
-        P: As it is, and with each of the three numbers of each lever arm moved by a step, shape
-            (1 + 3 cameras, DRIVEN, DRIVEN).
+        P: For the present lever arms, and with one component of one of them moved by a step, shape
+            (1 + 3 cameras, MOTION_ERRORS, MOTION_ERRORS).
     """
 
     P: FloatArray
 
     @classmethod
     def of(cls, covariance: FloatArray, cameras: int) -> LeverArmScore:
-        """Begin with a covariance of the motion and biases, shape (DRIVEN, DRIVEN)."""
+        """Begin with a covariance of the motion and biases, shape (MOTION_ERRORS, MOTION_ERRORS)."""
         return cls(np.repeat(covariance[None], 1 + 3 * cameras, axis=0))
 
     def predict(self, slopes: FloatArray, Q: FloatArray, walk: FloatArray) -> None:
-        """Move on.
+        """Propagate.
 
         Args:
-            slopes: Of the motion by itself and the biases, shape (9, DRIVEN).
+            slopes: Of the motion by itself and the biases, shape (9, MOTION_ERRORS).
             Q: Covariance of the noise that the motion gathers, shape (9, 9).
             walk: Variances that the biases gain, shape (6,).
         """
-        F = np.eye(DRIVEN)
+        F = np.eye(MOTION_ERRORS)
         F[MOTION] = slopes
         self.P = F @ self.P @ F.T
         self.P[:, MOTION, MOTION] += Q
-        biases = np.arange(MOTION.stop, DRIVEN)
+        biases = np.arange(MOTION.stop, MOTION_ERRORS)
         self.P[:, biases, biases] += walk
 
     def update(
         self, information: FloatArray, by_motion: FloatArray, to_cam: FloatArray, at: int
     ) -> FloatArray:
-        """Take an image.
+        """Update with an image.
 
         Args:
             information: What it says about turn and move of its camera, in its frame, shape (6, 6).
-            by_motion: That turn and move by the motion and biases, shape (6, DRIVEN).
+            by_motion: That turn and move by the motion and biases, shape (6, MOTION_ERRORS).
             to_cam: R_imu_cam', shape (3, 3).
             at: Index of the camera.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation.filter.lever_arm_score import DRIVEN, LeverArmScore
+from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, LeverArmScore
 
 STEPS = 6
 
@@ -17,7 +17,7 @@ def journey(seed):
     """Slopes, noise and what images say, two cameras in turn."""
     rng = np.random.default_rng(seed)
     for k in range(STEPS):
-        slopes = np.eye(9, DRIVEN) + 0.1 * rng.standard_normal((9, DRIVEN))
+        slopes = np.eye(9, MOTION_ERRORS) + 0.1 * rng.standard_normal((9, MOTION_ERRORS))
         root = 1e-3 * rng.standard_normal((9, 9))
         ways = 300.0 * rng.standard_normal((8, 6))
         to_cam = Rotation.random(random_state=seed + k).as_matrix()
@@ -26,16 +26,16 @@ def journey(seed):
 
 def by_motion(to_cam, arm_m):
     """Turn and move of a camera, in its frame, by attitude (local) and position; the world is the imu's."""
-    out = np.zeros((6, DRIVEN))
+    out = np.zeros((6, MOTION_ERRORS))
     out[:3, :3], out[3:, :3], out[3:, 3:6] = to_cam, -to_cam @ cross_matrix(arm_m), to_cam
     return out
 
 
 def log_det_s(seed, arms):
     """Of all innovations of whitened pixels, by the textbook's filter."""
-    P, total = 1e-4 * np.eye(DRIVEN), 0.0
+    P, total = 1e-4 * np.eye(MOTION_ERRORS), 0.0
     for slopes, Q, walk, ways, to_cam, at in journey(seed):
-        F, added = np.eye(DRIVEN), np.zeros((DRIVEN, DRIVEN))
+        F, added = np.eye(MOTION_ERRORS), np.zeros((MOTION_ERRORS, MOTION_ERRORS))
         F[:9], added[:9, :9], added[9:, 9:] = slopes, Q, np.diag(walk)
         P = F @ P @ F.T + added
         H = ways @ by_motion(to_cam, arms[at])
@@ -48,7 +48,7 @@ def log_det_s(seed, arms):
 @pytest.mark.parametrize("seed", range(3))
 def test_score_is_half_the_derivative_of_log_det(seed):
     arms = np.array([[0.1, -0.05, 0.02], [-0.2, 0.0, 0.07]])
-    followed, score = LeverArmScore.of(1e-4 * np.eye(DRIVEN), 2), np.zeros(6)
+    followed, score = LeverArmScore.of(1e-4 * np.eye(MOTION_ERRORS), 2), np.zeros(6)
     for slopes, Q, walk, ways, to_cam, at in journey(seed):
         followed.predict(slopes, Q, walk)
         score += followed.update(ways.T @ ways, by_motion(to_cam, arms[at]), to_cam, at)
