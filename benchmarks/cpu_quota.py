@@ -42,9 +42,11 @@ class CpuQuota:
             if second:
                 (_ROOT / "cgroup.subtree_control").write_text("+cpu")
                 (folder / "cpu.max").write_text(f"{quota_us} {PERIOD_US}")
+                (folder / "cpu.weight").write_text("10000")
             else:
                 (folder / "cpu.cfs_period_us").write_text(str(PERIOD_US))
                 (folder / "cpu.cfs_quota_us").write_text(str(quota_us))
+                (folder / "cpu.shares").write_text("262144")
         except OSError as error:
             self.problem = f"no control group for CPU time ({error}); run as root on a kernel that has them"
             self._remove()

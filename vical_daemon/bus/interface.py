@@ -63,7 +63,7 @@ class Bus(Protocol):
         handler: Handler | None = None,
         *,
         depth: int = 1024,
-        newest_wins: bool = False,
+        newest_bytes: int | None = None,
     ) -> Subscription:
         """Receive the samples of matching keys (``*`` matches one chunk, ``**`` any number).
 
@@ -72,7 +72,8 @@ class Bus(Protocol):
             handler: Called for each sample (LocalBus: in the publisher's thread, before `publish`
                 returns; zenoh: in a thread of its own). None: the caller takes them with `recv`.
             depth: Queue length when there is no handler.
-            newest_wins: A full queue drops the oldest (images for a detector) instead of the newest.
+            newest_bytes: The queue holds at most so many bytes, and drops the oldest when full (images for a
+                detector). None: it drops what arrives.
         """
         ...
 
@@ -108,9 +109,10 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
 class SampleQueue:
     """A bounded queue between the bus and a reader. Drops and counts what does not fit."""
 
-    def __init__(self, depth: int, newest_wins: bool) -> None:
+    def __init__(self, depth: int, newest_bytes: int | None = None) -> None:
         self._depth = depth
-        self._newest_wins = newest_wins
+        self._newest_bytes = newest_bytes
+        self._bytes = 0
         self._queue: deque[Sample] = deque()
         self._ready = threading.Condition()
         self._closed = False
@@ -119,19 +121,29 @@ class SampleQueue:
     def put(self, sample: Sample) -> None:
         """Append a sample; a full queue drops the oldest or this one. Never waits."""
         with self._ready:
-            if len(self._queue) >= self._depth:
-                self.dropped += 1
-                if not self._newest_wins:
-                    return
-                self._queue.popleft()
+            self._bytes += len(sample.payload)
             self._queue.append(sample)
+            while self._full:
+                self.dropped += 1
+                dropped = self._queue.pop() if self._newest_bytes is None else self._queue.popleft()
+                self._bytes -= len(dropped.payload)
             self._ready.notify()
 
     def recv(self, timeout_s: float | None = None) -> Sample | None:
         """Return the next sample, or None after the timeout or once closed and empty."""
         with self._ready:
             self._ready.wait_for(lambda: self._queue or self._closed, timeout_s)
-            return self._queue.popleft() if self._queue else None
+            if not self._queue:
+                return None
+            sample = self._queue.popleft()
+            self._bytes -= len(sample.payload)
+            return sample
+
+    @property
+    def _full(self) -> bool:
+        if len(self._queue) > self._depth:
+            return True
+        return self._newest_bytes is not None and self._bytes > self._newest_bytes and len(self._queue) > 1
 
     def close(self) -> None:
         """Wake the waiting readers; queued samples can still be taken."""
@@ -144,12 +156,12 @@ class LocalSubscription:
     """Subscription of a `LocalBus`."""
 
     def __init__(
-        self, bus: LocalBus, expression: str, handler: Handler | None, depth: int, newest_wins: bool
+        self, bus: LocalBus, expression: str, handler: Handler | None, depth: int, newest_bytes: int | None
     ) -> None:
         self.expression = expression
         self._bus = bus
         self._handler = handler
-        self._queue = SampleQueue(depth, newest_wins)
+        self._queue = SampleQueue(depth, newest_bytes)
 
     @property
     def dropped(self) -> int:
@@ -201,10 +213,10 @@ class LocalBus:
         handler: Handler | None = None,
         *,
         depth: int = 1024,
-        newest_wins: bool = False,
+        newest_bytes: int | None = None,
     ) -> LocalSubscription:
         """See `Bus.subscribe`."""
-        subscription = LocalSubscription(self, key_expression, handler, depth, newest_wins)
+        subscription = LocalSubscription(self, key_expression, handler, depth, newest_bytes)
         with self._lock:
             self._subscriptions.append(subscription)
         return subscription

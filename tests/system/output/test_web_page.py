@@ -388,16 +388,20 @@ def test_what_the_operator_needs_is_seen_without_scrolling(
     for number in range(1, 30):
         web_feed.publish_image(bus, number)
 
+    async def publish_images():
+        for number in itertools.count(30):
+            web_feed.publish_estimate(bus, web_feed.estimate(0.2 * min(number + 10, 70), rng))
+            web_feed.publish_image(bus, number)
+            await asyncio.sleep(0.05)
+
     async def script(page):
         await page.open(served.address, width, height, dark=dark)
         await page.wait("document.querySelectorAll('.meter').length === 7")
-        for number in range(30, 60):
-            web_feed.publish_estimate(bus, web_feed.estimate(0.2 * (number + 10), rng))
-            web_feed.publish_image(bus, number)
-            await asyncio.sleep(0.05)
+        feed = asyncio.create_task(publish_images())
         await page.wait("document.querySelector('#corners path.wanted') !== null")
         await page.wait("document.querySelectorAll('#corners path.cell').length > 0")
-        await page.wait("document.getElementById('imageadvice').textContent !== ''")
+        for name in ("wanted", "imageadvice"):
+            await page.wait(f"document.getElementById('{name}').textContent !== ''")
         low = await page.evaluate(
             "Math.max(...['status', 'headline', 'corners', 'wanted', 'imageadvice', 'meters']"
             ".map((id) => document.getElementById(id).getBoundingClientRect().bottom))"
@@ -419,6 +423,7 @@ def test_what_the_operator_needs_is_seen_without_scrolling(
             " scene.canvas.dispatchEvent(new PointerEvent(kind, { pointerId: 1, clientX: x, clientY: 50 }))"
         )
         turned = await page.evaluate("JSON.stringify(scene.turn)") != before
+        feed.cancel()
         return low, texts, wide, drawn, turned, page.errors
 
     low, texts, wide, drawn, turned, errors = browser.drive(script)
