@@ -125,7 +125,7 @@ def retract(state: State, layout: Layout, dx: FloatArray) -> State:
         state.gyro_bias + dx[GYRO_BIAS],
         state.accel_bias + dx[ACCEL_BIAS],
         tilted @ state.gravity,
-        {name: _moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
+        {name: moved_camera(camera, layout.cameras[name], dx) for name, camera in state.cameras.items()},
         gyro_matrix,
         accel_matrix,
         lag_s,
@@ -157,25 +157,30 @@ def difference(state: State, origin: State, layout: Layout) -> FloatArray:
     if layout.target_shape is not None:
         dx[layout.target_shape] = state.target_shape - origin.target_shape
     for name, where in layout.cameras.items():
-        a, b = state.cameras[name], origin.cameras[name]
-        if where.rotation is not None and where.position is not None:
-            dx[where.rotation] = grp_from_rotation(b.R_imu_cam.T @ a.R_imu_cam)
-            dx[where.position] = a.p_imu_cam - b.p_imu_cam
-        if where.timeshift is not None:
-            dx[where.timeshift] = a.timeshift_s - b.timeshift_s
-        if where.skew is not None:
-            dx[where.skew] = a.skew - b.skew
-        if where.intrinsics is not None and where.distortion is not None:
-            dx[where.intrinsics], dx[where.distortion] = (
-                a.intrinsics - b.intrinsics,
-                a.distortion - b.distortion,
-            )
-        if where.readout is not None:
-            dx[where.readout] = a.readout_s - b.readout_s
+        dx += camera_difference(state.cameras[name], origin.cameras[name], where, layout.size)
     return dx
 
 
-def _moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> CameraState:
+def camera_difference(camera: CameraState, origin: CameraState, where: CameraSlices, size: int) -> FloatArray:
+    """Errors that move `origin` to `camera`, zero elsewhere, shape (size,): the inverse of `moved_camera`."""
+    dx = np.zeros(size)
+    if where.rotation is not None and where.position is not None:
+        dx[where.rotation] = grp_from_rotation(origin.R_imu_cam.T @ camera.R_imu_cam)
+        dx[where.position] = camera.p_imu_cam - origin.p_imu_cam
+    if where.timeshift is not None:
+        dx[where.timeshift] = camera.timeshift_s - origin.timeshift_s
+    if where.skew is not None:
+        dx[where.skew] = camera.skew - origin.skew
+    if where.intrinsics is not None and where.distortion is not None:
+        dx[where.intrinsics] = camera.intrinsics - origin.intrinsics
+        dx[where.distortion] = camera.distortion - origin.distortion
+    if where.readout is not None:
+        dx[where.readout] = camera.readout_s - origin.readout_s
+    return dx
+
+
+def moved_camera(camera: CameraState, where: CameraSlices, dx: FloatArray) -> CameraState:
+    """Return the camera moved by its errors in `dx`, shape (n,). The argument is not changed."""
     R, p, K, D = camera.R_imu_cam, camera.p_imu_cam, camera.intrinsics, camera.distortion
     shift, readout, skew = camera.timeshift_s, camera.readout_s, camera.skew
     if where.rotation is not None and where.position is not None:

@@ -16,17 +16,17 @@ from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
-from vical_daemon.estimation.model.retract import orthonormal
+from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
+    CAMERA,
     FULL,
     INERTIAL,
     MarginalPrior,
     calibration_difference,
     carried_out,
-    moved,
 )
 from vical_daemon.estimation.smoother.normal import Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
@@ -243,7 +243,7 @@ class Bundle:
         w.bias = w.bias + dx[order.knots]
         full = np.zeros(FULL)
         full[self.problem.active] = dx[order.calib]
-        w.camera, w.imu = moved(w.camera, full), w.imu + full[INERTIAL][: len(w.imu)]
+        w.camera, w.imu = moved_camera(w.camera, CAMERA, full), w.imu + full[INERTIAL][: len(w.imu)]
         m = w.landmarks
         bearing = m.bearing + np.matmul(tangents(m.bearing), dl[:, :2, None])[..., 0]
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)

@@ -13,15 +13,15 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.model.imu_scale import NUMBERS
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, WINDOW_START
-from vical_daemon.estimation.model.retract import orthonormal
-from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.model.retract import camera_difference
+from vical_daemon.estimation.model.state import CameraSlices, CameraState
 from vical_daemon.estimation.smoother.window import Window
 
 # Of the calibration's errors; the time shift is that at the first image, and drifts from there on.
 ARM, TURN, SHIFT, LENS, DRIFT, READOUT, IMU = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15, 16, slice(17, 32)
 LAG = slice(32, 33)
+CAMERA = CameraSlices(ARM, TURN, SHIFT, DRIFT, slice(7, 11), slice(11, 15), READOUT)
 INERTIAL = slice(IMU.start, LAG.stop)
 FULL = LAG.stop
 HELD_M = 1e-4
@@ -84,38 +84,12 @@ def later(active: BoolArray, seconds: float) -> FloatArray:
     return np.asarray(G[np.ix_(at, at)])
 
 
-def camera_difference(now: CameraState, then: CameraState) -> FloatArray:
-    """Errors [arm, turn (local), shift, lens 8, drift, readout] from `then` to `now`, shape (17,)."""
-    return np.concatenate(
-        [
-            now.p_imu_cam - then.p_imu_cam,
-            so3.log(then.R_imu_cam.T @ now.R_imu_cam),
-            [now.timeshift_s - then.timeshift_s],
-            now.intrinsics - then.intrinsics,
-            now.distortion - then.distortion,
-            [now.skew - then.skew, now.readout_s - then.readout_s],
-        ]
-    )
-
-
 def calibration_difference(window: Window, carry: MarginalPrior) -> FloatArray:
     """Errors of the calibration that lead from what was carried in to the window's, shape (FULL,)."""
-    imu = window.imu - carry.imu if len(window.imu) else np.zeros(NUMBERS)
-    return np.concatenate([camera_difference(window.camera, carry.camera), imu])
-
-
-def moved(camera: CameraState, d: FloatArray) -> CameraState:
-    """The camera with errors of the calibration applied, shape (FULL,)."""
-    return replace(
-        camera,
-        R_imu_cam=orthonormal(camera.R_imu_cam @ so3.exp(d[TURN])),
-        p_imu_cam=camera.p_imu_cam + d[ARM],
-        timeshift_s=camera.timeshift_s + float(d[SHIFT]),
-        intrinsics=camera.intrinsics + d[7:11],
-        distortion=camera.distortion + d[11:15],
-        skew=camera.skew + float(d[DRIFT]),
-        readout_s=camera.readout_s + float(d[READOUT]),
-    )
+    d = camera_difference(window.camera, carry.camera, CAMERA, FULL)
+    if len(window.imu):
+        d[INERTIAL] = window.imu - carry.imu
+    return d
 
 
 def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> MarginalPrior:

@@ -12,12 +12,14 @@ from vical_daemon.estimation.filter.unobservable_directions import held_covarian
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.model.imu_scale import matrices
+from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 from vical_daemon.estimation.selection.clock_drift import evidence, probability
 from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
+    CAMERA,
     DRIFT,
     FULL,
     IMU,
@@ -27,7 +29,6 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     SHIFT,
     TURN,
     MarginalPrior,
-    moved,
 )
 
 _GYRO = slice(IMU.start, IMU.start + 9)
@@ -91,7 +92,9 @@ def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatA
     p = probability(evidence(camera.skew, float(P[DRIFT, DRIFT])))
     sigma = float(np.sqrt(P[DRIFT, DRIFT]))
     k, z = P[:, DRIFT] / sigma, camera.skew / sigma
-    return moved(camera, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(k, k)
+    return moved_camera(camera, CAMERA, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(
+        k, k
+    )
 
 
 def _over_imu(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
@@ -104,7 +107,7 @@ def _over_imu(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatA
         d = -gain @ numbers[at]
         mean += p * d
         mixed += p * (P - gain @ P[at] + np.outer(d, d))
-    return moved(carry.camera, mean), carry.imu + mean[INERTIAL], mixed - np.outer(mean, mean)
+    return moved_camera(carry.camera, CAMERA, mean), carry.imu + mean[INERTIAL], mixed - np.outer(mean, mean)
 
 
 def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> tuple[CameraState, FloatArray]:

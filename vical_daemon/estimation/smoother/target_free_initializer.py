@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -296,20 +297,7 @@ def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
 
 
 def _known(known: MarginalPrior) -> _Found:
-    c = known.camera
-    copy = CameraState(
-        c.R_imu_cam.copy(),
-        c.p_imu_cam.copy(),
-        c.timeshift_s,
-        c.intrinsics.copy(),
-        c.distortion.copy(),
-        c.distortion_model,
-        c.resolution,
-        c.readout_s,
-        c.skew,
-        c.readout_axis,
-    )
-    return _Found(copy, np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
+    return _Found(deepcopy(known.camera), np.concatenate([known.bias[:3], np.zeros(3), known.imu]), 5e-3)
 
 
 def _chained(t_cam_s: FloatArray, chain: CameraOrientations) -> Orientations:
