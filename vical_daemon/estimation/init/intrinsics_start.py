@@ -6,6 +6,7 @@ Only a start: the filter estimates the same eight numbers with everything else.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -68,11 +69,20 @@ class LensFit(NamedTuple):
     which: list[int]
 
     @property
+    def numbers(self) -> int:
+        """How many residuals there are."""
+        return 2 * sum(len(v.ids) for v in self.views)
+
+    @property
+    def squares(self) -> float:
+        """Sum of the squared residuals, px^2."""
+        return self.rms_px**2 * self.numbers
+
+    @property
     def corner_sigma_px(self) -> float:
         """Noise of a corner per axis, px: the residuals without what lens and poses have taken up."""
-        numbers = 2 * sum(len(v.ids) for v in self.views)
-        free = max(numbers - 6 * len(self.views) - len(self.theta), 1)
-        return float(self.rms_px * np.sqrt(numbers / free))
+        free = max(self.numbers - 6 * len(self.views) - len(self.theta), 1)
+        return float(self.rms_px * np.sqrt(self.numbers / free))
 
 
 def fit_lens(views: list[PointsFrame], lens: Lens, target: FloatArray) -> LensFit | None:
@@ -95,8 +105,7 @@ def adjusted(
 ) -> tuple[FloatArray, _Poses, float]:
     """Lens (4 + d,), poses and RMS residual in px after the adjustment, from a lens and poses."""
     theta = np.concatenate([lens.intrinsics, lens.distortion])
-    n = len(theta)
-    scale = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(n - 4)]) * _PRIOR[:n]
+    scale = _scale(lens)
     prior, cost, damping = theta.copy(), np.inf, 1e-3
     best = (theta, poses)
     for _ in range(_STEPS):
@@ -118,6 +127,40 @@ def adjusted(
         poses = [(R @ T, p + d[:3]) for (R, p), T, d in zip(best[1], turns, dposes, strict=True)]
     count = sum(2 * len(v.ids) for v in views)
     return best[0], best[1], float(np.sqrt(cost / max(count, 1)))
+
+
+def _scale(lens: Lens) -> FloatArray:
+    """How far the numbers of a lens may be off, shape (4 + d,)."""
+    n = 4 + len(lens.distortion)
+    scale: FloatArray = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(n - 4)]) * _PRIOR[:n]
+    return scale
+
+
+def along(fit: LensFit, lens: Lens, target: FloatArray, moves: list[FloatArray]) -> tuple[float, float]:
+    """How the squared residuals change if all corners move, and lens and poses follow them.
+
+    Args:
+        fit: Of the corners where they are.
+        lens: As it was before the fit.
+        target: Points of the target, m, shape (n, 3).
+        moves: How the corners of each of its views move, px, shape (n, 2).
+
+    Returns:
+        Half the first and half the second derivative of their sum by the share of `moves`, px^2.
+    """
+    here, up, down = (
+        normal
+        for share in (0.0, 1.0, -1.0)
+        if (normal := _normal(_moved(fit.views, moves, share), fit.poses, target, fit.theta, lens.model))
+    )
+    right = here._replace(b=0.5 * (up.b - down.b), c=0.5 * (up.c - down.c))
+    of_lens, of_poses = right.solve(np.zeros(len(fit.theta)), _scale(lens) ** -2.0, 1e-9)
+    taken = float(of_lens @ right.b) + float((of_poses * right.c).sum())
+    return 0.25 * (up.cost - down.cost), 0.5 * (up.cost + down.cost) - here.cost - taken
+
+
+def _moved(views: list[PointsFrame], moves: list[FloatArray], share: float) -> list[PointsFrame]:
+    return [replace(v, uv_px=v.uv_px + share * m) for v, m in zip(views, moves, strict=True)]
 
 
 def _without_outliers(

@@ -2,29 +2,23 @@
 
 A board that moves is bent by a rolling shutter as no pose and no lens bends it. Images turned upside down are
 read from below: their readout is negative. Images turned upright from a phone's side are read by columns.
+Corners move in proportion to the readout (`at_middle_row`), so that the squared residuals of a lens and poses
+that follow are nearly a parabola of it.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from vical_daemon.estimation.init.intrinsics_start import (
-    MOST_VIEWS,
-    adjusted,
-    estimate_intrinsics,
-    fit_lens,
-    spread,
-)
+from vical_daemon.estimation.init.intrinsics_start import LensFit, along, fit_lens, spread
 from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
 from vical_daemon.estimation.init.target_poses import Lens
-from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
-_TRIED_S = 0.008 * np.arange(6)
+_ROUNDS = 3
 _SHORT_S = 0.004
-_BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 34
+_BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 76 (EuRoC, 4 s from 55 s on)
 
 
 def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> float:
@@ -36,80 +30,71 @@ def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> f
         target: Points of the target, m, shape (n, 3).
         given_s: First row to last, s.
     """
-    above, below = (_bent(frames, lens, target, float(r)) for r in (_TRIED_S[1], -_TRIED_S[1]))
-    tried = np.unique([given_s, *(_TRIED_S if above <= below else -_TRIED_S)])
-    squares = np.array([_bent(frames, lens, target, float(r)) for r in tried]) ** 2
-    least = int(np.argmin(squares))
-    was = squares[int(np.searchsorted(tried, given_s))]
-    if not was - squares[least] > SURE_SIGMAS**2 * squares[least] / _numbers(frames):
-        return given_s
-    if not 0 < least < len(tried) - 1:
-        return float(tried[least])
-    around = slice(least - 1, least + 2)
-    a, b, _ = np.polyfit(tried[around] - tried[least], squares[around], 2)
-    return float(tried[least] - 0.5 * b / a)
+    found_s = given_s
+    for _ in range(_ROUNDS):
+        fit = _fit(frames, lens, target, found_s)
+        if fit is None:
+            return given_s
+        slope, bend = _by_readout(frames, lens, target, fit, lens.readout_axis)
+        gain = slope**2 / bend
+        if found_s == given_s and not gain > SURE_SIGMAS**2 * (fit.squares - gain) / fit.numbers:
+            return given_s
+        found_s -= slope / bend
+    return found_s
 
 
 def likely_axis(frames: Frames, lens: Lens, target: FloatArray) -> str:
-    """`ROWS` or `COLUMNS`: with which of them, read over 8 ms, the board is flatter.
+    """`ROWS` or `COLUMNS`: which of them, read one after the other, make the board flatter.
 
     Arguments as for `readout`.
     """
-    tried = (-float(_TRIED_S[1]), float(_TRIED_S[1]))
-
-    def bent(axis: str) -> float:
-        return min(_bent(frames, replace(lens, readout_axis=axis), target, r) for r in tried)
-
-    return min((ROWS, COLUMNS), key=bent)
+    fit = _fit(frames, lens, target)
+    if fit is None:
+        return ROWS
+    parabolas = {axis: _by_readout(frames, lens, target, fit, axis) for axis in (ROWS, COLUMNS)}
+    return max(parabolas, key=lambda axis: parabolas[axis][0] ** 2 / parabolas[axis][1])
 
 
 def looks_rolling(frames: Frames, lens: Lens, target: FloatArray) -> str:
     """Whether the board is flatter beyond doubt if rows, or columns, are read over 4 ms, not all at once.
 
     Returns `ROWS`, `COLUMNS`, or empty: no rolling shutter shows. It does where the readout is longer than
-    2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as for `readout`. The same corners are
-    compared, each time from lens and poses that a first adjustment found.
+    2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as for `readout`.
     """
-    tried = [(ROWS, 0.0), *((axis, r) for axis in (ROWS, COLUMNS) for r in (_SHORT_S, -_SHORT_S))]
-    ways = [_upright(frames, r, replace(lens, readout_axis=axis)) for axis, r in tried]
-    chosen = spread(ways[0], lens)
-    fit = fit_lens([ways[0][k] for k in chosen], lens, target)
+    fit = _fit(frames, lens, target)
     if fit is None:
         return ""
-    found = replace(lens, intrinsics=fit.theta[:4], distortion=fit.theta[4:])
-    squares = []
-    for way in ways:
-        views = [_only(way[chosen[k]], v.ids) for k, v in zip(fit.which, fit.views, strict=True)]
-        squares.append(adjusted(views, fit.poses, found, target)[2] ** 2)
-    best = 1 + int(np.argmin(squares[1:]))
-    numbers = 2.0 * sum(len(v.ids) for v in fit.views)
-    surely = squares[0] - squares[best] > _BEYOND_DOUBT * squares[best] / numbers
-    return tried[best][0] if surely else ""
+    gains = {}
+    for axis in (ROWS, COLUMNS):
+        slope, bend = _by_readout(frames, lens, target, fit, axis)
+        gains[axis] = 2.0 * abs(slope) * _SHORT_S - bend * _SHORT_S**2
+    axis = max(gains, key=lambda name: gains[name])
+    surely = gains[axis] > _BEYOND_DOUBT * (fit.squares - gains[axis]) / fit.numbers
+    return axis if surely else ""
 
 
-def _only(frame: PointsFrame, ids: IntArray) -> PointsFrame:
-    kept = np.isin(frame.ids, ids)
-    return PointsFrame(frame.camera, frame.t_cam_ns, frame.ids[kept], frame.uv_px[kept])
+def _fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
+    """A lens and poses adjusted to spread-out images whose rows are read like that; None: too few.
 
-
-def _numbers(frames: Frames) -> float:
-    """How many numbers an adjustment over some of the frames has to explain."""
-    sizes = [len(frame.ids) for _, frame in frames]
-    return 2.0 * sum(sizes) * min(1.0, MOST_VIEWS / max(len(sizes), 1))
-
-
-def _bent(frames: Frames, lens: Lens, target: FloatArray, readout_s: float) -> float:
-    """RMS by which the images miss a flat board, px, if their rows are read like that."""
-    fit = estimate_intrinsics(replace(lens), _upright(frames, readout_s, lens), target)
-    return float("nan") if fit is None else fit.rms_px
-
-
-def _upright(frames: Frames, readout_s: float, lens: Lens) -> list[PointsFrame]:
-    """Images as if their rows had been taken at once; always without the first and the last.
-
-    `at_middle_row` does not know how corners move there.
+    Always without the first and the last, of which `at_middle_row` does not know how corners move.
     """
-    found = (
-        at_middle_row(frames, readout_s, lens.resolution, lens.readout_axis) if readout_s else frames[1:-1]
-    )
-    return [frame for _, frame in found]
+    found = at_middle_row(frames, readout_s, lens.resolution, lens.readout_axis)
+    views = [frame for _, frame in (found if readout_s else frames[1:-1])]
+    chosen = spread(views, lens)
+    fit = fit_lens([views[k] for k in chosen], lens, target)
+    if fit is None or not np.isfinite(fit.rms_px):
+        return None
+    return fit._replace(which=[chosen[k] for k in fit.which])
+
+
+def _by_readout(
+    frames: Frames, lens: Lens, target: FloatArray, fit: LensFit, axis: str
+) -> tuple[float, float]:
+    """Half the first and second derivative of the squared residuals by the readout, px^2/s and px^2/s^2."""
+    seen, later = frames[1:-1], at_middle_row(frames, 1.0, lens.resolution, axis)
+    moves = []
+    for k, view in zip(fit.which, fit.views, strict=True):
+        frame = seen[k][1]
+        moves.append((later[k][1].uv_px - frame.uv_px)[np.isin(frame.ids, view.ids)])
+    slope, bend = along(fit, lens, target, moves)
+    return slope, max(bend, 1.0)  # without any motion a second of readout moves nothing

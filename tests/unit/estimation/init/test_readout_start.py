@@ -57,6 +57,18 @@ def test_a_rig_that_stands_still_shows_nothing():
     assert readout(frames, lens, BOARD, 0.011) == 0.011
 
 
+def test_a_readout_of_four_milliseconds_is_found_to_half_of_one():
+    frames, lens = seen(1, 0.004)
+    assert readout(frames, lens, BOARD, 0.0) == pytest.approx(0.004, abs=5e-4)
+
+
+def test_images_too_far_apart_show_nothing():
+    frames, lens = seen(1, 0.02)
+    slow = [(3.0 * t_s, frame) for t_s, frame in frames[::2]]
+    assert not looks_rolling(slow, lens, BOARD)
+    assert readout(slow, lens, BOARD, 0.0) == 0.0
+
+
 def test_views_that_show_no_pose_are_left_out():
     frames, lens = seen(1, 0.02)
     nowhere = np.full_like(frames[20][1].uv_px, 7.0)
