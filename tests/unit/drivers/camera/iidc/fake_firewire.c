@@ -319,7 +319,8 @@ static void *run_camera(void *unused)
         uint32_t raw = REG(0x81C) & 0xFFF, sent = 0;
         uint32_t width = REG(0x608) >> 29 == 7 ? REG(0xA0C) >> 16 : REG(0x608) >> 29 == 2 ? 1280 : 640;
         pthread_mutex_unlock(&lock);
-        t_close += period;
+        int64_t late = now_ns(CLOCK_MONOTONIC) - t_close;
+        t_close += late > NS ? late : period;                         /* held up for long: a pause of the bus */
         int64_t t_first = t_close + 1000000;                          /* first packet 1 ms later */
         while (sent < packets) {                                      /* in bunches, as interrupts come */
             uint32_t end = sent + 16 < packets ? sent + 16 : packets;
@@ -412,10 +413,22 @@ static int iso_resource(struct client *c, struct fw_cdev_allocate_iso_resource *
     return 0;
 }
 
+/* A clock, and the monotonic clock (mono_ns) at the same moment, ns. The kernel reads a clock and the cycle
+ * timer with interrupts off; this process may be held up between two readings, and then reads again. */
+static int64_t same_moment(clockid_t id, int64_t *mono_ns)
+{
+    int64_t shown, after;
+    do {
+        *mono_ns = now_ns(CLOCK_MONOTONIC);
+        shown = now_ns(id);
+        after = now_ns(CLOCK_MONOTONIC);
+    } while (after - *mono_ns > 20000);
+    return shown;
+}
+
 static int cycle_timer2(struct fw_cdev_get_cycle_timer2 *t)
 {
-    int64_t mono = now_ns(CLOCK_MONOTONIC), shown = mono;
-    if (t->clk_id == CLOCK_REALTIME) shown = now_ns(CLOCK_REALTIME);
+    int64_t mono, shown = same_moment(t->clk_id == CLOCK_REALTIME ? CLOCK_REALTIME : CLOCK_MONOTONIC, &mono);
     t->tv_sec = shown / NS;
     t->tv_nsec = (int32_t)(shown % NS);
     t->cycle_timer = cycle_register(bus_ns(mono));
@@ -443,8 +456,9 @@ static int handle(struct client *c, unsigned long request, void *argument)
     case FW_CDEV_IOC_DEALLOCATE_ISO_RESOURCE: return iso_resource(c, argument, FW_CDEV_EVENT_ISO_RESOURCE_DEALLOCATED);
     case FW_CDEV_IOC_GET_CYCLE_TIMER: {
         struct fw_cdev_get_cycle_timer *t = argument;
-        t->cycle_timer = cycle_register(bus_ns(now_ns(CLOCK_MONOTONIC)));
-        t->local_time = (uint64_t)(now_ns(CLOCK_REALTIME) / 1000);
+        int64_t mono;
+        t->local_time = (uint64_t)(same_moment(CLOCK_REALTIME, &mono) / 1000);
+        t->cycle_timer = cycle_register(bus_ns(mono));
         return 0;
     }
     case FW_CDEV_IOC_GET_CYCLE_TIMER2: return cycle_timer2(argument);
