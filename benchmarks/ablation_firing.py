@@ -21,13 +21,11 @@ from vical_daemon.estimation.target_free import TargetFreeCalibrator
 def _fired(counts: Counter[str]) -> list[tuple[Any, str, Callable[[Any], Any]]]:
     def excess(old: Any) -> Any:
         @wraps(old)
-        def new(self: Any, square: float, dof: int, change: Any) -> float:
-            result = float(old(self, square, dof, change))
+        def new(self: Any, square: float, dof: int) -> float:
+            result = float(old(self, square, dof))
             self.excess_seen = result
-            plain = square / self._limit(dof)
-            counts["small changes"] += result <= 1.0 < plain
-            strict = plain * (50.0 if self._windows < target_free_status._LEARNING else 1.0)
-            counts["tolerant at first"] += plain <= 1.0 < strict
+            strict = result * (50.0 if self._windows < target_free_status._LEARNING else 1.0)
+            counts["tolerant at first"] += result <= 1.0 < strict
             return result
 
         return new

@@ -127,12 +127,6 @@ FREE: dict[str, Mechanism] = {
         free=True,
         disturbances=("5 ms", "0.5 deg", "10 mm"),
     ),
-    "free: small changes": Mechanism(
-        WRONG,
-        "where the model fits poorly, a small contradiction is no change",
-        lambda: [(target_free_status, "_matters", gives(True))],
-        **_RULE,
-    ),
     "free: tolerant at first": Mechanism(
         WRONG,
         "fifty times the limit in the first four windows",

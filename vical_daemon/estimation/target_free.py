@@ -271,7 +271,7 @@ class TargetFreeCalibrator:
             found.calibration(),
             known.calibration(),
             self.active,
-            lambda square, dof: self.evaluator.excess(square, dof, change),
+            self.evaluator.excess,
         )
         if self._seek_shift:
             reopened = tuple({*reopened, *CLOCK})

@@ -21,7 +21,7 @@ from vical_daemon.estimation.result import (
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
-from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, FULL, MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import LOST, PATIENCE_S, Evaluator, lacking_verdict
 from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
@@ -33,8 +33,6 @@ _MOST_INERTIAL = 2.5
 _MOST_REFUSED = 0.4
 _LEARNING = 4  # windows
 _MOST_FACTOR = 100.0
-_MODEL_FITS = 1.5  # up to this factor the noise model is taken at its word
-_BIG_M, _BIG_RAD, _BIG_S = 5e-3, float(np.deg2rad(0.2)), 5e-4
 LOOKING_AGAIN = "the last images contradict the calibration: looking for what has changed"
 
 
@@ -214,24 +212,20 @@ class TargetFreeStatus(Evaluator):
             return True
         d = vectors.T @ (fit.change / scale)
         statistic, dof = float((d[informed] ** 2 / values[informed]).sum()), int(informed.sum())
-        full = np.zeros(FULL)
-        full[np.flatnonzero(self.active)] = fit.change
-        agree = self.excess(statistic, dof, full) <= 1.0
+        agree = self.excess(statistic, dof) <= 1.0
         self._growing = (0.0, 0) if complete else (statistic, dof)
         if complete:
             self._agreement.append((min(statistic, self._limit(dof)), dof))
         return agree
 
-    def excess(self, square: float, dof: int, change: FloatArray) -> float:
+    def excess(self, square: float, dof: int) -> float:
         """A sum of squares over the largest that may be chance, given how well windows have agreed so far.
 
         Args:
             square: Of a change of the calibration, over its covariance.
             dof: Its degrees of freedom.
-            change: The change, shape (FULL,): where the model fits poorly, a small one is not a changed rig.
         """
-        ratio = square / self._limit(dof)
-        return min(ratio, 1.0) if self.factor() >= _MODEL_FITS and not _matters(change) else ratio
+        return square / self._limit(dof)
 
     def _limit(self, dof: int) -> float:
         limit = chi_square_limit(dof, WINDOW_CONTRADICTS) * self.factor()
@@ -333,12 +327,6 @@ def _measured_over_stated(windows: Iterable[tuple[float, int]]) -> float:
     """Sum of the squared changes over that of their degrees of freedom, at least 1."""
     squares, dof = (sum(x) for x in zip((0.0, 0), *windows, strict=True))
     return max(1.0, squares / dof) if dof else 1.0
-
-
-def _matters(change: FloatArray) -> bool:
-    """Whether a change, shape (FULL,), is large enough to be a changed rig."""
-    arm, turn, shift = np.linalg.norm(change[:3]), np.linalg.norm(change[3:6]), abs(change[6])
-    return bool(arm > _BIG_M or turn > _BIG_RAD or shift > _BIG_S)
 
 
 def _changes(camera: str, full: FloatArray, active: BoolArray) -> list[Event]:
