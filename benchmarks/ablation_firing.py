@@ -54,9 +54,6 @@ def _fired(counts: Counter[str]) -> list[tuple[Any, str, Callable[[Any], Any]]]:
         def new(self: Any) -> float:
             result = float(old(self))
             counts["scatter before two windows"] += result > self.factor()
-            withdrawn, self._withdrawn = self._withdrawn, []
-            counts["withdrawn answers"] += result > old(self)
-            self._withdrawn = withdrawn
             return result
 
         return new

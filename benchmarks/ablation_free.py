@@ -14,7 +14,6 @@ from benchmarks.ablation_patches import (
     WRONG,
     Mechanism,
     gives,
-    held_at,
     then,
 )
 from vical_daemon.estimation import target_free
@@ -157,12 +156,6 @@ FREE: dict[str, Mechanism] = {
         SMALL,
         "until confirmed, disagreement counts at once and in full",
         lambda: [(TargetFreeStatus, "_reported_factor", _own_factor)],
-        **_RULE,
-    ),
-    "free: withdrawn answers": Mechanism(
-        SMALL,
-        "what contradicted answers given up counts, too",
-        lambda: [(TargetFreeStatus, "_withdrawn", held_at([]), True)],
         **_RULE,
     ),
     "free: pixel errors last": Mechanism(

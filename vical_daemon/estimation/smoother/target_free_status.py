@@ -56,7 +56,6 @@ class TargetFreeStatus(Evaluator):
         self._now_s = 0.0
         self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
         self._growing = 0.0, 0  # the same of the window that is not complete yet
-        self._withdrawn: list[tuple[float, int]] = []  # and of those that contradicted a single window
         self._windows = 0
         self._squares: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
@@ -100,8 +99,6 @@ class TargetFreeStatus(Evaluator):
         """
         if kept is not None and against_s:
             self.contradicted(against_s)
-        if kept is None and against_s and self._growing[1]:
-            self._withdrawn.append(self._growing)
         self.reason, self.motion_missing = cause_text(why, value), False
         if kept is not None and not self._quiet[0]:
             self._quiet = why, value
@@ -185,8 +182,6 @@ class TargetFreeStatus(Evaluator):
 
     def closed(self) -> None:
         """A window is complete and agreed."""
-        if self._windows + 1 >= _ENOUGH_WINDOWS:
-            self._withdrawn.clear()
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
         self._against_since_s = None
         if self.jitter_s >= ANNOUNCED_S:
@@ -239,12 +234,11 @@ class TargetFreeStatus(Evaluator):
     def _reported_factor(self) -> float:
         """What the variances are multiplied by when they are reported.
 
-        Until a second window has confirmed the answer, the window that still grows and those that
-        contradicted answers that were withdrawn count, too.
+        Until a second window has confirmed the answer, the window that still grows counts, too.
         """
         if self.proven:
             return self.factor()
-        return max(self.factor(), _measured_over_stated([*self._withdrawn, *self._agreement, self._growing]))
+        return max(self.factor(), _measured_over_stated([*self._agreement, self._growing]))
 
     # ------------------------------------------------------------------ what is said
     def trace(self) -> list[TracePoint]:

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, FULL, MarginalPrior, root_of
@@ -46,17 +45,6 @@ def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(ti
     assert focal_sigma(status) == pytest.approx(wider * np.sqrt(0.5) * 2.0, rel=1e-6)
     status.agrees(fit(1.0), carry(), complete=False)  # as it grows, it turns out to agree
     assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0, rel=1e-6)
-
-
-def test_what_contradicted_an_answer_that_was_withdrawn_widens_the_next_one():
-    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
-    status.closed()
-    status.agrees(fit(30.0), carry(), complete=False)
-    status.lost(Cause.WINDOW_CONTRADICTED, None, None, 2.0)
-    assert focal_sigma(status) > 20.0 * np.sqrt(0.5) * 2.0
-    for _ in range(2):
-        status.closed()
-    assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0)
 
 
 @pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (3.0, 3.0)])
