@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.temporal.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
+from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.rotation_registration import Registration, closest_point_registration
 from vical_daemon.estimation.temporal.rotation_start import Start, debiased_start
@@ -147,16 +147,11 @@ def _polish(data: _Data, bias: FloatArray, rough: Registration, options: TdIcpOp
         used=rough.weight > 0.2,
         jitter_s=options.stamp_jitter_s,
     )
-    noise = DriftNoise(
-        options.gyro_density,
-        options.gyro_walk,
-        options.bias_sigma_rps,
-        options.gyro_log_sigma,
-        options.estimate_noise,
-        options.gyro_matrix_sigma,
-    )
     return polish(
-        lambda b: GyroCurve.integrate(data.t_imu, data.gyro, b), (sensor,), bias + rough.bias_rps, noise
+        lambda b: GyroCurve.integrate(data.t_imu, data.gyro, b),
+        (sensor,),
+        bias + rough.bias_rps,
+        options.drift_noise(),
     )
 
 

@@ -123,15 +123,9 @@ def joint_with_gyro(
             reasons.append(f"{stream.name}: {alone.reason}")
         bias = alone.gyro_bias_rps
         sensors.append((stream.name, _from_alone(stream, alone, t_imu, gyro, base, options)))
-    noise = DriftNoise(
-        options.gyro_density,
-        options.gyro_walk,
-        options.bias_sigma_rps,
-        options.gyro_log_sigma,
-        options.estimate_noise,
-        options.gyro_matrix_sigma,
+    return _together(
+        name, sensors, lambda b: GyroCurve.integrate(t_imu, gyro, b), bias, options.drift_noise(), reasons
     )
-    return _together(name, sensors, lambda b: GyroCurve.integrate(t_imu, gyro, b), bias, noise, reasons)
 
 
 def _from_alone(

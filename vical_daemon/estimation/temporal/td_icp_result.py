@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.temporal.orientation_problem import DriftNoise
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -43,6 +44,17 @@ class TdIcpOptions:
     stamp_jitter_s: float = 0.0
     estimate_noise: bool = True
     gyro_matrix_sigma: float = 0.003
+
+    def drift_noise(self) -> DriftNoise:
+        """Noise of the curve that the gyro gives."""
+        return DriftNoise(
+            self.gyro_density,
+            self.gyro_walk,
+            self.bias_sigma_rps,
+            self.gyro_log_sigma,
+            self.estimate_noise,
+            self.gyro_matrix_sigma,
+        )
 
 
 @dataclass(frozen=True)
