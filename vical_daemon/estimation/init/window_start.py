@@ -20,6 +20,7 @@ from vical_daemon.estimation.init.board_window import BoardWindow, Frames, View
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.priors import KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 from vical_daemon.estimation.significance import SURE_SIGMAS
@@ -35,8 +36,8 @@ class WindowStart(NamedTuple):
 
     Attributes:
         filter: Begins at the first image and is to take them all.
-        size: How large the target is, relative to what was stated, where that is surely and by far not as
-            stated: to be started with anew. None: it may be.
+        size: How large the target is, relative to what it was taken to be, where that is surely and by far
+            another size, or where the size in its file fits as well: to be started with anew. None: it fits.
     """
 
     filter: LinearisedFilter
@@ -51,6 +52,7 @@ def window_start(
     step: Step,
     buffer: ImuBuffer,
     target: FloatArray,
+    stated: float = 1.0,
 ) -> WindowStart | None:
     """Adjust the first seconds; return a filter that takes their images.
 
@@ -65,6 +67,7 @@ def window_start(
         step: Propagates a filter to an image and corrects it.
         buffer: Inertial readings.
         target: Points of the target, m, shape (n, 3).
+        stated: Size of the target in its file over the one that it is taken to have.
 
     Returns:
         The start, or None where the data do not hold together.
@@ -72,11 +75,17 @@ def window_start(
     window = BoardWindow.begin(state, poses, frames, make(deepcopy(state)), buffer, target)
     if window is None or not window.solve():
         return None
-    trial = window.filter(make(deepcopy(state)))
     try:
-        trial.shared = shared_errors(window)
+        shared_by = shared_errors(window)
+        window.shared_sigmas = {name: errors.sigmas for name, errors in shared_by.items()}
+        if any(sigmas.any() for sigmas in window.shared_sigmas.values()):  # not what it was solved with
+            if not window.solve():
+                return None
+            shared_by = shared_errors(window)
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
+    trial = window.filter(make(deepcopy(state)))
+    trial.shared = shared_by
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
     if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().plausible():
         return None
@@ -86,15 +95,19 @@ def window_start(
         shared.begin()
     for consistency in out.consistency.values():
         consistency.settle()
-    return WindowStart(out, _size(trial.plain()))
+    return WindowStart(out, _size(trial.plain(), stated))
 
 
-def _size(f: CalibrationFilter) -> float | None:
-    """See `WindowStart.size`."""
+def _size(f: CalibrationFilter, stated: float) -> float | None:
+    """See `WindowStart.size`; the size in the file must be contradicted by data, not by the wider prior."""
     where = f.layout.target_scale
     if where is None:
         return None
     size, sigma = f.state.target_scale, float(f.sigmas()[where])
+    data = max(sigma**-2 - KNOWN_SIZE_SIGMA**-2, 0.0)
+    off = data * (stated - 1.0) - (size - 1.0) / sigma**2  # by the data alone: sigmas times their root
+    if stated != 1.0 and abs(off) <= SURE_SIGMAS * np.sqrt(data):
+        return stated
     return size if abs(size - 1.0) > max(_FAR, SURE_SIGMAS * sigma) else None
 
 
@@ -136,14 +149,14 @@ def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
 
 def _apart(window: BoardWindow, view: View, P: FloatArray) -> _Apart:
     """An image against all others; `P`: covariance of all unknowns."""
-    W, r = window.whitened(view)
-    A, b = W.T @ W, W.T @ r
+    W, rest = window.whitened(view)
+    own, b = window.information(view)
     at = window.places(view.node)
     spread = view.by_error @ P[at[:, None], at] @ view.by_error.T
-    others = np.linalg.solve(np.eye(len(A)) - spread @ A, spread)  # (spread^-1 - A)^-1
+    others = np.linalg.solve(np.eye(len(own)) - spread @ own, spread)  # (spread^-1 - own)^-1
     values, vectors = np.linalg.eigh(0.5 * (others + others.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    innovation = r + W @ (others @ b)
+    A, innovation = W.T @ W, rest + W @ (view.by_shared @ view.shared + others @ b)
     node = window.nodes[view.node]
     by_shared = W @ view.by_error @ shared_ways(window.at(node, view.camera), window.layout, view.camera)
     moved, M = W.T @ innovation, A @ root
