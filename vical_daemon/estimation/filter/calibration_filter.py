@@ -228,15 +228,10 @@ class CalibrationFilter:
 
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
         """The linearised image with the noise that its corners share."""
-        lin.shared = self._shared_in(image, lin.by_error)
-        return lin
-
-    def _shared_in(self, image: Image, by_error: FloatArray) -> FloatArray:
-        """Square root of the noise that the corners of an image share, in its ways; (k, 3), or (k, 0)."""
         shared = self.shared.get(image.camera)
-        if shared is None or not (shared.jitter_s or shared.shift_px):
-            return np.zeros((len(by_error), 0))
-        return by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas)
+        if shared is not None and (shared.jitter_s or shared.shift_px):
+            lin.shared = lin.by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas)
+        return lin
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""
@@ -298,16 +293,10 @@ class CalibrationFilter:
         ways, by_error = lin.ways, lin.by_error
         if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
             ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
-        kept = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
-        information = kept.T @ kept
-        shared = self._shared_in(image, by_error)
-        if shared.size:  # what all corners have in common says nothing
-            by_shared = information @ shared
-            inner = np.eye(shared.shape[1]) + shared.T @ by_shared
-            information = information - by_shared @ np.linalg.solve(inner, by_shared.T)
+        kept = ways[rows_of(fit.keep), :6] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
-        return self.arm_score.update(information[:6, :6], by_error[:6, :MOTION_ERRORS], to_cam, at)
+        return self.arm_score.update(kept.T @ kept, by_error[:6, :MOTION_ERRORS], to_cam, at)
 
     def _step_by(self, score: FloatArray, S: FloatArray) -> FloatArray:
         """Step of the state by a score of all lever arms, shape (3 cameras,), with the covariance S S'."""

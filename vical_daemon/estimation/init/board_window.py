@@ -28,7 +28,6 @@ from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
-from vical_daemon.estimation.noise.shared_errors import shared_ways
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH, OUTLIER_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
@@ -38,7 +37,6 @@ _DONE = 0.1  # a step that promises less than this of the sum of squares is the 
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
 _RELINK_S = 3e-4  # of change of the time shift: links are integrated between the new instants
-_SHARED_ROUNDS = 2  # the first may be misled by corners that do not belong
 _RATE_S = 0.03  # of readings before an instant: they show its angular acceleration
 
 Frames = list[tuple[float, PointsFrame]]
@@ -59,13 +57,11 @@ class View(NamedTuple):
     Attributes:
         node: Index of its instant.
         camera: Its name.
-        residual: Measured minus predicted, px, shape (n, 2), without what the corners share.
+        residual: Measured minus predicted, px, shape (n, 2).
         relative: Noise of each corner over that of the camera, shape (n,).
         seen: Corners that can be predicted, shape (n,).
         ways: See `Linear`, shape (2n, k).
         by_error: See `Linear`, shape (k, size).
-        by_shared: The ways by the errors that corners share, over their sigmas, shape (k, 3) or (k, 0).
-        shared: Most likely values of these, shape (3,) or (0,).
     """
 
     node: int
@@ -75,8 +71,6 @@ class View(NamedTuple):
     seen: BoolArray
     ways: FloatArray
     by_error: FloatArray
-    by_shared: FloatArray
-    shared: FloatArray
 
 
 class Linked(NamedTuple):
@@ -103,7 +97,6 @@ class BoardWindow:
         layout: Of the filter's errors; the constants are all but the motion.
         offset: Of the constants from the mean of the prior, shape (c,).
         sigma_px: Corner noise by camera.
-        shared_sigmas: Errors that the corners of an image share, by camera, see `SharedErrors.sigmas`.
     """
 
     def __init__(
@@ -122,7 +115,6 @@ class BoardWindow:
         self._information = root.T @ root
         self.offset = np.zeros(len(root))
         self.sigma_px = {name: noise.sigma_px for name, noise in prior.corner_noise.items()}
-        self.shared_sigmas: dict[str, FloatArray] = {}
 
     @classmethod
     def begin(
@@ -275,26 +267,7 @@ class BoardWindow:
             return None
         residual = np.where(seen[:, None], frame.uv_px - np.where(seen[:, None], uv, 0.0), 0.0)
         ways = np.where(np.repeat(seen, 2)[:, None], ways, 0.0)
-        by_shared = np.zeros((len(by_error), 0))
-        sigmas = self.shared_sigmas.get(name, np.zeros(0))
-        if sigmas.any():
-            by_shared = by_error @ (shared_ways(state, self.layout, name) * sigmas)
-        raw = View(k, name, residual, relative, seen, ways, by_error, by_shared, np.zeros(by_shared.shape[1]))
-        return self._without_shared(raw)
-
-    def _without_shared(self, raw: View) -> View:
-        """The same with the most likely errors that corners share; which corners belong follows from them."""
-        view = raw
-        for _ in range(_SHARED_ROUNDS if raw.shared.size else 0):
-            weight = self._weights(view)
-            W = raw.ways @ raw.by_shared * np.repeat(weight, 2)[:, None]
-            r = (raw.residual * weight[:, None]).ravel()
-            shared = np.asarray(np.linalg.solve(np.eye(W.shape[1]) + W.T @ W, W.T @ r), np.float64)
-            moved = (raw.ways @ (raw.by_shared @ shared)).reshape(-1, 2)
-            view = raw._replace(
-                residual=np.where(raw.seen[:, None], raw.residual - moved, 0.0), shared=shared
-            )
-        return view
+        return View(k, name, residual, relative, seen, ways, by_error)
 
     def _linked(self) -> Linked:
         s, layout, links = self.state, self.layout, self._links
@@ -325,10 +298,10 @@ class BoardWindow:
             g[at] += J.T @ r
 
         for view in now.views:
-            A, b = self.information(view)
+            W, r = self.whitened(view)
             at = self.places(view.node)
-            H[at[:, None], at] += view.by_error.T @ A @ view.by_error
-            g[at] += view.by_error.T @ b
+            H[at[:, None], at] += view.by_error.T @ (W.T @ W) @ view.by_error
+            g[at] += view.by_error.T @ (W.T @ r)
         for k, (e, by_motion, by_constants) in enumerate(zip(*now.linked, strict=True)):
             at = np.concatenate([np.arange(9 * k, 9 * k + 18), constants])
             add(np.concatenate([by_motion, by_constants], axis=1), -e, at)
@@ -341,24 +314,12 @@ class BoardWindow:
         first = 9 * len(self.nodes)
         return np.concatenate([np.arange(9 * node, 9 * node + 9), np.arange(first, first + len(self.offset))])
 
-    def information(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """Of an image about its ways, shape (k, k), and the right side, (k,); shared errors are noise."""
-        W, r = self.whitened(view)
-        A = W.T @ W
-        by_shared = A @ view.by_shared
-        inner = np.eye(by_shared.shape[1]) + view.by_shared.T @ by_shared
-        return A - by_shared @ np.linalg.solve(inner, by_shared.T), W.T @ r
-
     def whitened(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """Ways and residuals over the noise of the corners."""
-        weight = self._weights(view)
-        return view.ways * np.repeat(weight, 2)[:, None], (view.residual * weight[:, None]).ravel()
-
-    def _weights(self, view: View) -> FloatArray:
-        """Of each corner, 1/px; corners that do not belong hardly count (Geman and McClure)."""
+        """Ways and residuals over the noise; corners that do not belong hardly count (Geman and McClure)."""
         sigma = self.sigma_px[view.camera] * view.relative
         far = (view.residual**2).sum(axis=1) / sigma**2
-        return np.asarray(np.where(view.seen, 1.0 / (1.0 + far / OUTLIER_SIGMAS**2), 0.0) / sigma)
+        weight = np.where(view.seen, 1.0 / (1.0 + far / OUTLIER_SIGMAS**2), 0.0) / sigma
+        return view.ways * np.repeat(weight, 2)[:, None], (view.residual * weight[:, None]).ravel()
 
     def _cost(self, now: Present) -> float:
         """Sum of squares; of corners that do not belong only a part (Geman and McClure)."""
@@ -367,7 +328,6 @@ class BoardWindow:
             far = (view.residual**2).sum(axis=1) / (self.sigma_px[view.camera] * view.relative) ** 2
             # what is lost from sight costs as much as a gross outlier
             cost += float(np.where(view.seen, far / (1.0 + far / OUTLIER_SIGMAS**2), OUTLIER_SIGMAS**2).sum())
-            cost += float(view.shared @ view.shared)
         return cost
 
     def _learn_noise(self, views: list[View]) -> None:

@@ -75,17 +75,11 @@ def window_start(
     window = BoardWindow.begin(state, poses, frames, make(deepcopy(state)), buffer, target)
     if window is None or not window.solve():
         return None
+    trial = window.filter(make(deepcopy(state)))
     try:
-        shared_by = shared_errors(window)
-        window.shared_sigmas = {name: errors.sigmas for name, errors in shared_by.items()}
-        if any(sigmas.any() for sigmas in window.shared_sigmas.values()):  # not what it was solved with
-            if not window.solve():
-                return None
-            shared_by = shared_errors(window)
+        trial.shared = shared_errors(window)
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
-    trial = window.filter(make(deepcopy(state)))
-    trial.shared = shared_by
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
     if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().plausible():
         return None
@@ -149,14 +143,14 @@ def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
 
 def _apart(window: BoardWindow, view: View, P: FloatArray) -> _Apart:
     """An image against all others; `P`: covariance of all unknowns."""
-    W, rest = window.whitened(view)
-    own, b = window.information(view)
+    W, r = window.whitened(view)
+    A, b = W.T @ W, W.T @ r
     at = window.places(view.node)
     spread = view.by_error @ P[at[:, None], at] @ view.by_error.T
-    others = np.linalg.solve(np.eye(len(own)) - spread @ own, spread)  # (spread^-1 - own)^-1
+    others = np.linalg.solve(np.eye(len(A)) - spread @ A, spread)  # (spread^-1 - A)^-1
     values, vectors = np.linalg.eigh(0.5 * (others + others.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    A, innovation = W.T @ W, rest + W @ (view.by_shared @ view.shared + others @ b)
+    innovation = r + W @ (others @ b)
     node = window.nodes[view.node]
     by_shared = W @ view.by_error @ shared_ways(window.at(node, view.camera), window.layout, view.camera)
     moved, M = W.T @ innovation, A @ root
