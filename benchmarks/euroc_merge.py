@@ -3,7 +3,8 @@
 Three calibrations of the same corners, lens estimated: the whole; the halves as two recordings of one rig, as
 `vical merge` takes them (motion, biases and gravity anew); and the whole with its motion alone forgotten at
 the cut. What information the cut loses, the filter's own sigmas show: an efficient estimate of less data
-differs from one of more by sqrt(P_less - P_more).
+differs from one of more by sqrt(P_less - P_more). Gravity in the frame of the board, which does not move, is
+compared between the halves.
 """
 
 from __future__ import annotations
@@ -16,12 +17,45 @@ from vical_mocks.harness.recordings import Items, read
 
 from benchmarks.euroc_halves import FOLDER, NOISE, PRIOR, SPLIT_S
 from vical_daemon.estimation.calibrator import Calibrator
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray, PointsFrame
+from vical_daemon.estimation.model.state import GRAVITY
 from vical_daemon.vision.target import load_target
 
 NAMES = ("px", "py", "pz", "rx", "ry", "rz", "shift")
 _APART_NS = 10_000_000_000  # between two recordings, as `vical merge` puts them
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Gravity in the frame of the board.
+
+    Attributes:
+        vector: m/s^2, shape (3,).
+        tilt: Directions of its errors, shape (3, 2).
+        covariance: Of these, by the filter, rad^2, shape (2, 2).
+        factor: By how much the stated variances are larger, because errors last.
+    """
+
+    vector: FloatArray
+    tilt: FloatArray
+    covariance: FloatArray
+    factor: float
+
+    @classmethod
+    def of(cls, f: CalibrationFilter) -> Gravity:
+        """As a filter has it."""
+        covariance = f.covariance([*range(GRAVITY.start, GRAVITY.stop)])
+        return cls(f.state.gravity.copy(), f.state.tilt.copy(), covariance, f.consistency["cam0"].factor)
+
+    def print_difference(self, other: Gravity) -> None:
+        """Angles between both, and in sigmas."""
+        d = self.tilt.T @ np.cross(self.vector, other.vector) / (self.vector @ self.vector)
+        own = np.sqrt(np.diag(self.covariance + other.covariance))
+        stated = np.sqrt(np.diag(self.factor * self.covariance + other.factor * other.covariance))
+        cells = [np.round(x, 1).tolist() for x in (1e3 * d, d / own, d / stated)]
+        print("\ngravity, second half from first: {} mrad, {} of its sigmas, {} as stated".format(*cells))
 
 
 @dataclass(frozen=True)
@@ -32,6 +66,7 @@ class Answer:
         position_m, R_imu_cam, shift_s: Of the camera.
         stated: Sigmas as stated, shape (7,).
         own: Sigmas of the filter, if its model were exact, shape (7,).
+        gravity: At the cut and at the end.
     """
 
     position_m: FloatArray
@@ -39,6 +74,7 @@ class Answer:
     shift_s: float
     stated: FloatArray
     own: FloatArray
+    gravity: list[Gravity]
 
     def off(self, whole: Answer) -> FloatArray:
         """Difference from the whole, in the order of `NAMES`."""
@@ -50,10 +86,12 @@ def calibrate(items: Items, points: FloatArray, at_the_cut: str) -> Answer:
     """Calibrate the recording; `at_the_cut`: "", "next recording" or "lose motion"."""
     c = Calibrator(CalibrationOptions(imu_noise=NOISE), {"cam0": PRIOR}, points)
     later_ns, begin_ns = 0, items[0][0]
+    gravity: list[Gravity] = []
     for t_ns, item in items:
         if at_the_cut and (t_ns - begin_ns) * 1e-9 > SPLIT_S:
             if at_the_cut == "next recording":
                 c.finish()
+                gravity += [Gravity.of(c.filter)] if c.filter else []
                 c.next_recording()
                 later_ns = _APART_NS
             else:
@@ -80,6 +118,7 @@ def calibrate(items: Items, points: FloatArray, at_the_cut: str) -> Answer:
         camera.timeshift_cam_imu_s,
         np.sqrt(np.diag(np.array(camera.calibration_covariance))[:7]),
         np.sqrt(np.diag(own)),
+        [*gravity, Gravity.of(f)],
     )
 
 
@@ -88,6 +127,7 @@ def main(argv: list[str]) -> int:
     argparse.ArgumentParser(prog="python -m benchmarks euroc_merge", description=__doc__).parse_args(argv)
     items, points = read(FOLDER), load_target(FOLDER / "target.yaml").points_m
     whole = calibrate(items, points, "")
+    recordings: list[Gravity] = []
     print("| at the cut | | " + " | ".join(NAMES) + " |")
     print("|---|---|" + "---|" * len(NAMES))
     for what in ("next recording", "lose motion"):
@@ -99,4 +139,7 @@ def main(argv: list[str]) -> int:
             ("stated sigma over that of the whole", part.stated / whole.stated),
         ):
             print(f"| {what} | {name} | " + " | ".join(f"{x:.2f}" for x in row) + " |", flush=True)
+        if what == "next recording":
+            recordings = part.gravity
+    recordings[0].print_difference(recordings[1])
     return 0

@@ -45,7 +45,8 @@ _STEPPED_LEAST_S = 1e-3
 _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
-_MOST_CHANGES = 4  # of the rig's model in one start: rolling shutters, targets of another size
+_MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
+_ROUNDING = 1e-9
 
 
 class Calibrator:
@@ -181,16 +182,24 @@ class Calibrator:
 
     def _attempt(self, buffer: ImuBuffer) -> Attempt:
         """Try to start; where the data contradict the model of the rig, change that and try again."""
-        may_be_partial = self.filter is None
-        found = self._initializer.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+        may_be_partial, size, may_resize = self.filter is None, self.rig.size, True
         for _ in range(_MOST_CHANGES):
+            found = self._initializer.attempt(
+                buffer,
+                self.rig.priors,
+                may_be_partial=may_be_partial,
+                size=self.rig.size,
+                may_resize=may_resize,
+            )
             if found.rolling is not None:
                 self._estimate_readout(*found.rolling)
             elif found.size is not None:
-                self._resize(found.size)
+                self._resize(self.rig.size * found.size)
+                may_resize &= self.rig.size != 1.0  # the size in the file was found to fit
             else:
                 break
-            found = self._initializer.attempt(buffer, self.rig.priors, may_be_partial=may_be_partial)
+        if found.filter is None and self.rig.size != size:
+            self._resize(size)
         return found
 
     def _begin(self, f: LinearisedFilter, found: Attempt) -> None:
@@ -233,14 +242,19 @@ class Calibrator:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self.rig.estimate_readout(camera, axis)
         self.evaluator.layout = self.rig.layout
-        self._initializer.go_on_with(self.rig.layout, self.rig.target)
+        self._initializer.go_on_with(self.rig.layout, self.rig.target, self._resized)
         self.evaluator.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
-        """The target is far from the size in its file: go on with the size found, and estimate it."""
-        self.rig.resize(size)
+        """Take the target for `size` times as large as in its file; where that is far off, estimate it."""
+        self.rig.resize(1.0 if abs(size - 1.0) < _ROUNDING else size)
         self.evaluator.layout = self.rig.layout
-        self._initializer.go_on_with(self.rig.layout, self.rig.target, {model_selection.SIZE})
+        self._initializer.go_on_with(self.rig.layout, self.rig.target, self._resized)
+
+    @property
+    def _resized(self) -> set[str]:
+        """Whether the target is by far not as large as in its file, as what is known to be off."""
+        return {model_selection.SIZE} if self.rig.size != 1.0 else set()
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""

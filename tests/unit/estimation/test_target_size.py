@@ -59,3 +59,14 @@ def test_a_board_as_stated_is_believed():
     assert record.events == []
     focal, focal_asked = (c.estimate().cameras["cam0"].intrinsics_sigma[0] for c in (calibrator, asked))
     assert focal < 0.85 * focal_asked
+
+
+def test_noise_in_slow_motion_does_not_make_it_another_size():
+    # the closed form has it 15 % too small, at more than five of its sigmas
+    rig = reference_rig(5, mean_rate_dps=10.0, timeshift_cam_imu_s=0.01)
+    run = simulate(5, 12.0, rig=rig, camera_rate_hz=10.0, corner_sigma_px=0.2)
+    prior = camera_prior(run, 5, StartErrors(0.02, 5.0), exact_lens=False)
+    subject = CalibratorSubject(CalibrationOptions(imu_noise=imu_noise(run)), prior, run.points_m)
+    record = feed(run, subject)
+    assert record.snapshots
+    assert record.events == []

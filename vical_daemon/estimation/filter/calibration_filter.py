@@ -437,6 +437,7 @@ class CalibrationFilter:
             self,
             state=deepcopy(self.state),
             S=self.S.copy(),
+            arm_score=deepcopy(self.arm_score),
             _motion_straight=LinearityMonitor() if earlier is None else earlier._motion_straight,
             _view_straight={} if earlier is None else earlier._view_straight,
         )

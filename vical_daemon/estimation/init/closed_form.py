@@ -44,6 +44,7 @@ class StartData:
         layout: Which blocks are estimated.
         target: Points of the target, m, shape (n, 3).
         caches: Poses found in earlier attempts, by camera.
+        may_resize: Another size of the target may be suggested.
     """
 
     buffer: ImuBuffer
@@ -53,6 +54,7 @@ class StartData:
     layout: Layout
     target: FloatArray
     caches: dict[str, PoseCache]
+    may_resize: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +153,7 @@ def _with_motion(
         data.options,
         partial=partial,
         turn_axis_cam=turn_axis_cam,
+        may_resize=data.may_resize and not partial,
     )
 
 

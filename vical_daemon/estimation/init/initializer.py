@@ -61,7 +61,8 @@ class Initializer:
     """
 
     def __init__(self, options: CalibrationOptions, layout: Layout, target: FloatArray, step: Step) -> None:
-        self._options, self._layout, self._target, self._step = options, layout, target, step
+        self._given, self._layout, self._target, self._step = options, layout, target, step
+        self._options = options
         self._frames: dict[str, Frames] = {name: [] for name in layout.cameras}
         self._caches: dict[str, PoseCache] = {}
         self.anew()
@@ -110,13 +111,23 @@ class Initializer:
         self._every_s = min(1.25 * self._every_s, _ATTEMPT_MOST_S)
         return True
 
-    def attempt(self, buffer: ImuBuffer, priors: dict[str, CameraPrior], *, may_be_partial: bool) -> Attempt:
+    def attempt(
+        self,
+        buffer: ImuBuffer,
+        priors: dict[str, CameraPrior],
+        *,
+        may_be_partial: bool,
+        size: float = 1.0,
+        may_resize: bool = True,
+    ) -> Attempt:
         """Try to start from what was seen.
 
         Args:
             buffer: Inertial readings.
             priors: By camera.
             may_be_partial: A start with guesses is welcome where the motion shows no more.
+            size: Of the target as it is taken to be, over the one in its file.
+            may_resize: The closed form may suggest another size.
         """
         spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
         if len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S:
@@ -126,7 +137,7 @@ class Initializer:
             return _none("collecting the first seconds: move the rig, keep the target in view")
         self._tried = True
         data = start.StartData(
-            buffer, self._frames, priors, self._options, self._layout, self._target, self._caches
+            buffer, self._frames, priors, self._options, self._layout, self._target, self._caches, may_resize
         )
         rolling = self._rolling(buffer.newest_s, priors)
         if rolling is not None:
@@ -154,7 +165,9 @@ class Initializer:
             still_axes=result.still_axes,
             turn_axis_cam=result.turn_axis_cam,
         )
-        found = window_start(result.state, result.poses, frames, make, self._step, buffer, self._target)
+        found = window_start(
+            result.state, result.poses, frames, make, self._step, buffer, self._target, stated=1.0 / size
+        )
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)
@@ -163,9 +176,9 @@ class Initializer:
         return Attempt(found.filter, frames, result.reason)
 
     def go_on_with(self, layout: Layout, target: FloatArray, off: Collection[str] = ()) -> None:
-        """Keep what was seen, for another target or with other unknowns; `off`: known to be off."""
+        """Keep what was seen, for another target or with other unknowns; `off`: what seems to be off."""
         self._layout, self._target = layout, target
-        self._options = replace(self._options, estimate=self._options.estimate | set(off))
+        self._options = replace(self._given, estimate=self._given.estimate | set(off))
         self._caches.clear()
 
     def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> tuple[str, str] | None:

@@ -32,6 +32,7 @@ class RigModel:
         self, options: CalibrationOptions, cameras: dict[str, CameraPrior], target_points_m: FloatArray
     ) -> None:
         self.priors, self.target, self.size = dict(cameras), target_points_m, 1.0
+        self._stated = target_points_m
         self._options = options
         self._held = self._held_lenses()
         self._states = options.estimate | _ALWAYS
@@ -60,9 +61,8 @@ class RigModel:
         self.layout = self._lay_out()
 
     def resize(self, size: float) -> None:
-        """The target turned out to be `size` times as large as it was taken to be."""
-        self.target = self.target * size
-        self.size *= size
+        """The target is now taken to be `size` times as large as its file says."""
+        self.target, self.size = self._stated * size, size
         self.layout = self._lay_out()
 
     def start_from_lenses_of(self, state: State) -> None:

@@ -34,7 +34,7 @@ class StartResult:
         turn_axis_cam: Of a rig that turned about it at one rate all the time, camera frame, shape (3,): the
             delay and the mounting about this axis are guessed, too; None: not so.
         poses: Of all images used, by camera and in order.
-        size: True size of the target over the stated one, where it is surely and by far another; None: it may
+        size: True size of the target over the stated one, where it seems to be by far another; None: it may
             be as in its file.
     """
 
@@ -55,6 +55,8 @@ def motion_start(
     options: CalibrationOptions,
     partial: bool = False,
     turn_axis_cam: FloatArray | None = None,
+    *,
+    may_resize: bool = True,
 ) -> StartResult:
     """Lever arms, velocity and gravity; the state stands at the first pose of the first camera.
 
@@ -66,6 +68,7 @@ def motion_start(
         options: Switches.
         partial: The motion need not show the lever arms; what it does not show is taken as zero.
         turn_axis_cam: Of a partial start of a rig that turns at one rate, see `StartResult`: it shows none.
+        may_resize: Another size of the target may be suggested.
 
     Returns:
         The state, or the reason why not.
@@ -81,7 +84,7 @@ def motion_start(
         used += inside
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
-        if not partial:
+        if may_resize:
             other = _other_size(buffer, inside, camera, gyro_bias_rps[name], options)
             if other is not None:
                 return StartResult(None, "", size=other)
@@ -113,8 +116,10 @@ def _other_size(
     gyro_bias: FloatArray,
     options: CalibrationOptions,
 ) -> float | None:
-    """Size of the target over the stated one, where positions and accelerations fit with another one alone.
+    """Size of the target over the stated one, where positions and accelerations suggest another one.
 
+    It is to be confirmed (see `window_start`): noise of the positions, which the size multiplies, and of the
+    attitudes make it wrong by ten of its sigmas where the rig moves slowly.
     Gravity must come out right with it: an accelerometer in g, too, makes the world look another size.
     """
     R, p, sigma, t = _poses_of_imu(poses, camera)

@@ -20,6 +20,7 @@ from vical_daemon.estimation.init.board_window import BoardWindow, Frames, View
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.priors import KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.model.state import State
 from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
 from vical_daemon.estimation.significance import SURE_SIGMAS
@@ -35,8 +36,8 @@ class WindowStart(NamedTuple):
 
     Attributes:
         filter: Begins at the first image and is to take them all.
-        size: How large the target is, relative to what was stated, where that is surely and by far not as
-            stated: to be started with anew. None: it may be.
+        size: How large the target is, relative to what it was taken to be, where that is surely and by far
+            another size, or where the size in its file fits as well: to be started with anew. None: it fits.
     """
 
     filter: LinearisedFilter
@@ -51,6 +52,7 @@ def window_start(
     step: Step,
     buffer: ImuBuffer,
     target: FloatArray,
+    stated: float = 1.0,
 ) -> WindowStart | None:
     """Adjust the first seconds; return a filter that takes their images.
 
@@ -65,6 +67,7 @@ def window_start(
         step: Propagates a filter to an image and corrects it.
         buffer: Inertial readings.
         target: Points of the target, m, shape (n, 3).
+        stated: Size of the target in its file over the one that it is taken to have.
 
     Returns:
         The start, or None where the data do not hold together.
@@ -86,15 +89,19 @@ def window_start(
         shared.begin()
     for consistency in out.consistency.values():
         consistency.settle()
-    return WindowStart(out, _size(trial.plain()))
+    return WindowStart(out, _size(trial.plain(), stated))
 
 
-def _size(f: CalibrationFilter) -> float | None:
-    """See `WindowStart.size`."""
+def _size(f: CalibrationFilter, stated: float) -> float | None:
+    """See `WindowStart.size`; the size in the file must be contradicted by data, not by the wider prior."""
     where = f.layout.target_scale
     if where is None:
         return None
     size, sigma = f.state.target_scale, float(f.sigmas()[where])
+    data = max(sigma**-2 - KNOWN_SIZE_SIGMA**-2, 0.0)
+    off = data * (stated - 1.0) - (size - 1.0) / sigma**2  # by the data alone: sigmas times their root
+    if stated != 1.0 and abs(off) <= SURE_SIGMAS * np.sqrt(data):
+        return stated
     return size if abs(size - 1.0) > max(_FAR, SURE_SIGMAS * sigma) else None
 
 

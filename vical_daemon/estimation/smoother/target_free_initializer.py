@@ -202,6 +202,9 @@ class TargetFreeInitializer:
             seeds = _best_apart([f for f in rough if f is not None])
         fits = [epipolar_fit(t, gyro, frames, lens, R, s, fit_lens=free_lens) for R, s in seeds]
         good = [f for f in fits if f is not None]
+        if free_lens and not good:  # turns about one axis may not show it; the window estimates it later
+            fits = [epipolar_fit(t, gyro, frames, lens, R, s) for R, s in seeds]
+            good = [f for f in fits if f is not None]
         if not good:
             return (
                 reason or "too few features are followed from image to image: more texture or light is needed"

@@ -211,3 +211,12 @@ def test_what_is_kept_over_a_change_is_all_but_motion_gravity_mounting_and_time_
     np.testing.assert_allclose(P[np.ix_(moved, moved)], P_anew[np.ix_(moved, moved)], rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(P[np.ix_(moved, kept)], 0.0, atol=1e-18)
     np.testing.assert_array_equal(anew.state.gyro_bias, known.state.gyro_bias)
+
+
+def test_a_copy_that_runs_ahead_leaves_the_filter_as_it_is(recording):
+    f, buffer, base = build(recording)
+    f.update(one_frame(recording, f, buffer, base))
+    ahead, P = f.copy(), f.arm_score.P.copy()
+    ahead.predict(buffer.segment(f.state.t_s, f.state.t_s + 0.3))
+    np.testing.assert_array_equal(f.arm_score.P, P)
+    assert np.abs(ahead.arm_score.P - P).max() > 0.0

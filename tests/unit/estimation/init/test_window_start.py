@@ -35,9 +35,9 @@ def given():
     prior = camera_prior(run, SEED, StartErrors(), exact_lens=False)
     kept = []
 
-    def keep(*arguments):
+    def keep(*arguments, **named):
         kept.append(arguments)
-        return window_start(*arguments)
+        return window_start(*arguments, **named)
 
     calibrator = Calibrator(CalibrationOptions(imu_noise=imu_noise(run)), {CAMERA: prior}, run.points_m)
     with pytest.MonkeyPatch.context() as patch:

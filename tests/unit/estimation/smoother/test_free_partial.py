@@ -7,12 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vical_mocks import trajectory
 from vical_mocks.curves import Curve, Pause, Paused
-from vical_mocks.harness.feed import feed
+from vical_mocks.harness.feed import CalibratorSubject, StartErrors, camera_prior, feed, imu_noise
 from vical_mocks.rig import NOMINAL_P_IMU_CAM, NOMINAL_R_IMU_CAM, reference_rig
 from vical_mocks.tracks import simulate_tracks
 
+from benchmarks.verify import Plan
 from tests.unit.estimation.test_target_free import subject_for
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
 from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError
 
@@ -146,3 +148,14 @@ def test_a_cart_does_not_stretch_the_lens_that_it_cannot_show():
     off = np.array(camera.intrinsics) - run.rig.lens.intrinsics
     assert np.all(np.abs(off) < 4.0 * np.array(camera.intrinsics_sigma))
     assert camera.intrinsics_sigma[1] > 5.0 * camera.intrinsics_sigma[0]
+
+
+def test_a_drive_that_does_not_show_the_lens_starts_with_the_lens_as_given():
+    # in the fit of rotations the lens ran away, and there was no start
+    run = Plan("driving", 30.0, 14.0, 1.0).second(13)
+    options = CalibrationOptions(target_free=True, imu_noise=imu_noise(run))
+    prior = camera_prior(run, 13, StartErrors(), exact_lens=True)
+    record = feed(run, CalibratorSubject(options, prior, None))
+    assert record.snapshots
+    sigma = np.sqrt(np.diag(record.snapshots[-1].covariance))[:7]
+    assert np.abs(record.snapshots[-1].error[:7] / sigma).max() < 4.0
