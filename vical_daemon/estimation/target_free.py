@@ -276,7 +276,7 @@ class TargetFreeCalibrator:
         if self._seek_shift:
             reopened = tuple({*reopened, *CLOCK})
         if MOUNTING[0] in reopened and not self.evaluator.proven:
-            self._forget(known)
+            self._forget()
             return begun
         ended = self._first.adjusted(buffer, window, known, self._noise, reopened)
         if ended is None:
@@ -363,9 +363,9 @@ class TargetFreeCalibrator:
         self.carry = with_process_noise(fit.carry, noise, self.active, window.span_s, drifting=drifting)
         self.window = next_window(window, self.carry)
 
-    def _forget(self, known: MarginalPrior) -> None:
-        """What was kept over a change contradicts the images, too: start over, with the lens as a guess."""
-        self._first.guess_from(known)
+    def _forget(self) -> None:
+        """What was kept over a change contradicts the images, too: start over."""
+        self._first.anew()
         self.latest = None
         self._closed, self._confirmed = 0, False
         self.evaluator.changed()

@@ -151,18 +151,14 @@ class FirstWindow:
     ) -> tuple[Bundle, MarginalPrior, Fit | None]:
         """Adjust a window with what is known but for some errors."""
         imu_sigma = self._status.doubts.imu_sigma
-        carry = initial_prior(window, known, self._active, self.initializer.held, imu_sigma, reopened)
+        carry = initial_prior(
+            window, known, self._active, self.initializer.held, imu_sigma, self._prior, reopened
+        )
         bundle = Bundle(window, carry, *noise)
         return bundle, carry, bundle.solve(buffer, _STEPS)
 
-    def guess_from(self, known: MarginalPrior) -> None:
-        """Take what was known of the lens as a guess, and seek all else anew."""
-        lens = known.camera
-        self._prior = replace(
-            self._prior,
-            intrinsics=tuple(lens.intrinsics.tolist()),
-            distortion=tuple(lens.distortion.tolist()),
-            T_imu_cam=None if self._active[0] else self._prior.T_imu_cam,
-            readout_s=lens.readout_s,
-        )
+    def anew(self) -> None:
+        """Seek everything anew, from what was given; the mounting that was given is no longer the rig's."""
+        if self._active[0]:
+            self._prior = replace(self._prior, T_imu_cam=None)
         self.initializer = TargetFreeInitializer(self._options, self._prior)

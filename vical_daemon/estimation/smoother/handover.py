@@ -7,7 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import (
+    BoolArray,
+    CameraPrior,
+    FloatArray,
+    ImuNoise,
+    PointsFrame,
+)
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
     GYRO_BIAS_SIGMA_RPS,
@@ -25,7 +31,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     held_along,
     root_of,
 )
-from vical_daemon.estimation.smoother.target_free_initializer import start_sigmas
+from vical_daemon.estimation.smoother.target_free_initializer import prior_centre, start_sigmas
 from vical_daemon.estimation.smoother.window import KNOT_S, Landmarks, Window
 
 _GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2 = 4e-4, 5e-3  # by which biases may have walked while nothing was seen
@@ -37,6 +43,7 @@ def initial_prior(
     active: BoolArray,
     held: FloatArray | None,
     imu_sigma: float,
+    given: CameraPrior,
     reopened: Collection[int] = (),
 ) -> MarginalPrior:
     """Prior of a window that starts from nothing: wide, or with the calibration and biases known before.
@@ -47,9 +54,11 @@ def initial_prior(
         active: Which calibration errors are estimated, shape (FULL,).
         held: Axis along which the lever arm is held, see `TargetFreeInitializer`.
         imu_sigma: Of the entries of the imu's matrices, where nothing is known.
+        given: What is known about the camera without any data.
         reopened: Errors of the calibration of which nothing is known any more; of mounting and time shift.
     """
-    wide = first_carry(window, active, start_sigmas(window.camera, imu_sigma))
+    centre = prior_centre(window.camera, given)
+    wide = first_carry(window, centre, active, start_sigmas(centre, imu_sigma))
     if known is None:
         return wide if held is None else held_along(wide, held)
     known = known.at(wide.t_cam_s)

@@ -92,11 +92,12 @@ def calibration_difference(window: Window, carry: MarginalPrior) -> FloatArray:
     return d
 
 
-def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> MarginalPrior:
-    """Next to nothing known: wide sigmas around a start.
+def first_carry(window: Window, camera: CameraState, active: BoolArray, sigmas: FloatArray) -> MarginalPrior:
+    """Next to nothing known: wide sigmas.
 
     Args:
-        window: Started window; its camera is the centre of the prior.
+        window: Started window.
+        camera: Centre of the prior.
         active: Which of the calibration errors are estimated, shape (FULL,).
         sigmas: Of the calibration errors, shape (FULL,).
     """
@@ -105,7 +106,7 @@ def first_carry(window: Window, active: BoolArray, sigmas: FloatArray) -> Margin
     wide = np.concatenate([motion, biases, sigmas[np.flatnonzero(active)]])
     R, t_s = window.R[0], window.frames[0][0]
     root, speed = np.diag(1.0 / wide), R.T @ window.v[0]
-    return MarginalPrior(R.copy(), speed, np.zeros(6), window.camera, root, active, t_s, window.imu)
+    return MarginalPrior(R.copy(), speed, np.zeros(6), camera, root, active, t_s, window.imu)
 
 
 def held_along(carry: MarginalPrior, axis: FloatArray) -> MarginalPrior:

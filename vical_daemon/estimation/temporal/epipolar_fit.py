@@ -143,6 +143,7 @@ class _Fit:
         self.frames: list[tuple[float, PointsFrame]] = []
         self.dray: list[FloatArray] = []
         self.shrinking = np.zeros((len(pairs.of), 2))
+        self.lasting = 1.0
         self._rays()
 
     def _rays(self) -> None:
@@ -180,7 +181,9 @@ class _Fit:
             k = 4.0 if step < 5 else 2.5
             weight = np.where(self.ok, 1.0 / (1.0 + (e / (k * spread)) ** 2) ** 2, 0.0)
             size = 15 if self.fit_lens and step >= _LENS_AFTER else 7
-            H, g, _ = self._normal(e, J[:, :size], Jt, weight / spread**2)
+            H, g, each = self._normal(e, J[:, :size], Jt, weight / spread**2)
+            if size > 7 and step == _LENS_AFTER:
+                self.lasting = self._errors_last(H, each)
             if size > 7:
                 g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
             self._prior(H, g, bias)
@@ -201,6 +204,26 @@ class _Fit:
                 break
         return self._result(R, shift, bias, weight)
 
+    def _errors_last(self, H: FloatArray, each: FloatArray) -> float:
+        """By how much the scatter of blocks exceeds that of independent pairs, for the lens; at least 1.
+
+        A sighting is in several pairs, and errors of a tracker, or of a model without rolling shutter, last:
+        taken as independent, pairs outvote any prior of the lens.
+        """
+        scores = self._by_block(each)
+        scores -= scores.mean(axis=0)
+        inverse = np.linalg.inv(H + 1e-9 * np.diag(np.diag(H)))
+        scatter = np.diag(inverse @ (scores.T @ scores) @ inverse) / np.diag(inverse)
+        return max(1.0, float(np.median(scatter[7:])))
+
+    def _by_block(self, each: FloatArray) -> FloatArray:
+        """Gradients of the pairs (P, n) summed over half-second blocks."""
+        t = self.t_cam[self.pairs.first]
+        block = ((t - t[0]) / _BLOCK_S).astype(int)
+        sums = np.zeros((int(block.max()) + 1, each.shape[1]))
+        np.add.at(sums, block, each)
+        return sums
+
     def _prior(self, H: FloatArray, g: FloatArray, bias: FloatArray) -> None:
         """Add what is known before: of the bias, and of the lens where it is among the unknowns."""
         H[range(4, 7), range(4, 7)] += GYRO_BIAS_SIGMA_RPS**-2
@@ -213,6 +236,7 @@ class _Fit:
         P[:2, :2] = focal / f**2
         P[2:4, 2:4] = np.eye(2) / (_CENTRE_SIGMA * f) ** 2
         P[4:, 4:] = np.diag(np.array(_DISTORTION_SIGMA[self.model]) ** -2.0)
+        P *= self.lasting
         off = np.concatenate([self.intrinsics - self.given[0], self.distortion - self.given[1]])
         H[7:, 7:] += P
         g[7:] += P @ off
@@ -308,10 +332,7 @@ class _Fit:
             inverse = np.linalg.inv(H)
         except np.linalg.LinAlgError:
             return None
-        t = self.t_cam[self.pairs.first]
-        block = ((t - t[0]) / _BLOCK_S).astype(int)
-        sums = np.zeros((int(block.max()) + 1, H.shape[0]))
-        np.add.at(sums, block, each)
+        sums = self._by_block(each)
         covariance = inverse @ (sums.T @ sums) @ inverse + inverse
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         stretches: list[tuple[FloatArray, FloatArray]] = []

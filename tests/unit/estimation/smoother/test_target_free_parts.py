@@ -11,11 +11,13 @@ from vical_mocks.tracks import simulate_tracks
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import COLUMNS, CameraPrior, ImuNoise, PointsFrame
+from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_link
 from vical_daemon.estimation.model.retract import camera_difference, moved_camera
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
+from vical_daemon.estimation.smoother.handover import initial_prior
 from vical_daemon.estimation.smoother.inertial import Order
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.marginal_prior import (
@@ -138,6 +140,36 @@ def test_epipolar_fit_finds_mounting_delay_and_bias_without_knowing_any(scene):
     assert fit.inliers > 0.9
 
 
+@pytest.mark.parametrize("seed", [3, 5, 7])
+def test_a_rolling_shutter_does_not_take_the_start_far_from_the_lens_that_is_given(seed):
+    """Pairs share sightings, and errors of a shutter last: as independent ones they outvote the prior."""
+    rig = reference_rig(seed, timeshift_cam_imu_s=SHIFT_S, readout_s=0.03, readout_axis=COLUMNS)
+    run = simulate_tracks(seed, 6.0, rig=rig, camera_rate_hz=10.0)
+    t = (run.t_imu_ns - run.t_imu_ns[0]) * 1e-9
+    frames = [((f.t_cam_ns - int(run.t_imu_ns[0])) * 1e-9, f) for f in run.frames]
+    frames = [(s, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px)) for s, f in frames if 0.1 < s < 5.8]
+    lens = (np.array(rig.lens.intrinsics) * [1.03, 1.03, 1.0, 1.0], np.zeros(4), "radtan")
+    fit = epipolar_fit(t, run.gyro_rps, frames, lens, rig.R_imu_cam, 0.01, fit_lens=True)
+    off = np.abs(fit.intrinsics / np.array(rig.lens.intrinsics) - 1.0)
+    turn = Rotation.from_matrix(rig.R_imu_cam.T @ fit.R_imu_cam).magnitude()
+    assert off.max() < 0.05
+    assert np.rad2deg(turn) < 1.5  # 3.1 and 2.0 deg when they did, for the first two
+
+
+@pytest.mark.parametrize("given", [(400.0, 401.0, 320.0, 240.0), None])
+def test_the_first_prior_is_about_what_was_given_and_not_about_what_the_same_data_gave(scene, given):
+    window = scene.window()
+    found = window.camera.intrinsics * 1.5
+    window.camera = replace(window.camera, intrinsics=found, p_imu_cam=np.array([0.9, -1.0, 0.4]))
+    active = np.ones(FULL, dtype=bool)
+    carry = initial_prior(window, None, active, None, 2e-3, CameraPrior((640, 480), given))
+    np.testing.assert_array_equal(carry.camera.p_imu_cam, np.zeros(3))
+    middle = [319.5, 239.5]  # of the picture
+    np.testing.assert_allclose(carry.camera.intrinsics, given or [*found[:2], *middle])
+    np.testing.assert_array_equal(carry.camera.R_imu_cam, window.camera.R_imu_cam)
+    assert np.sqrt(carry.calibration()[7, 7]) == pytest.approx(0.05 * carry.camera.intrinsics[0])
+
+
 @pytest.mark.parametrize("seed", [0, 4, 9])
 def test_features_that_fit_no_motion_give_no_lens_without_an_image(seed):
     """Points that jump about: the lens ran away until no pixel had a ray, and a matrix was singular."""
@@ -147,7 +179,9 @@ def test_features_that_fit_no_motion_give_no_lens_without_an_image(seed):
     uv = rng.uniform([0.0, 0.0], [320.0, 240.0], (40, 2)) + np.cumsum(rng.normal(0, 8, (40, 40, 2)), axis=0)
     frames = [(0.1 * k, PointsFrame("cam0", k * 10**8, np.arange(40), uv[k])) for k in range(40)]
     lens = (np.array([216.0, 215.0, 158.0, 116.0]), np.array([-0.14, 0.07, 0.0, 0.0]), "radtan")
-    assert epipolar_fit(t, gyro, frames, lens, np.eye(3), 0.0, fit_lens=True) is None
+    fit = epipolar_fit(t, gyro, frames, lens, np.eye(3), 0.0, fit_lens=True)
+    edges = np.array([[0.0, 0.0], [320.0, 0.0], [0.0, 240.0], [320.0, 240.0]])
+    assert fit is None or unproject(edges, fit.intrinsics, fit.distortion, "radtan")[1].all()
 
 
 def test_start_finds_lever_arm_and_speed_linearly(scene):
@@ -179,7 +213,9 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s):
     window = scene.window(numbers=16)
     window.camera = replace(window.camera, readout_s=readout_s)
     active = np.ones(FULL, dtype=bool)
-    problem = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 50.0).problem
+    problem = Bundle(
+        window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 50.0
+    ).problem
     seen, links = window.observe(), window.stacked()
     normal, order = problem.normal(seen, links), problem.order()
     rng = np.random.default_rng(2)
@@ -253,7 +289,9 @@ def test_late_images_move_the_errors_of_links_as_told(scene):
 def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     window = scene.window()
     active = np.arange(FULL) < 7
-    bundle = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 1.0)
+    bundle = Bundle(
+        window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 1.0
+    )
     fit = bundle.solve(scene.buffer, 25)
     error = camera_difference(fit.carry.camera, scene.camera, CAMERA, 17)[:7]
     P = fit.carry.covariance()[11:, 11:]
@@ -266,9 +304,9 @@ def test_adjusted_window_is_right_within_its_own_sigmas(scene):
 def test_a_drift_carries_into_the_time_shift_of_the_next_window(scene):
     window = scene.window()
     active = (np.arange(FULL) < 7) | (np.arange(FULL) == DRIFT)
-    fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 1.0).solve(
-        scene.buffer, 25
-    )
+    fit = Bundle(
+        window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 1.0
+    ).solve(scene.buffer, 25)
     first, carry = window.camera, fit.carry
     assert carry.camera.timeshift_s == pytest.approx(
         first.timeshift_s + first.skew * window.span_s, abs=1e-12
@@ -290,9 +328,9 @@ def test_where_north_and_origin_are_changes_nothing(scene):
         world = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
         window.R, window.v = world @ window.R, window.v @ world.T
         window.p = window.p @ world.T + turn * np.array([3.0, -1.0, 0.5])
-        fit = Bundle(window, first_carry(window, active, start_sigmas(window.camera, 0.01)), 0.5).solve(
-            scene.buffer, 25
-        )
+        fit = Bundle(
+            window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 0.5
+        ).solve(scene.buffer, 25)
         results.append(fit)
     a, b = (np.sqrt(np.diag(r.carry.covariance())) for r in results)
     np.testing.assert_allclose(a, b, rtol=0.02)
