@@ -241,7 +241,11 @@ class Gx3Emulator:
             if error.errno not in (errno.EAGAIN, errno.EIO):
                 raise
             return
-        self._openers.count = max(1, self._openers.count)  # whoever writes has it open
+        if not self._openers.count:  # opened since the step began, and perhaps closed again
+            if self._openers.closed_by_all():
+                self._forget_host()
+            else:
+                self._openers.count = max(1, self._openers.count)  # whoever writes has it open
         self.device.receive(self._garbled(data), now_s)
 
     def _give(self, data: bytes) -> None:

@@ -18,7 +18,7 @@ from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.target_poses import Lens, PoseCache
 from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
-from vical_daemon.estimation.model.state import Layout
+from vical_daemon.estimation.model.state import Layout, State
 
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
@@ -149,15 +149,7 @@ class Initializer:
             result = start.partial_attempt(data, result.reason)
         if result.state is None:
             return _none(result.reason, result.motion_missing)
-        begin_s = result.state.t_s
-        shifts = {name: c.timeshift_s for name, c in result.state.cameras.items()}
-        frames = [
-            (t, f)
-            for kept in self._frames.values()
-            for t, f in kept
-            if t + shifts[f.camera] > begin_s - LATE_S
-        ]
-        frames.sort(key=lambda item: item[0] + shifts[item[1].camera])
+        frames = self._frames_from(result.state)
         make = partial(
             initial_filter,
             layout=self._layout,
@@ -174,6 +166,17 @@ class Initializer:
         if found.size is not None:
             return Attempt(None, [], "", size=found.size)
         return Attempt(found.filter, frames, result.reason)
+
+    def _frames_from(self, state: State) -> list[tuple[float, PointsFrame]]:
+        """Images from the time of the state on, with their stamps, s; in the order of IMU time."""
+        shifts = {name: c.timeshift_s for name, c in state.cameras.items()}
+        frames = [
+            (t, f)
+            for kept in self._frames.values()
+            for t, f in kept
+            if t + shifts[f.camera] > state.t_s - LATE_S
+        ]
+        return sorted(frames, key=lambda item: item[0] + shifts[item[1].camera])
 
     def go_on_with(self, layout: Layout, target: FloatArray, off: Collection[str] = ()) -> None:
         """Keep what was seen, for another target or with other unknowns; `off`: what seems to be off."""
