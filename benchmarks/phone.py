@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from vical_mocks.harness.recordings import Items, camera_of, read
+from vical_mocks.harness.recordings import Items, camera_of, feed, read
 
 from benchmarks.euroc_halves import row
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 from vical_daemon.estimation.result import CameraEstimate
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
@@ -30,14 +29,7 @@ HALF_S = 18.4
 def calibrate(items: Items, prior: CameraPrior, begin_s: float, end_s: float) -> CameraEstimate | str:
     """The camera by a stretch of the recording, or why there is no answer."""
     calibrator = TargetFreeCalibrator(CalibrationOptions(target_free=True), {"cam0": prior})
-    for t_ns, item in items:
-        if not begin_s <= (t_ns - items[0][0]) * 1e-9 <= end_s:
-            continue
-        if isinstance(item, PointsFrame):
-            calibrator.add_points(replace(item, camera="cam0"))
-            calibrator.process()
-        else:
-            calibrator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
+    feed(calibrator, items, begin_s, end_s)
     calibrator.finish()
     estimate = calibrator.estimate()
     return estimate.cameras.get("cam0", estimate.reason)

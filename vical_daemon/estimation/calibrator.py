@@ -46,7 +46,6 @@ _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
 _MOST_CHANGES = 5  # attempts with another model of the rig: rolling shutters, targets of another size
-_ROUNDING = 1e-9
 
 
 class Calibrator:
@@ -194,7 +193,7 @@ class Calibrator:
             if found.rolling is not None:
                 self._estimate_readout(*found.rolling)
             elif found.size is not None:
-                self._resize(self.rig.size * found.size)
+                self._resize(found.size)
                 may_resize &= self.rig.size != 1.0  # the size in the file was found to fit
             else:
                 break
@@ -247,7 +246,7 @@ class Calibrator:
 
     def _resize(self, size: float) -> None:
         """Take the target for `size` times as large as in its file; where that is far off, estimate it."""
-        self.rig.resize(1.0 if abs(size - 1.0) < _ROUNDING else size)
+        self.rig.resize(size)
         self.evaluator.layout = self.rig.layout
         self._initializer.go_on_with(self.rig.layout, self.rig.target, self._resized)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import yaml
 
 from vical_daemon.bus.messages import ImuMessage, decode_imu, decode_points
 from vical_daemon.estimation.measurements import ImuNoise, PointsFrame
+from vical_daemon.estimation.target_free import TargetFreeCalibrator
 from vical_daemon.logs import open_recording
 
 Items = list[tuple[int, ImuMessage | PointsFrame]]
@@ -35,6 +37,18 @@ def read(folder: Path) -> Items:
             items.append((frame.t_cam_ns, 1, frame))
     items.sort(key=lambda item: item[:2])
     return [(t, item) for t, _, item in items]
+
+
+def feed(calibrator: TargetFreeCalibrator, items: Items, begin_s: float, end_s: float) -> None:
+    """Give a part of a recording, seconds from its first message on, to the calibrator of `cam0`."""
+    for t_ns, item in items:
+        if not begin_s <= (t_ns - items[0][0]) * 1e-9 <= end_s:
+            continue
+        if isinstance(item, PointsFrame):
+            calibrator.add_points(replace(item, camera="cam0"))
+            calibrator.process()
+        else:
+            calibrator.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
 
 
 def camera_of(path: Path) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class Attempt:
         motion_missing: It is motion that is missing, not time.
         rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
             the other (`ROWS`, `COLUMNS`); None: there is none.
-        size: See `WindowStart`.
+        size: The target seems to be so many times as large as in its file, and is to be taken as that large.
     """
 
     filter: LinearisedFilter | None
@@ -144,7 +144,7 @@ class Initializer:
             return Attempt(None, [], "", rolling=rolling)
         result = start.attempt(data)
         if result.size is not None:
-            return Attempt(None, [], "", size=result.size)
+            return Attempt(None, [], "", size=size * result.size)
         if result.state is None and result.motion_missing and may_be_partial:
             result = start.partial_attempt(data, result.reason)
         if result.state is None:
@@ -157,14 +157,15 @@ class Initializer:
             still_axes=result.still_axes,
             turn_axis_cam=result.turn_axis_cam,
         )
+        stated = 1.0 / size
         found = window_start(
-            result.state, result.poses, frames, make, self._step, buffer, self._target, stated=1.0 / size
+            result.state, result.poses, frames, make, self._step, buffer, self._target, stated=stated
         )
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)
         if found.size is not None:
-            return Attempt(None, [], "", size=found.size)
+            return Attempt(None, [], "", size=1.0 if found.size == stated else size * found.size)
         return Attempt(found.filter, frames, result.reason)
 
     def _frames_from(self, state: State) -> list[tuple[float, PointsFrame]]:

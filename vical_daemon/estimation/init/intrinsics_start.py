@@ -146,13 +146,15 @@ def along(fit: LensFit, lens: Lens, target: FloatArray, moves: list[FloatArray])
         moves: How the corners of each of its views move, px, shape (n, 2).
 
     Returns:
-        Half the first and half the second derivative of their sum by the share of `moves`, px^2.
+        Half the first and half the second derivative of their sum by the share of `moves`, px^2; zeros where
+        a corner lies behind its camera.
     """
     here, up, down = (
-        normal
+        _normal(_moved(fit.views, moves, share), fit.poses, target, fit.theta, lens.model)
         for share in (0.0, 1.0, -1.0)
-        if (normal := _normal(_moved(fit.views, moves, share), fit.poses, target, fit.theta, lens.model))
     )
+    if here is None or up is None or down is None:
+        return 0.0, 0.0
     right = here._replace(b=0.5 * (up.b - down.b), c=0.5 * (up.c - down.c))
     of_lens, of_poses = right.solve(np.zeros(len(fit.theta)), _scale(lens) ** -2.0, 1e-9)
     taken = float(of_lens @ right.b) + float((of_poses * right.c).sum())
