@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, PLUMB_BOB
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 
 if TYPE_CHECKING:
     from vical_daemon.config.model import BusConfig, CameraConfig, Config
 
 NAMESPACE_LENGTH = 128
 """ROS 2 ends topics at 247 characters (RMW_TOPIC_MAX_NAME_LENGTH); our longest name takes 85 of them."""
-NEEDS_TARGET = "plumb_bob needs a target; without one use radtan"
 
 
 def contradictions(config: Config) -> Iterator[tuple[str, str]]:
@@ -23,10 +22,7 @@ def contradictions(config: Config) -> Iterator[tuple[str, str]]:
         if not imu.port.startswith("log:"):  # the rate of a recording is fixed
             yield from _check_gx3_rate(f"imus.{name}.rate_hz", imu.rate_hz)
     for name, camera in config.cameras.items():
-        path = f"cameras.{name}.lens"
-        yield from _check_lens(path, camera, config.calibration.fix)
-        if config.calibration.mode == "target_free" and camera.lens.distortion_model == PLUMB_BOB:
-            yield f"{path}.distortion_model", NEEDS_TARGET
+        yield from _check_lens(f"cameras.{name}.lens", camera, config.calibration.fix)
     yield from _check_bus(config.bus)
     if config.ros2 is not None and len(config.ros2_namespace) > NAMESPACE_LENGTH:
         yield "ros2.namespace", f"longer than {NAMESPACE_LENGTH} characters"

@@ -27,14 +27,14 @@ from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, F
 from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
-    FULL,
     LENS,
     SHIFT,
     MarginalPrior,
     calibration_difference,
+    length,
 )
 from vical_daemon.estimation.smoother.reports import window_reports
-from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer
+from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer, starting_camera
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
@@ -72,7 +72,7 @@ class TargetFreeCalibrator:
             raise ValueError(f"without a target there is no {block} to estimate")
         self.options = options
         self.camera, prior = next(iter(cameras.items()))
-        self.active = np.ones(FULL, dtype=bool)
+        self.active = np.ones(length(starting_camera(prior)), dtype=bool)
         self.active[:6] = "extrinsics" not in options.fix
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         self.active[LENS] = "intrinsics" not in options.fix

@@ -6,10 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from vical_daemon.bus import topics
-from vical_daemon.config.cross_checks import NEEDS_TARGET
 from vical_daemon.config.model import CalibrationConfig, CameraConfig, Config, ImuConfig, NoiseConfig
 from vical_daemon.config.priors import Initial
-from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.logs import Recording, Stream
 from vical_daemon.logs.recorded_logs import stamp_of
@@ -106,8 +104,6 @@ def make_job(
             f"{recording.path} holds no camera, neither images nor points; `vical info` shows what is in it"
         )
     priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
-    if target is None and any(p.distortion_model == PLUMB_BOB for p in priors.values()):
-        raise InputError(f"--initial: {NEEDS_TARGET}")
     config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
     config = replace(
         config,

@@ -173,13 +173,14 @@ def error_against_truth(
     """Estimate minus truth in the order of `PARAMETERS`; rotation: log(R_true^T R_estimate)."""
     R_true, p_true = run.rig.extrinsics_at(t_s)
     lens = run.rig.lens
+    coefficients = np.array([*lens.distortion, lens.sixth_power])[: len(distortion)]  # plumb_bob has k3
     return np.concatenate(
         [
             np.asarray(p_imu_cam) - p_true,
             log_so3(R_true.T @ R_imu_cam),
             [timeshift_s - float(run.rig.timeshift_at(t_s))],
             np.asarray(intrinsics) - np.asarray(lens.intrinsics),
-            np.asarray(distortion) - np.asarray(lens.distortion),
+            np.asarray(distortion) - coefficients,
         ]
     )
 
@@ -238,10 +239,9 @@ class CalibratorSubject:
 
     def _published_covariance(self, camera: CameraEstimate) -> FloatArray:
         """What the estimate claims; the correlations between its blocks come from the filter."""
-        claimed = np.zeros((15, 15))
-        claimed[:6, :6] = np.asarray(camera.T_imu_cam.covariance)
         sigmas = [camera.timeshift_sigma_s, *camera.intrinsics_sigma, *camera.distortion_sigma]
-        claimed[range(6, 15), range(6, 15)] = np.square(sigmas)
+        claimed = np.diag(np.square([0.0] * 6 + sigmas))
+        claimed[:6, :6] = np.asarray(camera.T_imu_cam.covariance)
         inner = getattr(self.calibrator, "filter", None)
         if inner is None:
             return claimed
@@ -251,7 +251,7 @@ class CalibratorSubject:
         spread[spread == 0.0] = 1.0  # a fixed lens that is surely right
         correlation = joint / np.outer(spread, spread)
         sigma = np.sqrt(np.diag(claimed))[places]
-        full = np.zeros((15, 15))
+        full = np.zeros_like(claimed)
         full[np.ix_(places, places)] = correlation * np.outer(sigma, sigma)
         full[:6, :6] = claimed[:6, :6]
         return full

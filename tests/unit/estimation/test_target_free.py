@@ -21,14 +21,17 @@ from vical_mocks.tracks import room_landmarks, simulate_tracks
 from vical_mocks.trajectory import one_axis, still
 
 from vical_daemon.estimation.events import ROLLING, EventKind
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.smoother.marginal_prior import FULL
+from vical_daemon.estimation.smoother.marginal_prior import LENS
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 
-def subject_for(run, *, lens_known=True, seed=0, start=None):
+def subject_for(run, *, lens_known=True, seed=0, start=None, model="radtan"):
     prior = camera_prior(run, seed, start or StartErrors(0.05, 5.0), exact_lens=lens_known)
+    if model != prior.distortion_model:
+        prior = replace(prior, distortion_model=model, distortion=None)
     prior = replace(prior, readout_s=0.0)
     fix = frozenset({"intrinsics"}) if lens_known else frozenset()
     options = CalibrationOptions(fix=fix, target_free=True, imu_noise=imu_noise(run))
@@ -166,11 +169,16 @@ def test_metric_scale_and_the_direction_of_gravity_are_right_within_their_sigmas
     assert np.sqrt(np.trace(P[2:5, 2:5])) < 0.02 * np.linalg.norm(v) + 5e-3
 
 
-def test_the_lens_is_found_too():
-    run = simulated(seed=6, seconds=8.0)
-    record = feed(run, subject_for(run, lens_known=False, seed=6))
+@pytest.mark.parametrize(("model", "sixth_power"), [("radtan", 0.0), ("plumb_bob", 0.05)])
+def test_the_lens_is_found_too(model, sixth_power):
+    plain = reference_rig(6, timeshift_cam_imu_s=-0.03)
+    rig = replace(plain, lens=replace(plain.lens, sixth_power=sixth_power))
+    run = simulate_tracks(6, 8.0, rig=rig, camera_rate_hz=10.0)
+    record = feed(run, subject_for(run, lens_known=False, seed=6, model=model))
     last = record.snapshots[-1]
-    assert nees(last.error, last.covariance, 15) < chi2.isf(1e-4, 15)
+    unknowns = len(last.error)
+    assert unknowns == 11 + len(COEFFICIENTS[model])
+    assert nees(last.error, last.covariance, unknowns) < chi2.isf(1e-4, unknowns)
     assert np.abs(last.error[7:9]).max() < 2.0  # px, from five percent
 
 
@@ -211,7 +219,9 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 
 
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
-    evaluator = TargetFreeStatus(CalibrationOptions(target_free=True), "cam0", np.ones(FULL, dtype=bool))
+    evaluator = TargetFreeStatus(
+        CalibrationOptions(target_free=True), "cam0", np.ones(LENS.start + 8, dtype=bool)
+    )
     evaluator.doubts.drifting = True
     evaluator.changed()
     assert not evaluator.doubts.drifting

@@ -22,11 +22,11 @@ from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
     CAMERA,
-    FULL,
     INERTIAL,
     MarginalPrior,
     calibration_difference,
     carried_out,
+    length,
 )
 from vical_daemon.estimation.smoother.normal import Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
@@ -192,8 +192,7 @@ class Bundle:
         S = Y.T @ Y
         s = Y.T @ u
         H, g = normal.H.copy(), normal.g.copy()
-        camera = order.calib[: len(self.problem.of_camera)]
-        at = np.concatenate([order.frames[:, :6].reshape(6 * F), camera])
+        at = np.concatenate([order.frames[:, :6].reshape(6 * F), order.camera])
         n, m = 9 * (F - 1), 6 * (F - 1)  # by a view where unknowns lie evenly: a fifth of the time
         H[:n, :n].reshape(F - 1, 9, F - 1, 9)[:, :6, :, :6] -= S[:m, :m].reshape(F - 1, 6, F - 1, 6)
         H[np.ix_(at[m:], at)] -= S[m:]
@@ -241,7 +240,7 @@ class Bundle:
         w.R = orthonormal(w.R @ so3.exp(d[:, :3]))
         w.p, w.v = w.p + d[:, 3:6], w.v + d[:, 6:]
         w.bias = w.bias + dx[order.knots]
-        full = np.zeros(FULL)
+        full = np.zeros(length(w.camera))
         full[self.problem.active] = dx[order.calib]
         w.camera, w.imu = moved_camera(w.camera, CAMERA, full), w.imu + full[INERTIAL][: len(w.imu)]
         m = w.landmarks

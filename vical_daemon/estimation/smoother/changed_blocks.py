@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.smoother.marginal_prior import FULL, SHIFT
+from vical_daemon.estimation.smoother.marginal_prior import SHIFT
 
 MOUNTING: tuple[int, ...] = tuple(range(6))
 CLOCK: tuple[int, ...] = (SHIFT,)
@@ -36,17 +36,17 @@ def changed_blocks(
 
     Args:
         found: Calibration of a window that knew nothing of the blocks, minus the one known before,
-            shape (FULL,).
-        found_covariance: Of it, zero where not estimated, shape (FULL, FULL).
+            shape (n,).
+        found_covariance: Of it, zero where not estimated, shape (n, n).
         known_covariance: Of what was known before, likewise.
-        active: Which errors are estimated, shape (FULL,).
+        active: Which errors are estimated, shape (n,).
         excess: Of a sum of squares and its degrees of freedom: above 1, it is no chance.
 
     Returns:
         Errors to reopen; empty: none has changed.
     """
     blocks = [block for block in (MOUNTING, CLOCK) if active[list(block)].any()]
-    rest = [k for k in range(FULL) if active[k] and k not in BOTH]
+    rest = [int(k) for k in np.flatnonzero(active) if k not in BOTH]
     for count in range(len(blocks)):
         scored = []
         for reopened in combinations(blocks, count):

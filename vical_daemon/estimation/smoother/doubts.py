@@ -19,7 +19,6 @@ from vical_daemon.estimation.selection.model_acceptance import known_off
 from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
-    FULL,
     IMU,
     INERTIAL,
     LAG,
@@ -29,7 +28,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
-_WHERE = {model_selection.IMU: np.arange(FULL)[IMU], model_selection.LAG: np.arange(FULL)[LAG]}
+_WHERE = {model_selection.IMU: np.r_[IMU], model_selection.LAG: np.r_[LAG]}
 _SIGMA = {model_selection.IMU: ENTRY_SIGMA, model_selection.LAG: LAG_SIGMA_S}
 
 Weights = dict[tuple[str, ...], float]
@@ -151,7 +150,7 @@ class TargetFreeDoubts:
 
 
 def _numbers(carry: MarginalPrior) -> FloatArray:
-    """Errors of the imu's scale, alignment and lag, at their place among the errors, shape (FULL,)."""
-    out = np.zeros(FULL)
+    """Errors of the imu's scale, alignment and lag, at their place among the errors, shape (n,)."""
+    out = np.zeros(len(carry.active))
     out[INERTIAL] = carry.imu
     return out

@@ -58,7 +58,7 @@ class FirstWindow:
     Args:
         options: Switches and noise.
         prior: What is known about the camera.
-        active: Which of the calibration errors are estimated, shape (FULL,).
+        active: Which of the calibration errors are estimated, shape (n,).
         status: Says whether a window fits, and agrees with what was known.
 
     Attributes:

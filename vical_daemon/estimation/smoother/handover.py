@@ -51,7 +51,7 @@ def initial_prior(
     Args:
         window: As the start left it; takes the known time shift along.
         known: What was known, or None.
-        active: Which calibration errors are estimated, shape (FULL,).
+        active: Which calibration errors are estimated, shape (n,).
         held: Axis along which the lever arm is held, see `TargetFreeInitializer`.
         imu_sigma: Of the entries of the imu's matrices, where nothing is known.
         given: What is known about the camera without any data.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
@@ -18,19 +18,18 @@ class Order:
     Args:
         F: Images.
         K: Knots.
-        k: Calibration errors.
-        imu: How many of them, the last ones, are numbers of the imu (`imu_scale`).
+        of_imu: Which of the calibration's errors are numbers of the imu (`imu_scale`), shape (k,).
     """
 
-    def __init__(self, F: int, K: int, k: int, imu: int = 0) -> None:
-        self.size = 9 * F + 6 * K + k
+    def __init__(self, F: int, K: int, of_imu: BoolArray) -> None:
+        self.size = 9 * F + 6 * K + len(of_imu)
         self.tail = 9 * (F - 1) + 6 * (K - 1)
         frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
         knots = 9 * (F - 1) + np.arange(6 * (K - 1)).reshape(K - 1, 6)
         self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
         self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
-        self.calib = self.tail + 15 + np.arange(k)
-        self.imu = self.calib[k - imu :]
+        self.calib = self.tail + 15 + np.arange(len(of_imu))
+        self.imu, self.camera = self.calib[of_imu], self.calib[~of_imu]
 
     def of_links(self, knots: IntArray) -> IntArray:
         """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 40)."""

@@ -18,22 +18,27 @@ from vical_daemon.estimation.model.retract import camera_difference
 from vical_daemon.estimation.model.state import CameraSlices, CameraState
 from vical_daemon.estimation.smoother.window import Window
 
-# Of the calibration's errors; the time shift is that at the first image, and drifts from there on.
-ARM, TURN, SHIFT, LENS, DRIFT, READOUT, IMU = slice(0, 3), slice(3, 6), 6, slice(7, 15), 15, 16, slice(17, 32)
-LAG = slice(32, 33)
-CAMERA = CameraSlices(ARM, TURN, SHIFT, DRIFT, slice(7, 11), slice(11, 15), READOUT)
+# Places of the calibration's errors. The time shift is that at the first image, and drifts from there on. The
+# lens is the last, because its length depends on its model.
+ARM, TURN, SHIFT, DRIFT, READOUT = slice(0, 3), slice(3, 6), 6, 7, 8
+IMU, LAG, LENS = slice(9, 24), slice(24, 25), slice(25, None)
+CAMERA = CameraSlices(ARM, TURN, SHIFT, DRIFT, slice(25, 29), slice(29, None), READOUT)
 INERTIAL = slice(IMU.start, LAG.stop)
-FULL = LAG.stop
 HELD_M = 1e-4
 BIASES = slice(5, 11)  # of a carry
 CALIBRATION = 11  # first calibration error of a carry; before it tilt 2, speed 3, biases 6
 
 
+def length(camera: CameraState) -> int:
+    """How many errors the calibration of a camera and the imu has."""
+    return LENS.start + len(camera.intrinsics) + len(camera.distortion)
+
+
 @dataclass(slots=True)
 class MarginalPrior:
-    """What is known at the first image of a window before its own data.
+    """What is known at the first image of a window before its own data; n: errors of the calibration.
 
-    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of `FULL`).
+    Errors: tilt (2), speed in the imu frame (3), biases (6), calibration (the active ones of `length`).
 
     Attributes:
         R: Attitude there; only its tilt matters.
@@ -41,7 +46,7 @@ class MarginalPrior:
         bias: [gyro, accel], shape (6,).
         camera: Calibration.
         root: W with W^T W = information of the errors, shape (d, d).
-        active: Which of the calibration errors are estimated, shape (FULL,).
+        active: Which of the calibration errors are estimated, shape (n,).
         t_cam_s: Stamp of that image, s.
         imu: Errors of the imu, see `Window`.
     """
@@ -69,8 +74,8 @@ class MarginalPrior:
         return replace(self, camera=camera, root=root, t_cam_s=t_cam_s)
 
     def calibration(self) -> FloatArray:
-        """Covariance of the calibration's errors, zero where not estimated, shape (FULL, FULL)."""
-        full = np.zeros((FULL, FULL))
+        """Covariance of the calibration's errors, zero where not estimated, shape (n, n)."""
+        full = np.zeros((len(self.active),) * 2)
         at = np.flatnonzero(self.active)
         full[np.ix_(at, at)] = self.covariance()[CALIBRATION:, CALIBRATION:]
         return full
@@ -78,15 +83,15 @@ class MarginalPrior:
 
 def later(active: BoolArray, seconds: float) -> FloatArray:
     """Active calibration errors some seconds later, by those now: the drift carries into the time shift."""
-    G = np.eye(FULL)
+    G = np.eye(len(active))
     G[SHIFT, DRIFT] = seconds
     at = np.flatnonzero(active)
     return np.asarray(G[np.ix_(at, at)])
 
 
 def calibration_difference(window: Window, carry: MarginalPrior) -> FloatArray:
-    """Errors of the calibration that lead from what was carried in to the window's, shape (FULL,)."""
-    d = camera_difference(window.camera, carry.camera, CAMERA, FULL)
+    """Errors of the calibration that lead from what was carried in to the window's, shape (n,)."""
+    d = camera_difference(window.camera, carry.camera, CAMERA, length(carry.camera))
     if len(window.imu):
         d[INERTIAL] = window.imu - carry.imu
     return d
@@ -98,8 +103,8 @@ def first_carry(window: Window, camera: CameraState, active: BoolArray, sigmas: 
     Args:
         window: Started window.
         camera: Centre of the prior.
-        active: Which of the calibration errors are estimated, shape (FULL,).
-        sigmas: Of the calibration errors, shape (FULL,).
+        active: Which of the calibration errors are estimated, shape (n,).
+        sigmas: Of the calibration errors, shape (n,).
     """
     biases = [GYRO_BIAS_SIGMA_RPS] * 3 + [ACCEL_BIAS_SIGMA_MPS2] * 3
     motion = [WINDOW_START.attitude_rad] * 2 + [WINDOW_START.velocity_mps] * 3
@@ -125,7 +130,7 @@ def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> Ma
     Args:
         window: Adjusted.
         covariance: Of [last image 9, last knot 6, active calibration errors].
-        active: Which of the calibration errors are estimated, shape (FULL,).
+        active: Which of the calibration errors are estimated, shape (n,).
     """
     k = int(np.count_nonzero(active))
     span_s, camera = window.span_s, window.camera

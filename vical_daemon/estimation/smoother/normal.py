@@ -21,7 +21,6 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     DRIFT,
     INERTIAL,
-    LENS,
     READOUT,
     SHIFT,
     TURN,
@@ -72,13 +71,14 @@ class Problem:
         self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
         self.jitter_s = jitter_s
         self.active = np.flatnonzero(carry.active)
-        self.of_camera = self.active[self.active < INERTIAL.start]  # the imu's own do not move pixels
-        self._columns = _slice(self.of_camera)
+        places = np.arange(len(carry.active))
+        self._of_imu = (places >= INERTIAL.start) & (places < INERTIAL.stop)  # they do not move pixels
+        self._columns = _slice(np.flatnonzero(carry.active[~self._of_imu]))
 
     def order(self) -> Order:
         """Places of the unknowns."""
         w = self.window
-        return Order(len(w.frames), len(w.bias), len(self.active), len(w.imu))
+        return Order(len(w.frames), len(w.bias), self._of_imu[self.active])
 
     # ------------------------------------------------------------------ pixels
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -143,10 +143,10 @@ class Problem:
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
         JW = JR @ Rt  # by the point in the world
         Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
-        Jc = np.empty((len(e), 2, INERTIAL.start))
+        Jc = np.empty((len(e), 2, INERTIAL.start + Jlens.shape[2]))
         Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, cross(Jy, y[:, None])
         Jc[:, :, SHIFT] = self._by_shift(seen, JR, R, x_imu, rates)
-        Jc[:, :, LENS] = Jlens
+        Jc[:, :, INERTIAL.start :] = Jlens
         Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
         Jc[:, :, READOUT] = Jc[:, :, SHIFT] * seen.row[:, None]
         Jc = Jc[:, :, self._columns]
@@ -214,9 +214,9 @@ class Problem:
         cost: float,
     ) -> Normal:
         w = self.window
-        F, k, L = len(w.frames), len(self.of_camera), len(seen.begin)
+        F, k, L = len(w.frames), Jc.shape[2], len(seen.begin)
         order = self.order()
-        calib = order.calib[:k]
+        calib = order.camera
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
         begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
         Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)

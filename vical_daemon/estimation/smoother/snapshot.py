@@ -21,7 +21,6 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     CAMERA,
     DRIFT,
-    FULL,
     IMU,
     INERTIAL,
     LENS,
@@ -67,6 +66,7 @@ def camera_estimate(
     camera, covariance = _averaged(carry, doubts)
     if held is not None:
         covariance[:3, :3] += held_covariance(np.outer(held, held))
+    reported = [*range(SHIFT + 1), *range(LENS.start, len(covariance))]
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
     return camera_snapshot(
         camera,
@@ -77,13 +77,13 @@ def camera_estimate(
         readout_sigma_s=sigma[READOUT],
         rms_px=rms_px,
         sigma_px=sigma_px,
-        joint=covariance[: LENS.stop, : LENS.stop],
+        joint=covariance[np.ix_(reported, reported)],
         rolling=doubts.rolling,
     )
 
 
 def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
-    """Camera and covariance (FULL, FULL) over the models of imu and clock; see `model_selection`."""
+    """Camera and covariance (n, n) over the models of imu and clock; see `model_selection`."""
     camera, numbers, P = _over_imu(carry, doubts)
     if doubts.gyro_frame:
         camera, P = _in_gyro_frame(camera, numbers, P)
@@ -99,9 +99,9 @@ def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatA
 
 def _over_imu(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
     """Camera, errors of the imu, and covariance over the hypotheses about these."""
-    P, numbers = carry.calibration() * doubts.factor, np.zeros(FULL)
+    P = carry.calibration() * doubts.factor
+    numbers, mean, mixed = np.zeros(len(P)), np.zeros(len(P)), np.zeros_like(P)
     numbers[INERTIAL] = carry.imu
-    mean, mixed = np.zeros(FULL), np.zeros((FULL, FULL))
     for p, at in doubts.stated:
         gain = np.linalg.solve(P[np.ix_(at, at)], P[at]).T
         d = -gain @ numbers[at]
@@ -112,7 +112,7 @@ def _over_imu(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatA
 
 def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> tuple[CameraState, FloatArray]:
     """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries."""
-    J = np.eye(FULL)
+    J = np.eye(len(P))
     by_entries = turn(np.eye(9).reshape(3, 3, 9))
     J[TURN, _GYRO] = -camera.R_imu_cam.T @ by_entries
     J[ARM, _GYRO] = so3.hat(camera.p_imu_cam) @ by_entries

@@ -11,7 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import RADTAN
+from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
@@ -141,10 +141,11 @@ class TargetFreeInitializer:
         if self.held is not None:
             return "turns about one axis do not show what has changed"
         c = known.camera
+        fx, fy, cx, cy = c.intrinsics.tolist()
         prior = replace(
             self.prior,
-            intrinsics=_four(c.intrinsics),
-            distortion=_four(c.distortion),
+            intrinsics=(fx, fy, cx, cy),
+            distortion=tuple(c.distortion.tolist()),
             T_imu_cam=(c.R_imu_cam, c.p_imu_cam),
             timeshift_cam_imu_s=c.timeshift_s,
             readout_s=c.readout_s,
@@ -297,7 +298,7 @@ def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
 
 
 def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
-    """How far each calibration error may be off at a start: many times what it is worth; shape (FULL,).
+    """How far each calibration error may be off at a start: many times what it is worth; shape (n,).
 
     Args:
         camera: Its focal length counts.
@@ -307,10 +308,12 @@ def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
     pose = [start.lever_arm_m] * 3 + [start.rotation_rad] * 3
     lens = [start.focal * f] * 2 + [start.centre * f] * 2
     distortion = [start.distortion] * 2 + [start.higher_distortion] * 2
-    if camera.distortion_model != RADTAN:
+    if camera.distortion_model == EQUIDISTANT:
         distortion = [EQUIDISTANT_SIGMA] * 4
+    elif camera.distortion_model == PLUMB_BOB:
+        distortion.append(start.distortion)
     imu = [imu_sigma] * ENTRIES + [LAG_SIGMA_S]
-    return np.array([*pose, start.timeshift_s, *lens, *distortion, SKEW_SIGMA, start.readout_s, *imu])
+    return np.array([*pose, start.timeshift_s, SKEW_SIGMA, start.readout_s, *imu, *lens, *distortion])
 
 
 def _known(known: MarginalPrior) -> _Found:
@@ -321,11 +324,6 @@ def _chained(t_cam_s: FloatArray, chain: CameraOrientations) -> Orientations:
     """Orientations strung together: their errors add up from the first on."""
     walked = np.cumsum(np.trace(chain.covariance, axis1=1, axis2=2) / 3.0)
     return Orientations(t_cam_s, chain.R_world_cam, np.sqrt(walked))
-
-
-def _four(values: FloatArray) -> tuple[float, float, float, float]:
-    a, b, c, d = (float(x) for x in values)
-    return a, b, c, d
 
 
 def _misfit(fit: EpipolarFit) -> float:

@@ -42,7 +42,7 @@ class TargetFreeStatus(Evaluator):
     Args:
         options: Switches and targets.
         camera: Name of the camera.
-        active: Which of the calibration errors are estimated, shape (FULL,).
+        active: Which of the calibration errors are estimated, shape (n,).
         rolling: The camera is said to have a rolling shutter, or its readout is asked for.
     """
 
@@ -128,7 +128,7 @@ class TargetFreeStatus(Evaluator):
         return self._windows >= _ENOUGH_WINDOWS
 
     def changed(self, change: FloatArray | None = None) -> None:
-        """The rig is not what it was; `change`: of the calibration's errors, shape (FULL,), where known."""
+        """The rig is not what it was; `change`: of the calibration's errors, shape (n,), where known."""
         why = Cause.CALIBRATION_CONTRADICTED
         self._announce(EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER, cause=why)
         if change is not None:
@@ -324,7 +324,7 @@ def _measured_over_stated(windows: Iterable[tuple[float, int]]) -> float:
 
 
 def _changes(camera: str, full: FloatArray, active: BoolArray) -> list[Event]:
-    """A change of the calibration, shape (FULL,), as events: what moved by how much; zero: it did not."""
+    """A change of the calibration, shape (n,), as events: what moved by how much; zero: it did not."""
     found = []
     if active[0]:
         found.append((EventKind.CAMERA_MOVED, float(np.linalg.norm(full[:3]))))

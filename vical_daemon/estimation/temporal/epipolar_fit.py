@@ -34,7 +34,11 @@ from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
 _ITERATIONS = 18
 # What a lens may be off by: focal length and its ratio (relative), centre (of the focal length), distortion.
 _FOCAL_SIGMA, _RATIO_SIGMA, _CENTRE_SIGMA = 0.1, 0.003, 0.03
-_DISTORTION_SIGMA = {"radtan": (0.1, 0.1, 0.005, 0.005), "equidistant": (0.05, 0.05, 0.05, 0.05)}
+_DISTORTION_SIGMA = {
+    "radtan": (0.1, 0.1, 0.005, 0.005),
+    "plumb_bob": (0.1, 0.1, 0.005, 0.005, 0.1),
+    "equidistant": (0.05, 0.05, 0.05, 0.05),
+}
 _LENS_AFTER = 4  # iterations with the lens as given
 _LEAST_RAYS = 0.5  # share of the features; no lens near the given one leaves more of them without a ray
 _GOOD = 0.25  # weight of a feature that fits
@@ -54,7 +58,7 @@ class EpipolarFit:
         timeshift_s: t_imu = t_cam + timeshift_s, s.
         gyro_bias: rad/s, shape (3,).
         intrinsics: fx fy cx cy, px; as given unless the lens was fitted.
-        distortion: Four coefficients; likewise.
+        distortion: The model's coefficients; likewise.
         rotation_covariance: Of the mounting, about the camera's axes, rad^2, shape (3, 3).
         timeshift_sigma_s: s.
         error: RMS epipolar error of the pairs used, in focal lengths.
@@ -156,7 +160,7 @@ class _Fit:
             self.dray = [self._ray_change(rays) for rays in (self.a, self.b)]
 
     def _ray_change(self, rays: FloatArray) -> FloatArray:
-        """D ray / d (fx fy cx cy, distortion) for a fixed pixel, shape (n, 3, 8).
+        """D ray / d (fx fy cx cy, distortion) for a fixed pixel, shape (n, 3, 4 + coefficients).
 
         The pixel stays: J_ray d ray + J_lens d lens = 0, and the ray keeps its length: since J_ray ray = 0,
         d ray = -J_ray^T (J_ray J_ray^T)^-1 J_lens d lens does both.
@@ -180,7 +184,7 @@ class _Fit:
             spread = 1.4826 * float(np.median(np.abs(e[self.ok]))) + 1e-9
             k = 4.0 if step < 5 else 2.5
             weight = np.where(self.ok, 1.0 / (1.0 + (e / (k * spread)) ** 2) ** 2, 0.0)
-            size = 15 if self.fit_lens and step >= _LENS_AFTER else 7
+            size = 7 if step < _LENS_AFTER else J.shape[1]  # first with the lens as given
             H, g, each = self._normal(e, J[:, :size], Jt, weight / spread**2)
             if size > 7 and step == _LENS_AFTER:
                 self.lasting = self._errors_last(H, each)
@@ -232,7 +236,7 @@ class _Fit:
             return
         f = self.given[0][0]
         focal = np.eye(2) * _FOCAL_SIGMA**-2 + np.array([[1.0, -1.0], [-1.0, 1.0]]) * _RATIO_SIGMA**-2
-        P = np.zeros((8, 8))
+        P = np.zeros((len(g) - 7,) * 2)
         P[:2, :2] = focal / f**2
         P[2:4, 2:4] = np.eye(2) / (_CENTRE_SIGMA * f) ** 2
         P[4:, 4:] = np.diag(np.array(_DISTORTION_SIGMA[self.model]) ** -2.0)
@@ -244,7 +248,7 @@ class _Fit:
     def _linearise(
         self, R: FloatArray, shift: float, bias: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Normalised errors (n,), derivatives by the shared unknowns (n, 7 or 15) and by t (n, 2)."""
+        """Normalised errors (n,), derivatives by the k shared unknowns (n, k) and by t (n, 2)."""
         p = self.pairs
         t = self.t_cam + shift
         curve = Attitudes(self.t_imu, self.gyro, bias)

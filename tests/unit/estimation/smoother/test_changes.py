@@ -14,7 +14,7 @@ from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
 from vical_daemon.estimation.smoother.jitter import StampOffsets
-from vical_daemon.estimation.smoother.marginal_prior import FULL
+from vical_daemon.estimation.smoother.marginal_prior import LENS
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
 DISTURBANCES = {
@@ -120,7 +120,8 @@ def test_a_crowd_that_walks_past_is_no_bump():
 
 
 # ---------------------------------------------------------------------- arithmetic
-ACTIVE = np.zeros(FULL, dtype=bool)
+N = LENS.start + 8  # errors of the calibration with a radtan lens
+ACTIVE = np.zeros(N, dtype=bool)
 ACTIVE[:11] = True
 
 
@@ -139,7 +140,7 @@ def answers(rng, moved):
     information = H.T @ H
     information[7:, 7:] += np.linalg.inv(known[7:, 7:])
     P = np.linalg.inv(information)
-    found, covariance, prior = np.zeros(FULL), np.zeros((FULL, FULL)), np.zeros((FULL, FULL))
+    found, covariance, prior = np.zeros(N), np.zeros((N, N)), np.zeros((N, N))
     found[:11] = P @ H.T @ y
     covariance[:11, :11], prior[:11, :11] = P, known
     return found, covariance, prior

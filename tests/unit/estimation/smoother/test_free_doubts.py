@@ -10,27 +10,28 @@ from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.marginal_prior import (
     CALIBRATION,
-    FULL,
     IMU,
     INERTIAL,
     LAG,
+    LENS,
     MarginalPrior,
     root_of,
 )
 from vical_daemon.estimation.smoother.snapshot import camera_estimate
 
 PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])
-NUMBERS = np.arange(FULL)[INERTIAL]
-STATED = {"both": NUMBERS, "imu": np.arange(FULL)[IMU], "lag": np.arange(FULL)[LAG], "none": NUMBERS[:0]}
+N = LENS.start + 8  # errors of the calibration with a radtan lens
+NUMBERS = np.arange(N)[INERTIAL]
+STATED = {"both": NUMBERS, "imu": np.arange(N)[IMU], "lag": np.arange(N)[LAG], "none": NUMBERS[:0]}
 
 
 def carry(seed, off):
     """A calibration in which what is known of the imu hangs together with all the rest."""
     rng = np.random.default_rng(seed)
-    size = np.array([1e-3] * 3 + [1e-3] * 3 + [1e-4] + [1.0] * 4 + [1e-3] * 4 + [1e-5, 1e-4, *PRIOR])
-    half = rng.standard_normal((FULL, FULL + 4)) / np.sqrt(FULL)
+    size = np.array([1e-3] * 6 + [1e-4, 1e-5, 1e-4, *PRIOR] + [1.0] * 4 + [1e-3] * 4)
+    half = rng.standard_normal((N, N + 4)) / np.sqrt(N)
     P = half @ half.T * np.outer(size, size) * 0.3
-    whole = np.eye(CALIBRATION + FULL)
+    whole = np.eye(CALIBRATION + N)
     whole[CALIBRATION:, CALIBRATION:] = P
     imu = off * np.sqrt(np.diag(P))[NUMBERS] * rng.standard_normal(16)
     camera = CameraState(
@@ -42,16 +43,16 @@ def carry(seed, off):
         "radtan",
         (640, 480),
     )
-    active = np.ones(FULL, dtype=bool)
+    active = np.ones(N, dtype=bool)
     return MarginalPrior(np.eye(3), np.zeros(3), np.zeros(6), camera, root_of(whole), active, 0.0, imu), P
 
 
 def given_stated(P, x, at):
     """Mean and covariance where `at` is zero, from the information matrix."""
-    rest = np.setdiff1d(np.arange(FULL), at)
+    rest = np.setdiff1d(np.arange(N), at)
     information = np.linalg.inv(P)
     left = np.linalg.inv(information[np.ix_(rest, rest)])
-    mean, covariance = np.zeros(FULL), np.zeros((FULL, FULL))
+    mean, covariance = np.zeros(N), np.zeros((N, N))
     mean[rest] = x[rest] + left @ information[np.ix_(rest, at)] @ x[at]
     covariance[np.ix_(rest, rest)] = left
     return mean, covariance
@@ -77,7 +78,7 @@ def mixture(P, x):
 @pytest.mark.parametrize(("seed", "off"), [(1, 0.0), (2, 0.7), (3, 1.5), (4, 2.5)])
 def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     known, P = carry(seed, off)
-    x = np.zeros(FULL)
+    x = np.zeros(N)
     x[NUMBERS] = known.imu
     doubts = TargetFreeDoubts("cam0", asked=frozenset(), rolling=True)
     doubts.drifting = True

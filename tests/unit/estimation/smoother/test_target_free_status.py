@@ -7,23 +7,22 @@ import pytest
 
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, FULL, MarginalPrior, root_of
+from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, LENS, MarginalPrior, root_of
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 
-SIGMA = np.array(
-    [1e-2] * 3 + [1e-3] * 3 + [1e-4] + [2.0] * 4 + [1e-3] * 4 + [1e-5, 1e-4] + [1e-3] * (FULL - 17)
-)
-LENS = CameraState(
+N = LENS.start + 8  # errors of the calibration with a radtan lens
+SIGMA = np.array([1e-2] * 3 + [1e-3] * 3 + [1e-4] + [1e-5, 1e-4] + [1e-3] * 16 + [2.0] * 4 + [1e-3] * 4)
+CAMERA = CameraState(
     np.eye(3), np.zeros(3), 0.01, np.array([500.0, 500.0, 320.0, 240.0]), np.zeros(4), "radtan", (640, 480)
 )
 
 
 def carry(shrunk=1.0):
-    whole = np.eye(CALIBRATION + FULL)
+    whole = np.eye(CALIBRATION + N)
     whole[CALIBRATION:, CALIBRATION:] = shrunk * np.diag(SIGMA**2)
-    active = np.ones(FULL, dtype=bool)
+    active = np.ones(N, dtype=bool)
     return MarginalPrior(
-        np.eye(3), np.zeros(3), np.zeros(6), LENS, root_of(whole), active, 0.0, np.zeros(FULL - 17)
+        np.eye(3), np.zeros(3), np.zeros(6), CAMERA, root_of(whole), active, 0.0, np.zeros(16)
     )
 
 
@@ -38,7 +37,7 @@ def focal_sigma(status):
 
 @pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (4.0, 4.0), (30.0, 30.0)])
 def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(times, wider):
-    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(N, dtype=bool))
     assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0)
     status.closed()
     status.agrees(fit(times), carry(), complete=False)
@@ -49,7 +48,7 @@ def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(ti
 
 @pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (3.0, 3.0)])
 def test_two_complete_windows_widen_the_sigmas_by_all_that_they_disagree_by(times, wider):
-    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(N, dtype=bool))
     for _ in range(2):
         status.closed()
         status.agrees(fit(times), carry(), complete=True)
@@ -58,7 +57,7 @@ def test_two_complete_windows_widen_the_sigmas_by_all_that_they_disagree_by(time
 
 
 def test_two_windows_that_agree_are_believed_again():
-    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(FULL, dtype=bool))
+    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(N, dtype=bool))
     status.closed()
     status.agrees(fit(1.5), carry(), complete=True)
     status.closed()
