@@ -134,6 +134,9 @@ CASES: dict[str, Case] = {
     "lens held, not this camera's, sigmas stated": Case(lens_known=True, lens_off="stated", trials=20),
     "straight board, its shape found": Case(estimate=frozenset({"target_shape"}), trials=20),
     "target-free, lens known": Case(lens_known=True, target_free=True, trials=50),
+    "target-free, lens held, not this camera's": Case(
+        lens_known=True, lens_off="silent", target_free=True, trials=50
+    ),
     "target-free": Case(target_free=True, start=StartErrors(0.05, 5.0), trials=50),
     "target-free, stamp jitter 1 ms": Case(
         lens_known=True, target_free=True, simulation={"stamp_jitter_s": 1e-3}, trials=20

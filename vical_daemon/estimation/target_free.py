@@ -20,6 +20,7 @@ from vical_daemon.estimation.filter.unobservable_directions import has_turned
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
@@ -75,9 +76,10 @@ class TargetFreeCalibrator:
         self.active = np.ones(length(starting_camera(prior)), dtype=bool)
         self.active[:6] = "extrinsics" not in options.fix
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
-        self.active[LENS] = "intrinsics" not in options.fix
+        lens = FixedLens.considered(prior, options.fix)
+        self.active[LENS] = "intrinsics" not in options.fix or lens is not None
         rolling = "readout" in options.estimate or prior.readout_s != 0.0
-        self.evaluator = TargetFreeStatus(options, self.camera, self.active, rolling=rolling)
+        self.evaluator = TargetFreeStatus(options, self.camera, self.active, rolling=rolling, lens=lens)
         self._first = FirstWindow(options, prior, self.active, self.evaluator)
         self.window: Window | None = None
         self.carry: MarginalPrior | None = None  # before the window

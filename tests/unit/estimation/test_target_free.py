@@ -182,6 +182,20 @@ def test_the_lens_is_found_too(model, sixth_power):
     assert np.abs(last.error[7:9]).max() < 2.0  # px, from five percent
 
 
+def test_a_fixed_lens_that_is_not_this_cameras_is_announced_and_its_errors_are_in_the_sigmas():
+    run = simulated(seed=1, seconds=12.0)
+    subject = subject_for(run)
+    prior = camera_prior(run, 1, StartErrors(), exact_lens=True)
+    fx, fy, cx, cy = prior.intrinsics
+    prior = replace(prior, intrinsics=(1.01 * fx, 1.01 * fy, cx - 8.0, cy + 4.0), readout_s=0.0)
+    record = feed(run, CalibratorSubject(subject.calibrator.options, prior, None))
+    assert EventKind.FIXED_LENS in {event.kind for _, event in record.events}
+    last = record.snapshots[-1]
+    assert nees(last.error, last.covariance, 7) < chi2.isf(1e-3, 7)
+    assert last.status == "converging"
+    assert "the fixed lens of cam0 is not this camera's: leave it free" in record.statuses[-1][2]
+
+
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 def test_a_rolling_shutter_of_which_nothing_was_said_is_found_and_told(axis):
     rig = reference_rig(2, timeshift_cam_imu_s=0.01, readout_s=0.02, readout_axis=axis)

@@ -11,8 +11,6 @@ from vical_daemon.estimation.model.state import ACCEL_BIAS, GYRO_BIAS, CameraSli
 from vical_daemon.estimation.noise.lens_limit import limit as lens_limit
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
 
-_ROUNDING = 1e-9  # of the sigma of a lens that is off: less is arithmetic
-
 
 def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float) -> CameraEstimate:
     """One camera as it is known now.
@@ -79,8 +77,7 @@ def _lens_sigmas(f: CalibrationFilter, name: str, spread: float) -> FloatArray:
         return np.zeros(4 + len(camera.distortion))
     raw = f.sigmas()
     if name in f.layout.held:
-        known = spread * raw[f.layout.lens(name)]
-        return np.where(known > _ROUNDING * f.layout.held[name].off_sigma, known, 0.0)
+        return f.layout.held[name].reported(spread * raw[f.layout.lens(name)])
     agreement = f.agreement[name]
     filtered = np.maximum(np.sqrt(agreement.factors), spread) * np.concatenate(
         [raw[where.intrinsics], raw[where.distortion]]

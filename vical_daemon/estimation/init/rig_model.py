@@ -43,9 +43,7 @@ class RigModel:
     def _held_lenses(self) -> dict[str, FixedLens]:
         """Lenses whose errors matter to something that is estimated, by camera."""
         fix = self._options.fix
-        if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
-            return {}
-        lenses = {name: FixedLens.of(prior) for name, prior in self.priors.items()}
+        lenses = {name: FixedLens.considered(prior, fix) for name, prior in self.priors.items()}
         return {name: lens for name, lens in lenses.items() if lens is not None}
 
     def _lay_out(self) -> Layout:

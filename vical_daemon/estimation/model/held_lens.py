@@ -18,6 +18,7 @@ from vical_daemon.estimation.model.camera_rays import rays_over_image
 
 _OFF_SHARE = 0.02  # of the focal length, of fx fy cx cy; EuRoC's published lens is 1.5 % off in cx
 _OFF_DISTORTION = 0.05  # EuRoC's k1: 0.045
+_ROUNDING = 1e-9  # of the sigma of a lens that is off: less is arithmetic
 _WIDER = 3.0  # times the sigma that is stated: which may be too small
 
 
@@ -47,6 +48,22 @@ class FixedLens:
         )
         default = np.array([_OFF_SHARE * values[0]] * 4 + [_OFF_DISTORTION] * (n - 4))
         return cls(values, sigma, np.maximum(default, _WIDER * sigma))
+
+    @classmethod
+    def considered(cls, prior: CameraPrior, fix: frozenset[str]) -> FixedLens | None:
+        """Return the lens of a camera whose errors matter to something that is estimated; None: it has none.
+
+        Args:
+            prior: What is known about the camera.
+            fix: See `CalibrationOptions`.
+        """
+        if "intrinsics" not in fix or {"extrinsics", "timeshift"} <= fix:
+            return None
+        return cls.of(prior)
+
+    def reported(self, sigma: FloatArray) -> FloatArray:
+        """Standard deviations as they are reported: zeros where only rounding is left; shape (n,)."""
+        return np.where(sigma > _ROUNDING * self.off_sigma, sigma, 0.0)
 
     def displacement_px(
         self, off: FloatArray, covariance: FloatArray, model: str, resolution: tuple[int, int]

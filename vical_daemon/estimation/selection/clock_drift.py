@@ -18,7 +18,8 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import OFF, SKEW_SIGMA, SKEW_WALK, SURE
 from vical_daemon.estimation.model.retract import retract
-from vical_daemon.estimation.selection.model_selection import lenses_known
+from vical_daemon.estimation.selection.model_mixture import joined, parts
+from vical_daemon.estimation.selection.model_selection import factor, lenses_known
 
 CLOCKS_IN_DOUBT = "the time shift still moves: waiting to see whether the clocks drift"
 _LEAST_S = 1.0
@@ -49,10 +50,12 @@ def _evidence(f: CalibrationFilter, camera: str) -> float:
     index = f.layout.cameras[camera].skew
     if index is None:
         return 0.0
-    variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index]) + stamps_variance(
-        f.stamp_sigma_s, f.state.t_s - f.began_s
-    )
+    variance = f.consistency[camera].factor * float(f.S[index] @ f.S[index]) + _stamps(f)
     return evidence(f.state.cameras[camera].skew, variance)
+
+
+def _stamps(f: CalibrationFilter) -> float:
+    return stamps_variance(f.stamp_sigma_s, f.state.t_s - f.began_s)
 
 
 def stamps_variance(stamp_sigma_s: float, elapsed_s: float) -> float:
@@ -101,26 +104,50 @@ def let_drift(f: CalibrationFilter, camera: str, *, anew: bool) -> Event:
 
 
 def averaged(f: CalibrationFilter) -> CalibrationFilter:
-    """Return the filter to be reported: mean and covariance over both models, for each camera."""
-    for name in f.layout.cameras:
-        f = _mixed(f, name, apart(f, name), lenses_known(f))
+    """Return the filter to be reported: mean and covariance over both models, for each camera.
+
+    Args:
+        f: As `model_selection.averaged` returns it.
+    """
+    for name, where in f.layout.cameras.items():
+        if where.skew is None or name in f.drifting:
+            continue
+        over, spread, skew = factor(f), f.consistency[name].factor, f.state.cameras[name].skew
+        S, off = parts(f.S, over) if f.layout.held else (f.S, np.zeros(len(f.S)))
+        variance = spread * float(S[where.skew] @ S[where.skew]) + _stamps(f)
+        p = probability(evidence(skew + off[where.skew], variance))
+        given = lenses_known(replace(f, S=S))
+        step, S, off = mixture(S, off, given, where.skew, skew, p, spread)
+        S = joined(S, off, over) if f.layout.held else S
+        f = replace(f, state=retract(f.state, f.layout, step), S=S)
     return f
 
 
-def _mixed(f: CalibrationFilter, camera: str, p: float, S: FloatArray) -> CalibrationFilter:
-    """The mixture: with probability `p` what the filter says, else that conditioned on no drift.
+def mixture(
+    S: FloatArray, off: FloatArray, given: FloatArray, at: int, skew: float, p: float, factor: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The mixture: with probability `p` what the estimator says, else that conditioned on no drift.
 
     With k = P e / sigma the column of the drift and z = drift / sigma, conditioning moves the mean by -k z
     and takes k k' off P; the mixture goes (1 - p) of that way, and its covariance is
-    P - (1 - p)(1 - p z^2) k k'. The gain k / sigma is that of the covariance S S'.
+    P - (1 - p)(1 - p z^2) k k'. What is reported for a fixed lens moves likewise, with k and sigma of the
+    covariance given the lens.
+
+    Args:
+        S: Square root of the covariance about the mean over all models, shape (n, m).
+        off: That mean minus what is reported, shape (n,); zeros where no lens is fixed.
+        given: As `S`, where errors of fixed lenses are known.
+        at: Place of the drift among the errors.
+        skew: Drift as reported, s/s.
+        p: Probability of a drift.
+        factor: Reported covariance over that of `S`.
+
+    Returns:
+        What the reported values move by, shape (n,), and new values of `S` and `off`.
     """
-    index = f.layout.cameras[camera].skew
-    if index is None or p == 1.0:
-        return f
-    sigma = float(np.sqrt(S[index] @ S[index]))
-    k = S @ (S[index] / sigma)
-    z = f.state.cameras[camera].skew / sigma
-    square = z * z / f.consistency[camera].factor  # of the reported covariance, `factor` times P
-    less = (1.0 - p) * (1.0 - p * square)
-    mixed: FloatArray = f.S - (1.0 - np.sqrt(1.0 - less)) * np.outer(k / sigma, f.S[index])
-    return replace(f, state=retract(f.state, f.layout, -(1.0 - p) * z * k), S=mixed)
+    variance, skew_mean = float(S[at] @ S[at]), skew + off[at]
+    gain = S @ S[at] / variance
+    less = (1.0 - p) * (1.0 - p * skew_mean**2 / variance / factor)
+    mixed: FloatArray = S - (1.0 - np.sqrt(1.0 - less)) * np.outer(gain, S[at])
+    step = -(1.0 - p) * skew * (given @ given[at]) / float(given[at] @ given[at])
+    return step, mixed, off - (1.0 - p) * skew_mean * gain - step

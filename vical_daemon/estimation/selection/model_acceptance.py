@@ -9,22 +9,14 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIGMA, OFF, SURE
 from vical_daemon.estimation.model.retract import retract
+from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
-from vical_daemon.estimation.selection.model_selection import (
-    IMU,
-    LAG,
-    SIZE,
-    TARGET,
-    Block,
-    blocks,
-    factor,
-    lens_block,
-    not_zero,
-    weights,
-)
+from vical_daemon.estimation.selection.model_mixture import Block, lens_block, not_zero
+from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, blocks, factor, weights
 from vical_daemon.estimation.significance import EVERY_S
 
 _MEASURED = 400  # images
@@ -49,6 +41,22 @@ def known_off(block: str, values: FloatArray, sigmas: FloatArray) -> Event:
     value = float(values[surest])
     signed = block in (SIZE, LAG)
     return Event(_KINDS[block], value=value if signed else abs(value), sigma=float(sigmas[surest]))
+
+
+def lens_off(camera: str, lens: FixedLens, block: Block, covariance: FloatArray, known: CameraState) -> Event:
+    """The announcement for a fixed lens that is not as given.
+
+    Args:
+        camera: Name of the camera.
+        lens: The lens as given.
+        block: Its block.
+        covariance: Of its values, shape (n, n).
+        known: The camera as estimated.
+    """
+    off_px, sigma_px = lens.displacement_px(
+        block.values, covariance, known.distortion_model, known.resolution
+    )
+    return Event(EventKind.FIXED_LENS, camera, off_px, sigma_px)
 
 
 def _widen(f: CalibrationFilter, block: Block, sigma: float) -> None:
@@ -110,11 +118,9 @@ def _off(f: CalibrationFilter, name: str) -> Event:
     f.off.add(name)
     if block.held:
         camera = next(c for c in f.layout.held if lens_block(c) == name)
-        known, rows = f.state.cameras[camera], f.S[block.where]
-        off_px, sigma_px = f.layout.held[camera].displacement_px(
-            block.values, factor(f) * (rows @ rows.T), known.distortion_model, known.resolution
-        )
-        return Event(EventKind.FIXED_LENS, camera, off_px, sigma_px)
+        rows = f.S[block.where]
+        covariance = factor(f) * (rows @ rows.T)
+        return lens_off(camera, f.layout.held[camera], block, covariance, f.state.cameras[camera])
     if name in _KNOWN_SIGMA:
         _widen(f, blocks(f)[name], _KNOWN_SIGMA[name])
     if name == TARGET:  # what stretches said of the lens, they said with the target as in its file

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.events import ROLLING, Event, EventKind
-from vical_daemon.estimation.measurements import ROWS, FloatArray
+from vical_daemon.estimation.measurements import ROWS
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, LAG_SIGMA_S, OFF, SURE
 from vical_daemon.estimation.selection import model_selection
 from vical_daemon.estimation.selection.clock_drift import (
@@ -15,23 +16,22 @@ from vical_daemon.estimation.selection.clock_drift import (
     probability,
     stamps_variance,
 )
-from vical_daemon.estimation.selection.model_acceptance import known_off
+from vical_daemon.estimation.selection.model_acceptance import known_off, lens_off
+from vical_daemon.estimation.selection.model_mixture import Block, Weights, hypotheses, lens_block, not_zero
 from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
     IMU,
-    INERTIAL,
     LAG,
+    LENS,
     READOUT,
     MarginalPrior,
+    calibration_root,
 )
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
-_WHERE = {model_selection.IMU: np.r_[IMU], model_selection.LAG: np.r_[LAG]}
 _SIGMA = {model_selection.IMU: ENTRY_SIGMA, model_selection.LAG: LAG_SIGMA_S}
-
-Weights = dict[tuple[str, ...], float]
 
 
 class TargetFreeDoubts:
@@ -41,18 +41,22 @@ class TargetFreeDoubts:
         camera: Name of the camera.
         asked: What is asked for (`CalibrationOptions.estimate`): estimated whatever the evidence.
         rolling: The shutter is said to be a rolling one, or its readout is asked for.
+        lens: The lens, where it is fixed; None: it is estimated, or taken as exact.
 
     Attributes:
         drifting: The camera's clock is known to run apart from the imu's.
+        lens: See above.
         imu_asked: The imu's matrices are asked for.
         imu_sigma: Prior of the entries of the imu's matrices.
         rolling: The shutter is known to be a rolling one.
         stamp_sigma_s: How well the imu's driver knows its device's clock, s.
     """
 
-    def __init__(self, camera: str, *, asked: frozenset[str], rolling: bool) -> None:
-        self._camera = camera
-        self._off = asked & set(_WHERE)
+    def __init__(
+        self, camera: str, *, asked: frozenset[str], rolling: bool, lens: FixedLens | None = None
+    ) -> None:
+        self._camera, self.lens, self._lens_block = camera, lens, lens_block(camera)
+        self._off = asked & set(_SIGMA)
         self.imu_asked = model_selection.IMU in asked
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
         self.drifting = False
@@ -82,11 +86,23 @@ class TargetFreeDoubts:
                 events.append(Event(kind, self._camera, readout_s, float(sigmas[READOUT])))
         if compared:
             weights = self._weights(carry, factor)
-            known = {name for name in _WHERE if model_selection.not_zero(weights, name) > SURE}
-            news = [(name, _WHERE[name]) for name in sorted(known - self._off)]
-            events += [known_off(name, _numbers(carry)[at], sigmas[at]) for name, at in news]
+            every = self._blocks(carry)
+            known = {name for name in every if not_zero(weights, name) > SURE}
+            news = sorted(known - self._off)
+            events += [self._known_off(name, every[name], carry, factor) for name in news]
             self._off |= known
         return events
+
+    def _known_off(self, name: str, block: Block, carry: MarginalPrior, factor: float) -> Event:
+        covariance = factor * carry.calibration()[block.where, block.where]
+        if self.lens is not None and block.held:
+            return lens_off(self._camera, self.lens, block, covariance, carry.camera)
+        return known_off(name, block.values, np.sqrt(np.diag(covariance)))
+
+    @property
+    def lens_off(self) -> bool:
+        """Whether images contradict the fixed lens beyond doubt."""
+        return self._lens_block in self._off
 
     def axis_changed(self) -> None:
         """What was seen of a readout was seen with the wrong axis."""
@@ -104,7 +120,7 @@ class TargetFreeDoubts:
         For `believed` see `model_selection.in_doubt`.
         """
         imu, enough = model_selection.IMU, 0.5 if believed else OFF
-        if imu not in self._off and model_selection.not_zero(self._weights(carry, factor), imu) > enough:
+        if imu not in self._off and not_zero(self._weights(carry, factor), imu) > enough:
             return model_selection.IN_DOUBT[imu]
         if not self.drifting and doubtful(self._drift(carry, factor), believed=believed):
             return CLOCKS_IN_DOUBT
@@ -113,15 +129,20 @@ class TargetFreeDoubts:
     def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> Doubts:
         """How likely each model is, for the report; arguments as for `watch`."""
         weights = self._weights(carry, factor)
-        every = max(weights, key=len)
-        if not compared and weights[every] < 0.5:
-            others = 0.5 / max(1.0 - weights[every], 1e-300)
-            weights = {true: 0.5 if true == every else others * p for true, p in weights.items()}
-        stated = tuple(
-            (p, np.concatenate([np.zeros(0, np.intp), *(_WHERE[name] for name in true)]))
-            for true, p in weights.items()
+        specified = max(weights, key=len)
+        if not compared and weights[specified] < 0.5:
+            others = 0.5 / max(1.0 - weights[specified], 1e-300)
+            weights = {true: 0.5 if true == specified else others * p for true, p in weights.items()}
+        every = self._blocks(carry)
+        return Doubts(
+            factor,
+            self.drifting,
+            every,
+            weights,
+            gyro_frame=not self.imu_asked,
+            rolling=self.rolling,
+            lens=self.lens,
         )
-        return Doubts(factor, self.drifting, stated, gyro_frame=not self.imu_asked, rolling=self.rolling)
 
     def _drift(self, carry: MarginalPrior, factor: float) -> float:
         """How much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated."""
@@ -138,19 +159,17 @@ class TargetFreeDoubts:
         Where windows disagree although all is free, it is the images, and what they say about the imu is
         worth less by as much again.
         """
-        doubtful = [name for name in _WHERE if name not in self._off]
-        if not doubtful:
-            return {(): 1.0}
-        numbers = _numbers(carry)
-        at = np.concatenate([_WHERE[name] for name in doubtful])
-        sigma = np.concatenate([np.full(len(_WHERE[name]), _SIGMA[name]) for name in doubtful])
-        covariance = carry.calibration()[np.ix_(at, at)] / np.outer(sigma, sigma)
-        values = {name: numbers[_WHERE[name]] / _SIGMA[name] for name in doubtful}
-        return model_selection.posterior(values, covariance, factor**2)
+        doubtful = {name: block for name, block in self._blocks(carry).items() if name not in self._off}
+        return hypotheses(calibration_root(carry), doubtful, factor**2)
 
-
-def _numbers(carry: MarginalPrior) -> FloatArray:
-    """Errors of the imu's scale, alignment and lag, at their place among the errors, shape (n,)."""
-    out = np.zeros(len(carry.active))
-    out[INERTIAL] = carry.imu
-    return out
+    def _blocks(self, carry: MarginalPrior) -> dict[str, Block]:
+        """What is estimated apart from the calibration, by its name in `CalibrationOptions.estimate`."""
+        entries = carry.imu[: IMU.stop - IMU.start]
+        found = {
+            model_selection.IMU: Block.of(IMU, entries, ENTRY_SIGMA),
+            model_selection.LAG: Block.of(LAG, carry.imu[len(entries) :], LAG_SIGMA_S),
+        }
+        if self.lens is not None:
+            now = np.concatenate([carry.camera.intrinsics, carry.camera.distortion])
+            found[self._lens_block] = Block.of_lens(LENS, self.lens, now)
+        return found

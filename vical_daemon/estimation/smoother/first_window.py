@@ -150,9 +150,9 @@ class FirstWindow:
         reopened: Collection[int],
     ) -> tuple[Bundle, MarginalPrior, Fit | None]:
         """Adjust a window with what is known but for some errors."""
-        imu_sigma = self._status.doubts.imu_sigma
+        doubts, held = self._status.doubts, self.initializer.held
         carry = initial_prior(
-            window, known, self._active, self.initializer.held, imu_sigma, self._prior, reopened
+            window, known, self._active, held, doubts.imu_sigma, self._prior, reopened, doubts.lens
         )
         bundle = Bundle(window, carry, *noise)
         return bundle, carry, bundle.solve(buffer, _STEPS)

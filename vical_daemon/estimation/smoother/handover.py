@@ -14,6 +14,7 @@ from vical_daemon.estimation.measurements import (
     ImuNoise,
     PointsFrame,
 )
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
     GYRO_BIAS_SIGMA_RPS,
@@ -45,6 +46,7 @@ def initial_prior(
     imu_sigma: float,
     given: CameraPrior,
     reopened: Collection[int] = (),
+    fixed: FixedLens | None = None,
 ) -> MarginalPrior:
     """Prior of a window that starts from nothing: wide, or with the calibration and biases known before.
 
@@ -56,9 +58,10 @@ def initial_prior(
         imu_sigma: Of the entries of the imu's matrices, where nothing is known.
         given: What is known about the camera without any data.
         reopened: Errors of the calibration of which nothing is known any more; of mounting and time shift.
+        fixed: The lens, where it is fixed and its errors are considered.
     """
     centre = prior_centre(window.camera, given)
-    wide = first_carry(window, centre, active, start_sigmas(centre, imu_sigma))
+    wide = first_carry(window, centre, active, start_sigmas(centre, imu_sigma, fixed))
     if known is None:
         return wide if held is None else held_along(wide, held)
     known = known.at(wide.t_cam_s)

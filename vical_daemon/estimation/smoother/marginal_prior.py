@@ -81,6 +81,13 @@ class MarginalPrior:
         return full
 
 
+def calibration_root(carry: MarginalPrior) -> FloatArray:
+    """Square root of the covariance of the calibration's errors, zero where not estimated, shape (n, d)."""
+    S = np.zeros((len(carry.active), len(carry.root)))
+    S[carry.active] = np.linalg.inv(carry.root)[CALIBRATION:]
+    return S
+
+
 def later(active: BoolArray, seconds: float) -> FloatArray:
     """Active calibration errors some seconds later, by those now: the drift carries into the time shift."""
     G = np.eye(len(active))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,13 +11,23 @@ import numpy as np
 from vical_daemon.estimation.filter.gyro_frame import turn
 from vical_daemon.estimation.filter.unobservable_directions import held_covariance
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.imu_scale import matrices
 from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
+from vical_daemon.estimation.selection import clock_drift
 from vical_daemon.estimation.selection.clock_drift import evidence, probability
+from vical_daemon.estimation.selection.model_mixture import (
+    Block,
+    Weights,
+    joined,
+    lenses_known,
+    mixture,
+    parts,
+)
 from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     CAMERA,
@@ -28,6 +39,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     SHIFT,
     TURN,
     MarginalPrior,
+    calibration_root,
 )
 
 _GYRO = slice(IMU.start, IMU.start + 9)
@@ -39,16 +51,20 @@ class Doubts(NamedTuple):
     Attributes:
         factor: Measured variance over the stated one; multiplies the reported covariance.
         drifting: The camera's clock is known to run apart from the imu's.
-        stated: Probabilities, each with the errors that are zero then: what of the imu is as specified.
+        every: What may be as specified: the imu, a fixed lens.
+        weights: Probability of each hypothesis about these.
         gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
         rolling: The shutter is known to be a rolling one: its readout is reported.
+        lens: The lens, where it is fixed.
     """
 
-    factor: float = 1.0
-    drifting: bool = False
-    stated: tuple[tuple[float, IntArray], ...] = ((1.0, np.zeros(0, np.intp)),)
+    factor: float
+    drifting: bool
+    every: Mapping[str, Block]
+    weights: Weights
     gyro_frame: bool = False
     rolling: bool = True
+    lens: FixedLens | None = None
 
 
 def camera_estimate(
@@ -68,12 +84,15 @@ def camera_estimate(
         covariance[:3, :3] += held_covariance(np.outer(held, held))
     reported = [*range(SHIFT + 1), *range(LENS.start, len(covariance))]
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
+    lens, lens_sigma = np.concatenate([camera.intrinsics, camera.distortion]), sigma[LENS]
+    if doubts.lens is not None:
+        lens, lens_sigma = doubts.lens.values, doubts.lens.reported(lens_sigma)
     return camera_snapshot(
         camera,
         pose=covariance[:6, :6],
         timeshift_sigma_s=sigma[SHIFT],
-        lens=np.concatenate([camera.intrinsics, camera.distortion]),
-        lens_sigma=sigma[LENS],
+        lens=lens,
+        lens_sigma=lens_sigma,
         readout_sigma_s=sigma[READOUT],
         rms_px=rms_px,
         sigma_px=sigma_px,
@@ -83,42 +102,31 @@ def camera_estimate(
 
 
 def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
-    """Camera and covariance (n, n) over the models of imu and clock; see `model_selection`."""
-    camera, numbers, P = _over_imu(carry, doubts)
+    """Camera and covariance (n, n) over the models of imu, fixed lens and clock; see `model_mixture`."""
+    step, S = mixture(calibration_root(carry), doubts.every, doubts.weights, doubts.factor)
+    camera, numbers = moved_camera(carry.camera, CAMERA, step), carry.imu + step[INERTIAL]
     if doubts.gyro_frame:
-        camera, P = _in_gyro_frame(camera, numbers, P)
-    if doubts.drifting or not carry.active[DRIFT]:
-        return camera, P
-    p = probability(evidence(camera.skew, float(P[DRIFT, DRIFT])))
-    sigma = float(np.sqrt(P[DRIFT, DRIFT]))
-    k, z = P[:, DRIFT] / sigma, camera.skew / sigma
-    return moved_camera(camera, CAMERA, -(1.0 - p) * z * k), P - (1.0 - p) * (1.0 - p * z * z) * np.outer(
-        k, k
-    )
+        camera, S = _in_gyro_frame(camera, numbers, S)
+    if carry.active[DRIFT] and not doubts.drifting:
+        fixed = doubts.lens is not None
+        S, off = parts(S, doubts.factor) if fixed else (S, np.zeros(len(S)))
+        p = probability(evidence(camera.skew + off[DRIFT], doubts.factor * float(S[DRIFT] @ S[DRIFT])))
+        given = lenses_known(S, doubts.every)
+        step, S, off = clock_drift.mixture(S, off, given, DRIFT, camera.skew, p, doubts.factor)
+        S = joined(S, off, doubts.factor) if fixed else S
+        camera = moved_camera(camera, CAMERA, step)
+    return camera, doubts.factor * (S @ S.T)
 
 
-def _over_imu(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray, FloatArray]:
-    """Camera, errors of the imu, and covariance over the hypotheses about these."""
-    P = carry.calibration() * doubts.factor
-    numbers, mean, mixed = np.zeros(len(P)), np.zeros(len(P)), np.zeros_like(P)
-    numbers[INERTIAL] = carry.imu
-    for p, at in doubts.stated:
-        gain = np.linalg.solve(P[np.ix_(at, at)], P[at]).T
-        d = -gain @ numbers[at]
-        mean += p * d
-        mixed += p * (P - gain @ P[at] + np.outer(d, d))
-    return moved_camera(carry.camera, CAMERA, mean), carry.imu + mean[INERTIAL], mixed - np.outer(mean, mean)
-
-
-def _in_gyro_frame(camera: CameraState, numbers: FloatArray, P: FloatArray) -> tuple[CameraState, FloatArray]:
+def _in_gyro_frame(camera: CameraState, numbers: FloatArray, S: FloatArray) -> tuple[CameraState, FloatArray]:
     """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries."""
-    J = np.eye(len(P))
+    J = np.eye(len(S))
     by_entries = turn(np.eye(9).reshape(3, 3, 9))
     J[TURN, _GYRO] = -camera.R_imu_cam.T @ by_entries
     J[ARM, _GYRO] = so3.hat(camera.p_imu_cam) @ by_entries
     back = so3.exp(-turn(numbers[:9].reshape(3, 3)))
     camera = replace(camera, R_imu_cam=back @ camera.R_imu_cam, p_imu_cam=back @ camera.p_imu_cam)
-    return camera, J @ P @ J.T
+    return camera, J @ S
 
 
 def imu_estimate(carry: MarginalPrior, *, matrices_asked: bool) -> ImuEstimate:

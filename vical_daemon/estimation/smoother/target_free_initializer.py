@@ -15,6 +15,7 @@ from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
 from vical_daemon.estimation.model.priors import EQUIDISTANT_SIGMA, LAG_SIGMA_S, SKEW_SIGMA, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
@@ -297,12 +298,13 @@ def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
     return replace(found, p_imu_cam=before.p_imu_cam, intrinsics=lens, distortion=before.distortion)
 
 
-def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
+def start_sigmas(camera: CameraState, imu_sigma: float, fixed: FixedLens | None = None) -> FloatArray:
     """How far each calibration error may be off at a start: many times what it is worth; shape (n,).
 
     Args:
         camera: Its focal length counts.
         imu_sigma: Of the entries of the imu's matrices.
+        fixed: The lens, where it is fixed and its errors are considered.
     """
     start, f = WINDOW_START, float(camera.intrinsics[0])
     pose = [start.lever_arm_m] * 3 + [start.rotation_rad] * 3
@@ -313,7 +315,8 @@ def start_sigmas(camera: CameraState, imu_sigma: float) -> FloatArray:
     elif camera.distortion_model == PLUMB_BOB:
         distortion.append(start.distortion)
     imu = [imu_sigma] * ENTRIES + [LAG_SIGMA_S]
-    return np.array([*pose, start.timeshift_s, SKEW_SIGMA, start.readout_s, *imu, *lens, *distortion])
+    of_lens = [*lens, *distortion] if fixed is None else fixed.off_sigma
+    return np.array([*pose, start.timeshift_s, SKEW_SIGMA, start.readout_s, *imu, *of_lens])
 
 
 def _known(known: MarginalPrior) -> _Found:

@@ -10,6 +10,7 @@ import numpy as np
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
+from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 from vical_daemon.estimation.result import (
@@ -23,7 +24,14 @@ from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.status.evaluator import LOST, PATIENCE_S, Evaluator, lacking_verdict
+from vical_daemon.estimation.status.evaluator import (
+    LOST,
+    PATIENCE_S,
+    Evaluator,
+    lacking_verdict,
+    lens_known,
+    lens_verdict,
+)
 from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
 from vical_daemon.estimation.wording import cause_text, direction_line, guidance_text
 
@@ -44,10 +52,17 @@ class TargetFreeStatus(Evaluator):
         camera: Name of the camera.
         active: Which of the calibration errors are estimated, shape (n,).
         rolling: The camera is said to have a rolling shutter, or its readout is asked for.
+        lens: The lens, where it is fixed and its errors are considered.
     """
 
     def __init__(
-        self, options: CalibrationOptions, camera: str, active: BoolArray, *, rolling: bool = False
+        self,
+        options: CalibrationOptions,
+        camera: str,
+        active: BoolArray,
+        *,
+        rolling: bool = False,
+        lens: FixedLens | None = None,
     ) -> None:
         super().__init__(options, "no features have been followed yet: is the picture dark or blurred?")
         self.camera, self.active = camera, active
@@ -64,7 +79,7 @@ class TargetFreeStatus(Evaluator):
         self._bumped = Cause.NONE
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
-        self.doubts = TargetFreeDoubts(camera, asked=options.estimate, rolling=rolling)
+        self.doubts = TargetFreeDoubts(camera, asked=options.estimate, rolling=rolling, lens=lens)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -255,12 +270,14 @@ class TargetFreeStatus(Evaluator):
     ) -> CalibrationEstimate:
         """Put everything together."""
         camera = None if carry is None else self._camera(carry)
-        missing = []
+        missing, lens_alone = [], False
         if camera is not None and carry is not None:
-            missing = self._weak(camera, carry.camera.R_imu_cam, carry.bias[:3])
+            at = carry.camera.R_imu_cam, carry.bias[:3]
+            missing = self._weak(camera, *at)
+            lens_alone = self.doubts.lens is not None and not self._weak(lens_known(camera), *at)
         doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), believed=self.believed)
         self.believed &= not doubt
-        verdict = self._decide(camera is not None, running, missing, doubt)
+        verdict = self._decide(camera is not None, running, missing, doubt, lens_alone=lens_alone)
         if carry is None:
             reported = self._published(verdict)
         else:
@@ -293,8 +310,18 @@ class TargetFreeStatus(Evaluator):
         doubts = self.doubts.weighed(carry, self._reported_factor(), bool(self._agreement))
         return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
 
-    def _decide(self, known: bool, running: bool, missing: list[WeakDirection], doubt: str) -> Verdict:
-        """By the data up to now; `doubt`: what may not be as it is taken to be, or nothing."""
+    def _decide(
+        self, known: bool, running: bool, missing: list[WeakDirection], doubt: str, *, lens_alone: bool
+    ) -> Verdict:
+        """By the data up to now.
+
+        Args:
+            known: There is a calibration.
+            running: Images are being used.
+            missing: Directions that are not known well enough.
+            doubt: What may not be as it is taken to be, or nothing.
+            lens_alone: Nothing would be missing if the fixed lens were known.
+        """
         if not known:
             return self._before_start(self._bumped)
         if not running and self._windows == 0:
@@ -313,6 +340,8 @@ class TargetFreeStatus(Evaluator):
             if doubt:
                 return Verdict(Status.CONVERGING, doubt + pause)
             return Verdict(Status.CONVERGED, pause.strip(" ()"))
+        if lens_alone:
+            return lens_verdict(missing[0], self.camera, off=self.doubts.lens_off)
         patient = self._now_s - (self._started_s or 0.0) > PATIENCE_S
         return lacking_verdict(missing, patient=patient, pause=pause)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from vical_daemon.estimation.wording import cause_text, direction_sigma
 
 PATIENCE_S = 15.0
 """So long after it could first have shown, a direction that the motion does not show is called that."""
+_RIDGE = 1e-12  # of a variance, against rounding
 LOST = 3.0
 """A direction whose sigma is this many times its limit after the patience is called unobservable."""
 
@@ -140,6 +142,25 @@ class Evaluator:
             return min(0.1, 0.001 * self.frames_seen)
         worst = max((direction.excess for direction in weak), default=1.0)
         return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
+
+
+def lens_known(e: CameraEstimate) -> CameraEstimate:
+    """The same camera if the errors of its lens were known: pose and time shift given the lens."""
+    joint = np.array(e.calibration_covariance)
+    lens = 7 + np.flatnonzero(np.diag(joint)[7:])
+    scale = np.sqrt(np.diag(joint)[lens])  # pixels and coefficients
+    rows = joint[lens] / scale[:, None]
+    own = rows[:, lens] / scale + _RIDGE * np.eye(len(lens))
+    known = joint[:7, :7] - rows[:, :7].T @ np.linalg.solve(own, rows[:, :7])
+    pose = replace(e.T_imu_cam, covariance=known[:6, :6].tolist())
+    return replace(e, T_imu_cam=pose, timeshift_sigma_s=float(np.sqrt(max(known[6, 6], 0.0))))
+
+
+def lens_verdict(worst: WeakDirection, camera: str, *, off: bool) -> Verdict:
+    """What is said where nothing is missing but for a fixed lens; `off`: images contradict it."""
+    how = "not this camera's" if off else "not known better"
+    text = f"{direction_sigma(worst)}: the fixed lens of {camera} is {how}: leave it free"
+    return Verdict(Status.CONVERGING, text)
 
 
 def lacking_verdict(lacking: list[WeakDirection], *, patient: bool, pause: str = "") -> Verdict:

@@ -25,13 +25,20 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
-from vical_daemon.estimation.selection import clock_drift, model_selection
-from vical_daemon.estimation.status.evaluator import LOST, PATIENCE_S, Evaluator, lacking_verdict
+from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
+from vical_daemon.estimation.status.evaluator import (
+    LOST,
+    PATIENCE_S,
+    Evaluator,
+    lacking_verdict,
+    lens_known,
+    lens_verdict,
+)
 from vical_daemon.estimation.status.excitation import ALL_WAYS
 from vical_daemon.estimation.status.holdout_check import imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
 from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
-from vical_daemon.estimation.wording import direction_line, direction_sigma, guidance_text
+from vical_daemon.estimation.wording import direction_line, guidance_text
 
 _ENOUGH_FRAMES = 60
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
@@ -230,18 +237,16 @@ class StatusEvaluator(Evaluator):
             return Verdict(Status.CONVERGED)
         lens = self._lens_to_blame(f, missing)
         if lens:
-            return Verdict(Status.CONVERGING, f"{direction_sigma(lacking[0])}: {lens}: leave it free")
+            return lens_verdict(lacking[0], lens, off=model_mixture.lens_block(lens) in f.off)
         patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > PATIENCE_S
         return lacking_verdict(lacking, patient=patient)
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
-        """What is wrong with a lens that is held, if nothing were missing but for that; else empty."""
-        known = replace(f, S=model_selection.lenses_known(f)) if f.layout.held else f
-        if known is f or any(self._missing(self._camera(n, known), n, known) for n in self.layout.cameras):
+        """The camera whose fixed lens is the only reason why something is missing; empty: there is none."""
+        cameras = {name: lens_known(self._camera(name, f)) for name in self.layout.held}
+        if not cameras or any(self._missing(e, name, f) for name, e in cameras.items()):
             return ""
-        name = max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
-        how = "not this camera's" if model_selection.lens_block(name) in f.off else "not known better"
-        return f"the fixed lens of {name} is {how}"
+        return max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
 
     def _unit_trouble(self) -> str:
         if len(self._size) < 20:

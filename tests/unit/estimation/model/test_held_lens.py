@@ -20,7 +20,7 @@ from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.result import Status
-from vical_daemon.estimation.selection import clock_drift, model_selection
+from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
 
 NAME = "cam0"
 HELD = CalibrationOptions(fix=frozenset({"intrinsics"}))
@@ -95,7 +95,7 @@ def test_a_lens_that_is_as_stated_costs_nothing_and_is_known_exactly():
 def test_a_wrong_lens_keeps_the_answer_of_the_stated_one_and_widens_it_by_what_the_lens_does():
     problem = Linear(off=1.0)
     f = problem.filter()
-    assert model_selection.off(f, model_selection.lens_block(NAME)) > 0.99
+    assert model_selection.off(f, model_mixture.lens_block(NAME)) > 0.99
     shown = model_selection.averaged(f)
     x, _ = problem.posterior(np.zeros(8))
     free, P = problem.posterior(problem.lens.off_sigma)
@@ -138,8 +138,25 @@ def test_the_odds_of_a_stated_sigma_are_those_of_two_priors():
         multivariate_normal(np.zeros(9), H @ np.diag(s**2) @ H.T + 0.09 * np.eye(9)).logpdf(z)
         for s in (np.ones(4), share)
     ]
-    found = model_selection.log_bayes_factor(P @ H.T @ z / 0.09, P, 1.0, share)
+    found = model_mixture.log_bayes_factor(P @ H.T @ z / 0.09, P, 1.0, share)
     assert found == pytest.approx(by_priors[0] - by_priors[1], abs=1e-6)
+
+
+def test_the_covariance_over_lens_and_clocks_is_about_what_is_reported():
+    """The clocks are judged by the lens that the images show: the given one may look like a drift."""
+    problem = Linear(off=1.0)
+    at = problem.skew
+    shown = clock_drift.averaged(model_selection.averaged(problem.filter()))
+    free, P = problem.posterior(problem.lens.off_sigma)  # images contradict the lens beyond doubt
+    held, given = problem.posterior(np.zeros(8))
+    p = clock_drift.probability(clock_drift.evidence(free[at], P[at, at]))
+    mean = free - (1 - p) * free[at] * P[:, at] / P[at, at]
+    covariance = P - (1 - p) * (1 - p * free[at] ** 2 / P[at, at]) * np.outer(P[:, at], P[:, at]) / P[at, at]
+    reported = held - (1 - p) * held[at] * given[:, at] / given[at, at]
+    expected = covariance + np.outer(mean - reported, mean - reported)
+    rows = problem.layout.cameras[NAME].position
+    np.testing.assert_allclose(shown.state.cameras[NAME].p_imu_cam, reported[rows], atol=1e-6)
+    np.testing.assert_allclose((shown.S @ shown.S.T)[rows, rows], expected[rows, rows], rtol=1e-3)
 
 
 def test_what_is_said_of_the_clocks_does_not_move_a_lens_that_is_held():

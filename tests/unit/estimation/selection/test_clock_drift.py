@@ -16,10 +16,10 @@ from vical_daemon.estimation.model.state import CameraState, State, make_layout
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.selection.clock_drift import (
-    _mixed,
     apart,
     averaged,
     in_doubt,
+    mixture,
     stamps_variance,
 )
 
@@ -58,12 +58,10 @@ def test_clocks_that_run_alike_are_the_gaussian_conditioned_on_no_drift():
     index, shift = f.layout.cameras[NAME].skew, f.layout.cameras[NAME].timeshift
     P = f.S @ f.S.T
     gain = P[:, index] / P[index, index]
-    alike = _mixed(f, NAME, 0.0, f.S)
-    np.testing.assert_allclose(alike.S @ alike.S.T, P - np.outer(gain, P[index]), atol=1e-18)
-    moved = alike.state.cameras[NAME]
-    assert moved.skew == pytest.approx(0.0, abs=1e-18)
-    assert moved.timeshift_s == pytest.approx(0.004 - 2e-5 * gain[shift], rel=1e-12)
-    assert f.state.cameras[NAME].skew == 2e-5  # the filter itself goes on as it was
+    step, S, _ = mixture(f.S, np.zeros(len(P)), f.S, index, 2e-5, 0.0, 1.0)
+    np.testing.assert_allclose(S @ S.T, P - np.outer(gain, P[index]), atol=1e-18)
+    assert step[index] == pytest.approx(-2e-5, rel=1e-12)
+    assert step[shift] == pytest.approx(-2e-5 * gain[shift], rel=1e-12)
 
 
 @pytest.mark.parametrize("factor", [1.0, 4.0])

@@ -13,6 +13,7 @@ from tests.unit.estimation.some_filter import NAME, imu_entries, some_filter
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, SIZE_SIGMA, SURE
+from vical_daemon.estimation.selection.model_mixture import log_bayes_factor
 from vical_daemon.estimation.selection.model_selection import (
     IMU,
     LAG,
@@ -20,7 +21,6 @@ from vical_daemon.estimation.selection.model_selection import (
     TARGET,
     averaged,
     in_doubt,
-    log_bayes_factor,
     off,
     weights,
 )

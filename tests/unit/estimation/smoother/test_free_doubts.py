@@ -95,17 +95,16 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
 def test_what_is_asked_for_is_never_taken_as_stated():
     known, _ = carry(5, 0.0)
     doubts = TargetFreeDoubts("cam0", asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
-    ((p, stated),) = doubts.weighed(known, 1.0, compared=True).stated
-    assert (p, len(stated)) == (1.0, 0)
+    assert doubts.weighed(known, 1.0, compared=True).weights == {(): 1.0}
 
 
 def test_until_windows_can_be_compared_the_imu_is_as_likely_true_as_not():
     known, _ = carry(6, 8.0)
     doubts = TargetFreeDoubts("cam0", asked=frozenset(), rolling=False)
     for compared, least in ((False, 0.5), (True, 0.0)):
-        shares = {len(stated): p for p, stated in doubts.weighed(known, 1.0, compared=compared).stated}
-        assert shares[16] == pytest.approx(least, abs=1e-6)
-        assert sum(p for p, _ in doubts.weighed(known, 1.0, compared=compared).stated) == pytest.approx(1.0)
+        shares = doubts.weighed(known, 1.0, compared=compared).weights
+        assert shares["imu_intrinsics", "accel_lag"] == pytest.approx(least, abs=1e-6)
+        assert sum(shares.values()) == pytest.approx(1.0)
     kinds = {event.kind for event in doubts.watch(known, 1.0, compared=False)}
     assert EventKind.IMU_INTRINSICS not in kinds
     assert EventKind.IMU_INTRINSICS in {event.kind for event in doubts.watch(known, 1.0, compared=True)}
