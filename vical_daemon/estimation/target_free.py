@@ -21,6 +21,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
+from vical_daemon.estimation.noise.lens_misfit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
@@ -86,6 +87,7 @@ class TargetFreeCalibrator:
         self.latest: MarginalPrior | None = None  # after its last adjustment
         self._closed = 0
         self._noise = Noise(options.corner_sigma_px)
+        self._misfit = LensMisfit()
         self._intake = SensorIntake()
         self._pending: list[Stamped] = []
         self._fitted_s = -np.inf  # stamp of the last image that fitted
@@ -357,6 +359,7 @@ class TargetFreeCalibrator:
             self.latest, self._noise = fit.carry, Noise.of(fit)
         self._closed += 1
         self.evaluator.closed()
+        self._learn_lens(window, bundle, fit)
         if self.window_closed is not None:
             self.window_closed(window, fit)
         if bundle.seen is not None:
@@ -364,6 +367,17 @@ class TargetFreeCalibrator:
         drifting, noise = self.evaluator.doubts.drifting, self.options.imu_noise
         self.carry = with_process_noise(fit.carry, noise, self.active, window.span_s, drifting=drifting)
         self.window = next_window(window, self.carry)
+
+    def _learn_lens(self, window: Window, bundle: Bundle, fit: Fit) -> None:
+        """Learn from a complete window by how much the lens model misses."""
+        if not len(fit.own_lens):
+            return
+        root = bundle.problem.lens_root
+        information = np.linalg.inv(fit.own_lens)
+        misfit = self._misfit
+        misfit.learn(root * fit.lens_px, information - root.T @ root, information @ window.own_lens)
+        self._noise = self._noise._replace(lens_px=misfit.px)
+        print("MISFIT", misfit.px, file=__import__("sys").stderr)
 
     def _forget(self) -> None:
         """What was kept over a change contradicts the images, too: start over."""

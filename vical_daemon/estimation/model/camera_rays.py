@@ -68,10 +68,21 @@ def rays_over_image(
     intrinsics: FloatArray, distortion: FloatArray, model: str, resolution: tuple[int, int]
 ) -> FloatArray:
     """Return rays through the centres of eight by six patches of an image, where they exist, shape (n, 3)."""
-    u, v = ((np.arange(n) + 0.5) * (size / n) for n, size in zip(_PATCHES, resolution, strict=True))
-    uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    rays, ok = unproject(uv, intrinsics, distortion, model)
+    rays, ok = unproject(patch_centres(resolution), intrinsics, distortion, model)
     return np.asarray(rays[ok])
+
+
+def patch_centres(resolution: tuple[int, int]) -> FloatArray:
+    """Pixels of the centres of eight by six patches of an image, row by row, shape (48, 2)."""
+    u, v = ((np.arange(n) + 0.5) * (size / n) for n, size in zip(_PATCHES, resolution, strict=True))
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def patches_seen(uv_px: FloatArray, resolution: tuple[int, int]) -> BoolArray:
+    """Which of these patches have pixels in them; uv_px shape (n, 2); shape (48,)."""
+    columns, rows = _PATCHES
+    at = (uv_px * (np.array(_PATCHES) / resolution)).astype(np.intp).clip(0, np.array(_PATCHES) - 1)
+    return np.bincount(at[:, 1] * columns + at[:, 0], minlength=columns * rows) > 0
 
 
 def undistort(

@@ -18,6 +18,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
@@ -60,6 +61,8 @@ class Fit(NamedTuple):
         change: Calibration found minus the one carried in, at the first image; active errors, shape (k,).
         landmarks: How many.
         parallax_deg: Typical angle under which a landmark's rays cross.
+        own_lens: Covariance of the window's own lens, shape (n, n), or (0, 0).
+        lens_px: Misfit of the lens model, as it was taken to be, px.
     """
 
     carry: MarginalPrior
@@ -77,6 +80,8 @@ class Fit(NamedTuple):
     change: FloatArray
     landmarks: int
     parallax_deg: float
+    own_lens: FloatArray
+    lens_px: float
 
 
 class _Step(NamedTuple):
@@ -85,7 +90,7 @@ class _Step(NamedTuple):
     predicted_reduction: float  # by how much the sum of squares should fall
 
 
-_Saved = tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray]
+_Saved = tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray, FloatArray]
 
 
 class Bundle:
@@ -97,6 +102,7 @@ class Bundle:
         sigma_px: Pixel noise, first guess.
         spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
         jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
+        lens_px: Misfit of the lens model, see `lens_misfit`, px.
     """
 
     def __init__(
@@ -106,9 +112,10 @@ class Bundle:
         sigma_px: float,
         spread: float = 1.0,
         jitter_s: float = 0.0,
+        lens_px: float = SYSTEMATIC_PX,
     ) -> None:
         self.window, self.carry = window, carry
-        self.problem = Problem(window, carry, sigma_px, spread, jitter_s)
+        self.problem = Problem(window, carry, sigma_px, spread, jitter_s, lens_px)
         self.seen: Seen | None = None
 
     # ------------------------------------------------------------------ the loop
@@ -171,11 +178,11 @@ class Bundle:
 
     def _save(self) -> _Saved:
         w = self.window
-        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu
+        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens
 
     def _restore(self, s: _Saved) -> None:
         w = self.window
-        w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu = s
+        w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens = s
 
     # ------------------------------------------------------------------ step
     def _reduced(self, normal: Normal, lam: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -243,6 +250,8 @@ class Bundle:
         full = np.zeros(length(w.camera))
         full[self.problem.active] = dx[order.calib]
         w.camera, w.imu = moved_camera(w.camera, CAMERA, full), w.imu + full[INERTIAL][: len(w.imu)]
+        if self.problem.own:
+            w.own_lens = w.own_lens + dx[order.own]
         m = w.landmarks
         bearing = m.bearing + np.matmul(tangents(m.bearing), dl[:, :2, None])[..., 0]
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
@@ -296,8 +305,8 @@ class Bundle:
         root, info = _in_place(H)
         if info:
             return None
-        tail = order.tail
-        L22 = np.tril(root[tail:, tail:])
+        own = len(order.own)
+        L22 = np.tril(root[order.tail - own :, order.tail - own :])
         try:
             covariance = np.asarray(np.linalg.inv(L22 @ L22.T), dtype=np.float64)
         except np.linalg.LinAlgError:
@@ -309,7 +318,7 @@ class Bundle:
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = calibration_difference(w, self.carry)[self.problem.active]
         return Fit(
-            carried_out(w, covariance, self.carry.active),
+            carried_out(w, covariance[own:, own:], self.carry.active),
             squares,
             max(self._dof(seen), 1),
             inertial,
@@ -324,6 +333,8 @@ class Bundle:
             change,
             len(seen.begin),
             parallax_deg(w, seen),
+            covariance[:own, :own],
+            self.problem.lens_px,
         )
 
 

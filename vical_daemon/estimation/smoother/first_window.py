@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, CalibrationOptions, CameraPrior
+from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
@@ -33,16 +34,18 @@ class Noise(NamedTuple):
         sigma_px: Of a feature, px.
         spread: How long its errors last.
         jitter_s: Of the stamps, s.
+        lens_px: Misfit of the lens model, px.
     """
 
     sigma_px: float
     spread: float = 1.0
     jitter_s: float = 0.0
+    lens_px: float = SYSTEMATIC_PX
 
     @classmethod
     def of(cls, fit: Fit) -> Noise:
         """Return that of an adjusted window."""
-        return cls(fit.sigma_px, fit.spread, fit.jitter_s)
+        return cls(fit.sigma_px, fit.spread, fit.jitter_s, fit.lens_px)
 
 
 class Begun(NamedTuple):

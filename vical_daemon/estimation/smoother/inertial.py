@@ -13,23 +13,31 @@ _LEAST_JITTER_S = 3e-5
 
 
 class Order:
-    """Places of the unknowns: images but the last, knots but the last, last image, last knot, calibration.
+    """Places of the unknowns.
+
+    Images but the last, knots but the last, the window's own lens, last image, last knot, calibration.
 
     Args:
         F: Images.
         K: Knots.
         of_imu: Which of the calibration's errors are numbers of the imu (`imu_scale`), shape (k,).
+        own: Errors of the window's own lens.
+
+    Attributes:
+        camera: Those that move pixels: of the calibration, and the window's own lens.
     """
 
-    def __init__(self, F: int, K: int, of_imu: BoolArray) -> None:
-        self.size = 9 * F + 6 * K + len(of_imu)
-        self.tail = 9 * (F - 1) + 6 * (K - 1)
+    def __init__(self, F: int, K: int, of_imu: BoolArray, own: int = 0) -> None:
+        self.size = 9 * F + 6 * K + own + len(of_imu)
+        self.tail = 9 * (F - 1) + 6 * (K - 1) + own
+        self.own = self.tail - own + np.arange(own)
         frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
         knots = 9 * (F - 1) + np.arange(6 * (K - 1)).reshape(K - 1, 6)
         self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
         self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
         self.calib = self.tail + 15 + np.arange(len(of_imu))
-        self.imu, self.camera = self.calib[of_imu], self.calib[~of_imu]
+        self.imu = self.calib[of_imu]
+        self.camera = np.concatenate([self.calib[~of_imu], self.own])
 
     def of_links(self, knots: IntArray) -> IntArray:
         """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 40)."""

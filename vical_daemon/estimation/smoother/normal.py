@@ -12,8 +12,9 @@ from vical_daemon.estimation.geometry.camera_model import project, project_jacob
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
-from vical_daemon.estimation.model.camera_rays import read_share
+from vical_daemon.estimation.model.camera_rays import patches_seen, read_share
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
+from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, patches
 from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
 from vical_daemon.estimation.smoother.jitter import first_guess
@@ -21,6 +22,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     DRIFT,
     INERTIAL,
+    LENS,
     READOUT,
     SHIFT,
     TURN,
@@ -63,13 +65,26 @@ class Problem:
         sigma_px: Pixel noise.
         spread: Square root of how many neighbouring images share an error of the pixels.
         jitter_s: Standard deviation of the images' stamps, s.
+        lens_px: Misfit of the lens model, see `lens_misfit`, px.
     """
 
     def __init__(
-        self, window: Window, carry: MarginalPrior, sigma_px: float, spread: float, jitter_s: float = 0.0
+        self,
+        window: Window,
+        carry: MarginalPrior,
+        sigma_px: float,
+        spread: float,
+        jitter_s: float = 0.0,
+        lens_px: float = SYSTEMATIC_PX,
     ) -> None:
         self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
-        self.jitter_s = jitter_s
+        self.jitter_s, self.lens_px = jitter_s, lens_px
+        self.own = len(window.own_lens) if carry.active[LENS].all() else 0
+        uv = np.concatenate([frame.uv_px for _, frame in window.frames])
+        seen = patches_seen(uv, carry.camera.resolution)
+        self.lens_root = (
+            patches(carry.camera, seen) / lens_px
+        )  # of the information in the prior of the own lens
         self.active = np.flatnonzero(carry.active)
         places = np.arange(len(carry.active))
         self._of_imu = (places >= INERTIAL.start) & (places < INERTIAL.stop)  # they do not move pixels
@@ -78,7 +93,7 @@ class Problem:
     def order(self) -> Order:
         """Places of the unknowns."""
         w = self.window
-        return Order(len(w.frames), len(w.bias), self._of_imu[self.active])
+        return Order(len(w.frames), len(w.bias), self._of_imu[self.active], self.own)
 
     # ------------------------------------------------------------------ pixels
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -112,9 +127,8 @@ class Problem:
     def pixel_errors(self, seen: Seen) -> tuple[FloatArray, BoolArray, FloatArray]:
         """Whitened errors (N, 2), which are valid, and Huber weights."""
         y = self._rays(seen)[0]
-        cam = self.window.camera
         with np.errstate(all="ignore"):
-            uv = project(y, cam.intrinsics, cam.distortion, cam.distortion_model)
+            uv = project(y, *self.window.lens)
         return self._weigh(seen, uv)
 
     def _weigh(self, seen: Seen, uv: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
@@ -129,7 +143,7 @@ class Problem:
         w, cam = self.window, self.window.camera
         y, x_imu, R, rates = self._rays(seen)
         with np.errstate(all="ignore"):
-            uv, Jy, Jlens = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)
+            uv, Jy, Jlens = project_jacobians(y, *w.lens)
         e, ok, weight = self._weigh(seen, uv)
         root = np.sqrt(weight) / (self.sigma_px * self.spread)
         Jy = np.where(ok[:, None, None], Jy, 0.0) * root[:, None, None]
@@ -149,7 +163,7 @@ class Problem:
         Jc[:, :, INERTIAL.start :] = Jlens
         Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
         Jc[:, :, READOUT] = Jc[:, :, SHIFT] * seen.row[:, None]
-        Jc = Jc[:, :, self._columns]
+        Jc = np.concatenate([Jc[:, :, self._columns], Jlens[:, :, : self.own]], axis=2)
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
         by_rho = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
@@ -190,7 +204,7 @@ class Problem:
         cam = self.window.camera
         y, x_imu, R, rates = self._rays(seen)
         with np.errstate(all="ignore"):
-            uv, Jy, _ = project_jacobians(y, cam.intrinsics, cam.distortion, cam.distortion_model)
+            uv, Jy, _ = project_jacobians(y, *self.window.lens)
         e, ok, weight = self._weigh(seen, uv)
         JR = (np.where(ok[:, None, None], Jy, 0.0).reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)
         root = np.sqrt(weight)[:, None]
@@ -242,7 +256,7 @@ class Problem:
         by_frame = W[:, :, : 6 * F].reshape(L, 3, F, 6)  # the same memory
         by_frame[seen.landmark, :, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf  # seen once in an image
         cost += add_links(w, links, self.jitter_s, order, H, g)
-        cost += self._add_prior(H, g, order)
+        cost += self._add_prior(H, g, order) + self._add_own_lens(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 
     def stamps_doubted(self, seen: Seen, links: PreintegratedLinks) -> float:
@@ -281,6 +295,15 @@ class Problem:
         up = self.window.R[0][2]
         H[turn[:, None], turn] += _GAUGE * np.outer(up, up)
         H[place, place] += _GAUGE
+        return float(e @ e)
+
+    def _add_own_lens(self, H: FloatArray, g: FloatArray, order: Order) -> float:
+        """How far the lens of a window may be from the common one."""
+        if not self.own:
+            return 0.0
+        e = self.lens_root @ self.window.own_lens
+        H[order.own[:, None], order.own] += self.lens_root.T @ self.lens_root
+        g[order.own] += self.lens_root.T @ e
         return float(e @ e)
 
 

@@ -90,6 +90,7 @@ class Window:
         gravity: Acceleration of free fall in the world, m/s^2, shape (3,).
         bad: (frame stamp in ns, track id) of observations refused.
         imu: Errors of scale, alignment, lag (`imu_scale`) where they are estimated, shape (16,); else empty.
+        own_lens: What fx fy cx cy and the distortion differ by in this window, see `lens_misfit`, shape (n,).
         turning: Measured rate (with bias), rad/s, and its derivative, rad/s^2, at each image, (2, F, 3).
     """
 
@@ -106,7 +107,18 @@ class Window:
     gravity: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, -9.80665]))
     bad: set[tuple[int, int]] = field(default_factory=set)
     imu: FloatArray = field(default_factory=lambda: np.zeros(0))
+    own_lens: FloatArray = field(default_factory=lambda: np.zeros(0))
     turning: FloatArray = field(default_factory=lambda: np.zeros((2, 0, 3)))
+
+    def __post_init__(self) -> None:
+        if not len(self.own_lens):
+            self.own_lens = np.zeros(4 + len(self.camera.distortion))
+
+    @property
+    def lens(self) -> tuple[FloatArray, FloatArray, str]:
+        """Fx fy cx cy, distortion and model in this window."""
+        camera, own = self.camera, self.own_lens
+        return camera.intrinsics + own[:4], camera.distortion + own[4:], camera.distortion_model
 
     @property
     def span_s(self) -> float:
