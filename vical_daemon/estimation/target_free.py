@@ -36,7 +36,11 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     length,
 )
 from vical_daemon.estimation.smoother.reports import window_reports
-from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer, starting_camera
+from vical_daemon.estimation.smoother.target_free_initializer import (
+    TargetFreeInitializer,
+    starting_camera,
+    with_next_term,
+)
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
@@ -73,14 +77,18 @@ class TargetFreeCalibrator:
         for block in sorted({"target_scale", "target_shape"} & options.estimate):
             raise ValueError(f"without a target there is no {block} to estimate")
         self.options = options
-        self.camera, prior = next(iter(cameras.items()))
+        self.camera, given = next(iter(cameras.items()))
+        prior = with_next_term(given)
         self.active = np.ones(length(starting_camera(prior)), dtype=bool)
         self.active[:6] = "extrinsics" not in options.fix
         self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         lens = FixedLens.considered(prior, options.fix)
         self.active[LENS] = "intrinsics" not in options.fix or lens is not None
         rolling = "readout" in options.estimate or prior.readout_s != 0.0
-        self.evaluator = TargetFreeStatus(options, self.camera, self.active, rolling=rolling, lens=lens)
+        term = prior is not given
+        self.evaluator = TargetFreeStatus(
+            options, self.camera, self.active, rolling=rolling, lens=lens, term=term
+        )
         self._first = FirstWindow(options, prior, self.active, self.evaluator)
         self.window: Window | None = None
         self.carry: MarginalPrior | None = None  # before the window
@@ -377,7 +385,6 @@ class TargetFreeCalibrator:
         misfit = self._misfit
         misfit.learn(root * fit.lens_px, information - root.T @ root, information @ window.own_lens)
         self._noise = self._noise._replace(lens_px=misfit.px)
-        print("MISFIT", misfit.px, file=__import__("sys").stderr)
 
     def _forget(self) -> None:
         """What was kept over a change contradicts the images, too: start over."""

@@ -7,7 +7,14 @@ import numpy as np
 from vical_daemon.estimation.events import ROLLING, Event, EventKind
 from vical_daemon.estimation.measurements import ROWS
 from vical_daemon.estimation.model.held_lens import FixedLens
-from vical_daemon.estimation.model.priors import ENTRY_SIGMA, KNOWN_OFF_SIGMA, LAG_SIGMA_S, OFF, SURE
+from vical_daemon.estimation.model.priors import (
+    ENTRY_SIGMA,
+    KNOWN_OFF_SIGMA,
+    LAG_SIGMA_S,
+    OFF,
+    SURE,
+    WINDOW_START,
+)
 from vical_daemon.estimation.selection import model_selection
 from vical_daemon.estimation.selection.clock_drift import (
     CLOCKS_IN_DOUBT,
@@ -30,6 +37,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 )
 from vical_daemon.estimation.smoother.snapshot import Doubts
 
+_TERM = "lens_term"
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
 _SIGMA = {model_selection.IMU: ENTRY_SIGMA, model_selection.LAG: LAG_SIGMA_S}
 
@@ -42,6 +50,7 @@ class TargetFreeDoubts:
         asked: What is asked for (`CalibrationOptions.estimate`): estimated whatever the evidence.
         rolling: The shutter is said to be a rolling one, or its readout is asked for.
         lens: The lens, where it is fixed; None: it is estimated, or taken as exact.
+        term: Its last coefficient is one more than its model has.
 
     Attributes:
         drifting: The camera's clock is known to run apart from the imu's.
@@ -53,9 +62,15 @@ class TargetFreeDoubts:
     """
 
     def __init__(
-        self, camera: str, *, asked: frozenset[str], rolling: bool, lens: FixedLens | None = None
+        self,
+        camera: str,
+        *,
+        asked: frozenset[str],
+        rolling: bool,
+        lens: FixedLens | None = None,
+        term: bool = False,
     ) -> None:
-        self._camera, self.lens, self._lens_block = camera, lens, lens_block(camera)
+        self._camera, self.lens, self._lens_block, self._term = camera, lens, lens_block(camera), term
         self._off = asked & set(_SIGMA)
         self.imu_asked = model_selection.IMU in asked
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
@@ -97,6 +112,8 @@ class TargetFreeDoubts:
         covariance = factor * carry.calibration()[block.where, block.where]
         if self.lens is not None and block.held:
             return lens_off(self._camera, self.lens, block, covariance, carry.camera)
+        if name == _TERM:
+            return Event(EventKind.LENS_TERM_MISSING, self._camera)
         return known_off(name, block.values, np.sqrt(np.diag(covariance)))
 
     @property
@@ -142,6 +159,7 @@ class TargetFreeDoubts:
             gyro_frame=not self.imu_asked,
             rolling=self.rolling,
             lens=self.lens,
+            term=self._term,
         )
 
     def _drift(self, carry: MarginalPrior, factor: float) -> float:
@@ -172,4 +190,7 @@ class TargetFreeDoubts:
         if self.lens is not None:
             now = np.concatenate([carry.camera.intrinsics, carry.camera.distortion])
             found[self._lens_block] = Block.of_lens(LENS, self.lens, now)
+        elif self._term and carry.active[-1]:
+            where, now = slice(len(carry.active) - 1, len(carry.active)), carry.camera.distortion[-1:]
+            found[_TERM] = Block(where, now, np.array([WINDOW_START.distortion]), np.zeros(1), held=True)
         return found

@@ -11,6 +11,7 @@ import numpy as np
 from vical_daemon.estimation.filter.gyro_frame import turn
 from vical_daemon.estimation.filter.unobservable_directions import held_covariance
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.imu_scale import matrices
@@ -56,6 +57,7 @@ class Doubts(NamedTuple):
         gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
         rolling: The shutter is known to be a rolling one: its readout is reported.
         lens: The lens, where it is fixed.
+        term: The last coefficient of the lens is one more than its model has, and is not reported.
     """
 
     factor: float
@@ -65,6 +67,7 @@ class Doubts(NamedTuple):
     gyro_frame: bool = False
     rolling: bool = True
     lens: FixedLens | None = None
+    term: bool = False
 
 
 def camera_estimate(
@@ -82,11 +85,14 @@ def camera_estimate(
     camera, covariance = _averaged(carry, doubts)
     if held is not None:
         covariance[:3, :3] += held_covariance(np.outer(held, held))
-    reported = [*range(SHIFT + 1), *range(LENS.start, len(covariance))]
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
     lens, lens_sigma = np.concatenate([camera.intrinsics, camera.distortion]), sigma[LENS]
     if doubts.lens is not None:
         lens, lens_sigma = doubts.lens.values, doubts.lens.reported(lens_sigma)
+    if doubts.term:
+        lens, lens_sigma = lens[:-1], lens_sigma[:-1]
+        camera = replace(camera, distortion=lens[4:], distortion_model=RADTAN)
+    reported = [*range(SHIFT + 1), *range(LENS.start, LENS.start + len(lens))]
     return camera_snapshot(
         camera,
         pose=covariance[:6, :6],

@@ -11,7 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB
+from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
@@ -281,6 +281,19 @@ def starting_camera(prior: CameraPrior) -> CameraState:
         prior.resolution,
         prior.readout_s,
         readout_axis=prior.readout_axis,
+    )
+
+
+def with_next_term(prior: CameraPrior) -> CameraPrior:
+    """A radtan lens with the term of the radius that it would have next, k3; other lenses as they are."""
+    if prior.distortion_model != RADTAN:
+        return prior
+    sigma = prior.distortion_sigma
+    return replace(
+        prior,
+        distortion_model=PLUMB_BOB,
+        distortion=(*prior.coefficients().tolist(), 0.0),
+        distortion_sigma=None if sigma is None else (*sigma, 0.0),
     )
 
 

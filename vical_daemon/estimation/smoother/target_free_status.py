@@ -53,6 +53,7 @@ class TargetFreeStatus(Evaluator):
         active: Which of the calibration errors are estimated, shape (n,).
         rolling: The camera is said to have a rolling shutter, or its readout is asked for.
         lens: The lens, where it is fixed and its errors are considered.
+        term: Its last coefficient is one more than its model has.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class TargetFreeStatus(Evaluator):
         *,
         rolling: bool = False,
         lens: FixedLens | None = None,
+        term: bool = False,
     ) -> None:
         super().__init__(options, "no features have been followed yet: is the picture dark or blurred?")
         self.camera, self.active = camera, active
@@ -79,7 +81,7 @@ class TargetFreeStatus(Evaluator):
         self._bumped = Cause.NONE
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
-        self.doubts = TargetFreeDoubts(camera, asked=options.estimate, rolling=rolling, lens=lens)
+        self.doubts = TargetFreeDoubts(camera, asked=options.estimate, rolling=rolling, lens=lens, term=term)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens

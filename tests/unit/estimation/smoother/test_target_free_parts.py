@@ -217,6 +217,7 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
     coefficients = len(COEFFICIENTS[model])
     distortion = np.resize([*window.camera.distortion, 0.01], coefficients)
     window.camera = replace(window.camera, readout_s=readout_s, distortion=distortion, distortion_model=model)
+    window.own_lens = 1e-6 * np.ones(4 + coefficients)
     active = np.ones(length(window.camera), dtype=bool)
     problem = Bundle(
         window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 50.0
@@ -238,6 +239,14 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
         assert slope == pytest.approx(
             wanted, rel=0.02, abs=0.02 * np.sqrt(normal.H[order.calib[k], order.calib[k]])
         ), k
+    own = window.own_lens
+    for k, size in enumerate(scales[LENS]):
+        step, costs = size * np.eye(len(own))[k], []
+        for d in (step, -step):
+            window.own_lens = own + d
+            costs.append(problem.normal(seen, links).cost)
+        slope, at = (costs[0] - costs[1]) / 4.0 / size, order.own[k]
+        assert slope == pytest.approx(normal.g[at], rel=0.02, abs=0.02 * np.sqrt(normal.H[at, at])), k
 
 
 def test_late_images_move_the_errors_of_links_as_told(scene):
