@@ -380,11 +380,10 @@ class TargetFreeCalibrator:
         """Learn from a complete window by how much the lens model misses."""
         if not len(fit.own_lens):
             return
-        root = bundle.problem.lens_root
-        information = np.linalg.inv(fit.own_lens)
-        misfit = self._misfit
-        misfit.learn(root * fit.lens_px, information - root.T @ root, information @ window.own_lens)
-        self._noise = self._noise._replace(lens_px=misfit.px)
+        root, information = bundle.problem.lens_root, np.linalg.inv(fit.own_lens)
+        own, weighted = information - root.T @ root, information @ window.own_lens
+        self._misfit.learn(root * fit.lens_px, own, weighted)
+        self._noise = self._noise._replace(lens_px=self._misfit.px)
 
     def _forget(self) -> None:
         """What was kept over a change contradicts the images, too: start over."""

@@ -182,6 +182,18 @@ def test_the_lens_is_found_too(model, sixth_power):
     assert np.abs(last.error[7:9]).max() < 2.0  # px, from five percent
 
 
+def test_a_term_that_the_lens_model_lacks_is_announced_and_in_the_sigmas():
+    plain = reference_rig(6, timeshift_cam_imu_s=-0.03)
+    rig = replace(plain, lens=replace(plain.lens, sixth_power=0.15))
+    run = simulate_tracks(6, 13.0, rig=rig, camera_rate_hz=10.0)
+    subject = subject_for(run, lens_known=False, seed=6)
+    record = feed(run, subject)
+    assert [e.kind for _, e in record.events] == [EventKind.LENS_TERM_MISSING]
+    assert subject.calibrator.estimate().cameras["cam0"].distortion_model == "radtan"
+    last = record.snapshots[-1]
+    assert nees(last.error, last.covariance, 15) < chi2.isf(1e-3, 15)
+
+
 def test_a_fixed_lens_that_is_not_this_cameras_is_announced_and_its_errors_are_in_the_sigmas():
     run = simulated(seed=1, seconds=12.0)
     subject = subject_for(run)

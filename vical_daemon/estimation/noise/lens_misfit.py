@@ -1,11 +1,12 @@
 """How far a lens model misses what a camera does, by the lenses of several windows.
 
-No lens model fits exactly. What it leaves over depends on where in the image the features are, so each window
-has a lens of its own: l + d, with d ~ N(0, s^2 (J'J)^-1), where J are the derivatives of those of 48 patches of
-the image in which it has features (`lens_limit.patches`): each patch is off by s. The windows estimate d along with the common
-lens l (`smoother/normal.py`), so errors of the model do not bias what is said of l, nor of the mounting.
-The size s is that under which the windows' data are most likely [Patterson and Thompson, "Recovery of
-inter-block information when block sizes are unequal", 1971]. [docs/math/target_free.md]
+No lens model fits exactly. What it leaves over depends on where in the image the features are. So each window
+has a lens of its own, l + d with d ~ N(0, s^2 (J'J)^-1). J are the derivatives by the lens at those of 48
+patches of the image in which the window has features (`lens_limit.patches`): each patch is off by s. Windows
+estimate d together with the common lens l (`smoother/normal.py`), so that errors of the model neither bias l
+nor contradict the mounting. s is the size under which the data of the windows are most likely [Patterson and
+Thompson, "Recovery of inter-block information when block sizes are unequal", 1971].
+[docs/math/target_free.md]
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 
-_SIZES_PX = SYSTEMATIC_PX * 1.1 ** np.arange(60)  # to 0.8 px: beyond, no tracker would follow
+_SIZES_PX = SYSTEMATIC_PX * 1.1 ** np.arange(80)  # to 5.6 px: lenses guessed from the resolution are nearer
 _WINDOWS = 40  # the newest, as many as `TargetFreeStatus` compares
 
 
