@@ -115,8 +115,8 @@ def move_by_derivatives(state: State, layout: Layout, S: FloatArray, segment: Im
     tilt = -so3.hat(g) @ state.tilt
     F[POSITION, GRAVITY], F[VELOCITY, GRAVITY] = (0.5 * T * T) * tilt, T * tilt
     if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        bias = np.concatenate([state.gyro_bias, state.accel_bias])
-        by = by_entries(errors, segment, bias, state.gyro_matrix, state.accel_matrix)
+        readings = np.concatenate([segment.gyro - state.gyro_bias, segment.accel - state.accel_bias], axis=1)
+        by = by_entries(errors, readings, state.gyro_matrix, state.accel_matrix)
         F[:, _BIASES], F[:, layout.gyro_matrix.start : layout.accel_matrix.stop] = by[:, :6], by[:, 6:]
     if layout.accel_lag is not None and segment.accel_slope is not None:
         F[:, layout.accel_lag] = errors.by_force(segment.accel_slope @ state.accel_matrix.T)

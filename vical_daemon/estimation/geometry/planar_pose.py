@@ -1,4 +1,4 @@
-"""Pose of a camera from one view of a planar target: both solutions, refined, with covariance.
+"""Pose of a camera from views of a planar target: both solutions of each, refined, with covariance.
 
 A plane seen in perspective has two poses that explain the image almost equally well; the nearer the view
 is to an affine one (small or distant or fronto-parallel board), the harder they are to tell apart. This
@@ -6,12 +6,14 @@ module returns both and says whether the data can decide.
 
 Method: homography by normalised DLT; its first-order behaviour at the board's centre fixes the rotation up to
 the sign of one square root (the two solutions); both are then refined by Levenberg-Marquardt on the
-reprojection error, together in one batch.
+reprojection error. All views and both solutions are worked on in one batch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +28,8 @@ _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / 
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4
 _HOPELESS_CHI2 = 100.0
+_TOGETHER = 64  # views in one batch: beyond, arrays leave the cache, and nothing is gained
+_NO_SPREAD = 1e-24  # variance of normalised coordinates: all points in one place
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,44 @@ class PlanarPoses:
     reason: str = ""
 
 
+class _Views(NamedTuple):
+    """Points of m views side by side, zero where a view has fewer than n.
+
+    Attributes:
+        plane: About their mean, m, shape (m, 2, n).
+        xy: Undistorted normalised coordinates, shape (m, 2, n).
+        seen: One for a point, zero for none, shape (m, n).
+        count: Points of each view, shape (m,).
+        centre: Their mean, m, shape (m, 2).
+    """
+
+    plane: FloatArray
+    xy: FloatArray
+    seen: FloatArray
+    count: FloatArray
+    centre: FloatArray
+
+    @classmethod
+    def of(cls, points_m: Sequence[FloatArray], xy: Sequence[FloatArray]) -> _Views:
+        rows = np.concatenate(
+            [np.concatenate([np.asarray(p)[:, :2] for p in points_m]), np.concatenate(xy)], axis=1
+        )
+        view = np.repeat(np.arange(len(xy)), [len(x) for x in xy])
+        good = np.isfinite(rows).all(axis=1)
+        count = np.bincount(view[good], minlength=len(xy))
+        seen = np.arange(count.max()) < count[:, None]
+        packed = np.zeros((*seen.shape, 4))
+        packed[seen] = rows[good]
+        centre = packed[..., :2].sum(axis=1) / np.maximum(count, 1)[:, None]
+        packed[..., :2] -= centre[:, None] * seen[..., None]
+        both = np.ascontiguousarray(np.swapaxes(packed, 1, 2))
+        return cls(both[:, :2], both[:, 2:], seen.astype(np.float64), count.astype(np.float64), centre)
+
+    def only(self, which: npt.NDArray[np.intp]) -> _Views:
+        """Some of the views."""
+        return _Views(*(x[which] for x in self))
+
+
 def planar_pose(points_m: FloatArray, xy: FloatArray, sigma: float | None = None) -> PlanarPoses:
     """Find the poses of a planar target from undistorted image points.
 
@@ -72,26 +114,40 @@ def planar_pose(points_m: FloatArray, xy: FloatArray, sigma: float | None = None
         Up to two poses, best first; a second that is clearly worse is refined only so far that this is sure.
         None where the points are too few, on a line or behind the camera.
     """
-    plane = np.asarray(points_m, dtype=np.float64)[:, :2]
-    xy = np.asarray(xy, dtype=np.float64)
-    good = np.isfinite(xy).all(axis=1)
-    if not good.all():
-        plane, xy = plane[good], xy[good]
-    if len(plane) < 4:
-        return PlanarPoses((), reason=f"{len(plane)} points: a pose needs at least 4")
-    centre = plane.mean(axis=0)
-    centred = plane - centre
-    extent = np.linalg.eigvalsh(centred.T @ centred)
-    if extent[0] <= _COLLINEAR**2 * extent[1]:
-        return PlanarPoses((), reason="the points lie on one line: show more rows of the target")
-    H = _homography(centred, xy)
-    if H is None:
-        return PlanarPoses((), reason="no homography fits the points")
-    R, p = _both_poses(H, centred, xy)
-    R, p, rms, information = _refine(R, p, centred, xy)
-    p = p - (R[:, :, :2] @ centre)
-    information = _move_origin(information, R, centre)
-    return _rank(R, p, rms, information, len(xy), sigma)
+    return planar_poses([points_m], [xy], sigma)[0]
+
+
+def planar_poses(
+    points_m: Sequence[FloatArray], xy: Sequence[FloatArray], sigma: float | None = None
+) -> list[PlanarPoses]:
+    """Find the poses of a planar target in each of several views, see `planar_pose`."""
+    if not len(xy):
+        return []
+    if len(xy) > _TOGETHER:
+        parts = [slice(k, k + _TOGETHER) for k in range(0, len(xy), _TOGETHER)]
+        return [found for part in parts for found in planar_poses(points_m[part], xy[part], sigma)]
+    views = _Views.of(points_m, xy)
+    out = [PlanarPoses((), reason=f"{int(n)} points: a pose needs at least 4") for n in views.count]
+    left = np.flatnonzero(views.count >= 4)
+    extent = np.linalg.eigvalsh(views.plane[left] @ np.swapaxes(views.plane[left], 1, 2))
+    line = extent[:, 0] <= _COLLINEAR**2 * extent[:, 1]
+    for k in left[line]:
+        out[k] = PlanarPoses((), reason="the points lie on one line: show more rows of the target")
+    left = left[~line]
+    H, found = _homographies(views.only(left))
+    for k in left[~found]:
+        out[k] = PlanarPoses((), reason="no homography fits the points")
+    left = left[found]
+    views = views.only(left)
+    R, p = _both_poses(H[found], views)
+    R, p, rms, information = _refine(R, p, views)
+    p = p - (R[..., :2] @ views.centre[:, None, :, None])[..., 0]
+    information = _move_origin(information, R, views.centre)
+    spread = _inverses(information)
+    same = np.linalg.norm(so3.log(np.swapaxes(R[:, 0], 1, 2) @ R[:, 1]), axis=1) < _SAME_ROTATION_RAD
+    for i, k in enumerate(left):
+        out[k] = _rank(R[i], p[i], rms[i], spread[i], int(views.count[i]), sigma, same=bool(same[i]))
+    return out
 
 
 def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
@@ -104,96 +160,80 @@ def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(far <= 6.0 * sigma)
 
 
-def _homography(plane: FloatArray, xy: FloatArray) -> FloatArray | None:
-    """Normalised DLT: xy ~ H [X Y 1]', scaled to H[2, 2] = 1; the board is centred, so H[2, 2] > 0."""
-    s_plane = np.sqrt(2.0 / np.mean(np.einsum("ij,ij->i", plane, plane)))
-    mean = xy.mean(axis=0)
-    spread = xy - mean
-    variance = np.mean(np.einsum("ij,ij->i", spread, spread))
-    if variance < 1e-24:
-        return None
-    s_xy = float(np.sqrt(2.0 / variance))
-    n = len(xy)
-    P = np.column_stack((plane * s_plane, np.ones(n)))
-    u = spread * s_xy
+def _homographies(v: _Views) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Normalised DLT: xy ~ H [X Y 1]', scaled to H[2, 2] = 1 (m, 3, 3), and where there is one (m,).
+
+    The board is centred, so that H[2, 2] > 0.
+    """
+    n = v.count
+    s_plane = np.sqrt(2.0 * n / np.einsum("min,min->m", v.plane, v.plane))
+    mean = v.xy.sum(axis=2) / n[:, None]
+    spread = (v.xy - mean[..., None]) * v.seen[:, None]
+    variance = np.einsum("min,min->m", spread, spread) / n
+    s_xy = np.sqrt(2.0 / np.maximum(variance, _NO_SPREAD))
+    P = np.concatenate((v.plane * s_plane[:, None, None], v.seen[:, None]), axis=1)
+    u = spread * s_xy[:, None, None]
     # rows [P 0 -x P], [0 P -y P]: the normal matrix is four 3x3 blocks of weighted P'P
-    A = np.zeros((9, 9))
-    PP = P.T @ P
-    xPP = (P * u[:, :1]).T @ P
-    yPP = (P * u[:, 1:]).T @ P
-    A[:3, :3] = A[3:6, 3:6] = PP
-    A[:3, 6:] = A[6:, :3] = -xPP
-    A[3:6, 6:] = A[6:, 3:6] = -yPP
-    A[6:, 6:] = (P * np.einsum("ij,ij->i", u, u)[:, None]).T @ P
-    H: FloatArray = np.linalg.eigh(A)[1][:, 0].reshape(3, 3).copy()
-    H *= np.array([s_plane, s_plane, 1.0])
-    H[:2] /= s_xy
-    H[:2] += mean[:, None] * H[2]
-    if abs(H[2, 2]) < 1e-12:
-        return None
-    out: FloatArray = H / H[2, 2]
-    return out
+    Pt = np.swapaxes(P, 1, 2)
+    A = np.zeros((len(n), 9, 9))
+    A[:, :3, :3] = A[:, 3:6, 3:6] = P @ Pt
+    A[:, :3, 6:] = A[:, 6:, :3] = -(P * u[:, :1]) @ Pt
+    A[:, 3:6, 6:] = A[:, 6:, 3:6] = -(P * u[:, 1:]) @ Pt
+    A[:, 6:, 6:] = (P * np.einsum("min,min->mn", u, u)[:, None]) @ Pt
+    H: FloatArray = np.linalg.eigh(A)[1][:, :, 0].reshape(-1, 3, 3).copy()
+    H[:, :, :2] *= s_plane[:, None, None]
+    H[:, :2] /= s_xy[:, None, None]
+    H[:, :2] += mean[:, :, None] * H[:, 2:]
+    found = (variance >= _NO_SPREAD) & (np.abs(H[:, 2, 2]) >= 1e-12)
+    return H / np.where(found, H[:, 2, 2], 1.0)[:, None, None], found
 
 
-def _both_poses(H: FloatArray, plane: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the two rotations (2, 3, 3) whose plane moves like H at the board's centre, and positions.
+def _both_poses(H: FloatArray, views: _Views) -> tuple[FloatArray, FloatArray]:
+    """Return the two rotations (m, 2, 3, 3) whose plane moves like H at the board's centre, and positions.
 
     Turn the camera so that the centre lies on its axis: there the derivative of the image by the board is
     the upper 2x2 block of the rotation over the depth. Its largest singular value is 1 / depth (a plane is
     foreshortened in one direction only); what lacks to unit columns is the third row, up to sign.
     """
-    c = H[:2, 2]
-    J = H[:2, :2] - np.outer(c, H[2, :2])
-    ray = np.array([c[0], c[1], 1.0])
-    ray /= np.sqrt(ray @ ray)
-    R_turn = _rotation_from_axis_z(ray)
-    B = R_turn[:2, :2] - np.outer(c, R_turn[2, :2])
-    A = np.linalg.solve(B, J)
-    M = A / np.linalg.norm(A, 2)
-    gap = np.eye(2) - M.T @ M
-    b0 = np.sqrt(max(gap[0, 0], 0.0))
-    b1 = np.sqrt(max(gap[1, 1], 0.0)) * (-1.0 if gap[0, 1] < 0.0 else 1.0)
-    R = np.empty((2, 3, 3))
-    R[:, :2, :2] = M
-    R[0, 2, :2] = b0, b1
-    R[1, 2, :2] = -b0, -b1
-    R[:, :, 2] = np.cross(R[:, :, 0], R[:, :, 1])
-    R = so3.matrix_from_quat(so3.quat_from_matrix(R_turn @ R))  # M is exact only without noise
-    return R, _positions(R, plane, xy)
+    c = H[:, :2, 2]
+    J = H[:, :2, :2] - c[:, :, None] * H[:, 2:, :2]
+    ray = np.concatenate((c, np.ones((len(c), 1))), axis=1)
+    ray /= np.sqrt(np.einsum("mi,mi->m", ray, ray))[:, None]
+    R_turn = _rotations_from_axis_z(ray)
+    A = np.linalg.solve(R_turn[:, :2, :2] - c[:, :, None] * R_turn[:, 2:, :2], J)
+    M = A / np.linalg.norm(A, 2, axis=(1, 2))[:, None, None]
+    gap = np.eye(2) - np.swapaxes(M, 1, 2) @ M
+    third = np.sqrt(np.maximum(np.diagonal(gap, axis1=1, axis2=2), 0.0))
+    third[:, 1] *= np.where(gap[:, 0, 1] < 0.0, -1.0, 1.0)
+    R = np.empty((len(H), 2, 3, 3))
+    R[:, :, :2, :2] = M[:, None]
+    R[:, 0, 2, :2], R[:, 1, 2, :2] = third, -third
+    R[..., 2] = np.cross(R[..., 0], R[..., 1])
+    R = so3.matrix_from_quat(so3.quat_from_matrix(R_turn[:, None] @ R))  # M is exact only without noise
+    return R, _positions(R, views)
 
 
-def _rotation_from_axis_z(ray: FloatArray) -> FloatArray:
-    """Return the smallest rotation that turns the z axis onto a unit ray with z > 0."""
-    x, y, z = ray
+def _rotations_from_axis_z(ray: FloatArray) -> FloatArray:
+    """Return the smallest rotations (m, 3, 3) that turn the z axis onto unit rays (m, 3) with z > 0."""
+    x, y, z = ray.T
     k = 1.0 / (1.0 + z)
-    return np.array([[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]])
+    rows = [[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]]
+    return np.moveaxis(np.array(rows), -1, 0)
 
 
-def _positions(R: FloatArray, plane: FloatArray, xy: FloatArray) -> FloatArray:
-    """Least squares for the position given rotations (2, 3, 3): linear in p, shape (2, 3)."""
-    turned = plane @ np.swapaxes(R[:, :, :2], 1, 2)  # (2, n, 3)
-    n = len(xy)
-    A = np.zeros((2 * n, 3))
-    A[:n, 0] = A[n:, 1] = 1.0
-    A[:n, 2], A[n:, 2] = -xy[:, 0], -xy[:, 1]
-    rhs = np.concatenate(
-        (
-            xy[:, 0] * turned[:, :, 2] - turned[:, :, 0],
-            xy[:, 1] * turned[:, :, 2] - turned[:, :, 1],
-        ),
-        axis=1,
-    )
-    return np.asarray(np.linalg.solve(A.T @ A, (rhs @ A).T).T, dtype=np.float64)
-
-
-def _residuals(
-    R: FloatArray, p: FloatArray, plane: FloatArray, xy: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return residuals (c, 2, n), predictions (c, 2, n) and inverse depths (c, n) of c candidates."""
-    q = R[:, :, :2] @ plane + p[:, :, None]
-    iz = 1.0 / np.where(q[:, 2] > 0.0, q[:, 2], np.nan)
-    predicted = q[:, :2] * iz[:, None]
-    return xy - predicted, predicted, iz
+def _positions(R: FloatArray, v: _Views) -> FloatArray:
+    """Least squares for the positions given rotations (m, 2, 3, 3): linear in them, shape (m, 2, 3)."""
+    turned = R[..., :2] @ v.plane[:, None]  # (m, 2, 3, n)
+    rays = np.concatenate((v.xy, v.seen[:, None]), axis=1)
+    A = np.zeros((len(R), 3, 3))
+    A[:, 0, 0] = A[:, 1, 1] = v.count
+    A[:, :2, 2] = A[:, 2, :2] = -v.xy.sum(axis=2)
+    A[:, 2, 2] = np.einsum("min,min->m", v.xy, v.xy)
+    off = v.xy[:, None] * turned[:, :, 2:] - turned[:, :, :2]
+    right = np.empty((len(R), 2, 3))
+    right[..., :2] = np.einsum("mcin,mn->mci", off, rays[:, 2])
+    right[..., 2] = -np.einsum("mcin,min->mc", off, v.xy)
+    return np.asarray(np.linalg.solve(A[:, None], right[..., None])[..., 0], dtype=np.float64)
 
 
 # The derivative of a point in the camera frame, R (X, Y, 0) + p, by [p, local rotation] is
@@ -206,108 +246,111 @@ _ENTRY = np.tile(np.array([[0, 0, 1], [0, 0, 2], [1, 2, 3]]), (3, 3))
 _SIGN = np.tile(np.array([[1.0, 0, -1], [0, 1, -1], [-1, -1, 1]]), (3, 3))
 
 
-def _normal_equations(
-    R: FloatArray, moments: FloatArray, e: FloatArray, predicted: FloatArray, iz: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return J'J (c, 6, 6) and J'e (c, 6) of the prediction by [p, local rotation].
+def _linearised(
+    R: FloatArray, p: FloatArray, v: _Views, moments: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sum of squares (m, c), J'J (m, c, 6, 6) and J'e (m, c, 6) of the prediction by [p, local rotation].
 
     Args:
-        R: Rotations of c candidates, shape (c, 3, 3).
-        moments: 1, X, Y, X^2, XY, Y^2 of the points, shape (n, 6).
-        e: Residuals, shape (c, 2, n).
-        predicted: Predictions, shape (c, 2, n).
-        iz: Inverse depths, shape (c, n).
+        R: Rotations of c candidates of each view, shape (m, c, 3, 3).
+        p: Their positions, m, shape (m, c, 3).
+        v: The views.
+        moments: 1, X, Y, X^2, XY, Y^2 of their points, zero for none, shape (m, 1, n, 6).
     """
-    c, n = iz.shape
-    rows = np.empty((c, 7, n))
-    w = np.multiply(iz, iz, out=rows[:, 0])
-    np.multiply(predicted, w[:, None], out=rows[:, 1:3])
-    rows[:, 3] = predicted[:, 0] * rows[:, 1] + predicted[:, 1] * rows[:, 2]
-    np.multiply(e, iz[:, None], out=rows[:, 4:6])
-    rows[:, 6] = -(predicted[:, 0] * rows[:, 4] + predicted[:, 1] * rows[:, 5])
-    sums = rows @ moments  # (c, 7, 6)
-    S = sums[:, _ENTRY, _MOMENT] * _SIGN
-    A = np.zeros((c, 9, 6))
-    A[:, :3, :3] = np.eye(3)
-    A[:, 3:6, 3:] = R @ _MINUS_HATS[:, :3]
-    A[:, 6:, 3:] = R @ _MINUS_HATS[:, 3:]
-    At = np.swapaxes(A, 1, 2)
-    g = np.swapaxes(sums[:, 4:, :3], 1, 2).reshape(c, 9, 1)
-    return At @ S @ A, (At @ g)[..., 0]
+    q = R[..., :2] @ v.plane[:, None] + p[..., None]
+    iz = 1.0 / np.where(q[..., 2, :] > 0.0, q[..., 2, :], np.nan)
+    predicted = q[..., :2, :] * iz[..., None, :]
+    e = (v.xy[:, None] - predicted) * v.seen[:, None, None]
+    rows = np.empty((*iz.shape[:2], 7, iz.shape[2]))
+    w = np.multiply(iz, iz, out=rows[:, :, 0])
+    np.multiply(predicted, w[:, :, None], out=rows[:, :, 1:3])
+    rows[:, :, 3] = predicted[:, :, 0] * rows[:, :, 1] + predicted[:, :, 1] * rows[:, :, 2]
+    np.multiply(e, iz[:, :, None], out=rows[:, :, 4:6])
+    rows[:, :, 6] = -(predicted[:, :, 0] * rows[:, :, 4] + predicted[:, :, 1] * rows[:, :, 5])
+    sums = rows @ moments  # (m, c, 7, 6)
+    S = sums[:, :, _ENTRY, _MOMENT] * _SIGN
+    A = np.zeros((*R.shape[:2], 9, 6))
+    A[:, :, :3, :3] = so3.IDENTITY
+    A[:, :, 3:6, 3:] = R @ _MINUS_HATS[:, :3]
+    A[:, :, 6:, 3:] = R @ _MINUS_HATS[:, 3:]
+    At = np.swapaxes(A, -1, -2)
+    g = np.swapaxes(sums[:, :, 4:, :3], -1, -2).reshape(*R.shape[:2], 9, 1)
+    return np.einsum("mcin,mcin->mc", e, e), At @ S @ A, (At @ g)[..., 0]
 
 
 def _refine(
-    R: FloatArray, p: FloatArray, plane: FloatArray, xy: FloatArray
+    R: FloatArray, p: FloatArray, views: _Views
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Levenberg-Marquardt on all candidates at once; returns R, p, rms and J'J (c, 6, 6)."""
-    X, Y = plane[:, 0], plane[:, 1]
-    moments = np.column_stack((np.ones_like(X), X, Y, X * X, X * Y, Y * Y))
-    plane_t, xy_t = np.ascontiguousarray(plane.T), np.ascontiguousarray(xy.T)
-    damping = np.full(len(R), 1e-6)
-    e, predicted, iz = _residuals(R, p, plane_t, xy_t)
-    cost = np.einsum("cin,cin->c", e, e)
+    """Levenberg-Marquardt on all candidates; returns R, p, rms (m, 2) and J'J (m, 2, 6, 6)."""
+    X, Y = views.plane[:, 0], views.plane[:, 1]
+    moments = np.stack((views.seen, X, Y, X * X, X * Y, Y * Y), axis=-1)[:, None]
+    damping = np.full(R.shape[:2], 1e-6)
+    cost, information, gradient = _linearised(R, p, views, moments)
+    left = np.arange(len(R))
     with np.errstate(invalid="ignore"):
-        information, gradient = _normal_equations(R, moments, e, predicted, iz)
         for _ in range(_STEPS):
-            alive = np.isfinite(cost)
-            A = np.where(alive[:, None, None], information, np.eye(6))
-            A = A + np.eye(6) * (damping[:, None] * np.einsum("cii->ci", A))[:, None, :]
-            g = np.where(alive[:, None], gradient, 0.0)
+            alive = np.isfinite(cost[left])
+            A = np.where(alive[..., None, None], information[left], np.eye(6))
+            A = A + np.eye(6) * (damping[left][..., None] * np.einsum("mcii->mci", A))[..., None, :]
+            g = np.where(alive[..., None], gradient[left], 0.0)
             step = np.linalg.solve(A, g[..., None])[..., 0]
-            R_new, p_new = R @ so3.exp(step[:, 3:]), p + step[:, :3]
-            e_new, predicted_new, iz_new = _residuals(R_new, p_new, plane_t, xy_t)
-            cost_new = np.einsum("cin,cin->c", e_new, e_new)
-            better = cost_new <= cost
-            damping = np.where(better, damping * 0.1, damping * 30.0)
-            R, p = np.where(better[:, None, None], R_new, R), np.where(better[:, None], p_new, p)
-            e, iz = np.where(better[:, None, None], e_new, e), np.where(better[:, None], iz_new, iz)
-            predicted = np.where(better[:, None, None], predicted_new, predicted)
-            cost = np.where(better, cost_new, cost)
-            information, gradient = _normal_equations(R, moments, e, predicted, iz)
-            gain = np.einsum("ci,ci->c", g, step)  # of the cost, as the linear model promised
-            done = (gain <= _GAIN_DONE * cost + 1e-26) | (damping > 1e6) | ~alive
+            trial = R[left] @ so3.exp(step[..., 3:]), p[left] + step[..., :3]
+            now = (*trial, *_linearised(*trial, views.only(left), moments[left]))
+            better = now[2] <= cost[left]
+            for kept, new in zip((R, p, cost, information, gradient), now, strict=True):
+                kept[left] = np.where(better.reshape(*better.shape, *[1] * (new.ndim - 2)), new, kept[left])
+            damping[left] *= np.where(better, 0.1, 30.0)
+            gain = np.einsum("mci,mci->mc", g, step)  # of the cost, as the linear model promised
+            worth = cost[left]
+            done = (gain <= _GAIN_DONE * worth + 1e-26) | (damping[left] > 1e6) | ~alive
             # a second pose that is clearly worse need not be refined to its last digit
-            hopeless = cost - 5.0 * gain > cost.min() * (1.0 + _HOPELESS_CHI2 / (2 * len(xy)))
-            if np.all(done | hopeless):
+            limit = worth.min(axis=1) * (1.0 + _HOPELESS_CHI2 / (2.0 * views.count[left]))
+            done |= worth - 5.0 * gain > limit[:, None]
+            left = left[~done.all(axis=1)]
+            if not len(left):
                 break
-    return R, p, np.sqrt(cost / (2 * len(xy))), information
+    return R, p, np.sqrt(cost / (2.0 * views.count)[:, None]), information
 
 
 def _move_origin(information: FloatArray, R: FloatArray, centre: FloatArray) -> FloatArray:
-    """Information of the pose of the target's origin from that of its centre (c, 6, 6)."""
+    """Information of the poses of the target's origin from those of its centre (m, 2), shape (m, c, 6, 6)."""
     T = np.zeros_like(information)
     T[:] = np.eye(6)
     # p_centre = p_origin + R exp(d) c, so its derivative by d is -R hat(c)
-    T[:, :3, 3:] = -R @ so3.hat(np.array([centre[0], centre[1], 0.0]))
-    out: FloatArray = np.swapaxes(T, 1, 2) @ information @ T
+    T[..., :3, 3:] = -R @ so3.hat(np.concatenate((centre, np.zeros((len(centre), 1))), axis=1))[:, None]
+    out: FloatArray = np.swapaxes(T, -1, -2) @ information @ T
     return out
 
 
-def _inverse(information: FloatArray) -> FloatArray:
-    """Inverse, in scaled units; a direction without information gets a huge variance, not an exception."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300))
-    w, V = np.linalg.eigh(information * np.outer(scale, scale))
-    W = (V * scale[:, None]) / np.sqrt(np.maximum(w, 1e-14))
-    out: FloatArray = W @ W.T
-    return out
+def _inverses(information: FloatArray) -> FloatArray:
+    """Inverses, in scaled units; a direction without information gets a huge variance, not an exception."""
+    sound = np.isfinite(information).all(axis=(-1, -2), keepdims=True)
+    information = np.where(sound, information, np.eye(6))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information, axis1=-1, axis2=-2), 1e-300))
+    w, V = np.linalg.eigh(information * (scale[..., :, None] * scale[..., None, :]))
+    W = (V * scale[..., :, None]) / np.sqrt(np.maximum(w, 1e-14))[..., None, :]
+    return np.asarray(W @ np.swapaxes(W, -1, -2))
 
 
 def _rank(
-    R: FloatArray, p: FloatArray, rms: FloatArray, information: FloatArray, n: int, sigma: float | None
+    R: FloatArray,
+    p: FloatArray,
+    rms: FloatArray,
+    spread: FloatArray,
+    n: int,
+    sigma: float | None,
+    *,
+    same: bool,
 ) -> PlanarPoses:
-    order = [int(i) for i in np.argsort(np.where(np.isfinite(rms), rms, np.inf)) if np.isfinite(rms[i])]
+    order = sorted(np.flatnonzero(np.isfinite(rms)).tolist(), key=lambda i: float(rms[i]))
     if not order:
         return PlanarPoses((), reason="the points lie behind the camera")
-    if len(order) == 2:
-        turn = np.linalg.norm(so3.log(R[order[0]].T @ R[order[1]]))
-        if turn < _SAME_ROTATION_RAD:
-            order = order[:1]
+    if same:
+        order = order[:1]
     best = rms[order[0]]
     measured = best * np.sqrt(2 * n / max(2 * n - 6, 1))
     noise = max(measured if sigma is None else sigma, 1e-12)
-    candidates = tuple(
-        PlanarPose(R[i], p[i], float(rms[i]), _inverse(information[i]) * noise**2) for i in order
-    )
+    candidates = tuple(PlanarPose(R[i], p[i], float(rms[i]), spread[i] * noise**2) for i in order)
     ambiguous = False
     if len(order) == 2:
         ambiguous = bool(2 * n * (rms[order[1]] ** 2 - best**2) < SURE_SIGMAS**2 * noise**2)

@@ -161,6 +161,36 @@ class ImuBuffer:
         gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
         return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:])
 
+    def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
+        """Return the readings of each interval between instants, one interval after the other.
+
+        Args:
+            t_s: Instants in order, s, shape (m + 1,).
+
+        Returns:
+            The readings, where the end of an interval and the begin of the next are two nodes of the same
+            time, and the first node of each interval, shape (m,). None where not covered.
+        """
+        rows = self.rows
+        if len(rows) < 2 or t_s[0] < rows[0, 0] or t_s[-1] > rows[-1, 0] or (t_s[1:] < t_s[:-1]).any():
+            return None
+        t = rows[:, 0]
+        after, before = (np.searchsorted(t, t_s, side=side) for side in ("right", "left"))
+        inside = np.maximum(before[1:] - after[:-1], 0)
+        first = min(max(int(after[0]) - 1, 0), len(rows) - 2)
+        last = max(int(before[-1]), first + 1)
+        slope = _slopes(rows[max(first - 1, 0) : last + 2], first - max(first - 1, 0), last + 1 - first)
+        k = np.clip(after - 1 - first, 0, last - first - 1)
+        value, change = _hermite(rows[first : last + 1], slope, t_s, k)
+        begin = np.concatenate([[0], np.cumsum(inside + 2)])
+        at = np.arange(begin[-1]) + np.repeat(after[:-1] - begin[:-1] - 1, inside + 2)
+        nodes, rise = np.take(rows, at, axis=0, mode="clip"), np.take(slope, at - first, axis=0, mode="clip")
+        for where, which in ((begin[:-1], slice(None, -1)), (begin[1:] - 1, slice(1, None))):
+            nodes[where, 0], nodes[where, 1:], rise[where] = t_s[which], value[which], change[which]
+        gap = float(np.diff(t[first : last + 1]).max())
+        segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:])
+        return segment, begin[:-1]
+
     def turning(self, t_s: FloatArray, half_s: float) -> tuple[FloatArray, FloatArray]:
         """How the imu turns about instants.
 
@@ -215,8 +245,9 @@ def _slopes(rows: FloatArray, begin: int, count: int) -> FloatArray:
     """
     t, values = rows[:, 0], rows[:, 1:]
     dt = t[1:] - t[:-1]
+    usual = np.sort(dt)[(len(dt) - 1) // 4]  # of two stamps that nearly coincide, the step says nothing
     chord = (values[1:] - values[:-1]) / dt[:, None]
-    whole = (dt <= 4.0 * dt.min()).astype(np.float64)
+    whole = (dt <= 4.0 * usual).astype(np.float64)
     sides = np.zeros((len(rows), 1))
     sides[:-1, 0] = whole
     sides[1:, 0] += whole

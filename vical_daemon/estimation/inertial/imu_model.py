@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
@@ -83,7 +84,7 @@ def strapdown(
     turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
     if turn_slope is not None and gyro_matrix is not None:
         turn_slope = turn_slope @ gyro_matrix[0].T
-    dR = _products(rotation_steps(omega, dt, turn_slope))
+    dR = products(rotation_steps(omega, dt, turn_slope))
     f_start = np.matmul(dR, force[..., None])[..., 0]
     before, after, h = f_start[:, :-1], f_start[:, 1:], dt[:, None]
     dv, dp = np.zeros_like(f_start), np.zeros_like(f_start)
@@ -103,7 +104,7 @@ def strapdown(
     return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0])
 
 
-def _products(steps: FloatArray) -> FloatArray:
+def products(steps: FloatArray) -> FloatArray:
     """Products of the first 0, 1, 2, ... rotation steps; shape (S, K, 3, 3) -> (S, K + 1, 3, 3)."""
     dR = np.empty((len(steps), steps.shape[1] + 1, 3, 3))
     dR[:, 0] = so3.IDENTITY
@@ -219,18 +220,74 @@ def influence(R_start: FloatArray, relative: Strapdown) -> Influence:
         The influence of each node.
     """
     t = relative.t_s
-    dt = t[1:] - t[:-1]
-    left = (t[-1] - t)[:, None]
     R = R_start @ relative.dR[0]
     V = relative.dv[0] @ R_start.T
     P = relative.dp[0] @ R_start.T
-    at = np.zeros((len(t), 9, 6))
-    at[:, 0:3, 0:3] = R[-1].T @ R
-    at[:, 3:6, 0:3] = so3.hat(P + V * left - P[-1]) @ R
-    at[:, 6:9, 0:3] = so3.hat(V - V[-1]) @ R
+    at = _influence_at(R, V, P, (t[-1] - t)[:, None], (R[-1], V[-1], P[-1]))
+    return Influence(at, *_trapezoids(t))
+
+
+def _influence_at(
+    R: FloatArray, V: FloatArray, P: FloatArray, left: FloatArray, end: tuple[FloatArray, ...]
+) -> FloatArray:
+    """See `Influence.at`: by the motion at each node, the time left until the end (n, 1), and the end."""
+    at = np.zeros((len(R), 9, 6))
+    at[:, 0:3, 0:3] = np.swapaxes(end[0], -1, -2) @ R
+    at[:, 3:6, 0:3] = so3.hat(P + V * left - end[2]) @ R
+    at[:, 6:9, 0:3] = so3.hat(V - end[1]) @ R
     at[:, 3:6, 3:6] = R * left[..., None]
     at[:, 6:9, 3:6] = R
+    return at
+
+
+def _trapezoids(t: FloatArray) -> tuple[FloatArray, float]:
+    """See `Influence.weights` and `Influence.beyond`."""
+    dt = t[1:] - t[:-1]
     weights = np.zeros(len(t))
     weights[1:] = 0.5 * dt
     weights[:-1] += 0.5 * dt
-    return Influence(at, weights, float((dt * dt) @ dt) / 6.0)
+    return weights, float((dt * dt) @ dt) / 6.0
+
+
+class Intervals(NamedTuple):
+    """Relative motion over each of m intervals, in the imu frame at its begin.
+
+    Attributes:
+        dt: Length, s, shape (m,).
+        dR: Rotation, shape (m, 3, 3).
+        dv, dp: Integrals of the specific force, m/s and m, shape (m, 3).
+        nodes: The readings of each.
+        influences: What their errors do to its end; empty unless asked for.
+    """
+
+    dt: FloatArray
+    dR: FloatArray
+    dv: FloatArray
+    dp: FloatArray
+    nodes: list[slice]
+    influences: list[Influence]
+
+
+def over_intervals(relative: Strapdown, begin: npt.NDArray[np.intp], *, errors: bool = False) -> Intervals:
+    """Take a strapdown over several intervals apart.
+
+    Args:
+        relative: Over all of them, batch of 1, see `ImuBuffer.intervals`.
+        begin: First node of each, shape (m,).
+        errors: Return what errors of the readings do, too.
+    """
+    t, dR, dv, dp = relative.t_s, relative.dR[0], relative.dv[0], relative.dp[0]
+    stop = np.append(begin[1:], len(t))
+    first, last = np.repeat(begin, stop - begin), stop - 1
+    from_begin = np.swapaxes(dR[first], 1, 2)
+    since = (t - t[first])[:, None]
+    R = from_begin @ dR
+    V = np.matmul(from_begin, (dv - dv[first])[..., None])[..., 0]
+    P = np.matmul(from_begin, (dp - dp[first] - since * dv[first])[..., None])[..., 0]
+    nodes = [slice(int(a), int(b)) for a, b in zip(begin, stop, strict=True)]
+    influences: list[Influence] = []
+    if errors:
+        end = np.repeat(last, stop - begin)
+        at = _influence_at(R, V, P, (t[end] - t)[:, None], (R[end], V[end], P[end]))
+        influences = [Influence(at[own], *_trapezoids(t[own])) for own in nodes]
+    return Intervals(t[last] - t[begin], R[last], V[last], P[last], nodes, influences)

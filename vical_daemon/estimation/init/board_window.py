@@ -23,7 +23,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
-from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_link
+from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_links
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
@@ -377,11 +377,7 @@ def _integrated(
     nodes: list[Node], state: State, noise: ImuNoise, buffer: ImuBuffer
 ) -> list[PreintegratedLink] | None:
     """Links between the instants; None where these are not in order or readings do not reach."""
-    links: list[PreintegratedLink] = []
-    for a, b in pairwise(nodes):
-        apart = b.at.t_s - a.at.t_s > 0.5 * _TOGETHER_S
-        link = make_link(buffer, a.at.t_s, b.at.t_s, _numbers(state), noise) if apart else None
-        if link is None:
-            return None
-        links.append(link)
-    return links
+    t_s = np.array([n.at.t_s for n in nodes])
+    if (np.diff(t_s) < 0.5 * _TOGETHER_S).any():
+        return None
+    return make_links(buffer, t_s, np.broadcast_to(_numbers(state), (len(nodes) - 1, 22)), noise)

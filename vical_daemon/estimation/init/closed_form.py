@@ -17,7 +17,7 @@ from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.readout_start import likely_axis, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
-from vical_daemon.estimation.init.target_poses import Lens, PoseCache, TargetPose
+from vical_daemon.estimation.init.target_poses import Lens, TargetPose, recent_poses
 from vical_daemon.estimation.init.velocity_gravity_init import StartResult, motion_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState, Layout
@@ -43,7 +43,6 @@ class StartData:
         options: Switches.
         layout: Which blocks are estimated.
         target: Points of the target, m, shape (n, 3).
-        caches: Poses found in earlier attempts, by camera.
         may_resize: Another size of the target may be suggested.
     """
 
@@ -53,7 +52,6 @@ class StartData:
     options: CalibrationOptions
     layout: Layout
     target: FloatArray
-    caches: dict[str, PoseCache]
     may_resize: bool = True
 
 
@@ -167,9 +165,8 @@ def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, 
     frames = at_middle_row(data.frames[name], readout_s, lens.resolution, lens.readout_axis)
     if data.layout.lens_free(name):
         estimate_intrinsics(lens, [f for _, f in frames], data.target)
-    cache = data.caches.setdefault(name, PoseCache())
     lens.readout_s = readout_s
-    return lens, cache.poses(frames, lens, data.target, since_s)
+    return lens, recent_poses(frames, lens, data.target, since_s)
 
 
 def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift_s: float) -> CameraState:

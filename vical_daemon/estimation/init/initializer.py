@@ -15,7 +15,7 @@ from vical_daemon.estimation.init.board_window import Frames
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.readout_start import looks_rolling
 from vical_daemon.estimation.init.rest import RestDetector
-from vical_daemon.estimation.init.target_poses import Lens, PoseCache
+from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import Layout, State
@@ -64,7 +64,6 @@ class Initializer:
         self._given, self._layout, self._target, self._step = options, layout, target, step
         self._options = options
         self._frames: dict[str, Frames] = {name: [] for name in layout.cameras}
-        self._caches: dict[str, PoseCache] = {}
         self.anew()
 
     def anew(self) -> None:
@@ -73,7 +72,6 @@ class Initializer:
         self._next_look_s = -np.inf
         self._tried = False
         self._rest = {name: RestDetector() for name in self._frames}
-        self._caches.clear()
         for frames in self._frames.values():
             frames.clear()
 
@@ -137,7 +135,7 @@ class Initializer:
             return _none("collecting the first seconds: move the rig, keep the target in view")
         self._tried = True
         data = start.StartData(
-            buffer, self._frames, priors, self._options, self._layout, self._target, self._caches, may_resize
+            buffer, self._frames, priors, self._options, self._layout, self._target, may_resize
         )
         rolling = self._rolling(buffer.newest_s, priors)
         if rolling is not None:
@@ -183,7 +181,6 @@ class Initializer:
         """Keep what was seen, for another target or with other unknowns; `off`: what seems to be off."""
         self._layout, self._target = layout, target
         self._options = replace(self._given, estimate=self._given.estimate | set(off))
-        self._caches.clear()
 
     def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> tuple[str, str] | None:
         """A camera whose images a rolling shutter has bent, though nobody said so, and its axis; or None."""

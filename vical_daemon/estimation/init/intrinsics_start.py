@@ -7,19 +7,16 @@ Only a start: the filter estimates the same eight numbers with everything else.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
-from vical_daemon.estimation.geometry.planar_pose import inliers, planar_pose
+from vical_daemon.estimation.geometry.planar_pose import inliers, planar_poses
 from vical_daemon.estimation.inertial.imu_model import cross
+from vical_daemon.estimation.init.target_poses import Lens, ideal_views
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
-from vical_daemon.estimation.model.camera_rays import unproject
-
-if TYPE_CHECKING:
-    from vical_daemon.estimation.init.target_poses import Lens
 
 MOST_VIEWS = 24
 _FEWEST, _LEAST_POINTS = 6, 12
@@ -197,14 +194,11 @@ def spread(frames: list[PointsFrame], lens: Lens, most: int = MOST_VIEWS) -> lis
 
 def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> tuple[list[int], _Poses]:
     """Which views show a pose, and these."""
-    poses, which = [], []
-    for k, v in enumerate(views):
-        rays, ok = unproject(v.uv_px, lens.intrinsics, lens.distortion, lens.model)
-        found = planar_pose(target[v.ids[ok]], rays[ok, :2] / rays[ok, 2:])
-        if found.candidates:
-            poses.append((found.candidates[0].R_cam_target, found.candidates[0].p_cam_target))
-            which.append(k)
-    return which, poses
+    seen = ideal_views(views, lens, target)
+    found = planar_poses([points for points, _ in seen], [xy for _, xy in seen])
+    which = [k for k, poses in enumerate(found) if poses.candidates]
+    best = [found[k].candidates[0] for k in which]
+    return which, [(pose.R_cam_target, pose.p_cam_target) for pose in best]
 
 
 class _Normal(NamedTuple):

@@ -1,22 +1,92 @@
-"""The start of the filter from the first seconds of data: nothing about the mounting need be known.
+"""Motion that is linear in what a start does not know: velocity, gravity, lever arm and accelerometer bias.
 
-Rotations, gyro bias and time shift come from `td_icp`; then velocity, gravity, accelerometer bias and lever
-arm are *linear* in the camera's positions (closed form of Dong-Si & Mourikis, "Estimator initialization in
-vision-aided inertial navigation with unknown camera-IMU calibration", 2012, with a known target).
+With attitudes and the gyro's bias known, from images of a target or from the gyro, a camera on the imu is at
+
+    p_cam(t_k) = p_0 + D_k + A_k z,   z = (v_0, gravity, p_imu_cam, b_a),
+
+with D_k the double integral of the rotated specific force, and A_k = [T, T^2/2, R_k, -B_k], B_k the double
+integral of the rotation. All starts solve parts of this for z: with a target (here), without one
+(`track_start`), after a gap (`motion_restart`), for another recording (`recording_start`). [Dong-Si and
+Mourikis, "Estimator initialization in vision-aided inertial navigation with unknown camera-IMU calibration",
+2012]
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.filter.unobservable_directions import HELD_M, STILL_RAD
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial.imu_model import strapdown
+from vical_daemon.estimation.inertial.imu_model import over_intervals, strapdown
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2
+
+SPEED, GRAVITY, ARM, BIAS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+"""Places in z."""
+
+
+class LinearMotion(NamedTuple):
+    """Positions that are linear in z.
+
+    Attributes:
+        T: Instants since the first, s, shape (n,).
+        D: Double integral of the specific force, m, shape (n, 3).
+        A: Derivatives of the positions by z, shape (n, 3, 12).
+    """
+
+    T: FloatArray
+    D: FloatArray
+    A: FloatArray
+
+    @classmethod
+    def between(
+        cls, buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bias: FloatArray
+    ) -> LinearMotion | None:
+        """Integrate readings between instants of the imu's clock (s, increasing, shape (n,)).
+
+        Args:
+            buffer: Inertial readings.
+            t_s: Instants.
+            R_world_imu: Attitudes there, shape (n, 3, 3).
+            gyro_bias: rad/s.
+
+        Returns:
+            The motion, or None where readings do not cover the instants.
+        """
+        found = buffer.intervals(t_s)
+        if found is None:
+            return None
+        segment, begin = found
+        x = over_intervals(strapdown(segment, gyro_bias[None], np.zeros((1, 3))), begin)
+        return cls.along(R_world_imu, x.dt, x.dR, x.dv, x.dp)
+
+    @classmethod
+    def along(
+        cls, R: FloatArray, dt: FloatArray, dR: FloatArray, dv: FloatArray, dp: FloatArray
+    ) -> LinearMotion:
+        """Add up relative motions, see `Intervals`, between attitudes (n, 3, 3)."""
+        # Half of the attitude mismatch at the far end is put at the near one: errors of vision do not add up.
+        near = R[:-1] @ so3.exp(0.5 * so3.log(np.swapaxes(R[:-1] @ dR, 1, 2) @ R[1:]))
+        middle = near @ so3.exp(0.5 * so3.log(dR))
+        forces = np.matmul(near, np.stack([dv, dp], axis=-1))
+        h = dt[:, None, None]
+        D = _summed(dt, forces[..., 0], forces[..., 1])
+        B = _summed(dt, (h * middle).reshape(-1, 9), (0.5 * h * h * middle).reshape(-1, 9))
+        T = np.concatenate([[0.0], np.cumsum(dt)])
+        A = np.empty((len(T), 3, 12))
+        A[:, :, SPEED], A[:, :, ARM], A[:, :, BIAS] = T[:, None, None] * so3.IDENTITY, R, -B.reshape(-1, 3, 3)
+        A[:, :, GRAVITY] = (0.5 * T * T)[:, None, None] * so3.IDENTITY
+        return cls(T, D, A)
+
+
+def _summed(dt: FloatArray, gained: FloatArray, moved: FloatArray) -> FloatArray:
+    """Positions (n, k) by what speed (n - 1, k) and position gain in each interval."""
+    speed = np.cumsum(gained, axis=0) - gained
+    return np.concatenate([np.zeros((1, gained.shape[1])), np.cumsum(dt[:, None] * speed + moved, axis=0)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,48 +113,34 @@ class LinearStart:
 
 
 def linear_start(
-    buffer: ImuBuffer,
-    t_imu_s: FloatArray,
-    R_world_imu: FloatArray,
+    motion: LinearMotion,
     p_world_cam: FloatArray,
-    gyro_bias: FloatArray,
     position_sigma: FloatArray,
     held_axes: FloatArray | None = None,
     *,
     free_size: bool = False,
-) -> LinearStart | None:
-    """Solve velocity, gravity, accelerometer bias and lever arm from poses of the camera.
-
-    s p_cam(t_k) = p_0 + v_0 t + g t^2/2 + D_k - B_k b_a + R_k p_imu_cam, with D_k the double integral of
-    the rotated specific force and B_k that of the rotation itself; s is the true size of the target over the
-    stated one, by which positions scale, and 1 unless `free_size`.
+) -> LinearStart:
+    """Solve velocity, gravity, accelerometer bias and lever arm from positions of the camera.
 
     Args:
-        buffer: Inertial readings that cover all instants.
-        t_imu_s: Instants of the poses in the imu's clock, s, increasing, shape (n,).
-        R_world_imu: Attitudes at these instants (vision, mounting from TD-ICP), shape (n, 3, 3).
+        motion: At the instants of the positions, with attitudes by vision (mounting from TD-ICP).
         p_world_cam: Camera positions, m, shape (n, 3).
-        gyro_bias: rad/s.
-        position_sigma: Standard deviation of each camera position, m, shape (n,).
+        position_sigma: Standard deviation of each, m, shape (n,).
         held_axes: Of the imu, along which the lever arm is held at zero, shape (k, 3): where an axis hardly
             turns (`still_axes`), errors of the attitudes would be taken for a lever arm along it.
-        free_size: Find the size of the target, too.
-
-    Returns:
-        The solution, or None where the readings do not cover the instants.
+        free_size: Find the size of the target, too, by which positions scale.
     """
-    integrals = integrate_twice(buffer, t_imu_s, R_world_imu, gyro_bias)
-    if integrals is None:
-        return None
-    D, B = integrals
-    A = _design(t_imu_s, R_world_imu, p_world_cam, B, free_size=free_size)
+    n = len(p_world_cam)
+    columns = [motion.A, np.broadcast_to(np.eye(3), (n, 3, 3))]  # z and p_0
+    columns += [-p_world_cam[:, :, None]] if free_size else []
+    A = np.concatenate(columns, axis=2)
     w = 1.0 / position_sigma
     rows = (A * w[:, None, None]).reshape(-1, A.shape[2])
-    y = (((0.0 if free_size else p_world_cam) - D) * w[:, None]).ravel()
+    y = (((0.0 if free_size else p_world_cam) - motion.D) * w[:, None]).ravel()
     prior = np.zeros((6, A.shape[2]))
-    prior[:3, 12:15] = np.eye(3) / ACCEL_BIAS_SIGMA_MPS2
+    prior[:3, BIAS] = np.eye(3) / ACCEL_BIAS_SIGMA_MPS2
     if held_axes is not None:
-        prior[3:, 9:12] = held_axes.T @ held_axes / HELD_M
+        prior[3:, ARM] = held_axes.T @ held_axes / HELD_M
     A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(6)])
     x, *_ = np.linalg.lstsq(A_all, y_all, rcond=None)
     residual = (y - rows @ x).reshape(-1, 3)
@@ -92,23 +148,7 @@ def linear_start(
     cov = np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)
     sigma = np.sqrt(np.diag(cov))
     size, sigma_size = (float(x[15]), float(sigma[15])) if free_size else (1.0, 0.0)
-    return LinearStart(x[9:12], x[3:6], x[6:9], x[12:15], sigma[9:12], size, sigma_size)
-
-
-def _design(
-    t_s: FloatArray, R_world_imu: FloatArray, p_world_cam: FloatArray, B: FloatArray, *, free_size: bool
-) -> FloatArray:
-    """Derivatives of the camera's positions by [p_0, v_0, g, p_imu_cam, b_a (, s)], (n, 3, 15 or 16)."""
-    T, eye = t_s - t_s[0], np.eye(3)
-    A = np.zeros((len(T), 3, 15 + free_size))
-    A[:, :, 0:3] = eye
-    A[:, :, 3:6] = T[:, None, None] * eye
-    A[:, :, 6:9] = (0.5 * T * T)[:, None, None] * eye
-    A[:, :, 9:12] = R_world_imu
-    A[:, :, 12:15] = -B
-    if free_size:
-        A[:, :, 15] = -p_world_cam
-    return A
+    return LinearStart(x[ARM], x[SPEED], x[GRAVITY], x[BIAS], sigma[ARM], size, sigma_size)
 
 
 def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:
@@ -119,31 +159,3 @@ def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:
     moved, axes = np.linalg.eigh(np.eye(3) - mean_R_world_imu.T @ mean_R_world_imu)
     still: FloatArray = axes[:, moved < STILL_RAD**2].T
     return still
-
-
-def integrate_twice(
-    buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bias: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return double integrals D (n, 3) of R f and B (n, 3, 3) of R, re-anchored to vision at each pose.
-
-    None where readings do not cover the instants.
-    """
-    n = len(t_s)
-    D, B = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    Vd, Vb = np.zeros(3), np.zeros((3, 3))
-    zero = np.zeros((1, 3))
-    for k in range(n - 1):
-        segment = buffer.segment(float(t_s[k]), float(t_s[k + 1]))
-        if segment is None:
-            return None
-        relative = strapdown(segment, gyro_bias[None], zero)
-        dt = float(t_s[k + 1] - t_s[k])
-        # Half of the attitude mismatch at the far end is put at the near one: errors of vision do not add up.
-        miss = so3.log(relative.dR[0, -1].T @ R_world_imu[k].T @ R_world_imu[k + 1])
-        R = R_world_imu[k] @ so3.exp(0.5 * miss)
-        turning = R @ so3.exp(0.5 * so3.log(relative.dR[0, -1]))
-        D[k + 1] = D[k] + Vd * dt + R @ relative.dp[0, -1]
-        B[k + 1] = B[k] + Vb * dt + turning * (0.5 * dt * dt)
-        Vd = Vd + R @ relative.dv[0, -1]
-        Vb = Vb + turning * dt
-    return D, B

@@ -1,7 +1,6 @@
 """The motion anew from a few images, with the calibration as it is known: after gaps and lost poses.
 
-Pose from the target; velocity linear in positions, p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a: the closed
-form of `initialise.linear_start` with everything but p_0 and v_0 known.
+Pose from the target; velocity linear in positions: `LinearMotion` with everything but p_0 and v_0 known.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.linear_start import integrate_twice
+from vical_daemon.estimation.init.linear_start import BIAS, GRAVITY, LinearMotion
 from vical_daemon.estimation.init.target_poses import Lens, TargetPose, pose_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
@@ -111,12 +110,11 @@ class MotionRestart:
         if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
             return None
         t_s, R = poses.t_s, poses.R
-        integrals = integrate_twice(buffer, t_s, R, state.gyro_bias)
-        if integrals is None:
+        found = LinearMotion.between(buffer, t_s, R, state.gyro_bias)
+        if found is None:
             return None
-        D, B = integrals
-        T = t_s - t_s[0]
-        y = poses.p - D + B @ state.accel_bias - 0.5 * (T * T)[:, None] * state.gravity
+        T, known = found.T, np.concatenate([state.gravity, state.accel_bias])
+        y = poses.p - found.D - np.concatenate([found.A[..., GRAVITY], found.A[..., BIAS]], axis=2) @ known
         start, velocity = np.linalg.lstsq(np.stack([np.ones_like(T), T], axis=1), y, rcond=None)[0]
         wide = self._sigmas(poses.first, layout, sigmas, float(T[-1]))
         elapsed_s = self._elapsed_s(poses.first.frame, float(t_s[0]) - state.t_s)

@@ -1,8 +1,8 @@
 """The motion at the beginning of another recording of the same rig: biases and gravity are new, too.
 
 As `motion_restart`, with gravity and the biases among the unknowns: the board may stand elsewhere, the imu
-was switched off. With the calibration known, all are linear in poses of the target over a second or two:
-p_k = p_0 + v_0 T + g T^2/2 + D_k - B_k b_a; the gyro's bias is by what its turns differ from those seen.
+was switched off. With the calibration known, all are linear in poses of the target over a second or two
+(`LinearMotion`); the gyro's bias is by what its turns differ from those seen.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import strapdown
-from vical_daemon.estimation.init.linear_start import integrate_twice
+from vical_daemon.estimation.init.linear_start import BIAS, GRAVITY, SPEED, LinearMotion
 from vical_daemon.estimation.init.motion_restart import MotionRestart
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.priors import (
@@ -45,10 +45,12 @@ class RecordingStart(MotionRestart):
         if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
             return None
         gyro_bias = _gyro_bias(buffer, poses.t_s, poses.R)
-        integrals = None if gyro_bias is None else integrate_twice(buffer, poses.t_s, poses.R, gyro_bias)
-        if gyro_bias is None or integrals is None:
+        if gyro_bias is None:
             return None
-        position, velocity, gravity, accel_bias = _linear(poses.t_s, poses.p, *integrals, state)
+        found = LinearMotion.between(buffer, poses.t_s, poses.R, gyro_bias)
+        if found is None:
+            return None
+        position, velocity, gravity, accel_bias = _linear(found, poses.p, state)
         span_s = float(poses.t_s[-1] - poses.t_s[0])
         wide = self._sigmas(poses.first, layout, sigmas, span_s)
         biases = BiasStart(
@@ -68,36 +70,37 @@ def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> F
 
     log(dR_gyro' dR_seen) = -integral of dR(t)' b dt, with dR from t to the end of each interval.
     """
-    zero = np.zeros((1, 3))
-    rows, misses = [], []  # unknown as well as the bias: the error of the first attitude
-    for k in range(1, len(t_s)):
-        segment = buffer.segment(float(t_s[0]), float(t_s[k]))
-        if segment is None:
-            return None
-        dR = strapdown(segment, zero, zero).dR[0]
-        dt = np.diff(segment.t_s)
-        middle = 0.5 * (dR[1:] + dR[:-1])
-        turned = np.einsum("n,nij->ij", dt, middle)  # of a constant vector, seen from the first attitude
-        rows.append(np.hstack([dR[-1].T @ turned, dR[-1].T]))
-        misses.append(so3.log(dR[-1].T @ R_world_imu[0].T @ R_world_imu[k]))
-    x, *_ = np.linalg.lstsq(np.concatenate(rows), -np.concatenate(misses), rcond=None)
+    found = buffer.intervals(t_s)
+    if found is None:
+        return None
+    segment, begin = found
+    dR = strapdown(segment, np.zeros((1, 3)), np.zeros((1, 3))).dR[0]
+    steps = np.diff(segment.t_s)[:, None, None] * 0.5 * (dR[1:] + dR[:-1])
+    end = np.append(begin[1:], len(dR)) - 1
+    turned = np.cumsum(steps, axis=0)[
+        end - 1
+    ]  # integral of dR: of a constant vector, seen from the first attitude
+    back = np.swapaxes(dR[end], 1, 2)
+    misses = so3.log(back @ R_world_imu[0].T @ R_world_imu[1:])
+    rows = np.concatenate([back @ turned, back], axis=2)  # the error of the first attitude is unknown, too
+    x, *_ = np.linalg.lstsq(rows.reshape(-1, 6), -misses.ravel(), rcond=None)
     return np.asarray(x[:3])
 
 
 def _linear(
-    t_s: FloatArray, p_world_imu: FloatArray, D: FloatArray, B: FloatArray, state: State
+    motion: LinearMotion, p_world_imu: FloatArray, state: State
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Position and velocity at the first pose, gravity of its known length, and the accelerometer's bias."""
-    T = t_s - t_s[0]
-    n, eye = len(T), np.eye(3)
-    A = np.zeros((n, 3, 12))
-    A[:, :, 0:3], A[:, :, 3:6] = eye, T[:, None, None] * eye
-    A[:, :, 6:9], A[:, :, 9:12] = (0.5 * T * T)[:, None, None] * eye, -B
+    n, eye = len(motion.T), np.eye(3)
+    A = np.concatenate(
+        [np.broadcast_to(eye, (n, 3, 3)), motion.A[..., SPEED], motion.A[..., GRAVITY], motion.A[..., BIAS]],
+        axis=2,
+    )
     noise_m = _POSITION_SIGMA_M
     prior = np.zeros((3, 12))
     prior[:, 9:12] = noise_m / ACCEL_BIAS_SIGMA_MPS2 * eye
     rows = np.concatenate([A.reshape(-1, 12), prior])
-    y = np.concatenate([(p_world_imu - D).ravel(), noise_m / ACCEL_BIAS_SIGMA_MPS2 * state.accel_bias])
+    y = np.concatenate([(p_world_imu - motion.D).ravel(), noise_m / ACCEL_BIAS_SIGMA_MPS2 * state.accel_bias])
     x, *_ = np.linalg.lstsq(rows, y, rcond=None)
     gravity = x[6:9] * (np.linalg.norm(state.gravity) / np.linalg.norm(x[6:9]))
     rest = y - rows[:, 6:9] @ gravity

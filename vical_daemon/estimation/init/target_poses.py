@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.planar_pose import PlanarPose, inliers, planar_pose
-from vical_daemon.estimation.measurements import BoolArray, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, inliers, planar_poses
+from vical_daemon.estimation.measurements import CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 
 _MIN_POINTS = 8
@@ -70,63 +71,68 @@ class TargetPose:
 
 def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) -> TargetPose | None:
     """Planar pose of one frame; None where too few points are seen or the two-fold ambiguity is open."""
-    if len(frame.ids) < _MIN_POINTS:
-        return None
-    rays, ok = unproject(frame.uv_px, lens.intrinsics, lens.distortion, lens.model)
-    points, xy = target[frame.ids[ok]], rays[ok, :2] / rays[ok, 2:]
-    found = planar_pose(points, xy)
-    for _ in range(_CLEANINGS):
-        if not found.candidates:
-            return None
-        good = _fitting(found.candidates[0], points, xy)
-        if good.all() or good.sum() < _MIN_POINTS:
-            break
-        points, xy = points[good], xy[good]
-        found = planar_pose(points, xy)
-    if not found.candidates or found.ambiguous:
-        return None
-    return TargetPose(t_cam_s, found.candidates[0], frame)
+    return poses_of([(t_cam_s, frame)], lens, target)[0]
 
 
-def _fitting(pose: PlanarPose, points: FloatArray, xy: FloatArray) -> BoolArray:
-    """Which corners are where the pose has them."""
+def poses_of(
+    frames: Sequence[tuple[float, PointsFrame]], lens: Lens, target: FloatArray
+) -> list[TargetPose | None]:
+    """Planar poses of frames with their stamps in s, see `pose_of`."""
+    left = [k for k, (_, f) in enumerate(frames) if len(f.ids) >= _MIN_POINTS]
+    views = dict(zip(left, ideal_views([frames[k][1] for k in left], lens, target), strict=True))
+    found: dict[int, PlanarPoses] = {}
+    for _ in range(1 + _CLEANINGS):
+        found.update(zip(left, planar_poses(*_columns([views[k] for k in left])), strict=True))
+        left = [k for k in left if found[k].candidates and _cleaned(views, k, found[k].candidates[0])]
+    return [
+        TargetPose(t, found[k].candidates[0], f)
+        if k in found and found[k].candidates and not found[k].ambiguous
+        else None
+        for k, (t, f) in enumerate(frames)
+    ]
+
+
+def ideal_views(
+    frames: Sequence[PointsFrame], lens: Lens, target: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """What the lens has not bent: points of the target, m (n, 3), and where they are, X/Z and Y/Z (n, 2)."""
+    if not frames:
+        return []
+    uv, ids = np.concatenate([f.uv_px for f in frames]), np.concatenate([f.ids for f in frames])
+    rays, ok = unproject(uv, lens.intrinsics, lens.distortion, lens.model)
+    ends = np.cumsum([len(f.ids) for f in frames])[:-1]
+    each = zip(np.split(target[ids], ends), np.split(rays, ends), np.split(ok, ends), strict=True)
+    return [(points[good], ray[good, :2] / ray[good, 2:]) for points, ray, good in each]
+
+
+def _columns(views: list[tuple[FloatArray, FloatArray]]) -> tuple[list[FloatArray], list[FloatArray]]:
+    return [points for points, _ in views], [xy for _, xy in views]
+
+
+def _cleaned(views: dict[int, tuple[FloatArray, FloatArray]], k: int, pose: PlanarPose) -> bool:
+    """Leave out corners that are not where the pose has them; False: there are none, or too few others."""
+    points, xy = views[k]
     seen = points @ pose.R_cam_target.T + pose.p_cam_target
     with np.errstate(all="ignore"):
         far = np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy, axis=1)
-    return inliers(far)
+    good = inliers(far)
+    if good.all() or good.sum() < _MIN_POINTS:
+        return False
+    views[k] = points[good], xy[good]
+    return True
 
 
-class PoseCache:
-    """Poses already found, so that repeated attempts cost little; a new lens empties it."""
+def recent_poses(
+    frames: Sequence[tuple[float, PointsFrame]], lens: Lens, target: FloatArray, since_s: float = -np.inf
+) -> list[TargetPose]:
+    """Poses of at most 160 of the frames since a stamp, evenly thinned, in order of time.
 
-    def __init__(self) -> None:
-        self._lens: tuple[float | str, ...] = ()
-        self._poses: dict[int, TargetPose | None] = {}
-
-    def poses(
-        self,
-        frames: list[tuple[float, PointsFrame]],
-        lens: Lens,
-        target: FloatArray,
-        since_s: float = -np.inf,
-    ) -> list[TargetPose]:
-        """Poses of at most 160 of the frames since a stamp, evenly thinned, in order of time.
-
-        Args:
-            frames: All there are: what is found of others is forgotten.
-            lens: In use; with the readout that the frames were freed from.
-            target: Points of the target, m, shape (n, 3).
-            since_s: Older frames are left out, s.
-        """
-        key = (*lens.intrinsics.tolist(), *lens.distortion.tolist(), lens.readout_s, lens.readout_axis)
-        if key != self._lens:
-            self._lens, self._poses = key, {}
-        known = {f.t_cam_ns: self._poses[f.t_cam_ns] for _, f in frames if f.t_cam_ns in self._poses}
-        recent = [item for item in frames if item[0] > since_s]
-        step = max(1, -(-len(recent) // _MOST_POSES))
-        chosen = recent[::-1][::step][::-1]
-        for t, f in chosen:
-            if f.t_cam_ns not in known:
-                known[f.t_cam_ns] = pose_of(f, t, lens, target)
-        self._poses = known
-        return [p for _, f in chosen if (p := known[f.t_cam_ns]) is not None]
+    Args:
+        frames: Stamps, s, and points, in order.
+        lens: In use.
+        target: Points of the target, m, shape (n, 3).
+        since_s: Older frames are left out, s.
+    """
+    recent = [item for item in frames if item[0] > since_s]
+    step = max(1, -(-len(recent) // _MOST_POSES))
+    return [p for p in poses_of(recent[::-1][::step][::-1], lens, target) if p is not None]

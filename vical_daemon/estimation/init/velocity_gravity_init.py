@@ -8,7 +8,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.linear_start import LinearStart, linear_start, still_axes
+from vical_daemon.estimation.init.linear_start import LinearMotion, LinearStart, linear_start, still_axes
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
@@ -84,14 +84,18 @@ def motion_start(
         used += inside
         if len(inside) < 15:
             return StartResult(None, f"{name}: inertial data cover {len(inside)} frames so far")
-        if may_resize:
-            other = _other_size(buffer, inside, camera, gyro_bias_rps[name], options)
+        R, p, sigma, t = _poses_of_imu(inside, camera)
+        axes: FloatArray | None = None
+        if partial:
+            R, sigma = _smooth(buffer, t, R, gyro_bias_rps[name]), np.maximum(sigma, _DRIFT_M)
+            axes = still_axes(R.mean(axis=0)) if turn_axis_cam is None else np.eye(3)
+        motion = LinearMotion.between(buffer, t, R, gyro_bias_rps[name])
+        if motion is not None and may_resize:
+            other = _other_size(motion, p, sigma, options.gravity_mps2)
             if other is not None:
                 return StartResult(None, "", size=other)
-        held = None if turn_axis_cam is None else np.eye(3)
-        linear, axes = _linear(buffer, inside, camera, gyro_bias_rps[name], partial, held)
-        invisible = linear is not None and float(np.max(linear.sigma_p_imu_cam)) > 0.1
-        if linear is None or (invisible and not partial):
+        linear = None if motion is None else linear_start(motion, p, sigma, axes)
+        if linear is None or (float(np.max(linear.sigma_p_imu_cam)) > 0.1 and not partial):
             why = f"{name}: lever arm not yet visible: turn the rig about two axes"
             return StartResult(None, why, motion_missing=True)
         if "extrinsics" not in options.fix:
@@ -109,26 +113,19 @@ def motion_start(
     return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used)
 
 
-def _other_size(
-    buffer: ImuBuffer,
-    poses: list[TargetPose],
-    camera: CameraState,
-    gyro_bias: FloatArray,
-    options: CalibrationOptions,
-) -> float | None:
+def _other_size(motion: LinearMotion, p: FloatArray, sigma: FloatArray, gravity_mps2: float) -> float | None:
     """Size of the target over the stated one, where positions and accelerations suggest another one.
 
     It is to be confirmed (see `window_start`): noise of the positions, which the size multiplies, and of the
     attitudes make it wrong by ten of its sigmas where the rig moves slowly.
     Gravity must come out right with it: an accelerometer in g, too, makes the world look another size.
     """
-    R, p, sigma, t = _poses_of_imu(poses, camera)
-    found = linear_start(buffer, t, R, p, gyro_bias, sigma, free_size=True)
-    if found is None or not _SIZES[0] < found.size < _SIZES[1]:
+    found = linear_start(motion, p, sigma, free_size=True)
+    if not _SIZES[0] < found.size < _SIZES[1]:
         return None
     if abs(found.size - 1.0) < max(_FAR_SIZE, SURE_SIGMAS * found.sigma_size):
         return None
-    gravity = float(np.linalg.norm(found.gravity)) / options.gravity_mps2
+    gravity = float(np.linalg.norm(found.gravity)) / gravity_mps2
     return found.size if 0.9 < gravity < 1.1 else None
 
 
@@ -140,23 +137,6 @@ def _poses_of_imu(
     p = np.array([p.p_target_cam for p in poses])
     sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
     return R, p, sigma, np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
-
-
-def _linear(
-    buffer: ImuBuffer,
-    poses: list[TargetPose],
-    camera: CameraState,
-    gyro_bias: FloatArray,
-    partial: bool,
-    held: FloatArray | None,
-) -> tuple[LinearStart | None, FloatArray | None]:
-    """The linear start, and the axes along which a partial one guesses: `held`, or those that are still."""
-    R, p, sigma, t = _poses_of_imu(poses, camera)
-    if not partial:
-        return linear_start(buffer, t, R, p, gyro_bias, sigma), None
-    R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
-    axes = still_axes(R.mean(axis=0)) if held is None else held
-    return linear_start(buffer, t, R, p, gyro_bias, sigma, axes), axes
 
 
 def _smooth(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bias: FloatArray) -> FloatArray:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import LOWER
@@ -19,16 +18,17 @@ NUMBERS = ENTRIES + 1
 
 
 def matrices(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """M_g and M_a of their entries (the lag may follow), shapes (3, 3)."""
-    accel = np.eye(3)
-    accel[LOWER[:, 0], LOWER[:, 1]] += numbers[9:ENTRIES]
-    return np.eye(3) + numbers[:9].reshape(3, 3), accel
+    """M_g and M_a (..., 3, 3) of their entries (..., 15), which the lag may follow; identity without any."""
+    gyro, accel = (np.zeros((*numbers.shape[:-1], 3, 3)) + np.eye(3) for _ in range(2))
+    if numbers.shape[-1]:
+        gyro += numbers[..., :9].reshape(gyro.shape)
+        accel[..., LOWER[:, 0], LOWER[:, 1]] += numbers[..., 9:ENTRIES]
+    return gyro, accel
 
 
 def by_entries(
     errors: Influence,
-    segment: ImuSegment,
-    bias: FloatArray,
+    readings: FloatArray,
     gyro_matrix: FloatArray,
     accel_matrix: FloatArray,
 ) -> FloatArray:
@@ -39,8 +39,7 @@ def by_entries(
 
     Args:
         errors: What errors of rate and force do to the end.
-        segment: Readings.
-        bias: [gyro, accel], shape (6,).
+        readings: [gyro, accel] without the biases, rad/s and m/s^2, shape (n + 1, 6).
         gyro_matrix: M_g in force.
         accel_matrix: M_a in force.
 
@@ -48,7 +47,6 @@ def by_entries(
         By [bias 6, entries 15], rows as in `Influence`, shape (9, 21).
     """
     at = (errors.weights[:, None, None] * errors.at).reshape(-1, 54)
-    readings = np.concatenate([segment.gyro - bias[:3], segment.accel - bias[3:]], axis=1)
     both = (at.T @ readings).reshape(9, 6, 6)  # end, error of rate or force, reading
     out, by_bias = np.empty((9, 6 + ENTRIES)), -at.sum(axis=0).reshape(9, 6)
     out[:, :3], out[:, 3:6] = by_bias[:, :3] @ gyro_matrix, by_bias[:, 3:] @ accel_matrix

@@ -13,11 +13,9 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer, ImuSegment
-from vical_daemon.estimation.inertial.imu_model import Influence, Strapdown, influence, strapdown
+from vical_daemon.estimation.inertial.imu_model import over_intervals, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
-from vical_daemon.estimation.model.unscented import root as root_of
-from vical_daemon.estimation.model.unscented import solve_lower
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
 _ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
@@ -46,60 +44,57 @@ class PreintegratedLink:
     imu: FloatArray
 
 
-def make_link(
-    buffer: ImuBuffer,
-    from_s: float,
-    to_s: float,
-    imu: FloatArray,
-    noise: ImuNoise,
-) -> PreintegratedLink | None:
-    """Integrate between two instants of the imu's clock.
+def make_links(
+    buffer: ImuBuffer, t_s: FloatArray, imu: FloatArray, noise: ImuNoise
+) -> list[PreintegratedLink] | None:
+    """Integrate between consecutive instants of the imu's clock.
 
     Args:
         buffer: Readings.
-        from_s: Begin, s.
-        to_s: End, s.
-        imu: [gyro, accel] bias, rad/s and m/s^2; with the numbers of `imu_scale` where they are estimated.
+        t_s: Instants in order, s, shape (m + 1,).
+        imu: Of each link [gyro, accel] bias, rad/s and m/s^2; with the numbers of `imu_scale` where they are
+            estimated; shape (m, 6) or (m, 22).
         noise: Densities.
 
     Returns:
-        The link; None where readings are missing, or none that a device could give.
+        The links; None where readings are missing for one, or none that a device could give.
     """
-    segment = buffer.segment(from_s, to_s)
-    if segment is None or len(segment.t_s) < 2 or segment.gap_s > _MAX_HOLE_S:
+    if len(t_s) < 2:
+        return []
+    found = buffer.intervals(t_s)
+    if found is None or found[0].gap_s > _MAX_HOLE_S:
         return None
-    motion, errors, by_imu = _integrated(segment, imu[:6], imu[6:])
-    covariance = errors.noise(noise)[_ORDER[:, None], _ORDER] + _ROUNDING
+    segment, begin = found
+    counts = np.diff(np.append(begin, len(segment.t_s)))
+    of = np.repeat(np.arange(len(imu)), counts)
+    M_g, M_a = matrices(imu[:, 6:])
+    lag = imu[of, 6 + ENTRIES :]
+    rate, force = segment.gyro - imu[of, :3], segment.accel - imu[of, 3:6]
+    turn_slope, force_slope = segment.gyro_slope, segment.accel_slope
+    assert turn_slope is not None
+    assert force_slope is not None
+    if lag.size:
+        as_read = np.concatenate([rate, force], axis=1)
+        rate, turn_slope = (np.matmul(M_g[of], x[..., None])[..., 0] for x in (rate, turn_slope))
+        force, force_slope = (
+            np.matmul(M_a[of], x[..., None])[..., 0] for x in (force + lag * force_slope, force_slope)
+        )
+    zero = np.zeros((1, 3))
+    even = ImuSegment(segment.t_s, rate, force, segment.gap_s, turn_slope, force_slope)
+    motion = over_intervals(strapdown(even, zero, zero), begin, errors=True)
+    covariance = np.array([e.noise(noise) for e in motion.influences])[:, _ORDER[:, None], _ORDER]
     try:
-        root = solve_lower(root_of(covariance), np.eye(9))
+        root = np.linalg.inv(np.linalg.cholesky(covariance + _ROUNDING))
     except np.linalg.LinAlgError:
         return None
-    return PreintegratedLink(
-        float(motion.t_s[-1]),
-        motion.dR[0, -1],
-        motion.dv[0, -1],
-        motion.dp[0, -1],
-        by_imu[_ORDER],
-        root,
-        imu.copy(),
-    )
-
-
-def _integrated(
-    segment: ImuSegment, bias: FloatArray, numbers: FloatArray
-) -> tuple[Strapdown, Influence, FloatArray]:
-    """Motion over a segment, what errors do to its end, and its derivatives by bias and numbers."""
-    if not len(numbers):
-        motion = strapdown(segment, bias[None, :3], bias[None, 3:])
-        errors = influence(so3.IDENTITY, motion)
-        return motion, errors, errors.by_bias()
-    M_g, M_a = matrices(numbers)
-    motion = strapdown(segment, bias[None, :3], bias[None, 3:], M_g[None], M_a[None], numbers[ENTRIES:])
-    errors = influence(so3.IDENTITY, motion)
-    slope = np.zeros_like(segment.accel) if segment.accel_slope is None else segment.accel_slope
-    by_lag = errors.by_force(slope @ M_a.T)
-    by_imu = np.column_stack([by_entries(errors, segment, bias, M_g, M_a), by_lag])
-    return motion, errors, by_imu
+    by_imu = [e.by_bias() for e in motion.influences]
+    if lag.size:
+        by_imu = [
+            np.column_stack([by_entries(e, as_read[own], g, a), e.by_force(force_slope[own])])
+            for e, own, g, a in zip(motion.influences, motion.nodes, M_g, M_a, strict=True)
+        ]
+    columns = (motion.dt.tolist(), motion.dR, motion.dv, motion.dp, np.array(by_imu)[:, _ORDER], root)
+    return [PreintegratedLink(*x) for x in zip(*columns, imu.copy(), strict=True)]
 
 
 class PreintegratedLinks(NamedTuple):

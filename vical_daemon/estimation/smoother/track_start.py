@@ -1,25 +1,24 @@
 """Velocity, gravity, lever arm and structure from tracks and an IMU, linearly, once rotations are known.
 
-With attitudes from the gyro, every camera centre is linear in z = (v0, gravity, lever arm, accel bias):
-c_i = q_i + A_i z, and a landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes from
-the accelerometer, so that the system is inhomogeneous; gravity's size is known and its direction is
-linearised anew each round. Squares are divided by the distances found in the round before, or near points
-would draw everything towards the camera. [Martinelli, "Closed-form solution of visual-inertial structure
-from motion", 2014; Dong-Si & Mourikis, "Estimator initialization in vision-aided inertial navigation with
-unknown camera-IMU calibration", 2012]
+With attitudes from the gyro, every camera centre is linear in z (`LinearMotion`): c_i = D_i + A_i z, and a
+landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes from the accelerometer, so
+that the system is inhomogeneous; gravity's size is known and its direction is linearised anew each round.
+Squares are divided by the distances found in the round before, or near points would draw everything towards
+the camera. [Martinelli, "Closed-form solution of visual-inertial structure from motion", 2014]
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_model import products
+from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
-from vical_daemon.estimation.model.inertial_links import PreintegratedLink, make_link
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import MEDIAN_ABSOLUTE
@@ -55,7 +54,7 @@ class ArmPrior:
         """Of z = (v0, gravity, lever arm, accel bias), shape (12, 12)."""
         out = np.diag([0.0] * 6 + [self.sigma_m**-2] * 3 + [ACCEL_BIAS_SIGMA_MPS2**-2] * 3)
         if self.held is not None:
-            out[6:9, 6:9] += np.outer(self.held, self.held) / HELD_M**2
+            out[ARM, ARM] += np.outer(self.held, self.held) / HELD_M**2
         return out
 
 
@@ -91,14 +90,14 @@ class TrackStart:
         gravity_mps2: float,
     ) -> None:
         shift = camera.timeshift_s
-        links: list[PreintegratedLink] = []
-        for (t0, _), (t1, _) in pairwise(frames):
-            link = make_link(buffer, t0 + shift, t1 + shift, imu, noise)
-            if link is None:
-                raise NoStartError("inertial data do not cover the images")
-            links.append(link)
+        t_s = np.array([t for t, _ in frames]) + shift
+        links = make_links(buffer, t_s, np.broadcast_to(imu, (len(frames) - 1, len(imu))), noise)
+        if links is None:
+            raise NoStartError("inertial data do not cover the images")
         self.camera, self._gravity_mps2 = camera, gravity_mps2
-        self._R, self._q, self._A = _centres(links)
+        stacked = PreintegratedLinks.stack(links)
+        self._R = products(stacked.dR[None])[0]
+        self._motion = LinearMotion.along(self._R, stacked.dt, stacked.dR, stacked.dv, stacked.dp)
         none = Landmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         zero = np.zeros((len(frames), 3))
         window = Window(
@@ -139,29 +138,28 @@ class TrackStart:
                 "speed and scale are not visible yet: move the rig to and fro while turning it"
             )
         z, gravity = found.z, found.gravity
-        if not np.isfinite(z).all() or float(np.abs(z[6:9]).max()) > _MAX_ARM_M:
+        if not np.isfinite(z).all() or float(np.abs(z[ARM]).max()) > _MAX_ARM_M:
             raise NoStartError(
                 "the lever arm is not visible yet: turn the rig about two axes while moving it"
             )
         window = self._window
-        T = np.concatenate([[0.0], np.cumsum([x.dt_s for x in window.links])])
         world = _upright(gravity / self._gravity_mps2)
-        motion = self._q + T[:, None] * z[:3] + 0.5 * (T * T)[:, None] * gravity + self._A[:, :, 9:] @ z[9:]
-        window.p = motion @ world.T
+        at = np.concatenate([z[SPEED], gravity, np.zeros(3), z[BIAS]])
+        window.p = (self._motion.D + self._motion.A @ at) @ world.T
         window.R = world @ self._R
         # the velocity by differences of positions would be coarse: it is carried along the links
-        v = [z[:3]]
+        v = [z[SPEED]]
         for k, link in enumerate(window.links):
             v.append(v[-1] + link.dt_s * gravity + self._R[k] @ link.dv)
         window.v = np.array(v) @ world.T
-        self.camera.p_imu_cam = z[6:9].copy()
-        window.bias[:, 3:] = z[9:]
+        self.camera.p_imu_cam = z[ARM].copy()
+        window.bias[:, 3:] = z[BIAS]
         window.gravity = np.array([0.0, 0.0, -self._gravity_mps2])
         return window
 
     def _solve(self, R_imu_cam: FloatArray, arm: ArmPrior, rounds: int) -> _Linear | None:
         """Iteratively reweighted least squares; None without a solution."""
-        seen, q, A = self._seen, self._q, self._A
+        seen, q, A = self._seen, self._motion.D, self._motion.A
         d = np.matmul(self._R[seen.frame] @ R_imu_cam, self._rays[..., None])[..., 0]
         P = np.eye(3) - d[:, :, None] * d[:, None, :]
         weight = self._ok / (2.0 * _RAY_SIGMA) ** 2
@@ -171,7 +169,7 @@ class TrackStart:
         z, misfit = np.zeros(12), np.inf
         for _ in range(rounds):
             reduced = _tangent_map(gravity)
-            q_now, A_now = q + A[:, :, 3:6] @ gravity, A @ reduced
+            q_now, A_now = q + A[:, :, GRAVITY] @ gravity, A @ reduced
             WP = P * weight[:, None, None]
             PA, Pq = WP @ A_now[seen.frame], np.matmul(WP, q_now[seen.frame][..., None])
             N = np.add.reduceat(WP, seen.begin) + 1e-6 * np.eye(3)
@@ -194,29 +192,9 @@ class TrackStart:
             # a mounting turned by half a circle sees everything behind itself
             misfit = spread if np.mean(ahead < 0.0) < _MOST_BEHIND else np.inf
             weight = self._ok / (_RAY_SIGMA * depth) ** 2 / (1.0 + (off / (3.0 * spread)) ** 2) ** 2
-            gravity = gravity + z[3:6]
+            gravity = gravity + z[GRAVITY]
             gravity *= self._gravity_mps2 / float(np.linalg.norm(gravity))
         return _Linear(z, gravity, misfit)
-
-
-def _centres(links: list[PreintegratedLink]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Attitudes R_i, and positions q_i + A_i z without the lever arm, in the first image's imu frame."""
-    R, P, V = np.eye(3), np.zeros(3), np.zeros(3)
-    PB, VB, T = np.zeros((3, 3)), np.zeros((3, 3)), 0.0
-    all_R, all_q, all_A = [R], [P], [np.zeros((3, 12))]
-    all_A[0][:, 6:9] = np.eye(3)
-    for x in links:
-        P = P + x.dt_s * V + R @ x.dp
-        PB = PB + x.dt_s * VB + R @ x.by_imu[6:9, 3:6]
-        V = V + R @ x.dv
-        VB = VB + R @ x.by_imu[3:6, 3:6]
-        R = R @ x.dR
-        T += x.dt_s
-        A = np.concatenate([T * np.eye(3), 0.5 * T * T * np.eye(3), R, PB], axis=1)
-        all_R.append(R)
-        all_q.append(P)
-        all_A.append(A)
-    return np.array(all_R), np.array(all_q), np.array(all_A)
 
 
 def _tangent_map(gravity: FloatArray) -> FloatArray:

@@ -8,7 +8,6 @@ are no special case: X = c + m / rho. [Civera et al., "Inverse depth parametriza
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,11 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
-from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_link
+from vical_daemon.estimation.model.inertial_links import (
+    PreintegratedLink,
+    PreintegratedLinks,
+    make_links,
+)
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 
@@ -159,25 +162,24 @@ class Window:
 
     def extend(self, buffer: ImuBuffer, frames: list[tuple[float, PointsFrame]]) -> int:
         """Add images, carrying the motion on by inertial data; return how many could be added."""
+        imu = np.concatenate([self.bias[-1], self.imu])[None]
+        t_s = np.array([self.frames[-1][0], *(t for t, _ in frames)]) + self.shift_s
+        for count in range(len(frames), -1, -1):  # all but those that readings do not reach
+            links = make_links(buffer, t_s[: count + 1], np.repeat(imu, count, axis=0), self.noise)
+            if links is not None:
+                break
         R, p, v = [self.R], [self.p], [self.v]
         at = (self.R[-1], self.p[-1], self.v[-1])
-        added = 0
-        for t, frame in frames:
-            before = self.frames[-1][0] + self.shift_s
-            imu = np.concatenate([self.bias[-1], self.imu])
-            link = make_link(buffer, before, t + self.shift_s, imu, self.noise)
-            if link is None:
-                break
+        for link in links or ():
             at = carried(link, *at, self.gravity)
             for store, value in zip((R, p, v), at, strict=True):
                 store.append(value[None])
-            self.links.append(link)
-            self.frames.append((t, frame))
-            added += 1
+        self.links += links or []
+        self.frames += frames[:count]
         self.R, self.p, self.v = np.concatenate(R), np.concatenate(p), np.concatenate(v)
         self.fit_knots()
         self.measure_turning(buffer)
-        return added
+        return count
 
     def measure_turning(self, buffer: ImuBuffer) -> None:
         """Take from the readings how the imu turns at each image, at the time shift of the links."""
@@ -188,12 +190,10 @@ class Window:
         """Integrate anew at the present time shift and biases; False where inertial data do not reach."""
         shift_s = self.camera.timeshift_s
         d = shift_s - self.shift_s
-        links: list[PreintegratedLink] = []
-        for ((t0, _), (t1, _)), imu in zip(pairwise(self.frames), self.imu_by_link(), strict=True):
-            link = make_link(buffer, t0 + shift_s, t1 + shift_s, imu, self.noise)
-            if link is None:
-                return False
-            links.append(link)
+        instants = np.array([t for t, _ in self.frames]) + shift_s
+        links = make_links(buffer, instants, self.imu_by_link(), self.noise)
+        if links is None:
+            return False
         rates = self.rates()
         self.p = self.p + d * self.v
         self.R = self.R @ so3.exp(d * rates)

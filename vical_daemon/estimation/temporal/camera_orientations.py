@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, planar_pose
+from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, planar_poses
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.model.camera_rays import undistort
 
@@ -69,12 +69,10 @@ def target_orientations(
     stamps: list[int] = []
     poses: list[PlanarPose] = []
     skipped = 0
-    for frame in frames:
-        known = (frame.ids >= 0) & (frame.ids < len(points_m))
-        xy, ok = undistort(frame.uv_px[known], intrinsics, distortion, model)
-        found = (
-            planar_pose(points_m[frame.ids[known][ok]], xy[ok], sigma) if ok.sum() >= _MIN_POINTS else None
-        )
+    frames = list(frames)
+    for frame, found in zip(
+        frames, _planar(frames, points_m, (intrinsics, distortion, model), sigma), strict=True
+    ):
         near = bool(stamps) and frame.t_cam_ns - stamps[-1] < 500_000_000
         pose = _choose(found, poses[-1] if near else None)
         if pose is None or pose.rms * float(intrinsics[0]) > _MAX_RMS_PX:
@@ -93,9 +91,23 @@ def target_orientations(
     return Orientations(np.array(stamps), R_world_cam, R @ covariance @ R_world_cam, skipped, p)
 
 
-def _choose(found: PlanarPoses | None, previous: PlanarPose | None) -> PlanarPose | None:
+def _planar(
+    frames: list[PointsFrame], points_m: FloatArray, lens: tuple[FloatArray, FloatArray, str], sigma: float
+) -> list[PlanarPoses]:
+    """Both poses of every frame; none where it shows too few points."""
+    points, rays = [], []
+    for frame in frames:
+        known = (frame.ids >= 0) & (frame.ids < len(points_m))
+        xy, ok = undistort(frame.uv_px[known], *lens)
+        enough = ok.sum() >= _MIN_POINTS
+        points.append(points_m[frame.ids[known][ok]] if enough else np.zeros((0, 3)))
+        rays.append(xy[ok] if enough else np.zeros((0, 2)))
+    return planar_poses(points, rays, sigma)
+
+
+def _choose(found: PlanarPoses, previous: PlanarPose | None) -> PlanarPose | None:
     """The best candidate, or where the image is undecided the one nearest to the previous frame's."""
-    if found is None or not found.candidates:
+    if not found.candidates:
         return None
     if not found.ambiguous:
         return found.candidates[0]

@@ -14,7 +14,7 @@ from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
-from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_link
+from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
 from vical_daemon.estimation.model.retract import camera_difference, moved_camera
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
@@ -76,6 +76,11 @@ class Scene:
         return linear.window(ArmPrior(np.zeros(3)))
 
 
+def _link(buffer, from_s, to_s, imu, noise):
+    links = make_links(buffer, np.array([from_s, to_s]), imu[None], noise)
+    return None if links is None else links[0]
+
+
 @pytest.fixture(scope="module")
 def scene():
     return Scene()
@@ -85,7 +90,7 @@ def scene():
 def test_links_derivatives_agree_with_differences(scene, numbers):
     zero = np.zeros(numbers)
     links = PreintegratedLinks.stack(
-        [make_link(scene.buffer, 0.3 + 0.05 * k, 0.35 + 0.05 * k, zero, scene.noise) for k in range(3)]
+        make_links(scene.buffer, np.linspace(0.3, 0.45, 4), np.tile(zero, (3, 1)), scene.noise)
     )
     rng = np.random.default_rng(1)
     R = Rotation.from_rotvec(0.4 * rng.standard_normal((4, 3))).as_matrix()
@@ -111,7 +116,7 @@ def test_links_derivatives_agree_with_differences(scene, numbers):
 
 def test_link_carries_the_true_motion(scene):
     biases = np.concatenate([scene.rig.gyro_bias.value(1.2), scene.rig.accel_bias.value(1.2)])
-    link = make_link(scene.buffer, 1.0, 1.5, biases, scene.noise)
+    link = _link(scene.buffer, 1.0, 1.5, biases, scene.noise)
     offset = (scene.run.t_imu_ns[0] - scene.run.options.epoch_ns) * 1e-9
     move, g = scene.rig.trajectory, scene.rig.gravity_world_mps2
     a, b = 1.0 + offset, 1.5 + offset
@@ -125,9 +130,9 @@ def test_a_link_is_not_made_over_a_hole_in_the_readings():
     buffer = ImuBuffer(0)
     for t in (0.0, 0.01, 0.02, 0.2, 0.21):
         buffer.append(t, np.zeros(3), np.zeros(3))
-    assert make_link(buffer, 0.0, 0.02, np.zeros(6), ImuNoise()) is not None
-    assert make_link(buffer, 0.01, 0.205, np.zeros(6), ImuNoise()) is None
-    assert make_link(buffer, 0.0, 0.3, np.zeros(6), ImuNoise()) is None
+    assert _link(buffer, 0.0, 0.02, np.zeros(6), ImuNoise()) is not None
+    assert _link(buffer, 0.01, 0.205, np.zeros(6), ImuNoise()) is None
+    assert _link(buffer, 0.0, 0.3, np.zeros(6), ImuNoise()) is None
 
 
 def test_epipolar_fit_finds_mounting_delay_and_bias_without_knowing_any(scene):
@@ -200,11 +205,11 @@ def test_links_follow_the_matrices_as_integrating_anew_does(scene):
     """What a link says of other biases, matrices and lags, against one integrated for them."""
     rng = np.random.default_rng(3)
     at = np.concatenate([[0.01, -0.02, 0.01], [0.1, 0.0, -0.1], 0.02 * rng.standard_normal(15), [2e-4]])
-    link = make_link(scene.buffer, 1.0, 1.25, at, scene.noise)
+    link = _link(scene.buffer, 1.0, 1.25, at, scene.noise)
     for k in range(22):
         step = np.zeros(22)
         step[k] = 1e-4
-        up, down = (make_link(scene.buffer, 1.0, 1.25, at + s * step, scene.noise) for s in (1.0, -1.0))
+        up, down = (_link(scene.buffer, 1.0, 1.25, at + s * step, scene.noise) for s in (1.0, -1.0))
         turn = Rotation.from_matrix(down.dR.T @ up.dR).as_rotvec()
         change = np.concatenate([turn, up.dv - down.dv, up.dp - down.dp]) / 2e-4
         scale = np.repeat(np.abs(link.by_imu).max(axis=1).reshape(3, 3).max(axis=1), 3)
