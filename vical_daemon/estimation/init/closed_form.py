@@ -7,16 +7,16 @@ from accelerations (`accel_alignment`), as a *partial* start: some of it stays u
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD, Alignment, align, align_at
 from vical_daemon.estimation.init.accel_evidence import CameraPath
-from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.init.linear_start import still_axes
-from vical_daemon.estimation.init.readout_start import likely_axis, readout
-from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
+from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
+from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
 from vical_daemon.estimation.init.target_poses import Lens, TargetPose, recent_poses
 from vical_daemon.estimation.init.velocity_gravity_init import StartResult, motion_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
@@ -55,6 +55,14 @@ class StartData:
     may_resize: bool = True
 
 
+class Seen(NamedTuple):
+    """What one camera has seen: its lens, as known or estimated, images without the readout, and poses."""
+
+    lens: Lens
+    frames: Frames
+    poses: list[TargetPose]
+
+
 @dataclass(frozen=True, slots=True)
 class _Rough:
     """One camera before its lever arm is known."""
@@ -64,15 +72,28 @@ class _Rough:
     gyro_bias_rps: FloatArray
 
 
-def attempt(data: StartData) -> StartResult:
-    """Try to start with everything known; see `StartData`.
+def attempt(data: StartData, *, may_be_partial: bool) -> StartResult:
+    """Try to start with everything known; where motion is missing, with guesses if these are welcome.
 
     Returns:
         A state at the first usable frame, or the reason why not.
     """
-    rough: dict[str, _Rough] = {}
+    seen: dict[str, Seen] = {}
     for name in data.priors:
-        lens, poses = _poses(data, name)
+        found, axis = _seen(data, name)
+        if axis:
+            return StartResult(None, "", rolling=(name, axis))
+        seen[name] = found
+    result = _complete(data, seen)
+    if result.state is None and result.motion_missing and may_be_partial:
+        return _partial(data, seen, result.reason)
+    return result
+
+
+def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
+    """A start with everything known, or the reason why not."""
+    rough: dict[str, _Rough] = {}
+    for name, (lens, _, poses) in seen.items():
         if len(poses) < _LEAST_POSES:
             return StartResult(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
@@ -87,12 +108,13 @@ def attempt(data: StartData) -> StartResult:
     return _with_motion(data, rough)
 
 
-def partial_attempt(data: StartData, reason: str) -> StartResult:
+def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult:
     """Try to start where rotations alone do not show the mounting: accelerations may.
 
     Args:
         data: See `StartData`.
-        reason: What `attempt` said; it stays true, whatever is found here.
+        seen: By camera.
+        reason: Why there is no complete start; it stays true, whatever is found here.
 
     Returns:
         A state that is a guess where the motion shows nothing, or the reason again.
@@ -100,8 +122,9 @@ def partial_attempt(data: StartData, reason: str) -> StartResult:
     rough: dict[str, _Rough] = {}
     turn_axis_cam: FloatArray | None = None
     refused = StartResult(None, reason, motion_missing=True)
-    for name in data.priors:
-        lens, poses = _poses(data, name, data.frames[name][-1][0] - _PARTIAL_STRETCH_S)
+    for name, (lens, frames, _) in seen.items():
+        since_s = data.frames[name][-1][0] - _PARTIAL_STRETCH_S
+        poses = recent_poses([x for x in frames if x[0] > since_s], lens, data.target)
         if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < PARTIAL_S:
             return refused
         path = CameraPath(
@@ -155,18 +178,24 @@ def _with_motion(
     )
 
 
-def _poses(data: StartData, name: str, since_s: float = -np.inf) -> tuple[Lens, list[TargetPose]]:
-    """Lens of a camera, as known or estimated, and its poses since a stamp."""
-    lens, readout_s = Lens.from_prior(data.priors[name]), data.priors[name].readout_s
-    if data.layout.cameras[name].readout is not None:
+def _seen(data: StartData, name: str) -> tuple[Seen, str]:
+    """What a camera has seen, and which way a shutter rolls of which nothing was said; empty: it does not."""
+    prior, given, target = data.priors[name], data.frames[name], data.target
+    lens, readout_s = Lens.from_prior(prior), prior.readout_s
+    estimated = data.layout.cameras[name].readout is not None
+    if estimated:
         if not (lens.readout_axis or readout_s):
-            lens.readout_axis = likely_axis(data.frames[name], lens, data.target)
-        readout_s = readout(data.frames[name], lens, data.target, readout_s)
-    frames = at_middle_row(data.frames[name], readout_s, lens.resolution, lens.readout_axis)
-    if data.layout.lens_free(name):
-        estimate_intrinsics(lens, [f for _, f in frames], data.target)
+            lens.readout_axis = likely_axis(given, lens, target)
+        readout_s = readout(given, lens, target, readout_s)
+    fit = lens_fit(given, lens, target, readout_s)
+    axis = ""
+    if fit is not None and not (estimated or readout_s):
+        axis = looks_rolling(given, lens, target, fit)
+    if fit is not None and data.layout.lens_free(name):
+        fit.take_into(lens)
     lens.readout_s = readout_s
-    return lens, recent_poses(frames, lens, data.target, since_s)
+    frames = at_middle_row(given, readout_s, lens.resolution, lens.readout_axis)
+    return Seen(lens, frames, [] if axis else recent_poses(frames, lens, target)), axis
 
 
 def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift_s: float) -> CameraState:

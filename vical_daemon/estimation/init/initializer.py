@@ -13,9 +13,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.board_window import Frames
 from vical_daemon.estimation.init.initial_filter import initial_filter
-from vical_daemon.estimation.init.readout_start import looks_rolling
 from vical_daemon.estimation.init.rest import RestDetector
-from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.init.window_start import Step, window_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import Layout, State
@@ -23,7 +21,6 @@ from vical_daemon.estimation.model.state import Layout, State
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
 _ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0
-_LOOK_S = 2.0  # a look takes 0.06 s of CPU
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
 
@@ -37,8 +34,7 @@ class Attempt:
         frames: Those it begins with, in order of the imu's time.
         reason: Why there is none, or what the motion does not show.
         motion_missing: It is motion that is missing, not time.
-        rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
-            the other (`ROWS`, `COLUMNS`); None: there is none.
+        rolling: See `StartResult`.
         size: The target seems to be so many times as large as in its file, and is to be taken as that large.
     """
 
@@ -69,7 +65,6 @@ class Initializer:
     def anew(self) -> None:
         """Forget what was seen and try often again."""
         self._next_s, self._every_s = -np.inf, _ATTEMPT_FIRST_S
-        self._next_look_s = -np.inf
         self._tried = False
         self._rest = {name: RestDetector() for name in self._frames}
         for frames in self._frames.values():
@@ -137,14 +132,11 @@ class Initializer:
         data = start.StartData(
             buffer, self._frames, priors, self._options, self._layout, self._target, may_resize
         )
-        rolling = self._rolling(buffer.newest_s, priors)
-        if rolling is not None:
-            return Attempt(None, [], "", rolling=rolling)
-        result = start.attempt(data)
+        result = start.attempt(data, may_be_partial=may_be_partial)
+        if result.rolling is not None:
+            return Attempt(None, [], "", rolling=result.rolling)
         if result.size is not None:
             return Attempt(None, [], "", size=size * result.size)
-        if result.state is None and result.motion_missing and may_be_partial:
-            result = start.partial_attempt(data, result.reason)
         if result.state is None:
             return _none(result.reason, result.motion_missing)
         frames = self._frames_from(result.state)
@@ -181,19 +173,6 @@ class Initializer:
         """Keep what was seen, for another target or with other unknowns; `off`: what seems to be off."""
         self._layout, self._target = layout, target
         self._options = replace(self._given, estimate=self._given.estimate | set(off))
-
-    def _rolling(self, newest_s: float, priors: dict[str, CameraPrior]) -> tuple[str, str] | None:
-        """A camera whose images a rolling shutter has bent, though nobody said so, and its axis; or None."""
-        if newest_s < self._next_look_s:
-            return None
-        self._next_look_s = newest_s + _LOOK_S
-        for name, where in self._layout.cameras.items():
-            if where.readout is None and priors[name].readout_s == 0.0:
-                lens = Lens.from_prior(priors[name])
-                axis = looks_rolling(self._frames[name], lens, self._target)
-                if axis:
-                    return name, axis
-        return None
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:

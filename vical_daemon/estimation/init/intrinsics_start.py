@@ -41,10 +41,8 @@ def estimate_intrinsics(
         The fit; None when too few views show a pose (the lens is then left alone).
     """
     fit = fit_lens([frames[k] for k in spread(frames, lens, most)], lens, target)
-    if fit is None:
-        return None
-    if np.isfinite(fit.rms_px) and 0.3 * lens.intrinsics[0] < fit.theta[0] < 3.0 * lens.intrinsics[0]:
-        lens.intrinsics, lens.distortion = fit.theta[:4], fit.theta[4:]
+    if fit is not None:
+        fit.take_into(lens)
     return fit
 
 
@@ -64,6 +62,11 @@ class LensFit(NamedTuple):
     rms_px: float
     views: list[PointsFrame]
     which: list[int]
+
+    def take_into(self, lens: Lens) -> None:
+        """Overwrite a lens, unless the fit has gone astray."""
+        if np.isfinite(self.rms_px) and 0.3 * lens.intrinsics[0] < self.theta[0] < 3.0 * lens.intrinsics[0]:
+            lens.intrinsics, lens.distortion = self.theta[:4], self.theta[4:]
 
     @property
     def numbers(self) -> int:

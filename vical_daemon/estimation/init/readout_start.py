@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.init.intrinsics_start import LensFit, along, fit_lens, spread
-from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
+from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row, by_readout
 from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray
 from vical_daemon.estimation.significance import SURE_SIGMAS
@@ -32,10 +32,10 @@ def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> f
     """
     found_s = given_s
     for _ in range(_ROUNDS):
-        fit = _fit(frames, lens, target, found_s)
+        fit = lens_fit(frames, lens, target, found_s)
         if fit is None:
             return given_s
-        slope, bend = _by_readout(frames, lens, target, fit, lens.readout_axis)
+        slope, bend = _parabola(frames, lens, target, fit, lens.readout_axis)
         gain = slope**2 / bend
         if found_s == given_s and not gain > SURE_SIGMAS**2 * (fit.squares - gain) / fit.numbers:
             return given_s
@@ -48,32 +48,29 @@ def likely_axis(frames: Frames, lens: Lens, target: FloatArray) -> str:
 
     Arguments as for `readout`.
     """
-    fit = _fit(frames, lens, target)
+    fit = lens_fit(frames, lens, target)
     if fit is None:
         return ROWS
-    parabolas = {axis: _by_readout(frames, lens, target, fit, axis) for axis in (ROWS, COLUMNS)}
+    parabolas = {axis: _parabola(frames, lens, target, fit, axis) for axis in (ROWS, COLUMNS)}
     return max(parabolas, key=lambda axis: parabolas[axis][0] ** 2 / parabolas[axis][1])
 
 
-def looks_rolling(frames: Frames, lens: Lens, target: FloatArray) -> str:
+def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) -> str:
     """Whether the board is flatter beyond doubt if rows, or columns, are read over 4 ms, not all at once.
 
     Returns `ROWS`, `COLUMNS`, or empty: no rolling shutter shows. It does where the readout is longer than
-    2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as for `readout`.
+    2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as for `readout`; `fit`: of them.
     """
-    fit = _fit(frames, lens, target)
-    if fit is None:
-        return ""
     gains = {}
     for axis in (ROWS, COLUMNS):
-        slope, bend = _by_readout(frames, lens, target, fit, axis)
+        slope, bend = _parabola(frames, lens, target, fit, axis)
         gains[axis] = 2.0 * abs(slope) * _SHORT_S - bend * _SHORT_S**2
     axis = max(gains, key=lambda name: gains[name])
     surely = gains[axis] > _BEYOND_DOUBT * (fit.squares - gains[axis]) / fit.numbers
     return axis if surely else ""
 
 
-def _fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
+def lens_fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
     """A lens and poses adjusted to spread-out images whose rows are read like that; None: too few.
 
     Always without the first and the last, of which `at_middle_row` does not know how corners move.
@@ -84,17 +81,15 @@ def _fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0)
     fit = fit_lens([views[k] for k in chosen], lens, target)
     if fit is None or not np.isfinite(fit.rms_px):
         return None
-    return fit._replace(which=[chosen[k] for k in fit.which])
+    return fit._replace(which=[chosen[k] + 1 for k in fit.which])
 
 
-def _by_readout(
-    frames: Frames, lens: Lens, target: FloatArray, fit: LensFit, axis: str
-) -> tuple[float, float]:
+def _parabola(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit, axis: str) -> tuple[float, float]:
     """Half the first and second derivative of the squared residuals by the readout, px^2/s and px^2/s^2."""
-    seen, later = frames[1:-1], at_middle_row(frames, 1.0, lens.resolution, axis)
-    moves = []
-    for k, view in zip(fit.which, fit.views, strict=True):
-        frame = seen[k][1]
-        moves.append((later[k][1].uv_px - frame.uv_px)[np.isin(frame.ids, view.ids)])
+    whole = by_readout(frames, fit.which, lens.resolution, axis)
+    moves = [
+        moved[np.isin(frames[k][1].ids, view.ids)]
+        for k, view, moved in zip(fit.which, fit.views, whole, strict=True)
+    ]
     slope, bend = along(fit, lens, target, moves)
     return slope, max(bend, 1.0)  # without any motion a second of readout moves nothing

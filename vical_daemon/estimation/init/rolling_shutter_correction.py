@@ -7,7 +7,8 @@ instant.
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -34,18 +35,36 @@ def at_middle_row(frames: Frames, readout_s: float, resolution: tuple[int, int],
     """
     if not readout_s:
         return frames
-    steps = [_step(a, b) for a, b in pairwise(frames)]
-    out: Frames = []
-    for (t_s, frame), before, after in zip(frames[1:-1], steps[:-1], steps[1:], strict=True):
+    inner = range(1, len(frames) - 1)
+    return [
+        (t_s, replace(frame, uv_px=frame.uv_px + readout_s * moved))
+        for (t_s, frame), moved in zip(frames[1:-1], by_readout(frames, inner, resolution, axis), strict=True)
+    ]
+
+
+def by_readout(
+    frames: Frames, which: Sequence[int], resolution: tuple[int, int], axis: str
+) -> list[FloatArray]:
+    """How `at_middle_row` moves the corners of some of the frames, by the readout, px/s, shapes (n, 2).
+
+    Args:
+        frames: (stamp in s, points), in order.
+        which: Their places; not the first nor the last.
+        resolution: width, height, px.
+        axis: See `read_share`.
+    """
+    steps = {k: _step(frames[k - 1], frames[k]) for k in {m for at in which for m in (at, at + 1)}}
+    out = []
+    for k in which:
+        frame = frames[k][1]
         speed = np.zeros((len(frame.ids), 2))
         count = np.zeros(len(frame.ids))
-        for ids, px_per_s in (before, after):
+        for ids, px_per_s in (steps[k], steps[k + 1]):
             _, mine, theirs = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)
             speed[mine] += px_per_s[theirs]
             count[mine] += 1.0
-        late_s = readout_s * read_share(frame.uv_px, resolution, axis)
-        uv = frame.uv_px - late_s[:, None] * speed / np.maximum(count, 1.0)[:, None]
-        out.append((t_s, PointsFrame(frame.camera, frame.t_cam_ns, frame.ids, uv, frame.sigma_px)))
+        share = read_share(frame.uv_px, resolution, axis)
+        out.append(-share[:, None] * speed / np.maximum(count, 1.0)[:, None])
     return out
 
 

@@ -123,16 +123,8 @@ def _cleaned(views: dict[int, tuple[FloatArray, FloatArray]], k: int, pose: Plan
 
 
 def recent_poses(
-    frames: Sequence[tuple[float, PointsFrame]], lens: Lens, target: FloatArray, since_s: float = -np.inf
+    frames: Sequence[tuple[float, PointsFrame]], lens: Lens, target: FloatArray
 ) -> list[TargetPose]:
-    """Poses of at most 160 of the frames since a stamp, evenly thinned, in order of time.
-
-    Args:
-        frames: Stamps, s, and points, in order.
-        lens: In use.
-        target: Points of the target, m, shape (n, 3).
-        since_s: Older frames are left out, s.
-    """
-    recent = [item for item in frames if item[0] > since_s]
-    step = max(1, -(-len(recent) // _MOST_POSES))
-    return [p for p in poses_of(recent[::-1][::step][::-1], lens, target) if p is not None]
+    """Poses of at most 160 of the frames (stamp in s, points), evenly thinned, in order of time."""
+    step = max(1, -(-len(frames) // _MOST_POSES))
+    return [p for p in poses_of(frames[::-1][::step][::-1], lens, target) if p is not None]

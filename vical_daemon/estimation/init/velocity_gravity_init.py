@@ -36,6 +36,8 @@ class StartResult:
         poses: Of all images used, by camera and in order.
         size: True size of the target over the stated one, where it seems to be by far another; None: it may
             be as in its file.
+        rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
+            the other (`ROWS`, `COLUMNS`); None: there is none.
     """
 
     state: State | None
@@ -45,6 +47,7 @@ class StartResult:
     turn_axis_cam: FloatArray | None = None
     poses: list[TargetPose] = field(default_factory=list)
     size: float | None = None
+    rolling: tuple[str, str] | None = None
 
 
 def motion_start(

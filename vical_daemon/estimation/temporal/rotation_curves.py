@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.inertial.imu_model import cross
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -66,7 +67,7 @@ def cumulative_product(steps: FloatArray) -> FloatArray:
 def _turn(rate: FloatArray, slope: FloatArray, s: FloatArray) -> FloatArray:
     """Rotation vector of a rate that changes linearly over s seconds, with the coning term (third order)."""
     s = s[..., None]
-    out: FloatArray = s * (rate + 0.5 * s * slope) + (s**3 / 12.0) * np.cross(rate, slope)
+    out: FloatArray = s * (rate + 0.5 * s * slope) + (s**3 / 12.0) * cross(rate, slope)
     return out
 
 
