@@ -24,7 +24,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_links
-from vical_daemon.estimation.model.rates import Rates, rates_after
+from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
@@ -37,7 +37,7 @@ _DONE = 0.1  # a step that promises less than this of the sum of squares is the 
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
 _RELINK_S = 3e-4  # of change of the time shift: links are integrated between the new instants
-_RATE_S = 0.03  # of readings before an instant: they show its angular acceleration
+_RATE_S = 0.02  # of readings on both sides of an instant: they show its angular acceleration
 
 Frames = list[tuple[float, PointsFrame]]
 
@@ -115,6 +115,7 @@ class BoardWindow:
         self._information = root.T @ root
         self.offset = np.zeros(len(root))
         self.sigma_px = {name: noise.sigma_px for name, noise in prior.corner_noise.items()}
+        self._measured = (np.zeros((0, 3)),) * 3  # rate, specific force, derivative of the rate
 
     @classmethod
     def begin(
@@ -140,6 +141,7 @@ class BoardWindow:
         last, link = nodes[-2].at, links[-1]
         nodes[-1].at = nodes[-1].at._replace(v=last.v + link.dt_s * g + last.R @ link.dv)
         out = cls(replace(state), nodes, links, prior, buffer, target)
+        out._read()
         out._find_rates()
         return out
 
@@ -160,13 +162,13 @@ class BoardWindow:
                 continue
             dx = cho_solve((root, True), g, check_finite=False)
             cost = self._cost(now)
-            before = self.state, self.offset, [n.at for n in self.nodes], self._links
+            before = self.state, self.offset, [n.at for n in self.nodes], self._links, self._measured
             self._move(dx)
             if self._stale() and not self._relink():
                 return False
             trial = self.present()
             if trial is None or not self._cost(trial) < cost + _DONE:
-                self.state, self.offset, motion, self._links = before
+                self.state, self.offset, motion, self._links, self._measured = before
                 for node, at in zip(self.nodes, motion, strict=True):
                     node.at = at
                 self._find_rates()
@@ -202,12 +204,22 @@ class BoardWindow:
         known = self.state.cameras[camera]
         return known.timeshift_s + known.skew * (t_s - self.nodes[0].at.t_s)
 
+    def _read(self) -> None:
+        """Take what the imu measures at the instants from the readings."""
+        t_s = np.array([n.at.t_s for n in self.nodes])
+        found = self._buffer.intervals(t_s)
+        assert found is not None  # links have been made over the same
+        segment, begin = found
+        at = np.append(begin, len(segment.t_s) - 1)
+        self._measured = segment.gyro[at], segment.accel[at], self._buffer.turning(t_s, _RATE_S)[1]
+
     def _find_rates(self) -> None:
-        for node in self.nodes:
-            t_s = node.at.t_s
-            segment = self._buffer.segment(max(t_s - _RATE_S, self._buffer.oldest_s), t_s)
-            if segment is not None:
-                node.rates = rates_after(self.at(node, node.frames[0][1].camera), segment, node.rates)
+        s = self.state
+        omega = (self._measured[0] - s.gyro_bias) @ s.gyro_matrix.T
+        force = (self._measured[1] - s.accel_bias) @ s.accel_matrix.T
+        alpha = self._measured[2] @ s.gyro_matrix.T
+        for node, *rates in zip(self.nodes, omega, force, alpha, strict=True):
+            node.rates = Rates(rates[0], node.at.R @ rates[1] + s.gravity, rates[2])
 
     def _stale(self) -> bool:
         """Whether time shifts have left the instants for which links hold."""
@@ -228,6 +240,7 @@ class BoardWindow:
         if links is None:
             return False
         self._links = PreintegratedLinks.stack(links)
+        self._read()
         self._find_rates()
         return True
 
@@ -288,25 +301,28 @@ class BoardWindow:
 
     def normal(self, now: Present) -> tuple[FloatArray, FloatArray]:
         """Normal matrix and right side of the step."""
-        c, F = len(self.offset), len(self.nodes)
-        n = 9 * F + c
+        F = 9 * len(self.nodes)
+        n = F + len(self.offset)
         H, g = np.zeros((n, n)), np.zeros(n)
-        constants = np.arange(9 * F, n)
 
-        def add(J: FloatArray, r: FloatArray, at: IntArray) -> None:
-            H[at[:, None], at] += J.T @ J
-            g[at] += J.T @ r
+        def add(A: FloatArray, b: FloatArray, first: int) -> None:
+            own = slice(first, first + len(A) - n + F)
+            k = own.stop - own.start
+            H[own, own] += A[:k, :k]
+            H[own, F:] += A[:k, k:]
+            H[F:, own] += A[k:, :k]
+            H[F:, F:] += A[k:, k:]
+            g[own] += b[:k]
+            g[F:] += b[k:]
 
         for view in now.views:
             W, r = self.whitened(view)
-            at = self.places(view.node)
-            H[at[:, None], at] += view.by_error.T @ (W.T @ W) @ view.by_error
-            g[at] += view.by_error.T @ (W.T @ r)
+            add(view.by_error.T @ (W.T @ W) @ view.by_error, view.by_error.T @ (W.T @ r), 9 * view.node)
         for k, (e, by_motion, by_constants) in enumerate(zip(*now.linked, strict=True)):
-            at = np.concatenate([np.arange(9 * k, 9 * k + 18), constants])
-            add(np.concatenate([by_motion, by_constants], axis=1), -e, at)
-        H[9 * F :, 9 * F :] += self._information
-        g[9 * F :] -= self._information @ self.offset
+            J = np.concatenate([by_motion, by_constants], axis=1)
+            add(J.T @ J, -J.T @ e, 9 * k)
+        H[F:, F:] += self._information
+        g[F:] -= self._information @ self.offset
         return H, g
 
     def places(self, node: int) -> IntArray:

@@ -8,14 +8,18 @@ that follow are nearly a parabola of it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vical_daemon.estimation.init.intrinsics_start import LensFit, along, fit_lens, spread
-from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row, by_readout
+from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row, corner_speeds
 from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray
+from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
+_AXES = (ROWS, COLUMNS)
 _ROUNDS = 3
 _SHORT_S = 0.004
 _BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 76 (EuRoC, 4 s from 55 s on)
@@ -35,7 +39,7 @@ def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> f
         fit = lens_fit(frames, lens, target, found_s)
         if fit is None:
             return given_s
-        slope, bend = _parabola(frames, lens, target, fit, lens.readout_axis)
+        [(slope, bend)] = _parabolas(frames, lens, target, fit, [lens.readout_axis])
         gain = slope**2 / bend
         if found_s == given_s and not gain > SURE_SIGMAS**2 * (fit.squares - gain) / fit.numbers:
             return given_s
@@ -51,8 +55,8 @@ def likely_axis(frames: Frames, lens: Lens, target: FloatArray) -> str:
     fit = lens_fit(frames, lens, target)
     if fit is None:
         return ROWS
-    parabolas = {axis: _parabola(frames, lens, target, fit, axis) for axis in (ROWS, COLUMNS)}
-    return max(parabolas, key=lambda axis: parabolas[axis][0] ** 2 / parabolas[axis][1])
+    gains = [slope**2 / bend for slope, bend in _parabolas(frames, lens, target, fit, _AXES)]
+    return _AXES[int(np.argmax(gains))]
 
 
 def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) -> str:
@@ -61,13 +65,13 @@ def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) 
     Returns `ROWS`, `COLUMNS`, or empty: no rolling shutter shows. It does where the readout is longer than
     2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as for `readout`; `fit`: of them.
     """
-    gains = {}
-    for axis in (ROWS, COLUMNS):
-        slope, bend = _parabola(frames, lens, target, fit, axis)
-        gains[axis] = 2.0 * abs(slope) * _SHORT_S - bend * _SHORT_S**2
-    axis = max(gains, key=lambda name: gains[name])
-    surely = gains[axis] > _BEYOND_DOUBT * (fit.squares - gains[axis]) / fit.numbers
-    return axis if surely else ""
+    gains = [
+        2.0 * abs(slope) * _SHORT_S - bend * _SHORT_S**2
+        for slope, bend in _parabolas(frames, lens, target, fit, _AXES)
+    ]
+    gain = max(gains)
+    surely = gain > _BEYOND_DOUBT * (fit.squares - gain) / fit.numbers
+    return _AXES[gains.index(gain)] if surely else ""
 
 
 def lens_fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
@@ -84,12 +88,18 @@ def lens_fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 
     return fit._replace(which=[chosen[k] + 1 for k in fit.which])
 
 
-def _parabola(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit, axis: str) -> tuple[float, float]:
+def _parabolas(
+    frames: Frames, lens: Lens, target: FloatArray, fit: LensFit, axes: Sequence[str]
+) -> list[tuple[float, float]]:
     """Half the first and second derivative of the squared residuals by the readout, px^2/s and px^2/s^2."""
-    whole = by_readout(frames, fit.which, lens.resolution, axis)
-    moves = [
-        moved[np.isin(frames[k][1].ids, view.ids)]
-        for k, view, moved in zip(fit.which, fit.views, whole, strict=True)
+    own = [
+        (frames[k][1].uv_px[kept], speed[kept])
+        for k, view, speed in zip(fit.which, fit.views, corner_speeds(frames, fit.which), strict=True)
+        for kept in [np.isin(frames[k][1].ids, view.ids)]
     ]
-    slope, bend = along(fit, lens, target, moves)
-    return slope, max(bend, 1.0)  # without any motion a second of readout moves nothing
+    out = []
+    for axis in axes:
+        moves = [-read_share(uv_px, lens.resolution, axis)[:, None] * speed for uv_px, speed in own]
+        slope, bend = along(fit, lens, target, moves)
+        out.append((slope, max(bend, 1.0)))  # without any motion a second of readout moves nothing
+    return out

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from vical_daemon.estimation.measurements import ROWS, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import ROWS, FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import read_share
 
 Frames = list[tuple[float, PointsFrame]]
@@ -35,45 +35,46 @@ def at_middle_row(frames: Frames, readout_s: float, resolution: tuple[int, int],
     """
     if not readout_s:
         return frames
-    inner = range(1, len(frames) - 1)
+    speeds = corner_speeds(frames, range(1, len(frames) - 1))
     return [
-        (t_s, replace(frame, uv_px=frame.uv_px + readout_s * moved))
-        for (t_s, frame), moved in zip(frames[1:-1], by_readout(frames, inner, resolution, axis), strict=True)
+        (t_s, replace(frame, uv_px=frame.uv_px - readout_s * share[:, None] * speed))
+        for (t_s, frame), speed in zip(frames[1:-1], speeds, strict=True)
+        for share in [read_share(frame.uv_px, resolution, axis)]
     ]
 
 
-def by_readout(
-    frames: Frames, which: Sequence[int], resolution: tuple[int, int], axis: str
-) -> list[FloatArray]:
-    """How `at_middle_row` moves the corners of some of the frames, by the readout, px/s, shapes (n, 2).
+def corner_speeds(frames: Frames, which: Sequence[int]) -> list[FloatArray]:
+    """How fast the corners of some of the frames move, px/s, shapes (n, 2); zero where nothing shows it.
 
     Args:
         frames: (stamp in s, points), in order.
         which: Their places; not the first nor the last.
-        resolution: width, height, px.
-        axis: See `read_share`.
     """
     steps = {k: _step(frames[k - 1], frames[k]) for k in {m for at in which for m in (at, at + 1)}}
     out = []
     for k in which:
-        frame = frames[k][1]
-        speed = np.zeros((len(frame.ids), 2))
-        count = np.zeros(len(frame.ids))
-        for ids, px_per_s in (steps[k], steps[k + 1]):
-            _, mine, theirs = np.intersect1d(frame.ids, ids, assume_unique=True, return_indices=True)
-            speed[mine] += px_per_s[theirs]
+        speed = np.zeros((len(frames[k][1].ids), 2))
+        count = np.zeros(len(speed))
+        before, after = steps[k], steps[k + 1]
+        for mine, px_per_s in ((before.second, before.px_per_s), (after.first, after.px_per_s)):
+            speed[mine] += px_per_s
             count[mine] += 1.0
-        share = read_share(frame.uv_px, resolution, axis)
-        out.append(-share[:, None] * speed / np.maximum(count, 1.0)[:, None])
+        out.append(speed / np.maximum(count, 1.0)[:, None])
     return out
 
 
-def _step(
-    a: tuple[float, PointsFrame], b: tuple[float, PointsFrame]
-) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    """Which corners both images show, and how fast they move, px/s."""
+class _Step(NamedTuple):
+    """Corners that two images show: their places in each, shapes (n,), and how fast they move, px/s (n, 2)."""
+
+    first: IntArray
+    second: IntArray
+    px_per_s: FloatArray
+
+
+def _step(a: tuple[float, PointsFrame], b: tuple[float, PointsFrame]) -> _Step:
     dt_s = b[0] - a[0]
     if not 0.0 < dt_s < _MAX_STEP_S:
-        return np.zeros(0, np.int64), np.zeros((0, 2))
-    ids, first, second = np.intersect1d(a[1].ids, b[1].ids, assume_unique=True, return_indices=True)
-    return ids, (b[1].uv_px[second] - a[1].uv_px[first]) / dt_s
+        none = np.zeros(0, np.intp)
+        return _Step(none, none, np.zeros((0, 2)))
+    _, first, second = np.intersect1d(a[1].ids, b[1].ids, assume_unique=True, return_indices=True)
+    return _Step(first, second, (b[1].uv_px[second] - a[1].uv_px[first]) / dt_s)
