@@ -18,6 +18,8 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
+_SHORT = 64  # rotation steps up to which one after the other is quickest
+
 
 class Motion(NamedTuple):
     """Attitude, position and velocity of the imu in the world, a batch of S; and the two rates at the end.
@@ -106,14 +108,25 @@ def strapdown(
 
 def products(steps: FloatArray) -> FloatArray:
     """Products of the first 0, 1, 2, ... rotation steps; shape (S, K, 3, 3) -> (S, K + 1, 3, 3)."""
-    dR = np.empty((len(steps), steps.shape[1] + 1, 3, 3))
+    S, K = steps.shape[:2]
+    dR = np.empty((S, K + 1, 3, 3))
     dR[:, 0] = so3.IDENTITY
-    if len(steps) == 1:  # of two matrices, dot takes half as long as matmul
-        for k, step in enumerate(steps[0]):
-            np.dot(dR[0, k], step, out=dR[0, k + 1])
+    if K > _SHORT:  # pieces of sqrt(K) steps at once, then each from where the one before has ended
+        k = int(np.sqrt(K))
+        m = -(-K // k)
+        pieces = np.empty((S, m * k, 3, 3))
+        pieces[:, :K], pieces[:, K:] = steps, so3.IDENTITY
+        pieces = np.ascontiguousarray(np.swapaxes(pieces.reshape(S, m, k, 3, 3), 1, 2))
+        for step in range(1, k):
+            np.matmul(pieces[:, step - 1], pieces[:, step], out=pieces[:, step])
+        begin = products(pieces[:, -1])[:, :-1]
+        dR[:, 1:] = np.swapaxes(begin[:, None] @ pieces, 1, 2).reshape(S, m * k, 3, 3)[:, :K]
+    elif S == 1:  # of two matrices, dot takes half as long as matmul
+        for at, step in enumerate(steps[0]):
+            np.dot(dR[0, at], step, out=dR[0, at + 1])
     else:
-        for k in range(steps.shape[1]):
-            np.matmul(dR[:, k], steps[:, k], out=dR[:, k + 1])
+        for at in range(K):
+            np.matmul(dR[:, at], steps[:, at], out=dR[:, at + 1])
     return dR
 
 

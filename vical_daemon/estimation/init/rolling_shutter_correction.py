@@ -64,7 +64,7 @@ def corner_speeds(frames: Frames, which: Sequence[int]) -> list[FloatArray]:
 
 
 class _Step(NamedTuple):
-    """Corners that two images show: their places in each, shapes (n,), and how fast they move, px/s (n, 2)."""
+    """Corners that two images show: their places in each, shapes (n,), and their speed, px/s, (n, 2)."""
 
     first: IntArray
     second: IntArray

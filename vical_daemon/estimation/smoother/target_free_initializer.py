@@ -25,6 +25,7 @@ from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError,
 from vical_daemon.estimation.smoother.window import Window
 from vical_daemon.estimation.temporal.camera_orientations import Orientations as CameraOrientations
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
+from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 from vical_daemon.estimation.temporal.td_icp import td_icp
@@ -51,6 +52,7 @@ _MIN_TRACKS = 12
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _FULL_FITS = 2
 _ROUGH_STEPS = 8
+_ROUGH_ROWS, _FULL_ROWS = 4000, 12000  # features in pairs of images: more of the same images add little
 _APART_RAD = float(np.deg2rad(2.0))
 _MAX_HOLE_S = 0.5
 _STILL_PX = 1.0  # median travel of a feature over half a second
@@ -200,12 +202,16 @@ class TargetFreeInitializer:
         lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
         free_lens = known is None and "intrinsics" not in self.options.fix
         if free_lens and len(seeds) > _FULL_FITS:  # look around with the lens as given: three times quicker
-            rough = [epipolar_fit(t, gyro, frames, lens, R, s, most=_ROUGH_STEPS) for R, s in seeds]
+            every = _every(frames, _ROUGH_ROWS)
+            rough = [
+                epipolar_fit(t, gyro, frames, lens, R, s, most=_ROUGH_STEPS, every=every) for R, s in seeds
+            ]
             seeds = _best_apart([f for f in rough if f is not None])
-        fits = [epipolar_fit(t, gyro, frames, lens, R, s, fit_lens=free_lens) for R, s in seeds]
+        every = _every(frames, _FULL_ROWS)
+        fits = [epipolar_fit(t, gyro, frames, lens, R, s, fit_lens=free_lens, every=every) for R, s in seeds]
         good = [f for f in fits if f is not None]
         if free_lens and not good:  # turns about one axis may not show it; the window estimates it later
-            fits = [epipolar_fit(t, gyro, frames, lens, R, s) for R, s in seeds]
+            fits = [epipolar_fit(t, gyro, frames, lens, R, s, every=every) for R, s in seeds]
             good = [f for f in fits if f is not None]
         if not good:
             return (
@@ -340,6 +346,11 @@ def _chained(t_cam_s: FloatArray, chain: CameraOrientations) -> Orientations:
     """Orientations strung together: their errors add up from the first on."""
     walked = np.cumsum(np.trace(chain.covariance, axis1=1, axis2=2) / 3.0)
     return Orientations(t_cam_s, chain.R_world_cam, np.sqrt(walked))
+
+
+def _every(frames: Frames, most: int) -> int:
+    """In which images pairs are to begin, so that there are at most so many features in pairs."""
+    return max(1, math.ceil(len(LAGS_S) * sum(len(f.ids) for _, f in frames) / most))
 
 
 def _misfit(fit: EpipolarFit) -> float:

@@ -92,6 +92,7 @@ def epipolar_fit(
     fit_lens: bool = False,
     max_step_s: float = 0.02,
     most: int = _ITERATIONS,
+    every: int = 1,
     gyro_density: float | None = None,
 ) -> EpipolarFit | None:
     """Fit mounting, delay, gyro bias (and the focal length) to tracks.
@@ -106,6 +107,7 @@ def epipolar_fit(
         fit_lens: Fit the lens too, within what a rough lens may be off by.
         max_step_s: Largest change of the delay in one iteration, s.
         most: Iterations.
+        every: See `make_pairs`.
         gyro_density: Of the gyro's noise, rad/s/sqrt(Hz); where given, what is known of errors that persist
             along tracks goes into `covariance` and `stretches`.
 
@@ -113,7 +115,7 @@ def epipolar_fit(
         The fit; None where the tracks do not allow one. Sigmas are empirical (sandwich over half-second
         blocks), so slow errors of the tracker count.
     """
-    pairs = make_pairs(frames)
+    pairs = make_pairs(frames, every=every)
     if pairs is None:
         return None
     fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens, max_step_s)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
 
-_LAGS_S = (0.1, 0.25, 0.5)
+LAGS_S = (0.1, 0.25, 0.5)
 _MIN_SHARED = 12
 
 
@@ -34,7 +34,7 @@ class Pairs:
 
 
 def make_pairs(
-    frames: list[tuple[float, PointsFrame]], lags_s: tuple[float, ...] = _LAGS_S, every: int = 1
+    frames: list[tuple[float, PointsFrame]], lags_s: tuple[float, ...] = LAGS_S, every: int = 1
 ) -> Pairs | None:
     """Pair images a tenth, a quarter and half a second apart; None where too few share features.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.inertial.imu_model import rotation_steps
+from vical_daemon.estimation.inertial.imu_model import products, rotation_steps
 from vical_daemon.estimation.measurements import FloatArray
 
 
@@ -21,12 +21,7 @@ class Attitudes:
     def __init__(self, t_s: FloatArray, gyro: FloatArray, bias: FloatArray) -> None:
         self.t_s = t_s
         self.rate = gyro - bias
-        steps = rotation_steps(self.rate[None], np.diff(t_s))[0]
-        R = np.empty((len(t_s), 3, 3))
-        R[0] = np.eye(3)
-        for k in range(len(steps)):
-            np.matmul(R[k], steps[k], out=R[k + 1])
-        self.R = R
+        self.R = R = products(rotation_steps(self.rate[None], np.diff(t_s)))[0]
         middle = R[:-1] @ so3.exp(0.25 * (self.rate[:-1] + self.rate[1:]) * np.diff(t_s)[:, None])
         self.area = np.zeros((len(t_s), 3, 3))
         np.cumsum(middle * np.diff(t_s)[:, None, None], axis=0, out=self.area[1:])
