@@ -397,7 +397,7 @@ class TargetFreeCalibrator:
         """After a partial start, the rig turns about a second axis: all of the calibration will show."""
         self.window = self.carry = self.latest = None
         self._closed = 0
-        self.initializer.again()
+        self.initializer.attempts.anew()
         self.evaluator.lost(Cause.SECOND_AXIS, None, None)
 
     def _lost(
@@ -425,7 +425,7 @@ class TargetFreeCalibrator:
         if unproven:  # one window stands against one: neither is known to be right
             self.latest, self._closed, self._confirmed = None, 0, False
         self.carry = None
-        self.initializer.again()
+        self.initializer.attempts.anew()
         self.evaluator.lost(why, value, self.latest, against_s)
 
     @property
@@ -444,7 +444,7 @@ class TargetFreeCalibrator:
             camera, offset_s = self.latest.camera, self._intake.offset_s(self.camera)
             self.latest.camera = replace(camera, timeshift_s=camera.timeshift_s + offset_s)
         self._anew = self.latest is not None
-        self.initializer.again()
+        self.initializer.attempts.anew()
         self.evaluator.next_recording()
         self._stepped_s = abs(self._intake.imu_stepped_s)
         self._intake.next_recording()

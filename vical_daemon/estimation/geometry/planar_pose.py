@@ -29,7 +29,6 @@ _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4
 _HOPELESS_CHI2 = 100.0
 _TOGETHER = 64  # views in one batch: beyond, arrays leave the cache, and nothing is gained
-_NO_SPREAD = 1e-24  # variance of normalised coordinates: all points in one place
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +169,8 @@ def _homographies(v: _Views) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     mean = v.xy.sum(axis=2) / n[:, None]
     spread = (v.xy - mean[..., None]) * v.seen[:, None]
     variance = np.einsum("min,min->m", spread, spread) / n
-    s_xy = np.sqrt(2.0 / np.maximum(variance, _NO_SPREAD))
+    apart = variance >= 1e-24  # else all points are in one place
+    s_xy = np.sqrt(2.0 / np.where(apart, variance, 1.0))
     P = np.concatenate((v.plane * s_plane[:, None, None], v.seen[:, None]), axis=1)
     u = spread * s_xy[:, None, None]
     # rows [P 0 -x P], [0 P -y P]: the normal matrix is four 3x3 blocks of weighted P'P
@@ -184,7 +184,7 @@ def _homographies(v: _Views) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     H[:, :, :2] *= s_plane[:, None, None]
     H[:, :2] /= s_xy[:, None, None]
     H[:, :2] += mean[:, :, None] * H[:, 2:]
-    found = (variance >= _NO_SPREAD) & (np.abs(H[:, 2, 2]) >= 1e-12)
+    found = apart & (np.abs(H[:, 2, 2]) >= 1e-12)
     return H / np.where(found, H[:, 2, 2], 1.0)[:, None, None], found
 
 

@@ -14,11 +14,12 @@ import numpy as np
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD, Alignment, align, align_at
 from vical_daemon.estimation.init.accel_evidence import CameraPath
+from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
 from vical_daemon.estimation.init.target_poses import Lens, TargetPose, recent_poses
-from vical_daemon.estimation.init.velocity_gravity_init import StartResult, motion_start
+from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
@@ -63,15 +64,6 @@ class Seen(NamedTuple):
     poses: list[TargetPose]
 
 
-@dataclass(frozen=True, slots=True)
-class _Rough:
-    """One camera before its lever arm is known."""
-
-    camera: CameraState
-    poses: list[TargetPose]
-    gyro_bias_rps: FloatArray
-
-
 def attempt(data: StartData, *, may_be_partial: bool) -> StartResult:
     """Try to start with everything known; where motion is missing, with guesses if these are welcome.
 
@@ -92,7 +84,7 @@ def attempt(data: StartData, *, may_be_partial: bool) -> StartResult:
 
 def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
     """A start with everything known, or the reason why not."""
-    rough: dict[str, _Rough] = {}
+    rough: dict[str, RotationsKnown] = {}
     for name, (lens, _, poses) in seen.items():
         if len(poses) < _LEAST_POSES:
             return StartResult(
@@ -100,12 +92,17 @@ def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
             )
         found = _timing(data.buffer, poses, lens)
         long = poses[-1].t_cam_s - poses[0].t_cam_s > _PATIENCE_S
-        why = found.reason or _not_sure_yet(found, (2.0 if long else 1.0) * _SHIFT_SIGMA_S)
+        why = found.reason or not_sure_yet(
+            found.timeshift_sigma_s,
+            float(np.max(found.rotation_sigma_rad)),
+            (2.0 if long else 1.0) * _SHIFT_SIGMA_S,
+            ROTATION_SIGMA_RAD,
+        )
         if why:
             return StartResult(None, f"{name}: {why}", motion_missing=True)
         camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_cam_imu_s)
-        rough[name] = _Rough(camera, poses, found.gyro_bias_rps)
-    return _with_motion(data, rough)
+        rough[name] = RotationsKnown(camera, poses, found.gyro_bias_rps)
+    return motion_start(data.buffer, rough, data.options, may_resize=data.may_resize)
 
 
 def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult:
@@ -119,7 +116,7 @@ def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult
     Returns:
         A state that is a guess where the motion shows nothing, or the reason again.
     """
-    rough: dict[str, _Rough] = {}
+    rough: dict[str, RotationsKnown] = {}
     turn_axis_cam: FloatArray | None = None
     refused = StartResult(None, reason, motion_missing=True)
     for name, (lens, frames, _) in seen.items():
@@ -140,8 +137,8 @@ def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult
         if found is None or not found.trusted:
             return refused
         camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_s)
-        rough[name] = _Rough(camera, poses, found.gyro_bias_rps)
-    result = _with_motion(data, rough, partial=True, turn_axis_cam=turn_axis_cam)
+        rough[name] = RotationsKnown(camera, poses, found.gyro_bias_rps)
+    result = motion_start(data.buffer, rough, data.options, True, turn_axis_cam)
     return refused if result.state is None else replace(result, reason=reason)
 
 
@@ -157,25 +154,6 @@ def _steady(data: StartData, name: str, path: CameraPath) -> tuple[Alignment | N
         return None, None
     axes = still_axes(path.R_target_cam.mean(axis=0))
     return (align_at(path, rows, shift_s, axes[0]), axes[0]) if len(axes) == 1 else (None, None)
-
-
-def _with_motion(
-    data: StartData,
-    rough: dict[str, _Rough],
-    *,
-    partial: bool = False,
-    turn_axis_cam: FloatArray | None = None,
-) -> StartResult:
-    return motion_start(
-        data.buffer,
-        {name: r.poses for name, r in rough.items()},
-        {name: r.camera for name, r in rough.items()},
-        {name: r.gyro_bias_rps for name, r in rough.items()},
-        data.options,
-        partial=partial,
-        turn_axis_cam=turn_axis_cam,
-        may_resize=data.may_resize and not partial,
-    )
 
 
 def _seen(data: StartData, name: str) -> tuple[Seen, str]:
@@ -200,23 +178,10 @@ def _seen(data: StartData, name: str) -> tuple[Seen, str]:
 
 def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift_s: float) -> CameraState:
     """A camera whose lever arm is still to be found; what is held fixed is as it was given."""
-    prior, fix = data.priors[name], data.options.fix
-    p_imu_cam = np.zeros(3)
-    if "timeshift" in fix and prior.timeshift_cam_imu_s is not None:
-        shift_s = prior.timeshift_cam_imu_s
-    if "extrinsics" in fix and prior.T_imu_cam is not None:
-        R_imu_cam, p_imu_cam = prior.T_imu_cam[0].copy(), prior.T_imu_cam[1].copy()
-    return CameraState(
-        R_imu_cam,
-        p_imu_cam,
-        shift_s,
-        lens.intrinsics,
-        lens.distortion,
-        lens.model,
-        lens.resolution,
-        lens.readout_s,
-        readout_axis=lens.readout_axis,
-    )
+    camera = camera_by_rotations(data.priors[name], data.options.fix, R_imu_cam, shift_s)
+    camera.intrinsics, camera.distortion = lens.intrinsics, lens.distortion
+    camera.readout_s, camera.readout_axis = lens.readout_s, lens.readout_axis
+    return camera
 
 
 def _attitude_sigmas(poses: list[TargetPose], lens: Lens) -> FloatArray:
@@ -233,14 +198,3 @@ def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: Lens) -> TdIcpResu
         np.array([p.R_target_cam for p in poses]),
         _attitude_sigmas(poses, lens),
     )
-
-
-def _not_sure_yet(result: TdIcpResult, most_s: float) -> str:
-    """Why TD-ICP's answer does not do yet, with time shifts known to `most_s`; empty when it does."""
-    if result.timeshift_sigma_s > most_s:
-        known = 1e3 * result.timeshift_sigma_s
-        return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
-    if float(np.max(result.rotation_sigma_rad)) > ROTATION_SIGMA_RAD:
-        worst = np.rad2deg(float(np.max(result.rotation_sigma_rad)))
-        return f"mounting rotation known to {worst:.1f} deg so far: turn the rig about a second axis"
-    return ""

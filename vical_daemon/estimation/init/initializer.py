@@ -11,6 +11,7 @@ import numpy as np
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
+from vical_daemon.estimation.init.attempts import Attempts
 from vical_daemon.estimation.init.board_window import Frames
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rest import RestDetector
@@ -20,7 +21,6 @@ from vical_daemon.estimation.model.state import Layout, State
 
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
-_ATTEMPT_FIRST_S, _ATTEMPT_MOST_S = 0.5, 4.0
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
 
@@ -58,14 +58,14 @@ class Initializer:
 
     def __init__(self, options: CalibrationOptions, layout: Layout, target: FloatArray, step: Step) -> None:
         self._given, self._layout, self._target, self._step = options, layout, target, step
-        self._options = options
+        self._options, self._attempts = options, Attempts(first_s=0.5)
         self._frames: dict[str, Frames] = {name: [] for name in layout.cameras}
         self.anew()
 
     def anew(self) -> None:
         """Forget what was seen and try often again."""
-        self._next_s, self._every_s = -np.inf, _ATTEMPT_FIRST_S
-        self._tried = False
+        self._attempts.anew()
+        self._newest_s = -np.inf
         self._rest = {name: RestDetector() for name in self._frames}
         for frames in self._frames.values():
             frames.clear()
@@ -98,11 +98,8 @@ class Initializer:
 
     def due(self, newest_s: float) -> bool:
         """Whether it is time for another attempt; a rig at rest adds nothing to the last one."""
-        if newest_s < self._next_s or (self._tried and self._rests):
-            return False
-        self._next_s = newest_s + self._every_s
-        self._every_s = min(1.25 * self._every_s, _ATTEMPT_MOST_S)
-        return True
+        self._newest_s = newest_s
+        return self._attempts.due(newest_s) and not (self._attempts.count and self._rests)
 
     def attempt(
         self,
@@ -124,11 +121,11 @@ class Initializer:
         """
         spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
         if len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S:
-            self._every_s = _ATTEMPT_FIRST_S
             if self._rests:
                 return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
             return _none("collecting the first seconds: move the rig, keep the target in view")
-        self._tried = True
+        if self._attempts.due(self._newest_s):  # not again for another model of the rig
+            self._attempts.tried(self._newest_s)
         data = start.StartData(
             buffer, self._frames, priors, self._options, self._layout, self._target, may_resize
         )

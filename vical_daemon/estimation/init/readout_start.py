@@ -19,7 +19,6 @@ from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray
 from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
-_AXES = (ROWS, COLUMNS)
 _ROUNDS = 3
 _SHORT_S = 0.004
 _BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 76 (EuRoC, 4 s from 55 s on)
@@ -55,8 +54,8 @@ def likely_axis(frames: Frames, lens: Lens, target: FloatArray) -> str:
     fit = lens_fit(frames, lens, target)
     if fit is None:
         return ROWS
-    gains = [slope**2 / bend for slope, bend in _parabolas(frames, lens, target, fit, _AXES)]
-    return _AXES[int(np.argmax(gains))]
+    by_rows, by_columns = _parabolas(frames, lens, target, fit, (ROWS, COLUMNS))
+    return max((by_rows, ROWS), (by_columns, COLUMNS), key=lambda x: x[0][0] ** 2 / x[0][1])[1]
 
 
 def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) -> str:
@@ -65,13 +64,11 @@ def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) 
     Returns `ROWS`, `COLUMNS`, or empty: no rolling shutter shows. It does where the readout is longer than
     2 ms and the motion fast enough (hands: 5 to 8 ms). Arguments as for `readout`; `fit`: of them.
     """
-    gains = [
-        2.0 * abs(slope) * _SHORT_S - bend * _SHORT_S**2
-        for slope, bend in _parabolas(frames, lens, target, fit, _AXES)
-    ]
-    gain = max(gains)
+    parabolas = _parabolas(frames, lens, target, fit, (ROWS, COLUMNS))
+    gains = [2.0 * abs(slope) * _SHORT_S - bend * _SHORT_S**2 for slope, bend in parabolas]
+    gain, axis = max(zip(gains, (ROWS, COLUMNS), strict=True))
     surely = gain > _BEYOND_DOUBT * (fit.squares - gain) / fit.numbers
-    return _AXES[gains.index(gain)] if surely else ""
+    return axis if surely else ""
 
 
 def lens_fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:

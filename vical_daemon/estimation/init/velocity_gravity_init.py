@@ -50,11 +50,24 @@ class StartResult:
     rolling: tuple[str, str] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class RotationsKnown:
+    """One camera before its lever arm is known.
+
+    Attributes:
+        camera: Mounting and time shift are used, the lever arm will be set.
+        poses: In order.
+        gyro_bias_rps: As found with this camera, shape (3,).
+    """
+
+    camera: CameraState
+    poses: list[TargetPose]
+    gyro_bias_rps: FloatArray
+
+
 def motion_start(
     buffer: ImuBuffer,
-    seen: dict[str, list[TargetPose]],
-    cameras: dict[str, CameraState],
-    gyro_bias_rps: dict[str, FloatArray],
+    known: dict[str, RotationsKnown],
     options: CalibrationOptions,
     partial: bool = False,
     turn_axis_cam: FloatArray | None = None,
@@ -65,13 +78,11 @@ def motion_start(
 
     Args:
         buffer: Inertial readings.
-        seen: Poses by camera, in order.
-        cameras: By camera; mounting and time shift are used, lever arms are set.
-        gyro_bias_rps: As found with each camera, shape (3,).
+        known: By camera.
         options: Switches.
         partial: The motion need not show the lever arms; what it does not show is taken as zero.
         turn_axis_cam: Of a partial start of a rig that turns at one rate, see `StartResult`: it shows none.
-        may_resize: Another size of the target may be suggested.
+        may_resize: Another size of the target may be suggested; not from a partial start.
 
     Returns:
         The state, or the reason why not.
@@ -79,8 +90,9 @@ def motion_start(
     state: State | None = None
     size, still = 0.0, None
     used: list[TargetPose] = []
-    for name, poses in seen.items():
-        camera = cameras[name]
+    cameras = {name: x.camera for name, x in known.items()}
+    for name, x in known.items():
+        camera, poses, gyro_bias = x.camera, x.poses, x.gyro_bias_rps
         # Only the latest stretch: the double integral drifts, and what was long ago costs more than it gives.
         since = max(buffer.oldest_s, poses[-1].t_cam_s + camera.timeshift_s - _STRETCH_S)
         inside = [p for p in poses if since < p.t_cam_s + camera.timeshift_s < buffer.newest_s]
@@ -90,10 +102,10 @@ def motion_start(
         R, p, sigma, t = _poses_of_imu(inside, camera)
         axes: FloatArray | None = None
         if partial:
-            R, sigma = _smooth(buffer, t, R, gyro_bias_rps[name]), np.maximum(sigma, _DRIFT_M)
+            R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
             axes = still_axes(R.mean(axis=0)) if turn_axis_cam is None else np.eye(3)
-        motion = LinearMotion.between(buffer, t, R, gyro_bias_rps[name])
-        if motion is not None and may_resize:
+        motion = LinearMotion.between(buffer, t, R, gyro_bias)
+        if motion is not None and may_resize and not partial:
             other = _other_size(motion, p, sigma, options.gravity_mps2)
             if other is not None:
                 return StartResult(None, "", size=other)
@@ -106,7 +118,7 @@ def motion_start(
         if state is None:
             size = float(np.linalg.norm(linear.gravity))
             still = axes
-            state = _state_at(inside[0], camera, linear, gyro_bias_rps[name], cameras, options)
+            state = _state_at(inside[0], camera, linear, gyro_bias, cameras, options)
     if not 0.7 * options.gravity_mps2 < size < 1.3 * options.gravity_mps2:
         why = (
             f"gravity comes out as {size:.2f} m/s^2 instead of {options.gravity_mps2:.2f}: "

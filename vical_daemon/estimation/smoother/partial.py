@@ -14,7 +14,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError, TrackStart
-from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _STEP_RAD = float(np.deg2rad(15.0))
 _FINE_RAD = float(np.deg2rad(4.0))
@@ -31,7 +31,8 @@ def still_axis(t_s: FloatArray, gyro_rps: FloatArray, bias_rps: FloatArray) -> F
         gyro_rps: Rates, rad/s, shape (m, 3).
         bias_rps: Of the gyro, rad/s, shape (3,).
     """
-    axes = still_axes(Attitudes(t_s, gyro_rps, bias_rps).R.mean(axis=0))
+    curve = GyroCurve.integrate(t_s, gyro_rps, bias_rps)
+    axes = still_axes(so3.matrix_from_quat(curve.q_ref_imu).mean(axis=0))
     return axes[0] if len(axes) == 1 else None
 
 

@@ -13,6 +13,8 @@ from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.attempts import Attempts
+from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.held_lens import FixedLens
@@ -45,7 +47,6 @@ class _Found(NamedTuple):
 
 _SPAN_S, _LONG_SPAN_S = 5.0, 8.0
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
-_EVERY_S, _EVERY_MOST_S = 1.0, 4.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
 _MIN_TRACKS = 12
@@ -66,6 +67,7 @@ class TargetFreeInitializer:
         prior: What is known about the camera.
 
     Attributes:
+        attempts: When they are made.
         motion_missing: What the last attempt lacked was motion, not time.
         held: Axis of the imu along which the lever arm is not known and stays as it is, unit, shape (3,): the
             last start was a partial one. None: all of it shows.
@@ -75,12 +77,7 @@ class TargetFreeInitializer:
         self.options, self.prior = options, prior
         self.motion_missing = False
         self.held: FloatArray | None = None
-        self._next_s = -np.inf
-        self._every_s = _EVERY_S
-
-    def again(self) -> None:
-        """Start over: try soon."""
-        self._next_s, self._every_s = -np.inf, _EVERY_S
+        self.attempts = Attempts(first_s=1.0)
 
     def stretch(
         self, buffer: ImuBuffer, frames: Frames, end_s: float, known: MarginalPrior | None, *, last: bool
@@ -97,18 +94,17 @@ class TargetFreeInitializer:
         Returns:
             The images; why there are none; or None when it is not time to try.
         """
-        if end_s < self._next_s and not last:
+        if not (last or self.attempts.due(end_s)):
             return None
         shift = known.camera.timeshift_s if known else self.prior.timeshift_cam_imu_s or 0.0
-        span = _LONG_SPAN_S if self._every_s > 1.5 * _EVERY_S else _SPAN_S
+        span = _LONG_SPAN_S if self.attempts.count > 1 else _SPAN_S
         usable = _last_stretch(
             frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), span
         )
         if not usable or usable[-1][0] - usable[0][0] < (_LEAST_KNOWN_S if known else _LEAST_S) - 0.1:
             self.motion_missing = False
             return "collecting the first seconds: move the rig, keep textured things in view"
-        self._next_s = end_s + self._every_s
-        self._every_s = min(1.3 * self._every_s, _EVERY_MOST_S)
+        self.attempts.tried(end_s)
         self.motion_missing = True
         if _still(usable):
             return "the camera stands still: move the rig to and fro while turning it"
@@ -219,20 +215,17 @@ class TargetFreeInitializer:
             )
         best = min(good, key=_misfit)
         about = None
-        why = _not_sure_yet(best, mounting_known=given is not None)
+        worst = float(np.sqrt(np.max(np.diag(best.rotation_covariance))))
+        most = _ROTATION_SIGMA_RAD if given is None else np.inf
+        why = not_sure_yet(best.timeshift_sigma_s, worst, _SHIFT_SIGMA_S, most)
         if why and frames[-1][0] - frames[0][0] > PARTIAL_S:
             inside = (t > frames[0][0] + best.timeshift_s) & (t < frames[-1][0] + best.timeshift_s)
             about = _only_unsure_about(best, still_axis(t[inside], gyro[inside], best.gyro_bias))
         if why and about is None:
             return reason or why
-        camera.R_imu_cam, camera.timeshift_s = best.R_imu_cam, best.timeshift_s
+        camera = camera_by_rotations(prior, self.options.fix, best.R_imu_cam, best.timeshift_s)
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
-        sigma = WINDOW_START.lever_arm_m
-        if given is not None:
-            camera.R_imu_cam, camera.p_imu_cam = (x.copy() for x in given)
-            sigma = 1e-4
-        if prior.timeshift_cam_imu_s is not None and "timeshift" in self.options.fix:
-            camera.timeshift_s = prior.timeshift_cam_imu_s
+        sigma = WINDOW_START.lever_arm_m if given is None else 1e-4
         return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + NUMBERS)]), sigma, about)
 
     def _seeds(
@@ -255,7 +248,8 @@ class TargetFreeInitializer:
         if not chains:
             return seeds, ""
         chain = max(chains, key=lambda c: len(c.t_cam_ns))
-        t_cam = np.array([s for s, f in frames if f.t_cam_ns in set(chain.t_cam_ns.tolist())])
+        chained = set(chain.t_cam_ns.tolist())
+        t_cam = np.array([s for s, f in frames if f.t_cam_ns in chained])
         if prior.T_imu_cam is not None:
             curve = GyroCurve.integrate(t, gyro, np.zeros(3))
             stepped = nearest_shift(curve, _chained(t_cam, chain), *seeds[0], SEARCHED_S)
@@ -272,22 +266,6 @@ class TargetFreeInitializer:
             tilt = np.deg2rad(20.0)
             seeds += [(R @ so3.exp(s * tilt * axis), shift) for axis in np.eye(3) for s in (-1.0, 1.0)]
         return seeds, ""
-
-
-def starting_camera(prior: CameraPrior) -> CameraState:
-    """Camera as given; a lens of 60 degrees across where nothing is."""
-    R, p = (np.eye(3), np.zeros(3)) if prior.T_imu_cam is None else prior.T_imu_cam
-    return CameraState(
-        np.array(R, np.float64),
-        np.array(p, np.float64),
-        prior.timeshift_cam_imu_s or 0.0,
-        prior.start_intrinsics(),
-        prior.coefficients(),
-        prior.distortion_model,
-        prior.resolution,
-        prior.readout_s,
-        readout_axis=prior.readout_axis,
-    )
 
 
 def with_next_term(prior: CameraPrior) -> CameraPrior:
@@ -375,18 +353,6 @@ def _only_unsure_about(fit: EpipolarFit, axis: FloatArray | None) -> FloatArray 
     across = np.eye(3) - np.outer(along, along)
     worst = np.sqrt(np.linalg.eigvalsh(across @ fit.rotation_covariance @ across)[-1])
     return axis if worst < _ROTATION_SIGMA_RAD else None
-
-
-def _not_sure_yet(fit: EpipolarFit, *, mounting_known: bool) -> str:
-    worst = float(np.sqrt(np.max(np.diag(fit.rotation_covariance))))
-    if worst > _ROTATION_SIGMA_RAD and not mounting_known:
-        return (
-            f"mounting rotation known to {np.rad2deg(worst):.1f} deg so far: turn the rig about a second axis"
-        )
-    if fit.timeshift_sigma_s > _SHIFT_SIGMA_S:
-        known = 1e3 * fit.timeshift_sigma_s
-        return f"time shift known to {known:.1f} ms so far: turn the rig faster, about changing axes"
-    return ""
 
 
 def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -> Frames:

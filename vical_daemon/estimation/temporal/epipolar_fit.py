@@ -29,7 +29,7 @@ from vical_daemon.estimation.temporal.epipolar_errors import (
     track_noise,
 )
 from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
-from vical_daemon.estimation.temporal.gyro_attitudes import Attitudes
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _ITERATIONS = 18
 # What a lens may be off by: focal length and its ratio (relative), centre (of the focal length), distortion.
@@ -253,7 +253,7 @@ class _Fit:
         """Normalised errors (n,), derivatives by the k shared unknowns (n, k) and by t (n, 2)."""
         p = self.pairs
         t = self.t_cam + shift
-        curve = Attitudes(self.t_imu, self.gyro, bias)
+        curve = GyroCurve.integrate(self.t_imu, self.gyro, bias)
         inside = (t > self.t_imu[0]) & (t < self.t_imu[-1])
         if inside.mean() < 0.7:
             return None
