@@ -72,17 +72,14 @@ def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) 
 
 
 def lens_fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
-    """A lens and poses adjusted to spread-out images whose rows are read like that; None: too few.
-
-    Always without the first and the last, of which `at_middle_row` does not know how corners move.
-    """
-    found = at_middle_row(frames, readout_s, lens.resolution, lens.readout_axis)
-    views = [frame for _, frame in (found if readout_s else frames[1:-1])]
+    """A lens and poses adjusted to spread-out images whose rows are read like that; None: too few."""
+    views = [frame for _, frame in at_middle_row(frames, readout_s, lens.resolution, lens.readout_axis)]
+    left_out = 1 if readout_s else 0  # at either end
     chosen = spread(views, lens)
     fit = fit_lens([views[k] for k in chosen], lens, target)
     if fit is None or not np.isfinite(fit.rms_px):
         return None
-    return fit._replace(which=[chosen[k] + 1 for k in fit.which])
+    return fit._replace(which=[chosen[k] + left_out for k in fit.which])
 
 
 def _parabolas(

@@ -48,13 +48,17 @@ def corner_speeds(frames: Frames, which: Sequence[int]) -> list[FloatArray]:
 
     Args:
         frames: (stamp in s, points), in order.
-        which: Their places; not the first nor the last.
+        which: Their places. Of the first and the last, only half the motion is known, and none is taken.
     """
-    steps = {k: _step(frames[k - 1], frames[k]) for k in {m for at in which for m in (at, at + 1)}}
+    inner = {k for k in which if 0 < k < len(frames) - 1}
+    steps = {k: _step(frames[k - 1], frames[k]) for k in inner | {k + 1 for k in inner}}
     out = []
     for k in which:
         speed = np.zeros((len(frames[k][1].ids), 2))
         count = np.zeros(len(speed))
+        if k not in inner:
+            out.append(speed)
+            continue
         before, after = steps[k], steps[k + 1]
         for mine, px_per_s in ((before.second, before.px_per_s), (after.first, after.px_per_s)):
             speed[mine] += px_per_s

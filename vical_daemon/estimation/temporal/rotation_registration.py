@@ -77,7 +77,7 @@ def closest_points(
 def closest_point_registration(
     curve: RotationCurve, t_cam_s: FloatArray, q_world_cam: FloatArray, start: Start
 ) -> Registration:
-    """Iterate pairing and registering until the shift rests (0.1 ms) and the mounting does (1 mrad).
+    """Iterate pairing and registering until the shift rests (1 us) and the rotations do (1e-6 rad).
 
     Closest points pull the shift towards whatever makes residuals small, so its last digits are biased: the
     final polish of `td_icp` drops the pairs. This phase is for its width: it walks in from 100 ms off.
@@ -104,7 +104,7 @@ def closest_point_registration(
         q_imu_cam = so3.quat_multiply(q_imu_cam, so3.quat_from_rotvec(turn))
         q_world_ref = so3.quat_multiply(so3.quat_from_rotvec(d_world), q_world_ref)
         window = max(0.5 * window, 0.005)
-        done = abs(step) < 1e-4 and float(np.abs(turn).max()) < 1e-3
+        done = abs(step) < 1e-6 and float(np.abs(turn).max()) < 1e-6
     return Registration(
         shift, so3.matrix_from_quat(q_imu_cam), so3.matrix_from_quat(q_world_ref), bias, weight, rounds
     )
