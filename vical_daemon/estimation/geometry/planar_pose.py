@@ -70,14 +70,14 @@ class _Views(NamedTuple):
         plane: About their mean, m, shape (m, 2, n).
         xy: Undistorted normalised coordinates, shape (m, 2, n).
         seen: One for a point, zero for none, shape (m, n).
-        count: Points of each view, shape (m,).
+        points: Their number in each view, shape (m,).
         centre: Their mean, m, shape (m, 2).
     """
 
     plane: FloatArray
     xy: FloatArray
     seen: FloatArray
-    count: FloatArray
+    points: FloatArray
     centre: FloatArray
 
     @classmethod
@@ -126,8 +126,8 @@ def planar_poses(
         parts = [slice(k, k + _TOGETHER) for k in range(0, len(xy), _TOGETHER)]
         return [found for part in parts for found in planar_poses(points_m[part], xy[part], sigma)]
     views = _Views.of(points_m, xy)
-    out = [PlanarPoses((), reason=f"{int(n)} points: a pose needs at least 4") for n in views.count]
-    left = np.flatnonzero(views.count >= 4)
+    out = [PlanarPoses((), reason=f"{int(n)} points: a pose needs at least 4") for n in views.points]
+    left = np.flatnonzero(views.points >= 4)
     extent = np.linalg.eigvalsh(views.plane[left] @ np.swapaxes(views.plane[left], 1, 2))
     line = extent[:, 0] <= _COLLINEAR**2 * extent[:, 1]
     for k in left[line]:
@@ -145,7 +145,7 @@ def planar_poses(
     spread = _inverses(information)
     same = np.linalg.norm(so3.log(np.swapaxes(R[:, 0], 1, 2) @ R[:, 1]), axis=1) < _SAME_ROTATION_RAD
     for i, k in enumerate(left):
-        out[k] = _rank(R[i], p[i], rms[i], spread[i], int(views.count[i]), sigma, same=bool(same[i]))
+        out[k] = _rank(R[i], p[i], rms[i], spread[i], int(views.points[i]), sigma, same=bool(same[i]))
     return out
 
 
@@ -164,7 +164,7 @@ def _homographies(v: _Views) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
 
     The board is centred, so that H[2, 2] > 0.
     """
-    n = v.count
+    n = v.points
     s_plane = np.sqrt(2.0 * n / np.einsum("min,min->m", v.plane, v.plane))
     mean = v.xy.sum(axis=2) / n[:, None]
     spread = (v.xy - mean[..., None]) * v.seen[:, None]
@@ -226,7 +226,7 @@ def _positions(R: FloatArray, v: _Views) -> FloatArray:
     turned = R[..., :2] @ v.plane[:, None]  # (m, 2, 3, n)
     rays = np.concatenate((v.xy, v.seen[:, None]), axis=1)
     A = np.zeros((len(R), 3, 3))
-    A[:, 0, 0] = A[:, 1, 1] = v.count
+    A[:, 0, 0] = A[:, 1, 1] = v.points
     A[:, :2, 2] = A[:, 2, :2] = -v.xy.sum(axis=2)
     A[:, 2, 2] = np.einsum("min,min->m", v.xy, v.xy)
     off = v.xy[:, None] * turned[:, :, 2:] - turned[:, :, :2]
@@ -304,12 +304,12 @@ def _refine(
             worth = cost[left]
             done = (gain <= _GAIN_DONE * worth + 1e-26) | (damping[left] > 1e6) | ~alive
             # a second pose that is clearly worse need not be refined to its last digit
-            limit = worth.min(axis=1) * (1.0 + _HOPELESS_CHI2 / (2.0 * views.count[left]))
+            limit = worth.min(axis=1) * (1.0 + _HOPELESS_CHI2 / (2.0 * views.points[left]))
             done |= worth - 5.0 * gain > limit[:, None]
             left = left[~done.all(axis=1)]
             if not len(left):
                 break
-    return R, p, np.sqrt(cost / (2.0 * views.count)[:, None]), information
+    return R, p, np.sqrt(cost / (2.0 * views.points)[:, None]), information
 
 
 def _move_origin(information: FloatArray, R: FloatArray, centre: FloatArray) -> FloatArray:
