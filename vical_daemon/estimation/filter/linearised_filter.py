@@ -14,7 +14,7 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_update import ImageFit, corner_gate
 from vical_daemon.estimation.filter.linearise import Image, Linear, by_derivatives, by_small_steps
-from vical_daemon.estimation.filter.propagate import move_by_derivatives
+from vical_daemon.estimation.filter.propagate import Propagated, move_by_derivatives
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model.rates import rates_after
@@ -41,25 +41,43 @@ class Instant(NamedTuple):
 
 
 @dataclass(slots=True)
+class Derivatives:
+    """Those about one reference: a second filter about it has the same.
+
+    Attributes:
+        moved: Of the motion over segments, by their end (s).
+        views: Of images, by camera and stamp (ns).
+    """
+
+    moved: dict[float, Propagated] = field(default_factory=dict)
+    views: dict[tuple[str, int], Linear] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
 class LinearisedFilter(CalibrationFilter):
     """A filter whose `state` is the reference about which it is linearised; its mean is stored apart.
 
     Attributes:
         offset: The mean, as errors of `state`, shape (n,).
         instants: Motion of the reference from here on, in order; between them inertial data carry it.
+        known: Derivatives about the reference, as far as they have been worked out.
     """
 
     offset: FloatArray = field(default_factory=lambda: np.zeros(0))
     instants: list[Instant] = field(default_factory=list)
+    known: Derivatives = field(default_factory=Derivatives)
 
     @classmethod
-    def about(cls, calibration: State, instants: list[Instant], known: CalibrationFilter) -> LinearisedFilter:
+    def about(
+        cls, calibration: State, instants: list[Instant], known: CalibrationFilter, derivatives: Derivatives
+    ) -> LinearisedFilter:
         """What `known` knows, linearised about a reference.
 
         Args:
             calibration: Of the reference; its motion does not count.
             instants: Its motion; the filter begins at the first of them.
             known: A filter with mean and covariance there; is used up.
+            derivatives: About this reference, as far as they are known.
         """
         begin, *later = instants
         cameras = {name: replace(camera) for name, camera in calibration.cameras.items()}
@@ -72,7 +90,8 @@ class LinearisedFilter(CalibrationFilter):
             cameras=cameras,
         )
         fields_of = {x.name: getattr(known, x.name) for x in fields(known)} | {"state": state}
-        return cls(**fields_of, offset=difference(known.state, state, known.layout), instants=later)
+        offset = difference(known.state, state, known.layout)
+        return cls(**fields_of, offset=offset, instants=later, known=derivatives)
 
     @property
     def mean(self) -> State:
@@ -99,16 +118,18 @@ class LinearisedFilter(CalibrationFilter):
         if len(segment.t_s) < 2 or segment.t_s[-1] <= segment.t_s[0]:
             self.rates = rates_after(state, segment, self.rates)
             return
-        columns = np.column_stack([self.S[:d, :d], self.offset[:d]])
-        moved = move_by_derivatives(state, self.layout, columns, segment)
-        self.offset[:9] = moved.linear[:, d]
+        end_s = float(segment.t_s[-1])
+        if end_s not in self.known.moved:
+            self.known.moved[end_s] = move_by_derivatives(state, self.layout, np.eye(d), segment)
+        moved = self.known.moved[end_s]
+        self.offset[:9] = moved.linear @ self.offset[:d]
         for where in self.layout.cameras.values():
             if where.timeshift is not None and where.skew is not None:
                 self.offset[where.timeshift] += moved.seconds * self.offset[where.skew]
         Q = self._noise(moved.influence)
-        self._grow(moved._replace(linear=moved.linear[:, :d]), Q)
+        self._grow(moved._replace(linear=moved.linear @ self.S[:d, :d]), Q)
         self._predict_score(moved, Q)
-        state.t_s = float(segment.t_s[-1])
+        state.t_s = end_s
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
         while self.instants and self.instants[0].t_s < state.t_s + _SAME_S:
             there = self.instants.pop(0)
@@ -126,12 +147,15 @@ class LinearisedFilter(CalibrationFilter):
 
     def _linearise(self, image: Image) -> Linear:
         """About the reference; the pixels are those of the mean."""
-        where, known = self.layout.cameras[image.camera], self.state.cameras[image.camera]
-        rolling = where.readout is not None or known.readout_s != 0.0
-        derive = by_small_steps if rolling else by_derivatives
-        lin = derive(self.state, self.layout, self.rates, image, self.S)
-        lin.z = lin.z + (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
-        return self._with_shared(image, lin)
+        views, key = self.known.views, (image.camera, image.t_ns)
+        if key not in views:
+            rolling = self.layout.cameras[image.camera].readout is not None
+            rolling |= self.state.cameras[image.camera].readout_s != 0.0
+            derive = by_small_steps if rolling else by_derivatives
+            views[key] = derive(self.state, self.layout, self.rates, image, self.S)
+        lin = views[key]
+        z = lin.z + (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
+        return self._with_shared(image, replace(lin, z=z, spread=lin.by_error @ self.S, _moves=None))
 
     def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
         """By the reference: it has been adjusted to all images, while the mean may have lost its way."""

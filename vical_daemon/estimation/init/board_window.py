@@ -18,7 +18,7 @@ from scipy.linalg import cho_solve, cholesky
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.linearise import Image, by_small_steps, view_derivatives
-from vical_daemon.estimation.filter.linearised_filter import Instant, LinearisedFilter
+from vical_daemon.estimation.filter.linearised_filter import Derivatives, Instant, LinearisedFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
@@ -115,6 +115,7 @@ class BoardWindow:
         self._information = root.T @ root
         self.offset = np.zeros(len(root))
         self.sigma_px = {name: noise.sigma_px for name, noise in prior.corner_noise.items()}
+        self._derivatives = Derivatives()  # of the filters about the window, once it is solved
         self._measured = (np.zeros((0, 3)),) * 3  # rate, specific force, derivative of the rate
 
     @classmethod
@@ -188,7 +189,7 @@ class BoardWindow:
         prior.state = replace(prior.state, t_s=t_s, R_world_imu=R, p_world_imu=p, v_world_imu=v)
         for name, noise in prior.corner_noise.items():
             noise.sigma_px = noise.guess_px = self.sigma_px[name]
-        return LinearisedFilter.about(self.state, [n.at for n in self.nodes], prior)
+        return LinearisedFilter.about(self.state, [n.at for n in self.nodes], prior, self._derivatives)
 
     # ------------------------------------------------------------------ values
     def at(self, node: Node, camera: str) -> State:

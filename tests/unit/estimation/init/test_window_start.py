@@ -128,7 +128,7 @@ def test_a_filter_about_another_reference_ends_at_the_same_place(given):
     for reference in (found.state, elsewhere):
         prior = make(state)
         prior.state, prior.S = known.state, known.S.copy()
-        f = LinearisedFilter.about(reference, instants, prior)
+        f = LinearisedFilter.about(reference, instants, prior, Derivatives())
         for t_s, frame in frames:
             step(f, frame, t_s)
         ends.append(f.plain())
