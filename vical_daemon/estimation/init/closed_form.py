@@ -45,6 +45,7 @@ class StartData:
         layout: Which blocks are estimated.
         target: Points of the target, m, shape (n, 3).
         may_resize: Another size of the target may be suggested.
+        look: For rolling shutters of which nothing was said.
     """
 
     buffer: ImuBuffer
@@ -54,6 +55,7 @@ class StartData:
     layout: Layout
     target: FloatArray
     may_resize: bool = True
+    look: bool = True
 
 
 class Seen(NamedTuple):
@@ -165,11 +167,11 @@ def _seen(data: StartData, name: str) -> tuple[Seen, str]:
         if not (lens.readout_axis or readout_s):
             lens.readout_axis = likely_axis(given, lens, target)
         readout_s = readout(given, lens, target, readout_s)
-    fit = lens_fit(given, lens, target, readout_s)
-    axis = ""
-    if fit is not None and not (estimated or readout_s):
+    free, look, axis = data.layout.lens_free(name), data.look and not (estimated or readout_s), ""
+    fit = lens_fit(given, lens, target, readout_s) if free or look else None
+    if fit is not None and look:
         axis = looks_rolling(given, lens, target, fit)
-    if fit is not None and data.layout.lens_free(name):
+    if fit is not None and free:
         fit.take_into(lens)
     lens.readout_s = readout_s
     frames = at_middle_row(given, readout_s, lens.resolution, lens.readout_axis)

@@ -21,6 +21,7 @@ from vical_daemon.estimation.model.state import Layout, State
 
 _MIN_SPAN_S = 3.0
 _MAX_FRAMES = 500
+_LOOK_S = 2.0  # the same images over and over would look like a rolling shutter by chance
 LATE_S = 2e-3
 """An image this little before the state is used by moving the pose back, s."""
 
@@ -65,7 +66,7 @@ class Initializer:
     def anew(self) -> None:
         """Forget what was seen and try often again."""
         self._attempts.anew()
-        self._newest_s = -np.inf
+        self._newest_s = self._next_look_s = -np.inf
         self._rest = {name: RestDetector() for name in self._frames}
         for frames in self._frames.values():
             frames.clear()
@@ -126,8 +127,11 @@ class Initializer:
             return _none("collecting the first seconds: move the rig, keep the target in view")
         if self._attempts.due(self._newest_s):  # not again for another model of the rig
             self._attempts.tried(self._newest_s)
+        look = self._newest_s >= self._next_look_s
+        if look:
+            self._next_look_s = self._newest_s + _LOOK_S
         data = start.StartData(
-            buffer, self._frames, priors, self._options, self._layout, self._target, may_resize
+            buffer, self._frames, priors, self._options, self._layout, self._target, may_resize, look
         )
         result = start.attempt(data, may_be_partial=may_be_partial)
         if result.rolling is not None:

@@ -116,8 +116,7 @@ def motion_start(
         if "extrinsics" not in options.fix:
             camera.p_imu_cam = linear.p_imu_cam
         if state is None:
-            size = float(np.linalg.norm(linear.gravity))
-            still = axes
+            size, still = float(np.linalg.norm(linear.gravity)), axes
             state = _state_at(inside[0], camera, linear, gyro_bias, cameras, options)
     if not 0.7 * options.gravity_mps2 < size < 1.3 * options.gravity_mps2:
         why = (
