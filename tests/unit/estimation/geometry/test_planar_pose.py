@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.planar_pose import planar_pose
+from vical_daemon.estimation.geometry.planar_pose import planar_pose, planar_poses
 
 SIGMA = 0.3 / 460
 
@@ -108,3 +108,25 @@ def test_four_corners_suffice():
     R, p = so3.exp(np.array([0.5, -0.4, 0.3])), np.array([0.05, 0.02, 0.5])
     result = planar_pose(board, _image(board, R, p), sigma=1e-4)
     assert np.linalg.norm(so3.log(R.T @ result.candidates[0].R_cam_target)) < 1e-6
+
+
+def test_views_of_a_batch_are_what_each_is_alone():
+    rng = np.random.default_rng(9)
+    board = _board()
+    points, views = [], []
+    for k in range(150):
+        chosen = np.sort(rng.choice(len(board), rng.integers(4, 60), replace=False))
+        R, p = _random_pose(rng)
+        points.append(board[chosen])
+        views.append(_image(board[chosen], R, p) + rng.normal(0, SIGMA, (len(chosen), 2)))
+        if k % 7 == 0:
+            views[-1][:3] = np.nan  # with four points, too few are left
+        if k % 11 == 0:
+            views[-1][:] = 0.1
+    assert planar_poses([], []) == []
+    for together, xy, seen in zip(planar_poses(points, views), points, views, strict=True):
+        alone = planar_pose(xy, seen)
+        assert (together.reason, together.ambiguous) == (alone.reason, alone.ambiguous)
+        for one, other in zip(together.candidates, alone.candidates, strict=True):
+            np.testing.assert_allclose(one.R_cam_target, other.R_cam_target, atol=1e-6)
+            np.testing.assert_allclose(one.p_cam_target, other.p_cam_target, atol=1e-6)

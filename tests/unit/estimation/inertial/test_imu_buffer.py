@@ -1,10 +1,13 @@
 """The inertial buffer: exact ends, holes, and bounded memory."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial.imu_model import strapdown
+from vical_daemon.estimation.inertial.imu_model import influence, over_intervals, strapdown
+from vical_daemon.estimation.measurements import ImuNoise
 
 
 def rates(t):
@@ -55,6 +58,39 @@ def test_a_hole_in_the_data_is_bridged_by_straight_lines():
     seg = buffer.segment(0.015, 0.205)
     np.testing.assert_allclose(seg.gyro_slope, 1.0, atol=1e-9)
     np.testing.assert_allclose(seg.accel[:, 0], 5.0 * seg.t_s, atol=1e-9)
+
+
+def test_intervals_are_the_segments_between_their_instants():
+    buffer = filled()
+    t_s = np.array([0.123, 0.13, 0.131, 0.1345, 0.5, 0.5, 0.73])  # between readings, at them, of no length
+    segment, begin = buffer.intervals(t_s)
+    x = over_intervals(strapdown(segment, np.zeros((1, 3)), np.zeros((1, 3))), begin, errors=True)
+    for k, (a, b) in enumerate(pairwise(t_s)):
+        alone = buffer.segment(a, b)
+        nodes = x.nodes[k]
+        np.testing.assert_allclose(segment.t_s[nodes], alone.t_s, atol=1e-12)
+        if a == b:
+            continue
+        np.testing.assert_allclose(segment.gyro[nodes], alone.gyro, atol=1e-9)
+        np.testing.assert_allclose(segment.accel_slope[nodes], alone.accel_slope, atol=1e-7)
+        motion = strapdown(alone, np.zeros((1, 3)), np.zeros((1, 3)))
+        for found, wanted in ((x.dR, motion.dR), (x.dv, motion.dv), (x.dp, motion.dp)):
+            np.testing.assert_allclose(found[k], wanted[0, -1], atol=1e-11)
+        expected = influence(np.eye(3), motion)
+        np.testing.assert_allclose(x.influences[k].at, expected.at, atol=1e-10)
+        np.testing.assert_allclose(x.influences[k].noise(ImuNoise()), expected.noise(ImuNoise()), atol=1e-18)
+
+
+@pytest.mark.parametrize("t_s", [[-0.1, 0.2], [0.2, 5.2], [0.3, 0.2]])
+def test_no_intervals_beyond_the_readings_nor_backwards(t_s):
+    assert filled().intervals(np.array(t_s)) is None
+
+
+def test_two_readings_that_nearly_coincide_leave_the_slopes_of_others_alone():
+    buffer = ImuBuffer(0)
+    for t in (*np.arange(0.0, 0.2, 0.01), 0.1901, *np.arange(0.2, 0.3, 0.01)):
+        buffer.append(t, np.full(3, t), np.full(3, t))
+    np.testing.assert_allclose(buffer.segment(0.11, 0.28).gyro_slope, 1.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("a", "b"), [(-0.1, 0.2), (0.2, 5.2), (0.3, 0.2)])

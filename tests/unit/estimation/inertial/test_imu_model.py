@@ -159,3 +159,16 @@ def test_white_noise_of_a_force_that_keeps_its_direction_is_exact():
     np.testing.assert_allclose(
         Q[3:, 3:], 0.01 * np.kron([[T**3 / 3, T**2 / 2], [T**2 / 2, T]], np.eye(3)), atol=1e-15
     )
+
+
+def test_many_rotation_steps_multiply_like_few():
+    rng = np.random.default_rng(4)
+    for batch, count in ((1, 1), (1, 64), (1, 65), (1, 1000), (3, 700)):
+        steps = Rotation.from_rotvec(0.01 * rng.standard_normal((batch * count, 3))).as_matrix()
+        steps = steps.reshape(batch, count, 3, 3)
+        found = im.products(steps)
+        R = np.broadcast_to(np.eye(3), (batch, 3, 3))
+        np.testing.assert_array_equal(found[:, 0], R)
+        for k in range(count):
+            R = R @ steps[:, k]
+            np.testing.assert_allclose(found[:, k + 1], R, atol=1e-12)

@@ -18,7 +18,7 @@ from vical_mocks.points import simulate
 
 from benchmarks import zoo
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.filter.linearised_filter import Derivatives, Instant, LinearisedFilter
+from vical_daemon.estimation.filter.linearised_filter import Derivatives, LinearisedFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.init import initializer
 from vical_daemon.estimation.init.window_start import window_start
