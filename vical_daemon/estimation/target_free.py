@@ -18,6 +18,7 @@ from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.filter.unobservable_directions import has_turned
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
@@ -36,11 +37,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     length,
 )
 from vical_daemon.estimation.smoother.reports import window_reports
-from vical_daemon.estimation.smoother.target_free_initializer import (
-    TargetFreeInitializer,
-    starting_camera,
-    with_next_term,
-)
+from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer, with_next_term
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
