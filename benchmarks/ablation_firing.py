@@ -15,7 +15,6 @@ from unittest.mock import patch
 from vical_daemon.estimation.smoother import target_free_status
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
-from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 
 def _fired(counts: Counter[str]) -> list[tuple[Any, str, Callable[[Any], Any]]]:
@@ -23,19 +22,8 @@ def _fired(counts: Counter[str]) -> list[tuple[Any, str, Callable[[Any], Any]]]:
         @wraps(old)
         def new(self: Any, square: float, dof: int) -> float:
             result = float(old(self, square, dof))
-            self.excess_seen = result
             strict = result * (50.0 if self._windows < target_free_status._LEARNING else 1.0)
             counts["tolerant at first"] += result <= 1.0 < strict
-            return result
-
-        return new
-
-    def agrees(old: Any) -> Any:
-        @wraps(old)
-        def new(self: Any, fit: Any, carry: Any, **how: Any) -> bool:
-            self.evaluator.excess_seen = 0.0
-            result = bool(old(self, fit, carry, **how))
-            counts["lasting jitter"] += not result and self.evaluator.excess_seen <= 1.0
             return result
 
         return new
@@ -69,7 +57,6 @@ def _fired(counts: Counter[str]) -> list[tuple[Any, str, Callable[[Any], Any]]]:
 
     return [
         (TargetFreeStatus, "excess", excess),
-        (TargetFreeCalibrator, "_agrees", agrees),
         (TargetFreeStatus, "fits", fits),
         (TargetFreeStatus, "_reported_factor", reported),
         (TargetFreeDoubts, "weighed", weighed),

@@ -27,7 +27,6 @@ from vical_daemon.estimation.smoother import (
 )
 from vical_daemon.estimation.smoother.bundle import Bundle
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
-from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.marginal_prior import DRIFT
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
@@ -66,6 +65,10 @@ def _both_blocks(*_args: Any) -> tuple[int, ...]:
     return target_free.BOTH
 
 
+def _as_it_is(carry: Any) -> Any:
+    return carry
+
+
 _FAULTS = (
     "free: skew 100 ppm",
     "free: stamp jitter 1 ms",
@@ -85,16 +88,18 @@ FREE: dict[str, Mechanism] = {
         faults=("free: skew 100 ppm",),
         disturbances=("nothing", DRIFTS),
     ),
+    "free: clocks that change": Mechanism(
+        MOVED,
+        "before each window the time shift may step and its drift may change",
+        lambda: [(target_free, "opened", _as_it_is)],
+        free=True,
+        faults=("free: skew 100 ppm",),
+        disturbances=("nothing", DRIFTS, "5 ms"),
+    ),
     "free: walk of the delay": Mechanism(
         MOVED,
         "the time shift may wander from window to window",
         lambda: [(handover, "SHIFT_WALK", 0.0)],
-        **_RULE,
-    ),
-    "free: lasting jitter": Mechanism(
-        MOVED,
-        "late stamps that follow each other: the clock stepped",
-        lambda: [(StampOffsets, "lasts", gives(False))],
         **_RULE,
     ),
     "free: what has changed": Mechanism(

@@ -110,6 +110,7 @@ class Rig:
         p_imu_cam: Lever arm before any bump, m, shape (3,).
         timeshift_cam_imu_s: t_imu = t_cam + timeshift at t_s = 0, s.
         clock_skew_ppm: Growth of the shift, microseconds per second.
+        clock_skew_from_s: When it begins to grow, s.
         gravity_world_mps2: Acceleration of free fall in the target frame; not along an axis.
         lens: Intrinsics and distortion.
         readout_s: First to last row; 0: global shutter. The frame's stamp is that of the middle row:
@@ -126,6 +127,7 @@ class Rig:
     p_imu_cam: FloatArray = field(default_factory=lambda: NOMINAL_P_IMU_CAM.copy())
     timeshift_cam_imu_s: float = 0.0
     clock_skew_ppm: float = 0.0
+    clock_skew_from_s: float = 0.0
     gravity_world_mps2: FloatArray = field(default_factory=nominal_gravity)
     lens: Lens = field(default_factory=Lens)
     readout_s: float = 0.0
@@ -146,7 +148,8 @@ class Rig:
     def timeshift_at(self, t_s: npt.ArrayLike) -> FloatArray:
         """The shift t_imu - t_cam at imu times `t_s`, s, shape of `t_s`."""
         t = np.asarray(t_s, np.float64)
-        shift = self.timeshift_cam_imu_s + self.clock_skew_ppm * 1e-6 * t
+        drifted_s = np.maximum(t - self.clock_skew_from_s, 0.0) if self.clock_skew_from_s else t
+        shift = self.timeshift_cam_imu_s + self.clock_skew_ppm * 1e-6 * drifted_s
         for bump in self.bumps:
             shift = shift + np.where(t >= bump.at_s, bump.timeshift_s, 0.0)
         return np.asarray(shift)

@@ -26,6 +26,7 @@ from vical_daemon.estimation.noise.lens_misfit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
+from vical_daemon.estimation.smoother.clock_changes import opened
 from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
 from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.marginal_prior import (
@@ -52,7 +53,6 @@ _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _STEPS_GROW = 12
 _PATIENCE_S = 15.0  # in which a changed mounting or clock is looked for; then anything may have changed
-_MORE_JITTER = 2.0  # times that of the stamps before: no chance in windows of 30 images and more
 
 
 class TargetFreeCalibrator:
@@ -338,11 +338,10 @@ class TargetFreeCalibrator:
             self._close(fit, bundle)
 
     def _agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
-        """Whether a window agrees with what was known of calibration and stamps, as far as it shows that."""
+        """Whether a window agrees with what was known of the calibration, as far as it shows that."""
         if fit.parallax_deg < _MIN_PARALLAX_DEG:
             return True
-        stepped = fit.jitter_lasts and fit.jitter_s > _MORE_JITTER * self._noise.jitter_s
-        return self.evaluator.agrees(fit, carry, complete=complete) and not stepped
+        return self.evaluator.agrees(fit, carry, complete=complete)
 
     def _close(self, fit: Fit, bundle: Bundle) -> None:
         """Carry what the window knows into the next."""
@@ -369,8 +368,7 @@ class TargetFreeCalibrator:
             self.window_closed(window, fit)
         if bundle.seen is not None:
             self._reports += window_reports(bundle.problem, bundle.seen)
-        drifting, noise = self.evaluator.doubts.drifting, self.options.imu_noise
-        self.carry = with_process_noise(fit.carry, noise, self.active, window.span_s, drifting=drifting)
+        self.carry = opened(self._walked(self.evaluator.window_done(fit.carry), window.span_s))
         self.window = next_window(window, self.carry)
 
     def _learn_lens(self, window: Window, bundle: Bundle, fit: Fit) -> None:
@@ -381,6 +379,11 @@ class TargetFreeCalibrator:
         own, weighted = information - root.T @ root, information @ window.own_lens
         self._misfit.learn(root * fit.lens_px, own, weighted)
         self._noise = self._noise._replace(lens_px=self._misfit.px)
+
+    def _walked(self, carry: MarginalPrior, span_s: float) -> MarginalPrior:
+        """What goes into the next window: biases and delay walk."""
+        drifting, noise = self.evaluator.doubts.drifting, self.options.imu_noise
+        return with_process_noise(carry, noise, self.active, span_s, drifting=drifting)
 
     def _forget(self) -> None:
         """What was kept over a change contradicts the images, too: start over."""
@@ -422,6 +425,8 @@ class TargetFreeCalibrator:
         if unproven:  # one window stands against one: neither is known to be right
             self.latest, self._closed, self._confirmed = None, 0, False
         self.carry = None
+        if self.latest is not None:
+            self.latest = self.evaluator.settled(self.latest)
         self.initializer.attempts.anew()
         self.evaluator.lost(why, value, self.latest, against_s)
 

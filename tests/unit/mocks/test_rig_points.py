@@ -96,6 +96,11 @@ def test_bump_changes_extrinsics_and_shift_from_its_time_on():
     assert np.all(np.diff(stamps) > 0)
 
 
+def test_a_clock_may_begin_to_drift_later():
+    rig = reference_rig(7, timeshift_cam_imu_s=0.01, clock_skew_ppm=100.0, clock_skew_from_s=3.0)
+    assert rig.timeshift_at([0.0, 3.0, 5.0]) == pytest.approx([0.01, 0.01, 0.0102])
+
+
 def test_rolling_shutter_rows_are_later():
     run = noise_free_run(readout_s=0.02)
     frame = run.frames[30]

@@ -18,6 +18,10 @@ SKEW_SIGMA = 1e-4
 """Drift of clocks that do not run alike, s/s; two poor crystals."""
 SKEW_WALK = 1e-8
 """How such a drift wanders (temperature), s/s per sqrt(s)."""
+STEP_SIGMA_S = 1e-3
+"""By how much a time shift steps where a clock or its driver changes, s."""
+CLOCK_CHANGES_HZ = 1 / 3600
+"""How often that happens: about once an hour."""
 SHIFT_WALK = 2e-6
 """How a time shift wanders without a drift, s/sqrt(s): clocks are not quite constant."""
 ENTRY_SIGMA = 2e-3

@@ -54,11 +54,11 @@ class Fit(NamedTuple):
         sigma_px: Pixel noise that was found.
         spread: Square root of the images that share an error.
         jitter_s: Standard deviation of the images' stamps, s; 0 where none is seen.
-        jitter_lasts: Images are late one like the next: their clock stepped, and did not jitter.
         steps: Iterations done.
         settled: The last of them changed nothing to speak of.
         used, refused: Observations.
-        change: Calibration found minus the one carried in, at the first image; active errors, shape (k,).
+        change: Calibration found minus the one carried in, at the first image; active errors, then jumps,
+            shape (k + 2 m,).
         landmarks: How many.
         parallax_deg: Typical angle under which a landmark's rays cross.
         own_lens: Covariance of the window's own lens, shape (n, n), or (0, 0).
@@ -72,7 +72,6 @@ class Fit(NamedTuple):
     sigma_px: float
     spread: float
     jitter_s: float
-    jitter_lasts: bool
     steps: int
     settled: bool
     used: int
@@ -90,7 +89,9 @@ class _Step(NamedTuple):
     predicted_reduction: float  # by how much the sum of squares should fall
 
 
-_Saved = tuple[FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray, FloatArray]
+_Saved = tuple[
+    FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray, FloatArray, FloatArray
+]
 
 
 class Bundle:
@@ -178,11 +179,11 @@ class Bundle:
 
     def _save(self) -> _Saved:
         w = self.window
-        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens
+        return w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens, w.jumps
 
     def _restore(self, s: _Saved) -> None:
         w = self.window
-        w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens = s
+        w.R, w.p, w.v, w.bias, w.camera, w.landmarks, w.imu, w.own_lens, w.jumps = s
 
     # ------------------------------------------------------------------ step
     def _reduced(self, normal: Normal, lam: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -250,6 +251,7 @@ class Bundle:
         full = np.zeros(length(w.camera))
         full[self.problem.active] = dx[order.calib]
         w.camera, w.imu = moved_camera(w.camera, CAMERA, full), w.imu + full[INERTIAL][: len(w.imu)]
+        w.jumps = w.jumps + dx[order.jumps]
         if self.problem.own:
             w.own_lens = w.own_lens + dx[order.own]
         m = w.landmarks
@@ -313,19 +315,19 @@ class Bundle:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
         self.seen = seen
-        inertial, jitter_s, lasts = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
+        inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = calibration_difference(w, self.carry)[self.problem.active]
+        change = np.concatenate([change, w.jumps - self.carry.jumps])
         return Fit(
-            carried_out(w, covariance[own:, own:], self.carry.active),
+            carried_out(w, covariance[own:, own:], self.carry),
             squares,
             max(self._dof(seen), 1),
             inertial,
             self.problem.sigma_px,
             self.problem.spread,
             jitter_s,
-            lasts,
             steps,
             settled,
             int(good.sum()),

@@ -16,16 +16,18 @@ from vical_daemon.estimation.model.priors import (
     WINDOW_START,
 )
 from vical_daemon.estimation.selection import model_selection
-from vical_daemon.estimation.selection.clock_drift import (
-    CLOCKS_IN_DOUBT,
-    doubtful,
-    evidence,
-    probability,
-    stamps_variance,
-)
+from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 from vical_daemon.estimation.selection.model_acceptance import known_off, lens_off
 from vical_daemon.estimation.selection.model_mixture import Block, Weights, hypotheses, lens_block, not_zero
 from vical_daemon.estimation.significance import SURE_SIGMAS
+from vical_daemon.estimation.smoother.clock_changes import (
+    Clock,
+    forgotten,
+    over_clocks,
+    settled,
+    stepped_s,
+    what_happened,
+)
 from vical_daemon.estimation.smoother.marginal_prior import (
     DRIFT,
     IMU,
@@ -40,6 +42,13 @@ from vical_daemon.estimation.smoother.snapshot import Doubts
 _TERM = "lens_term"
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
 _SIGMA = {model_selection.IMU: ENTRY_SIGMA, model_selection.LAG: LAG_SIGMA_S}
+
+_WINDOWS_SHOW = 2  # beginning with that in which something changed, until what it was is clear
+
+
+def _shown(clocks: list[Clock], complete: int) -> list[Clock]:
+    """Hypotheses without a jump, or with one that enough windows follow."""
+    return [c for c in clocks if c.jump < 0 or c.jump < complete - _WINDOWS_SHOW]
 
 
 class TargetFreeDoubts:
@@ -78,6 +87,7 @@ class TargetFreeDoubts:
         self.rolling = self._rolling_known = rolling
         self.stamp_sigma_s = 0.0
         self._began_s = np.inf
+        self._announced_s: tuple[float, ...] = ()  # jumps that may be the drift that was announced
 
     def watch(self, carry: MarginalPrior, factor: float, compared: bool) -> list[Event]:
         """Announce what has got beyond doubt.
@@ -87,11 +97,7 @@ class TargetFreeDoubts:
             factor: Measured variance over the stated one.
             compared: Windows could be compared; before, what looks like the imu may as well be the images.
         """
-        events: list[Event] = []
-        if not self.drifting and probability(self._drift(carry, factor)) >= SURE:
-            self.drifting = True
-            sigma = float(np.sqrt(carry.calibration()[DRIFT, DRIFT]))
-            events.append(Event(EventKind.CLOCK_DRIFT, self._camera, float(carry.camera.skew), sigma))
+        events = self._news_of_drift(carry, self.clocks(carry, factor), len(carry.jump_t_s) - 1)
         sigmas = np.sqrt(factor * np.diag(carry.calibration()))
         if not self.rolling:
             self.rolling = self.rolls(carry, factor)
@@ -139,9 +145,62 @@ class TargetFreeDoubts:
         imu, enough = model_selection.IMU, 0.5 if believed else OFF
         if imu not in self._off and not_zero(self._weights(carry, factor), imu) > enough:
             return model_selection.IN_DOUBT[imu]
-        if not self.drifting and doubtful(self._drift(carry, factor), believed=believed):
-            return CLOCKS_IN_DOUBT
+        if not self.drifting:
+            apart = sum(c.probability for c in self.clocks(carry, factor) if c.drifts)
+            if apart > 0.5 or (apart > OFF and not believed):
+                return CLOCKS_IN_DOUBT
         return ""
+
+    def clocks(self, carry: MarginalPrior, factor: float) -> list[Clock]:
+        """Hypotheses about the clocks, with probabilities."""
+        self._began_s = min(self._began_s, carry.t_cam_s)
+        elapsed_s = carry.t_cam_s - self._began_s
+        return what_happened(carry, factor, self.stamp_sigma_s, elapsed_s, drifting=self.drifting)
+
+    def window_done(self, carry: MarginalPrior, factor: float) -> tuple[MarginalPrior, list[Event]]:
+        """Decide, at the end of a window, what happened to the clocks; make room for another change.
+
+        A step within a window looks like a drift at first. So windows after it must show which one it was.
+
+        Args:
+            carry: Out of the window.
+            factor: Measured variance over the stated one.
+
+        Returns:
+            What goes on, and what is announced.
+        """
+        clocks = self.clocks(carry, factor)
+        if not clocks:
+            return carry, []
+        complete = len(carry.jump_t_s)
+        events, seen = self._news_of_drift(carry, clocks, complete), _shown(clocks, complete)
+        rate = sum(c.probability for c in seen if c.rate)
+        step = sum(c.probability for c in seen if c.jump >= 0 and not c.rate)
+        if rate + step < SURE or max(rate, step) < 1.0 - OFF:
+            return forgotten(carry, clocks), events
+        likely = max(clocks, key=lambda c: c.probability)
+        if not likely.rate:
+            events.append(Event(EventKind.TIMESHIFT_STEPPED, self._camera, stepped_s(carry, likely)))
+        elif carry.jump_t_s[likely.jump] not in self._announced_s:
+            kind = EventKind.CLOCK_WANDER if self.drifting else EventKind.CLOCK_DRIFT
+            events.append(self._drift(kind, carry, clocks))
+        return settled(carry, clocks), events
+
+    def _news_of_drift(self, carry: MarginalPrior, clocks: list[Clock], complete: int) -> list[Event]:
+        """Announce clocks that surely drift; `complete`: windows that follow a jump and will not grow."""
+        if self.drifting or sum(c.probability for c in _shown(clocks, complete) if c.drifts) < SURE:
+            return []
+        return [self._drift(EventKind.CLOCK_DRIFT, carry, clocks)]
+
+    def _drift(self, kind: EventKind, carry: MarginalPrior, clocks: list[Clock]) -> Event:
+        """The clocks drift, from now on for sure; the announcement."""
+        self.drifting, self._announced_s = True, carry.jump_t_s
+        d, P = over_clocks(carry, clocks)
+        return Event(kind, self._camera, float(carry.camera.skew + d[DRIFT]), float(np.sqrt(P[DRIFT, DRIFT])))
+
+    def settled(self, carry: MarginalPrior, factor: float) -> MarginalPrior:
+        """What is known without the unknowns of past changes: the mixture over what may have happened."""
+        return settled(carry, self.clocks(carry, factor))
 
     def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> Doubts:
         """How likely each model is, for the report; arguments as for `watch`."""
@@ -153,7 +212,7 @@ class TargetFreeDoubts:
         every = self._blocks(carry)
         return Doubts(
             factor,
-            self.drifting,
+            tuple(self.clocks(carry, factor)),
             every,
             weights,
             gyro_frame=not self.imu_asked,
@@ -161,15 +220,6 @@ class TargetFreeDoubts:
             lens=self.lens,
             term=self._term,
         )
-
-    def _drift(self, carry: MarginalPrior, factor: float) -> float:
-        """How much more likely a drift of the clocks is than none (Bayes factor); 0: not estimated."""
-        if not carry.active[DRIFT]:
-            return 0.0
-        self._began_s = min(self._began_s, carry.t_cam_s)
-        variance = factor * float(carry.calibration()[DRIFT, DRIFT])
-        variance += stamps_variance(self.stamp_sigma_s, carry.t_cam_s - self._began_s)
-        return evidence(carry.camera.skew, variance)
 
     def _weights(self, carry: MarginalPrior, factor: float) -> Weights:
         """Probability of each hypothesis about the imu, named by what is as specified.

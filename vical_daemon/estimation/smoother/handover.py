@@ -132,4 +132,5 @@ def next_window(window: Window, carry: MarginalPrior) -> Window:
         empty,
         gravity=window.gravity,
         imu=window.imu,
+        jumps=carry.jumps.copy(),
     )

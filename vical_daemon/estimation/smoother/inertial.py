@@ -22,13 +22,14 @@ class Order:
         K: Knots.
         of_imu: Which of the calibration's errors are numbers of the imu (`imu_scale`), shape (k,).
         own: Errors of the window's own lens.
+        jumps: Numbers of the clocks' jumps, after all others.
 
     Attributes:
         camera: Those that move pixels: of the calibration, and the window's own lens.
     """
 
-    def __init__(self, F: int, K: int, of_imu: BoolArray, own: int = 0) -> None:
-        self.size = 9 * F + 6 * K + own + len(of_imu)
+    def __init__(self, F: int, K: int, of_imu: BoolArray, own: int = 0, jumps: int = 0) -> None:
+        self.size = 9 * F + 6 * K + own + len(of_imu) + jumps
         self.tail = 9 * (F - 1) + 6 * (K - 1) + own
         self.own = self.tail - own + np.arange(own)
         frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
@@ -36,6 +37,7 @@ class Order:
         self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
         self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
         self.calib = self.tail + 15 + np.arange(len(of_imu))
+        self.jumps = self.tail + 15 + len(of_imu) + np.arange(jumps)
         self.imu = self.calib[of_imu]
         self.camera = np.concatenate([self.calib[~of_imu], self.own])
 
@@ -125,8 +127,8 @@ def _add_walk(window: Window, order: Order, H: FloatArray, g: FloatArray) -> flo
 
 def links_left(
     window: Window, links: PreintegratedLinks, jitter_s: float, order: Order, root: FloatArray
-) -> tuple[float, float, bool]:
-    """Mean squared error of the links, the jitter of the stamps that they show, s, and whether it lasts.
+) -> tuple[float, float]:
+    """Mean squared error of the links, and the jitter of the stamps that they show, s.
 
     Args:
         window: Adjusted.
@@ -137,8 +139,8 @@ def links_left(
     """
     e, J = link_errors(window, links)
     if not jitter_s:
-        return float((e**2).mean()), 0.0, False
+        return float((e**2).mean()), 0.0
     late = StampOffsets(window, e, J, jitter_s)
     shown_s = float(np.sqrt(late.mean_square(J, order.of_links(window.knots()), root)))
     left = (float((e**2).sum()) - late.explained()) / e.size
-    return left, shown_s if shown_s > _LEAST_JITTER_S else 0.0, late.lasts()
+    return left, shown_s if shown_s > _LEAST_JITTER_S else 0.0

@@ -16,7 +16,6 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.stamp_jitter import excess
-from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.smoother.window import IntArray, Window
 
 _OPEN_S = 1.0  # as good as no prior, where a rig that stands still shows nothing
@@ -56,15 +55,6 @@ class StampOffsets:
         """Most likely tau for these states, and their variances if the states were exact, shapes (F,)."""
         inverse = cho_solve((self._root, True), np.eye(len(self._root)))
         return -inverse @ self._right, inverse.diagonal().copy()
-
-    def lasts(self) -> bool:
-        """Whether delays follow those before, beyond five sigma: then the clock stepped, and did not jitter.
-
-        The first autocorrelation of n independent values has a standard deviation of 1 / sqrt(n).
-        """
-        tau, _ = self.delays()
-        power = float((tau**2).sum())
-        return bool(float(tau[1:] @ tau[:-1]) * np.sqrt(len(tau)) > SURE_SIGMAS * power > 0.0)
 
     def by_states(self, J: FloatArray, at: IntArray, size: int) -> FloatArray:
         """B'J over all states, shape (F, size); `at` (F - 1, c): where the columns of J live."""

@@ -6,7 +6,7 @@ can arise from nothing. [docs/math/target_free.md, "From window to window"]
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,6 +49,9 @@ class MarginalPrior:
         active: Which of the calibration errors are estimated, shape (n,).
         t_cam_s: Stamp of that image, s.
         imu: Errors of the imu, see `Window`.
+        jumps: Step of the time shift, s, and change of its drift, s/s, at each of the last few boundaries
+            between windows, shape (2 m,); their errors follow those of the calibration. See `clock_changes`.
+        jump_t_s: Stamps of these boundaries, s.
     """
 
     R: FloatArray
@@ -59,6 +62,12 @@ class MarginalPrior:
     active: BoolArray
     t_cam_s: float
     imu: FloatArray
+    jumps: FloatArray = field(default_factory=lambda: np.zeros(0))
+    jump_t_s: tuple[float, ...] = ()
+
+    @property
+    def _calibration(self) -> slice:
+        return slice(CALIBRATION, len(self.root) - len(self.jumps))
 
     def covariance(self) -> FloatArray:
         """Covariance of the errors, shape (d, d)."""
@@ -70,21 +79,21 @@ class MarginalPrior:
         seconds = t_cam_s - self.t_cam_s
         camera = replace(self.camera, timeshift_s=self.camera.timeshift_s + self.camera.skew * seconds)
         root = self.root.copy()
-        root[:, CALIBRATION:] = root[:, CALIBRATION:] @ later(self.active, -seconds)
+        root[:, self._calibration] = root[:, self._calibration] @ later(self.active, -seconds)
         return replace(self, camera=camera, root=root, t_cam_s=t_cam_s)
 
     def calibration(self) -> FloatArray:
         """Covariance of the calibration's errors, zero where not estimated, shape (n, n)."""
         full = np.zeros((len(self.active),) * 2)
         at = np.flatnonzero(self.active)
-        full[np.ix_(at, at)] = self.covariance()[CALIBRATION:, CALIBRATION:]
+        full[np.ix_(at, at)] = self.covariance()[self._calibration, self._calibration]
         return full
 
 
 def calibration_root(carry: MarginalPrior) -> FloatArray:
     """Square root of the covariance of the calibration's errors, zero where not estimated, shape (n, d)."""
     S = np.zeros((len(carry.active), len(carry.root)))
-    S[carry.active] = np.linalg.inv(carry.root)[CALIBRATION:]
+    S[carry.active] = np.linalg.inv(carry.root)[CALIBRATION : len(carry.root) - len(carry.jumps)]
     return S
 
 
@@ -131,28 +140,29 @@ def held_along(carry: MarginalPrior, axis: FloatArray) -> MarginalPrior:
     return replace(carry, root=np.linalg.qr(stacked)[1])
 
 
-def carried_out(window: Window, covariance: FloatArray, active: BoolArray) -> MarginalPrior:
+def carried_out(window: Window, covariance: FloatArray, carry: MarginalPrior) -> MarginalPrior:
     """Turn the marginal at a window's last image into coordinates without origin and heading.
 
     Args:
         window: Adjusted.
-        covariance: Of [last image 9, last knot 6, active calibration errors].
-        active: Which of the calibration errors are estimated, shape (n,).
+        covariance: Of [last image 9, last knot 6, active calibration errors, jumps].
+        carry: What was carried into the window.
     """
-    k = int(np.count_nonzero(active))
+    active = carry.active
+    k, m = int(np.count_nonzero(active)), len(carry.jumps)
     span_s, camera = window.span_s, window.camera
     camera = replace(camera, timeshift_s=camera.timeshift_s + camera.skew * span_s)
     R, v = window.last_at(camera.timeshift_s)
-    J = np.zeros((CALIBRATION + k, 15 + k))
+    J = np.zeros((CALIBRATION + k + m, 15 + k + m))
     speed = R.T @ v
     J[:2, :3] = tangents(R[2][None])[0].T
     J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R.T
     J[5:11, 9:15] = np.eye(6)
-    J[11:, 15:] = later(active, span_s)
+    J[11 : 11 + k, 15 : 15 + k] = later(active, span_s)
+    J[11 + k :, 15 + k :] = np.eye(m)
     root = root_of(J @ covariance @ J.T)
-    return MarginalPrior(
-        R, speed, window.bias[-1].copy(), camera, root, active, window.frames[-1][0], window.imu
-    )
+    bias, t_s = window.bias[-1].copy(), window.frames[-1][0]
+    return MarginalPrior(R, speed, bias, camera, root, active, t_s, window.imu, window.jumps, carry.jump_t_s)
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

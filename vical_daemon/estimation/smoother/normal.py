@@ -93,7 +93,7 @@ class Problem:
     def order(self) -> Order:
         """Places of the unknowns."""
         w = self.window
-        return Order(len(w.frames), len(w.bias), self._of_imu[self.active], self.own)
+        return Order(len(w.frames), len(w.bias), self._of_imu[self.active], self.own, len(w.jumps))
 
     # ------------------------------------------------------------------ pixels
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -270,24 +270,26 @@ class Problem:
 
     # ------------------------------------------------------------------ prior
     def _prior_errors(self) -> tuple[FloatArray, FloatArray]:
-        """Errors (d,) of the carried knowledge and derivatives (d, 9 + 6 + k)."""
+        """Errors (d,) of the carried knowledge and derivatives (d, 9 + 6 + k + jumps)."""
         w, c = self.window, self.carry
         R0, v0 = w.R[0], w.v[0]
         up, now = c.R[2], R0[2]
         B = tangents(up[None])[0]
         speed = R0.T @ v0
         calibration = calibration_difference(w, c)[self.active]
-        e = np.concatenate([B.T @ np.cross(now, up), speed - c.speed, w.bias[0] - c.bias, calibration])
-        J = np.zeros((len(e), 15 + len(self.active)))
+        e = np.concatenate(
+            [B.T @ np.cross(now, up), speed - c.speed, w.bias[0] - c.bias, calibration, w.jumps - c.jumps]
+        )
+        J = np.zeros((len(e), len(e) + 4))
         J[:2, :3] = B.T
         J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R0.T
         J[5:11, 9:15] = np.eye(6)
-        J[11:, 15:] = np.eye(len(self.active))
+        J[11:, 15:] = np.eye(len(e) - 11)
         return c.root @ e, c.root @ J
 
     def _add_prior(self, H: FloatArray, g: FloatArray, order: Order) -> float:
         e, J = self._prior_errors()
-        at = np.concatenate([order.frames[0], order.knots[0], order.calib])
+        at = np.concatenate([order.frames[0], order.knots[0], order.calib, order.jumps])
         H[at[:, None], at] += J.T @ J
         g[at] += J.T @ e
         # where the origin lies and which way is north cannot be seen: held, at no cost

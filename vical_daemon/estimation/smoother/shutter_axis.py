@@ -39,4 +39,5 @@ def read_by_columns(window: Window) -> Window:
     other = deepcopy(window)
     other.bad.clear()  # what did not fit with rows
     other.camera = replace(window.camera, readout_axis=COLUMNS, readout_s=0.0)
+    other.jumps = window.jumps[:0]  # it starts from nothing
     return other

@@ -19,20 +19,11 @@ from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate
-from vical_daemon.estimation.selection import clock_drift
-from vical_daemon.estimation.selection.clock_drift import evidence, probability
-from vical_daemon.estimation.selection.model_mixture import (
-    Block,
-    Weights,
-    joined,
-    lenses_known,
-    mixture,
-    parts,
-)
+from vical_daemon.estimation.selection.model_mixture import Block, Weights, mixture
+from vical_daemon.estimation.smoother.clock_changes import Clock, over_clocks
 from vical_daemon.estimation.smoother.marginal_prior import (
     ARM,
     CAMERA,
-    DRIFT,
     IMU,
     INERTIAL,
     LENS,
@@ -51,7 +42,7 @@ class Doubts(NamedTuple):
 
     Attributes:
         factor: Measured variance over the stated one; multiplies the reported covariance.
-        drifting: The camera's clock is known to run apart from the imu's.
+        clocks: Hypotheses about the clocks; none: the drift is not estimated.
         every: What may be as specified: the imu, a fixed lens.
         weights: Probability of each hypothesis about these.
         gyro_frame: The camera is reported in the frame in which the gyro's matrix is symmetric.
@@ -61,7 +52,7 @@ class Doubts(NamedTuple):
     """
 
     factor: float
-    drifting: bool
+    clocks: tuple[Clock, ...]
     every: Mapping[str, Block]
     weights: Weights
     gyro_frame: bool = False
@@ -109,19 +100,24 @@ def camera_estimate(
 
 def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
     """Camera and covariance (n, n) over the models of imu, fixed lens and clock; see `model_mixture`."""
-    step, S = mixture(calibration_root(carry), doubts.every, doubts.weights, doubts.factor)
-    camera, numbers = moved_camera(carry.camera, CAMERA, step), carry.imu + step[INERTIAL]
+    d, S = _over_clocks(carry, doubts)
+    every = {name: replace(b, values=b.values + d[b.where]) for name, b in doubts.every.items()}
+    step, S = mixture(S, every, doubts.weights, doubts.factor)
+    d = d + step
+    camera, numbers = moved_camera(carry.camera, CAMERA, d), carry.imu + d[INERTIAL]
     if doubts.gyro_frame:
         camera, S = _in_gyro_frame(camera, numbers, S)
-    if carry.active[DRIFT] and not doubts.drifting:
-        fixed = doubts.lens is not None
-        S, off = parts(S, doubts.factor) if fixed else (S, np.zeros(len(S)))
-        p = probability(evidence(camera.skew + off[DRIFT], doubts.factor * float(S[DRIFT] @ S[DRIFT])))
-        given = lenses_known(S, doubts.every)
-        step, S, off = clock_drift.mixture(S, off, given, DRIFT, camera.skew, p, doubts.factor)
-        S = joined(S, off, doubts.factor) if fixed else S
-        camera = moved_camera(camera, CAMERA, step)
     return camera, doubts.factor * (S @ S.T)
+
+
+def _over_clocks(carry: MarginalPrior, doubts: Doubts) -> tuple[FloatArray, FloatArray]:
+    """What the mean moves by, shape (n,), and root of the covariance over its factor, over the clocks."""
+    if not doubts.clocks:
+        return np.zeros(len(carry.active)), calibration_root(carry)
+    d, P = over_clocks(carry, doubts.clocks, doubts.factor)
+    scale = np.where(carry.active, np.sqrt(np.maximum(np.diag(P), 1e-300)), 1.0)  # pixels and microseconds
+    values, vectors = np.linalg.eigh(P / np.outer(scale, scale) / doubts.factor)
+    return d, scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def _in_gyro_frame(camera: CameraState, numbers: FloatArray, S: FloatArray) -> tuple[CameraState, FloatArray]:

@@ -21,8 +21,9 @@ from vical_daemon.estimation.result import (
 )
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Fit
+from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
-from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import (
     LOST,
@@ -197,6 +198,16 @@ class TargetFreeStatus(Evaluator):
         if self._trace.due(t_s):
             self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
 
+    def window_done(self, carry: MarginalPrior) -> MarginalPrior:
+        """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
+        carry, events = self.doubts.window_done(carry, self.factor())
+        self.announce_all(events)
+        return carry
+
+    def settled(self, carry: MarginalPrior) -> MarginalPrior:
+        """What is known, for a start: the mixture over what may have happened to the clocks."""
+        return self.doubts.settled(carry, self.factor())
+
     def closed(self) -> None:
         """A window is complete and agreed."""
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
@@ -214,15 +225,16 @@ class TargetFreeStatus(Evaluator):
             carry: What was known before.
             complete: It will not grow any more: it counts for the measured variance.
         """
-        P_old = carry.covariance()[CALIBRATION:, CALIBRATION:]
-        # at the first image, where the change was taken
-        P_new = fit.carry.at(carry.t_cam_s).covariance()[CALIBRATION:, CALIBRATION:]
+        # at the first image, where the change was taken; of the clocks by what most likely happened to them
+        after = fit.carry.at(carry.t_cam_s)
+        clocks = self.doubts.clocks(fit.carry, self.factor())
+        change, (P_old, P_new) = compared_by(carry, after, fit.change, clocks)
         scale = np.sqrt(np.diag(P_old))
         values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
         informed = values > 0.02  # directions in which the window has information
         if not informed.any():
             return True
-        d = vectors.T @ (fit.change / scale)
+        d = vectors.T @ (change / scale)
         statistic, dof = float((d[informed] ** 2 / values[informed]).sum()), int(informed.sum())
         agree = self.excess(statistic, dof) <= 1.0
         self._growing = (0.0, 0) if complete else (statistic, dof)

@@ -94,6 +94,7 @@ class Window:
         bad: (frame stamp in ns, track id) of observations refused.
         imu: Errors of scale, alignment, lag (`imu_scale`) where they are estimated, shape (16,); else empty.
         own_lens: What fx fy cx cy and the distortion differ by in this window, see `lens_misfit`, shape (n,).
+        jumps: See `MarginalPrior`.
         turning: Measured rate (with bias), rad/s, and its derivative, rad/s^2, at each image, (2, F, 3).
     """
 
@@ -111,6 +112,7 @@ class Window:
     bad: set[tuple[int, int]] = field(default_factory=set)
     imu: FloatArray = field(default_factory=lambda: np.zeros(0))
     own_lens: FloatArray = field(default_factory=lambda: np.zeros(0))
+    jumps: FloatArray = field(default_factory=lambda: np.zeros(0))
     turning: FloatArray = field(default_factory=lambda: np.zeros((2, 0, 3)))
 
     def __post_init__(self) -> None:

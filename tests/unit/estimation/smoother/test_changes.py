@@ -13,7 +13,6 @@ from benchmarks import gaps
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.marginal_prior import LENS
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
@@ -184,22 +183,6 @@ def test_what_is_held_fixed_never_changed():
     active[:6] = False
     found, covariance, prior = answers(np.random.default_rng(3), 100.0 * np.eye(7)[6])
     assert changed_blocks(found, covariance, prior, active, excess) == CLOCK
-
-
-class _Delays(StampOffsets):
-    def __init__(self, tau):
-        self._tau = tau
-
-    def delays(self):
-        return self._tau, np.zeros(len(self._tau))
-
-
-def test_delays_that_jitter_do_not_last_and_those_of_a_step_do():
-    rng = np.random.default_rng(5)
-    assert not any(_Delays(1e-3 * rng.standard_normal(60)).lasts() for _ in range(1000))
-    step = np.where(np.arange(60) < 45, 0.0, 0.02) + 1e-4 * rng.standard_normal(60)
-    assert _Delays(step).lasts()
-    assert not _Delays(np.zeros(60)).lasts()
 
 
 class _Spin:
