@@ -99,7 +99,7 @@ class Calibrator:
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
-            self.evaluator.saw_reading(*reading)
+            self.evaluator.saw_reading(*reading[:3])
         self.evaluator.announce_all(self._intake.imu_news())
 
     @property

@@ -258,7 +258,7 @@ REFERENCE: dict[EventKind, About] = {
         "The IMU repeated one reading bit by bit. Value: for how long.", "s", "When new readings come."
     ),
     EventKind.IMU_CLIPPED: About(
-        "Motion exceeds the range of the IMU; readings at the range are left out. Value: their share.",
+        "Motion exceeds the range of the IMU; what exceeds it is bridged. Value: share of such readings.",
         "1",
         "Once, 5 s after the first of them.",
     ),

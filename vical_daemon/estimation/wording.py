@@ -375,7 +375,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.IMU_CLIPPED: (
         "",
         lambda e: (
-            f"{_of(e, 100.0, '%', '.1f')} of the readings are at the range of the IMU and left out: "
+            f"{_of(e, 100.0, '%', '.1f')} of the readings are at the range of the IMU: "
             "move the rig more gently"
         ),
     ),

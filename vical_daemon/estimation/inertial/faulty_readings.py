@@ -1,6 +1,6 @@
 """Faults of single inertial readings: clipped at the sensor's range, and spikes.
 
-Both are left out before integration; what remains is a short gap that interpolation bridges, or a gap.
+Clipped ones are bridged (`clipped_readings`); spikes are left out.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ Six = Sequence[float]
 """One reading in plain numbers, rad/s and m/s^2: of six, numpy takes ten times as long."""
 
 _AT_RANGE = 8
-"""So many readings of one channel at exactly its extreme value, and so many different values close to it: a
-coarse channel at rest repeats its extreme, too, but has few values."""
+"""So many readings of one channel at exactly its extreme value, and so many different values close to it, or
+so many steps of its resolution at once to get there: a coarse channel at rest repeats its extreme, too."""
+_STOPS = 4
+"""A channel in motion that stops for so many readings is at its range: noise and motion would go on."""
 _OFTEN = 4.0
 """Times as often as a value close to it must the extreme occur: without clipping it is the rarest of them."""
 _NEAR = 0.9
@@ -37,41 +39,73 @@ _CHANNELS = ((0, 1, 2, 6, 7, 8), (3, 4, 5, 9, 10, 11))
 """Of each sensor, upwards and downwards."""
 
 
-class RangeLimits:
+class RangeLimits(Generic[T]):
     """Finds the readings that are clipped at a sensor's range, without knowing the range.
 
     The six channels are followed upwards and downwards. A value that comes back again and again as the
-    extreme of one of them is the end of the range, for all three channels of that sensor. A larger value
-    later shows that it was not.
+    extreme of one of them is the end of the range, for all three channels of that sensor. So is one at which
+    a channel stops in full motion: it comes there over many of its steps at once, and stays. Readings that
+    may be such a stop are held until it is decided. A larger value later shows that it was not the end.
+
+    Attributes:
+        found: How often an end was found.
     """
 
     def __init__(self) -> None:
         self._extreme = [1e-9] * 12
         self._near = [_NEAR * 1e-9] * 12
         self._at = [0] * 12
+        self._stays = [0] * 12  # readings in a row at the extreme, reached in motion
         self._values: list[dict[float, int]] = [{} for _ in range(12)]
         self._clips = [False] * 12
+        self._step = [math.inf] * 2  # smallest change of a channel of each sensor: its resolution, or more
+        self._previous: Six = (math.nan,) * 6
+        self._held: list[tuple[Six, T]] = []
+        self.found = 0
 
-    def clipped(self, six: Six) -> bool:
-        """Whether a channel of a reading (rad/s, m/s^2) is at the end of its range."""
+    def sift(self, six: Six, item: T) -> list[tuple[Six, T, tuple[int, ...]]]:
+        """Take a reading (rad/s, m/s^2).
+
+        Returns:
+            The readings that are decided on, in order, each with those of its six channels at their range.
+        """
         a, b, c, d, e, f = six
         both = (a, b, c, d, e, f, -a, -b, -c, -d, -e, -f)
-        extreme = self._extreme
+        for i, (value, before) in enumerate(zip(six, self._previous, strict=True)):
+            if 0.0 < abs(value - before) < self._step[i // 3]:
+                self._step[i // 3] = abs(value - before)
+        waits = False
         for i, (value, near) in enumerate(zip(both, self._near, strict=True)):
             if value > near:
-                self._follow(i, value)
-                self._near[i] = _NEAR * extreme[i]
-        return True in self._clips and any(
-            both[i] == extreme[i] and extreme[i] in self._ends(channels)
+                self._follow(i, value, abs(six[i % 6] - self._previous[i % 6]))
+                self._near[i] = _NEAR * self._extreme[i]
+                waits |= 0 < self._stays[i] < _STOPS and not self._clips[i]
+            elif self._stays[i]:
+                self._stays[i] = 0
+        self._previous = six
+        self._held.append((six, item))
+        if waits:
+            return []
+        held, self._held = self._held, []
+        return [(x, kept, self.at_range(x)) for x, kept in held]
+
+    def at_range(self, six: Six) -> tuple[int, ...]:
+        """Which of the six channels of a reading are at the end of their range."""
+        if True not in self._clips:
+            return ()
+        both, extreme = (*six, *(-x for x in six)), self._extreme
+        return tuple(
+            i % 6
             for channels in _CHANNELS
             for i in channels
+            if both[i] == extreme[i] and extreme[i] in self._ends(channels)
         )
 
     def _ends(self, channels: Sequence[int]) -> set[float]:
         """Where the range of a sensor ends."""
         return {self._extreme[i] for i in channels if self._clips[i]}
 
-    def _follow(self, i: int, value: float) -> None:
+    def _follow(self, i: int, value: float, change: float) -> None:
         extreme, values = self._extreme[i], self._values[i]
         if value > extreme:
             values[extreme] = self._at[i]
@@ -79,12 +113,22 @@ class RangeLimits:
             self._extreme[i], self._at[i], self._clips[i] = value, 1, False
         elif value == extreme:
             self._at[i] += 1
-            usual = sum(values.values()) / max(len(values), 1)
-            self._clips[i] = (
-                self._at[i] >= _AT_RANGE and len(values) >= _AT_RANGE and self._at[i] > _OFTEN * usual
-            )
         elif value in values or len(values) < _VALUES:
             values[value] = values.get(value, 0) + 1
+        if value < self._extreme[i]:
+            self._stays[i] = 0
+        elif self._stays[i] or change >= _AT_RANGE * self._step[i % 6 // 3]:
+            self._stays[i] = self._stays[i] + 1 if value == extreme else 1
+        if value == extreme:
+            clips = self._stays[i] >= _STOPS or self._returns(i)
+            self.found += clips and not self._clips[i]
+            self._clips[i] |= clips
+
+    def _returns(self, i: int) -> bool:
+        """Whether the extreme of a channel has come back more often than an extreme does."""
+        values = self._values[i]
+        usual = sum(values.values()) / max(len(values), 1)
+        return self._at[i] >= _AT_RANGE and len(values) >= _AT_RANGE and self._at[i] > _OFTEN * usual
 
 
 class SpikeFilter(Generic[T]):
@@ -92,8 +136,8 @@ class SpikeFilter(Generic[T]):
 
     A straight line through the two readings before predicts each one. A reading that is far from it is held
     until the next one. It was a spike if that is back where the motion was and the other sensor saw nothing:
-    a shock shows in gyro and accelerometer, and a motion goes on. Two in a row that are far from each other,
-    too, do not support each other: the one after them decides.
+    a shock shows in gyro and accelerometer, and a motion goes on. If the next one is not back, either, the
+    one after them decides about both.
 
     Attributes:
         held: The readings that are held, two at most, with whatever was given along.
@@ -121,33 +165,41 @@ class SpikeFilter(Generic[T]):
             back, off = _apart(six, self._last), _apart(first, self._last)
             gyro, accel = (x / max(usual, 1e-12) for x, usual in zip(off, self._largest, strict=True))
             which = int(accel > gyro)
-            if back[which] < 0.5 * off[which]:
+            missed = self._missed(six, len(self.held) + 1)
+            if back[which] < 0.5 * off[which] and not self._stands_out(missed):
                 self.spikes += len(self.held)
                 self.held = []
-                self._note(six, self._missed(six))
+                self._note(six, missed)
                 return [item]
             self.held.append((six, item))
-            if len(self.held) == 2 and _apart(six, first)[which] > 0.5 * off[which]:
+            if len(self.held) == 2:
                 return []
             released, self.held = self.held, []
             for good, _ in released:
                 self._note(good, self._missed(good))
             return [x for _, x in released]
         missed = self._missed(six)
-        if len(self._first) >= LEARN:
-            (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
-            gyro_off = gyro > _HARMFUL[0] and gyro > _SPIKE * usual_gyro
-            if gyro_off != (accel > _HARMFUL[1] and accel > _SPIKE * usual_accel):
-                self.held = [(six, item)]
-                return []
+        if len(self._first) >= LEARN and self._stands_out(missed):
+            self.held = [(six, item)]
+            return []
         self._note(six, missed)
         return [item]
 
-    def _missed(self, six: Six) -> tuple[float, float]:
-        """Errors of the prediction: gyro rad/s, accelerometer m/s^2."""
-        a, b, c, d, e, f = self._last
-        p, q, r, s, t, u = self._before
-        return _apart(six, (2.0 * a - p, 2.0 * b - q, 2.0 * c - r, 2.0 * d - s, 2.0 * e - t, 2.0 * f - u))
+    def _stands_out(self, missed: tuple[float, float]) -> bool:
+        """Whether an error of the prediction is one of a spike: of one sensor only."""
+        (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
+        gyro_off = gyro > _HARMFUL[0] and gyro > _SPIKE * usual_gyro
+        return gyro_off != (accel > _HARMFUL[1] and accel > _SPIKE * usual_accel)
+
+    def _missed(self, six: Six, steps: int = 1) -> tuple[float, float]:
+        """Errors of the prediction over one reading: gyro rad/s, accelerometer m/s^2.
+
+        A straight line over several steps misses a bend of the motion by the sum of their numbers.
+        """
+        line = [a + steps * (a - b) for a, b in zip(self._last, self._before, strict=True)]
+        gyro, accel = _apart(six, line)
+        more = 0.5 * steps * (steps + 1)
+        return gyro / more, accel / more
 
     def _note(self, six: Six, missed: tuple[float, float]) -> None:
         if self._count >= 2:

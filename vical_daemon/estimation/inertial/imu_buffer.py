@@ -7,12 +7,13 @@ differences): straight lines would shorten a 3 Hz shake by 0.3 % at 100 Hz. [doc
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
 
 GAP_S = 0.05
 """Between samples further apart than this nothing is known, s. A cubic over 50 ms misses a 3 Hz motion of
@@ -32,6 +33,8 @@ class ImuSegment(NamedTuple):
         gap_s: Longest interval between two real samples used, s.
         gyro_slope: Their derivatives by time, rad/s^2, shape (n + 1, 3); None: straight lines.
         accel_slope: m/s^3, shape (n + 1, 3).
+        spread: One sigma of what clipped readings miss, common to the segment, rad/s and m/s^2, shape
+            (n + 1, 6); None: none is clipped.
     """
 
     t_s: FloatArray
@@ -40,6 +43,7 @@ class ImuSegment(NamedTuple):
     gap_s: float
     gyro_slope: FloatArray | None = None
     accel_slope: FloatArray | None = None
+    spread: FloatArray | None = None
 
 
 class ImuBuffer:
@@ -54,7 +58,7 @@ class ImuBuffer:
         self._rows = np.empty((4096, 7))
         self._start = 0
         self._stop = 0
-        self._breaks: list[tuple[float, float]] = []
+        self._spread: FloatArray | None = None  # of each row; None: no reading was clipped
 
     def __len__(self) -> int:
         return self._stop - self._start
@@ -74,19 +78,19 @@ class ImuBuffer:
         """Time of the oldest reading held, s; +inf when empty."""
         return float(self._rows[self._start, 0]) if len(self) else np.inf
 
-    def append(self, t_s: float, gyro: FloatArray, accel: FloatArray, *, broken: bool = False) -> bool:
+    def append(
+        self, t_s: float, gyro: FloatArray, accel: FloatArray, spread: Sequence[float] | None = None
+    ) -> bool:
         """Add a reading; False (and nothing done) when it is not newer than the last, or not finite.
 
         Args:
             t_s: Its time, s.
             gyro: rad/s, shape (3,).
             accel: m/s^2, shape (3,).
-            broken: What happened since the reading before cannot be interpolated, however short it was.
+            spread: One sigma of each, beyond the sensor's noise, shape (6,); None: there is none.
         """
         if t_s <= self.newest_s:
             return False
-        if broken and len(self):
-            self._breaks.append((self.newest_s, t_s))
         if self._stop == len(self._rows):
             self._make_room()
         row = self._rows[self._stop]
@@ -95,18 +99,27 @@ class ImuBuffer:
         row[4:7] = accel
         if not math.isfinite(row.sum()):
             return False
+        if spread is not None and self._spread is None:
+            self._spread = np.zeros((len(self._rows), 6))
+        if self._spread is not None:
+            self._spread[self._stop] = 0.0 if spread is None else spread
         self._stop += 1
         return True
 
+    def replace(self, row: int, six: Sequence[float], spread: Sequence[float]) -> None:
+        """Give a row of `rows` other values, rad/s and m/s^2, and their spread."""
+        if self._spread is None:
+            self._spread = np.zeros((len(self._rows), 6))
+        self._rows[self._start + row, 1:] = six
+        self._spread[self._start + row] = spread
+
     def _make_room(self) -> None:
-        live = self.rows
-        if len(live) > len(self._rows) // 2:
-            grown = np.empty((2 * len(self._rows), 7))
-            grown[: len(live)] = live
-            self._rows = grown
-        else:
-            self._rows[: len(live)] = live.copy()
-        self._start, self._stop = 0, len(live)
+        length = len(self._rows) * (2 if len(self) > len(self._rows) // 2 else 1)
+        live = slice(self._start, self._stop)
+        self._rows = _moved(self._rows, live, length)
+        if self._spread is not None:
+            self._spread = _moved(self._spread, live, length)
+        self._start, self._stop = 0, len(self)
 
     @property
     def usual_gap_s(self) -> float:
@@ -117,8 +130,6 @@ class ImuBuffer:
 
     def gap_within(self, from_s: float, to_s: float) -> bool:
         """Whether readings are missing somewhere between two instants, ends included."""
-        if any(begin < to_s and end > from_s for begin, end in self._breaks):
-            return True
         t = self.rows[:, 0]
         low = max(int(np.searchsorted(t, from_s, side="right")) - 1, 0)
         span = t[low : int(np.searchsorted(t, to_s, side="left")) + 1]
@@ -128,14 +139,11 @@ class ImuBuffer:
     def cut(self, before_s: float) -> None:
         """Forget every reading before `before_s`."""
         self._start += int(np.searchsorted(self.rows[:, 0], before_s))
-        self._breaks = [b for b in self._breaks if b[1] > before_s]
 
     def trim(self, before_s: float) -> None:
         """Forget readings older than `before_s`, but for the last one before it."""
         index = int(np.searchsorted(self.rows[:, 0], before_s)) - 1
         self._start += max(index, 0)
-        if self._breaks:
-            self._breaks = [b for b in self._breaks if b[1] > before_s]
 
     def segment(self, from_s: float, to_s: float) -> ImuSegment | None:
         """Return the readings between two instants with interpolated ends; None where not covered."""
@@ -159,7 +167,20 @@ class ImuBuffer:
         rise = np.concatenate([change[:1], slope[middle], change[1:]])
         times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
         gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
-        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:])
+        spread = self._spread_of(slice(first, last + 1), middle, times)
+        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:], spread)
+
+    def _spread_of(self, rows: slice, middle: slice, times_s: FloatArray) -> FloatArray | None:
+        """Spread at instants: those of some of the rows, and one before and one after, on straight lines."""
+        if self._spread is None:
+            return None
+        spread, t = self._spread[self._start : self._stop][rows], self.rows[rows, 0]
+        if not spread.any():
+            return None
+        share = (times_s[[0, -1]] - t[[0, -2]]) / (t[[1, -1]] - t[[0, -2]])
+        first = spread[0] + share[0] * (spread[1] - spread[0])
+        last = spread[-2] + share[1] * (spread[-1] - spread[-2])
+        return np.concatenate([first[None], spread[middle], last[None]])
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
@@ -188,8 +209,24 @@ class ImuBuffer:
         for where, which in ((begin[:-1], slice(None, -1)), (begin[1:] - 1, slice(1, None))):
             nodes[where, 0], nodes[where, 1:], rise[where] = t_s[which], value[which], change[which]
         gap = float(np.diff(t[first : last + 1]).max())
-        segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:])
+        spread = self._spread_at(slice(first, last + 1), at - first, k, t_s, begin)
+        segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:], spread)
         return segment, begin[:-1]
+
+    def _spread_at(
+        self, rows: slice, at: IntArray, before: IntArray, t_s: FloatArray, begin: IntArray
+    ) -> FloatArray | None:
+        """Spread at the nodes of `intervals`: that of rows, and at instants on straight lines between two."""
+        if self._spread is None:
+            return None
+        spread, t = self._spread[self._start : self._stop][rows], self.rows[rows, 0]
+        if not spread.any():
+            return None
+        share = ((t_s - t[before]) / (t[before + 1] - t[before]))[:, None]
+        ends = spread[before] + share * (spread[before + 1] - spread[before])
+        nodes = np.take(spread, at, axis=0, mode="clip")
+        nodes[begin[:-1]], nodes[begin[1:] - 1] = ends[:-1], ends[1:]
+        return np.asarray(nodes)
 
     def turning(self, t_s: FloatArray, half_s: float) -> tuple[FloatArray, FloatArray]:
         """How the imu turns about instants.
@@ -214,6 +251,13 @@ class ImuBuffer:
         before, at, after = turns.at(np.concatenate([t_s - half, t_s, t_s + half])).reshape(3, -1, 3)
         half = half[:, None]
         return (after - before) / (2.0 * half), (after - 2.0 * at + before) / half**2
+
+
+def _moved(values: FloatArray, live: slice, length: int) -> FloatArray:
+    """Copy the live rows to the begin of an array of some length."""
+    out = np.empty((length, values.shape[1]))
+    out[: live.stop - live.start] = values[live]
+    return out
 
 
 class _Turns:

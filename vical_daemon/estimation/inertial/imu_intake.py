@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
+from vical_daemon.estimation.inertial.clipped_readings import Bridged, ClippedReadings
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, Six, SpikeFilter
 from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
 from vical_daemon.estimation.inertial.stamp_steps import LEARN, StampSteps
@@ -22,11 +23,12 @@ _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
 class Reading(NamedTuple):
-    """One inertial reading: stamp as it came, ns; rad/s; m/s^2."""
+    """One inertial reading: stamp as it came, ns; rad/s; m/s^2; `Bridged.spread`."""
 
     t_imu_ns: int
     gyro_rps: FloatArray
     specific_force_mps2: FloatArray
+    spread: Six | None = None
 
 
 class ImuIntake:
@@ -44,7 +46,7 @@ class ImuIntake:
         base_ns: First stamp, ns; stamps of images are counted from it, too.
         refused: Readings left out: out of order, no possible values, or with a wrong stamp.
         repeated: Readings left out because they repeat the one before, bit by bit.
-        clipped: Readings left out because a channel is at its range.
+        clipped: Readings of which a channel is at its range.
         between: Another recording was announced, and no reading of it has been added yet.
         gap_end_s: Where readings resumed after the latest gap, s; -inf: there was none.
     """
@@ -62,11 +64,11 @@ class ImuIntake:
         self._newest_s = -np.inf  # stamp as it came, plus what the clock has been set back
         self._held: tuple[float, Reading] | None = None
         self._last: tuple[float, ...] = ()
-        self._repeats = 0  # of the newest reading
-        self._limits = RangeLimits()
+        self._repeated_ns: int | None = None  # stamp of the newest reading that repeats the one before
+        self._limits: RangeLimits[int] = RangeLimits()
         self._spikes: SpikeFilter[tuple[int, Six]] = SpikeFilter()
+        self._bridges = ClippedReadings()
         self._taken = 0
-        self._clips = 0  # readings left out since the newest
         self._clipping: tuple[float, int, int] | None = None  # since when, and counts then
         self._news: list[Event] = []
         self._gap: Event | None = None  # forwards, until an image shows whether the clock was set
@@ -114,7 +116,7 @@ class ImuIntake:
             return []
         if six == self._last:
             self.repeated += 1
-            self._repeats += 1
+            self._repeated_ns = t_imu_ns
             return []
         self._last = six
         if self.buffer is None:
@@ -122,27 +124,47 @@ class ImuIntake:
             self.buffer = ImuBuffer(t_imu_ns)
         added = []
         for good_ns, good in self._spikes.sift(six, (t_imu_ns, six)):
-            added += self._unless_clipped(self.buffer, good_ns, good)
+            for bridged in self._bridged_over(self.buffer, good_ns, good):
+                added += self._place(self.buffer, bridged)
         return added
 
-    def _unless_clipped(self, buffer: ImuBuffer, t_imu_ns: int, six: Six) -> list[Reading]:
-        """Add a reading whose channels are all within their range; what others read is not known."""
+    def _bridged_over(self, buffer: ImuBuffer, t_imu_ns: int, six: Six) -> list[Bridged]:
+        """Give channels at the end of their range a value; also those before it was known to be the end."""
+        found = self._limits.found
+        decided = self._limits.sift(six, t_imu_ns)
+        if self._limits.found > found:
+            self._bridge_buffer(buffer)
+        out = []
+        for reading, t_ns, at_range in decided:
+            t_s = (t_ns - self.base_ns) * 1e-9
+            self._taken += 1
+            if at_range:
+                self.clipped += 1
+                self._clipping = self._clipping or (t_s, self._taken, self.clipped)
+            self._announce_clipping(t_s)
+            out += self._bridges.take(t_ns, reading, at_range)
+        return out
+
+    def _bridge_buffer(self, buffer: ImuBuffer) -> None:
+        bridges = ClippedReadings()
+        rows = buffer.rows.tolist()
+        settled = [
+            x for t_s, *six in rows for x in bridges.take(round(t_s * 1e9), six, self._limits.at_range(six))
+        ]
+        for row, x in enumerate([*settled, *bridges.rest()]):
+            if x.spread is not None:
+                self.clipped += 1
+                buffer.replace(row, x.six, x.spread)
+
+    def _place(self, buffer: ImuBuffer, bridged: Bridged) -> list[Reading]:
+        """Add a reading to the buffer, or hold it."""
+        t_imu_ns, six, spread = bridged
         t_s = (t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
-        self._taken += 1
-        if self._limits.clipped(six):
-            self.clipped += 1
-            self._clips += 1
-            self._clipping = self._clipping or (t_s, self._taken, self.clipped)
-            return []
-        self._announce_clipping(t_s)
         if self.between and t_s < self._newest_s + _APART_S:  # its stamps overlap, or seem to go on
             self.base_ns -= round((self._newest_s + _APART_S - t_s) * 1e9)
             t_s = self._newest_s + _APART_S
         values = np.array(six)
-        added = self._in_order(buffer, t_s, Reading(t_imu_ns, values[:3], values[3:]))
-        if added:
-            self._repeats = self._clips = 0
-        return added
+        return self._in_order(buffer, t_s, Reading(t_imu_ns, values[:3], values[3:], spread))
 
     def _announce_clipping(self, t_s: float) -> None:
         if self._clipping is not None and self._clipping[0] < t_s - _CLIPPED_S:
@@ -156,7 +178,7 @@ class ImuIntake:
         interval_s = t_s - self._newest_s
         if self._bridged(buffer, interval_s):
             self._held = None
-            self._add(buffer, t_s, reading, broken=self._clips > 0)
+            self._add(buffer, t_s, reading)
             return [reading]
         if self._held is not None:
             held_s, held = self._held
@@ -186,19 +208,20 @@ class ImuIntake:
             held_s, t_s = held_s + back_s, t_s + back_s
         elif not self.between:
             self._believe_gap()
-            kind = EventKind.IMU_REPEATED if self._repeats else EventKind.IMU_GAP
-            if not self._clips:
-                self._gap = Event(kind, value=held_s - self._newest_s)
+            since_ns = self.base_ns + round((self._newest_s - self._set_back_s) * 1e9)
+            repeats = self._repeated_ns is not None and since_ns < self._repeated_ns < held.t_imu_ns
+            kind = EventKind.IMU_REPEATED if repeats else EventKind.IMU_GAP
+            self._gap = Event(kind, value=held_s - self._newest_s)
         self.between = False
         self._add(buffer, held_s, held)
         self.gap_end_s = buffer.newest_s
         self._add(buffer, t_s, reading)
         return [held, reading]
 
-    def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading, *, broken: bool = False) -> None:
+    def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> None:
         self._newest_s = t_s
         even_s = self._steps.even(t_s)
-        buffer.append(even_s, reading.gyro_rps, reading.specific_force_mps2, broken=broken)
+        buffer.append(even_s, reading.gyro_rps, reading.specific_force_mps2, reading.spread)
 
     def saw_image(self, ahead_s: float) -> None:
         """Learn from an image whether stamps that jumped forwards mean a gap, or a clock that was set.
@@ -222,8 +245,9 @@ class ImuIntake:
         self._believe_gap()
         self._steps, self._set_back_s = StampSteps(), 0.0
         self._spikes.restart()
+        self._bridges = ClippedReadings()
         self._newest_s = -np.inf if self.buffer is None else self.buffer.newest_s
-        self._held, self._repeats, self._clips, self.between = None, 0, 0, True
+        self._held, self._repeated_ns, self.between = None, None, True
 
     def news(self) -> list[Event]:
         """What happened to the stream since the last call; a gap after an image, or half a second."""

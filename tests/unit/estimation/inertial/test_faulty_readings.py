@@ -1,4 +1,4 @@
-"""Readings clipped at a sensor's range, and spikes, are left out; everything else is taken as it is."""
+"""Readings at a sensor's range are found, and spikes are left out; everything else is taken as it is."""
 
 from __future__ import annotations
 
@@ -24,9 +24,12 @@ def motion(seconds: float = 30.0, noise: float = 2e-3, step: float = 0.0) -> np.
     return np.round(six / step) * step if step else six
 
 
-def left_out(six: np.ndarray) -> np.ndarray:
-    limits = RangeLimits()
-    return np.array([limits.clipped(row) for row in six.tolist()])
+def at_range(six: np.ndarray) -> np.ndarray:
+    """Which readings have a channel at its range; those that are held at the end are left away."""
+    limits: RangeLimits[int] = RangeLimits()
+    decided = [x for k, row in enumerate(six.tolist()) for x in limits.sift(row, k)]
+    assert [k for _, k, _ in decided] == list(range(len(decided)))
+    return np.array([bool(channels) for _, _, channels in decided])
 
 
 @pytest.mark.parametrize("step", [0.0, 3.5e-4])
@@ -35,27 +38,26 @@ def test_clipped_readings_are_found_from_the_first_run_on(step, sensor, at) -> N
     six = motion(step=step)
     beyond = (np.abs(six[:, sensor]) >= at).any(axis=1)
     six[:, sensor] = np.clip(six[:, sensor], -at, at)
-    found = left_out(six)
+    found = at_range(six)
     assert not found[~beyond].any()
-    first = np.flatnonzero(beyond)[0]
-    assert found[first + 40 :].sum() > 0.95 * beyond[first + 40 :].sum()
+    assert found[100:].sum() == beyond[100 : len(found)].sum()  # it starts beyond the range
 
 
 @pytest.mark.parametrize("step", [0.0, 3.5e-4, 2e-3])
 def test_readings_within_the_range_are_not(step) -> None:
-    assert left_out(motion(step=step)).mean() < 1e-3
+    assert at_range(motion(step=step)).mean() < 1e-3
 
 
 @pytest.mark.parametrize("step", [0.0, 1e-3, 1e-2, 0.1])
 def test_a_coarse_sensor_at_rest_is_not_at_its_range(step) -> None:
     six = np.random.default_rng(2).normal(GRAVITY, 5e-3, (6000, 6))
-    assert not left_out(np.round(six / step) * step if step else six).any()
+    assert not at_range(np.round(six / step) * step if step else six).any()
 
 
 def test_a_larger_value_shows_that_the_range_is_wider() -> None:
     six = motion()
     six[: len(six) // 2, :3] = np.clip(six[: len(six) // 2, :3], -1.0, 1.0)
-    found = left_out(six)
+    found = at_range(six)
     assert found[: len(six) // 2].mean() > 0.2
     assert found[len(six) // 2 + 200 :].mean() < 0.01
 
@@ -73,10 +75,11 @@ def test_single_spikes_are_left_out_and_nothing_else() -> None:
     assert sifted(six) == np.setdiff1d(np.arange(len(six)), at).tolist()
 
 
-def test_two_spikes_in_a_row_are_left_out_and_hide_no_later_ones() -> None:
+@pytest.mark.parametrize("second", [(1, -14.0), (0, 10.0), (0, 4.0)])
+def test_two_spikes_in_a_row_are_left_out_and_hide_no_later_ones(second) -> None:
     six = motion()
     six[300, 0] += 9.0
-    six[301, 1] -= 14.0
+    six[301, second[0]] += second[1]
     later = np.arange(320, 700, 20)
     six[later, 2] += 5.0
     assert sifted(six) == np.setdiff1d(np.arange(len(six)), [300, 301, *later]).tolist()
@@ -107,8 +110,15 @@ def take(six: np.ndarray) -> tuple[ImuIntake, list[EventKind]]:
     return intake, kinds
 
 
-def test_clipping_is_announced_once_with_its_share_and_is_never_interpolated() -> None:
-    six = motion()
+def test_a_rate_that_is_reached_within_a_few_steps_of_a_coarse_sensor_is_no_range() -> None:
+    six = np.random.default_rng(2).normal(GRAVITY, 1e-3, (2000, 6))
+    six[500:, 2] += np.minimum(np.arange(1500) * 0.05, 1.0)  # a robot that turns at 1 rad/s
+    assert not at_range(np.round(six / 0.01) * 0.01).any()
+
+
+def test_clipping_is_announced_once_with_its_share_and_bridged_as_far_as_it_goes() -> None:
+    true = motion()
+    six = true.copy()
     beyond = (np.abs(six[:, :3]) >= 1.5).any(axis=1)
     six[:, :3] = np.clip(six[:, :3], -1.5, 1.5)
     intake, events = ImuIntake(), []
@@ -118,9 +128,18 @@ def test_clipping_is_announced_once_with_its_share_and_is_never_interpolated() -
     assert [event.kind for event in events] == [EventKind.IMU_CLIPPED]
     assert events[0].value == pytest.approx(beyond[1000:].mean(), abs=0.1)
     assert intake.left_out["imu_clipped"] == pytest.approx(beyond.sum(), rel=0.1)
-    where = np.flatnonzero(beyond[2000:])[0] + 2000
     assert intake.buffer is not None
-    assert intake.buffer.gap_within(where / RATE_HZ - 0.02, where / RATE_HZ + 0.02)
+    assert not intake.buffer.gap_within(0.0, intake.buffer.newest_s)
+    error = intake.buffer.rows - np.column_stack([np.arange(len(six)) / RATE_HZ, true])[: len(intake.buffer)]
+    segment = intake.buffer.segment(0.0, intake.buffer.newest_s)
+    assert segment is not None
+    assert segment.spread is not None
+    uncertain = segment.spread > 0.0
+    assert np.count_nonzero(error[:, 1:][~uncertain]) <= 1  # the first of all
+    assert (uncertain.any(axis=1) == beyond[: len(uncertain)]).mean() > 0.999
+    ratio = np.abs(error[:, 1:][uncertain]) / segment.spread[uncertain]
+    assert np.sqrt(np.mean(ratio**2)) < 1.0
+    assert np.sqrt(np.mean(error[:, 1:][uncertain] ** 2)) < 0.1  # of up to 0.5 rad/s beyond
 
 
 def test_spikes_leave_no_event_and_no_gap() -> None:

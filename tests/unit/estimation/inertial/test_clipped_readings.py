@@ -1,0 +1,75 @@
+"""What becomes of readings at the end of a sensor's range."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation.inertial.clipped_readings import Bridged, ClippedReadings
+
+PERIOD_NS = 5_000_000
+RAIL = 1.0
+
+
+def bridged(rate: np.ndarray, other: np.ndarray | None = None) -> list[Bridged]:
+    """Rates about x (and y), rad/s, of a gyro that ends at 1 rad/s."""
+    six = np.zeros((len(rate), 6))
+    six[:, 0] = rate
+    six[:, 1] = 0.0 if other is None else other
+    six = np.clip(six, -RAIL, RAIL)
+    bridges, out = ClippedReadings(), []
+    for k, row in enumerate(six.tolist()):
+        out += bridges.take(k * PERIOD_NS, row, tuple(np.flatnonzero(np.abs(row) == RAIL).tolist()))
+    out += bridges.rest()
+    assert [x.t_ns for x in out] == [k * PERIOD_NS for k in range(len(rate))]
+    return out
+
+
+def test_readings_within_the_range_pass_at_once_and_unchanged() -> None:
+    bridges = ClippedReadings()
+    six = (0.1, 0.2, 0.3, 1.0, 2.0, 9.8)
+    assert bridges.take(7, six, ()) == [Bridged(7, six)]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_cubic_motion_is_restored_exactly_and_bounded_by_the_range(sign) -> None:
+    t = np.arange(100) * 5e-3
+    rate = sign * (1.3 - 12.0 * (t - 0.25) ** 2 - 10.0 * (t - 0.25) ** 3)
+    out = bridged(rate)
+    np.testing.assert_allclose([x.six[0] for x in out], rate, atol=1e-9)
+    spread = {round(x.spread[0], 9) for x in out if x.spread is not None}
+    assert spread == {round(float(np.abs(rate).max() - RAIL) / np.sqrt(3.0), 9)}
+    assert [x.spread is not None for x in out] == (np.abs(rate) > RAIL).tolist()
+
+
+def test_two_channels_wait_for_each_other_and_keep_their_own_runs() -> None:
+    t = np.arange(216) * 5e-3  # ends within the range of both
+    a, b = 1.3 * np.sin(8.0 * t), 1.2 * np.sin(8.0 * t + 0.6)
+    out = bridged(a, b)
+    for channel, rate in ((0, a), (1, b)):
+        uncertain = np.array([x.spread is not None and x.spread[channel] > 0.0 for x in out])
+        assert (uncertain == (np.abs(rate) > RAIL)).all()
+        error = np.array([x.six[channel] for x in out]) - rate
+        assert np.abs(error).max() < 0.06
+        assert not error[~uncertain].any()
+
+
+def test_a_run_without_an_end_is_released_and_may_be_twice_the_range() -> None:
+    rate = np.concatenate([np.linspace(0.0, 0.99, 50), np.full(500, 1.5)])
+    out = bridged(rate)
+    assert out[-1].six[0] == 1.5 * RAIL
+    assert out[-1].spread is not None
+    assert out[-1].spread[0] == pytest.approx(0.5 * RAIL / np.sqrt(3.0))
+    bridges = ClippedReadings()
+    held = [len(bridges.take(k * PERIOD_NS, (RAIL, 0.0, 0.0, 0.0, 0.0, 9.8), (0,))) for k in range(500)]
+    assert sum(held) >= 500 - 202  # one second
+
+
+def test_a_reading_that_comes_off_the_range_for_a_moment_keeps_its_value() -> None:
+    t = np.arange(100) * 5e-3
+    rate = 1.3 - 12.0 * (t - 0.25) ** 2
+    rate[50] = 0.95
+    out = bridged(rate)
+    assert out[50].six[0] == 0.95
+    assert out[50].spread is None
+    assert out[49].spread is not None
