@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from vical_daemon.estimation.inertial.clipped_readings import Bridged, ClippedReadings
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 
 PERIOD_NS = 5_000_000
 RAIL = 1.0
@@ -73,3 +76,17 @@ def test_a_reading_that_comes_off_the_range_for_a_moment_keeps_its_value() -> No
     assert out[50].six[0] == 0.95
     assert out[50].spread is None
     assert out[49].spread is not None
+
+
+def test_intervals_have_the_spread_of_their_segments():
+    rng, buffer = np.random.default_rng(0), ImuBuffer(0)
+    for k in range(100):
+        spread = rng.random(6).tolist() if 40 < k < 60 else None
+        buffer.append(0.01 * k, rng.standard_normal(3), rng.standard_normal(3), spread)
+    t_s = np.array([0.353, 0.4021, 0.47, 0.553, 0.6604])
+    found, begin = buffer.intervals(t_s)
+    alone = [buffer.segment(a, b) for a, b in pairwise(t_s)]
+    expected = [np.zeros((len(x.t_s), 6)) if x.spread is None else x.spread for x in alone]
+    np.testing.assert_allclose(found.t_s, np.concatenate([x.t_s for x in alone]))
+    np.testing.assert_allclose(found.spread, np.concatenate(expected))
+    assert [int(k) for k in begin] == np.cumsum([0, *(len(x.t_s) for x in alone[:-1])]).tolist()
