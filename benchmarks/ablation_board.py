@@ -244,7 +244,7 @@ BOARD: dict[str, Mechanism] = {
     "imu clipped": Mechanism(
         WRONG,
         "readings at the end of the range",
-        lambda: [(RangeLimits, "clipped", gives(False))],
+        lambda: [(RangeLimits, "at_range", gives(()))],
         disturbances=("gyro clips",),
     ),
     "imu spikes": Mechanism(

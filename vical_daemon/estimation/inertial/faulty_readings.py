@@ -45,7 +45,7 @@ class RangeLimits(Generic[T]):
     The six channels are followed upwards and downwards. A value that comes back again and again as the
     extreme of one of them is the end of the range, for all three channels of that sensor. So is one at which
     a channel stops in full motion: it comes there over many of its steps at once, and stays. Readings that
-    may be such a stop are held until it is decided. A larger value later shows that it was not the end.
+    repeat such a value are held until it is decided. A larger value later shows that it was not the end.
 
     Attributes:
         found: How often an end was found.
@@ -74,19 +74,19 @@ class RangeLimits(Generic[T]):
         for i, (value, before) in enumerate(zip(six, self._previous, strict=True)):
             if 0.0 < abs(value - before) < self._step[i // 3]:
                 self._step[i // 3] = abs(value - before)
-        waits = False
+        waiting = 0  # readings, the newest ones
         for i, (value, near) in enumerate(zip(both, self._near, strict=True)):
             if value > near:
                 self._follow(i, value, abs(six[i % 6] - self._previous[i % 6]))
                 self._near[i] = _NEAR * self._extreme[i]
-                waits |= 0 < self._stays[i] < _STOPS and not self._clips[i]
+                if 1 < self._stays[i] < _STOPS and not self._clips[i]:
+                    waiting = max(waiting, self._stays[i])
             elif self._stays[i]:
                 self._stays[i] = 0
         self._previous = six
         self._held.append((six, item))
-        if waits:
-            return []
-        held, self._held = self._held, []
+        decided = max(len(self._held) - waiting, 0)
+        held, self._held = self._held[:decided], self._held[decided:]
         return [(x, kept, self.at_range(x)) for x, kept in held]
 
     def at_range(self, six: Six) -> tuple[int, ...]:
