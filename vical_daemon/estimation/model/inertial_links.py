@@ -80,7 +80,7 @@ def make_links(
             np.matmul(M_a[of], x[..., None])[..., 0] for x in (force + lag * force_slope, force_slope)
         )
     zero = np.zeros((1, 3))
-    even = ImuSegment(segment.t_s, rate, force, segment.gap_s, turn_slope, force_slope)
+    even = ImuSegment(segment.t_s, rate, force, segment.gap_s, turn_slope, force_slope, segment.spread)
     motion = over_intervals(strapdown(even, zero, zero), begin, errors=True)
     covariance = np.array([e.noise(noise) for e in motion.influences])[:, _ORDER[:, None], _ORDER]
     try:

@@ -9,6 +9,8 @@ import pytest
 
 from vical_daemon.estimation.inertial.clipped_readings import Bridged, ClippedReadings
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.measurements import ImuNoise
+from vical_daemon.estimation.model.inertial_links import make_links
 
 PERIOD_NS = 5_000_000
 RAIL = 1.0
@@ -90,3 +92,20 @@ def test_intervals_have_the_spread_of_their_segments():
     np.testing.assert_allclose(found.t_s, np.concatenate([x.t_s for x in alone]))
     np.testing.assert_allclose(found.spread, np.concatenate(expected))
     assert [int(k) for k in begin] == np.cumsum([0, *(len(x.t_s) for x in alone[:-1])]).tolist()
+
+
+@pytest.mark.parametrize("imu", [6, 22])
+def test_links_over_clipped_readings_know_less(imu):
+    """What the clipped readings miss is common to them: a turn of its mean over the time."""
+    rng, missed_rps = np.random.default_rng(1), 0.05
+    plain, clipped = ImuBuffer(0), ImuBuffer(0)
+    for k in range(60):
+        rate, force = rng.standard_normal(3), rng.standard_normal(3)
+        plain.append(0.01 * k, rate, force)
+        clipped.append(0.01 * k, rate, force, [missed_rps, 0, 0, 0, 0, 0] if 20 <= k <= 30 else None)
+    noise = ImuNoise()
+    ends_s = np.array([0.15, 0.35])
+    ((known,), (less,)) = (make_links(x, ends_s, np.zeros((1, imu)), noise) for x in (plain, clipped))
+    more = np.linalg.inv(less.root_information.T @ less.root_information)
+    more -= np.linalg.inv(known.root_information.T @ known.root_information)
+    assert np.sqrt(np.trace(more[:3, :3])) == pytest.approx(0.11 * missed_rps, rel=0.05)
