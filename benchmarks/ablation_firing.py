@@ -13,7 +13,7 @@ from typing import Any
 from unittest.mock import patch
 
 from vical_daemon.estimation.smoother import target_free_status
-from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 
 
@@ -59,7 +59,7 @@ def _fired(counts: Counter[str]) -> list[tuple[Any, str, Callable[[Any], Any]]]:
         (TargetFreeStatus, "excess", excess),
         (TargetFreeStatus, "fits", fits),
         (TargetFreeStatus, "_reported_factor", reported),
-        (TargetFreeDoubts, "weighed", weighed),
+        (AlternativeModels, "weighed", weighed),
     ]
 
 

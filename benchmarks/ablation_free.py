@@ -25,8 +25,8 @@ from vical_daemon.estimation.smoother import (
     target_free_initializer,
     target_free_status,
 )
+from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Bundle
-from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.marginal_prior import DRIFT
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
@@ -47,10 +47,10 @@ def _agreed() -> list[tuple[Any, ...]]:
 
 
 def _compared() -> list[tuple[Any, ...]]:
-    weighed = TargetFreeDoubts.weighed
+    weighed = AlternativeModels.weighed
     return [
         (
-            TargetFreeDoubts,
+            AlternativeModels,
             "weighed",
             lambda self, carry, factor, _compared: weighed(self, carry, factor, True),
         )
@@ -172,7 +172,7 @@ FREE: dict[str, Mechanism] = {
     "free: stamp jitter": Mechanism(
         SMALL,
         "late and early images as unknowns",
-        lambda: [(Bundle, "_doubts_stamps", gives(False))],
+        lambda: [(Bundle, "_suspects_jitter", gives(False))],
         free=True,
         faults=("free: stamp jitter 1 ms",),
     ),

@@ -109,7 +109,7 @@ class TargetFreeCalibrator:
     def stamps_known_to(self, sigma_s: float) -> None:
         """Take how well the imu's driver knows its device's clock now, one sigma, s; nonsense is ignored."""
         if self._intake.stamps_known_to(sigma_s):
-            self.evaluator.doubts.stamp_sigma_s = sigma_s
+            self.evaluator.models.stamp_sigma_s = sigma_s
 
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
@@ -382,7 +382,7 @@ class TargetFreeCalibrator:
 
     def _walked(self, carry: MarginalPrior, span_s: float) -> MarginalPrior:
         """What goes into the next window: biases and delay walk."""
-        drifting, noise = self.evaluator.doubts.drifting, self.options.imu_noise
+        drifting, noise = self.evaluator.models.drifting, self.options.imu_noise
         return with_process_noise(carry, noise, self.active, span_s, drifting=drifting)
 
     def _forget(self) -> None:

@@ -248,9 +248,9 @@ def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
     evaluator = TargetFreeStatus(
         CalibrationOptions(target_free=True), "cam0", np.ones(LENS.start + 8, dtype=bool)
     )
-    evaluator.doubts.drifting = True
+    evaluator.models.drifting = True
     evaluator.changed()
-    assert not evaluator.doubts.drifting
+    assert not evaluator.models.drifting
 
 
 def test_a_drifting_clock_is_followed_also_over_darkness():

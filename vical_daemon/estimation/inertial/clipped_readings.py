@@ -31,12 +31,12 @@ class Bridged(NamedTuple):
     Attributes:
         t_ns: Its stamp, ns.
         six: Rates, rad/s, and specific forces, m/s^2.
-        spread: One sigma of each of them beyond the sensor's noise, shape (6,); None: there is none.
+        clipping_sigma: One sigma of each of them beyond the sensor's noise, shape (6,); None: there is none.
     """
 
     t_ns: int
     six: Six
-    spread: Six | None = None
+    clipping_sigma: Six | None = None
 
 
 @dataclass(slots=True)
@@ -45,7 +45,7 @@ class _Held:
 
     t_ns: int
     six: list[float]
-    spread: list[float] = field(default_factory=lambda: [0.0] * 6)
+    clipping_sigma: list[float] = field(default_factory=lambda: [0.0] * 6)
     waits: int = 0
 
 
@@ -139,7 +139,7 @@ class ClippedReadings:
         out = []
         while self._held and self._held[0].waits == 0:
             x = self._held.popleft()
-            out.append(Bridged(x.t_ns, x.six, x.spread if any(x.spread) else None))
+            out.append(Bridged(x.t_ns, x.six, x.clipping_sigma if any(x.clipping_sigma) else None))
         return out
 
 
@@ -157,8 +157,8 @@ def _bridge(run: _Run, channel: int) -> None:
     if run.after >= _LEAST and len(run.before) >= _LEAST:
         cubic = np.linalg.lstsq(powers[~clipped], values[~clipped], rcond=None)[0]
         beyond = np.copysign(1.0, rail) * (powers @ cubic - rail)
-    spread = _EVEN * float(np.abs(beyond[clipped]).max())
+    clipping_sigma = _EVEN * float(np.abs(beyond[clipped]).max())
     for reading, off, is_clipped in zip(run.readings, beyond[len(run.before) :], run.clipped, strict=True):
         if is_clipped:
             reading.six[channel] = rail + float(np.copysign(max(off, 0.0), rail))
-            reading.spread[channel] = spread
+            reading.clipping_sigma[channel] = clipping_sigma

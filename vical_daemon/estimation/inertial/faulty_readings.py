@@ -89,6 +89,10 @@ class RangeLimits(Generic[T]):
         held, self._held = self._held[:decided], self._held[decided:]
         return [(x, kept, self.at_range(x)) for x, kept in held]
 
+    def restart(self) -> None:
+        """Another recording follows: readings that wait for a decision are dropped, the range stays."""
+        self._held, self._stays = [], [0] * 12
+
     def at_range(self, six: Six) -> tuple[int, ...]:
         """Which of the six channels of a reading are at the end of their range."""
         if True not in self._clips:

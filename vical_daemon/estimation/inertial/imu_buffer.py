@@ -33,7 +33,7 @@ class ImuSegment(NamedTuple):
         gap_s: Longest interval between two real samples used, s.
         gyro_slope: Their derivatives by time, rad/s^2, shape (n + 1, 3); None: straight lines.
         accel_slope: m/s^3, shape (n + 1, 3).
-        spread: One sigma of what clipped readings miss, common to the segment, rad/s and m/s^2, shape
+        clipping_sigma: One sigma of what clipped readings miss, common to the segment, rad/s and m/s^2, shape
             (n + 1, 6); None: none is clipped.
     """
 
@@ -43,7 +43,7 @@ class ImuSegment(NamedTuple):
     gap_s: float
     gyro_slope: FloatArray | None = None
     accel_slope: FloatArray | None = None
-    spread: FloatArray | None = None
+    clipping_sigma: FloatArray | None = None
 
 
 class ImuBuffer:
@@ -58,7 +58,7 @@ class ImuBuffer:
         self._rows = np.empty((4096, 7))
         self._start = 0
         self._stop = 0
-        self._spread: FloatArray | None = None  # of each row; None: no reading was clipped
+        self._clipping_sigma: FloatArray | None = None  # of each row; None: no reading was clipped
 
     def __len__(self) -> int:
         return self._stop - self._start
@@ -79,7 +79,7 @@ class ImuBuffer:
         return float(self._rows[self._start, 0]) if len(self) else np.inf
 
     def append(
-        self, t_s: float, gyro: FloatArray, accel: FloatArray, spread: Sequence[float] | None = None
+        self, t_s: float, gyro: FloatArray, accel: FloatArray, clipping_sigma: Sequence[float] | None = None
     ) -> bool:
         """Add a reading; False (and nothing done) when it is not newer than the last, or not finite.
 
@@ -87,7 +87,7 @@ class ImuBuffer:
             t_s: Its time, s.
             gyro: rad/s, shape (3,).
             accel: m/s^2, shape (3,).
-            spread: One sigma of each, beyond the sensor's noise, shape (6,); None: there is none.
+            clipping_sigma: One sigma of each, beyond the sensor's noise, shape (6,); None: there is none.
         """
         if t_s <= self.newest_s:
             return False
@@ -99,26 +99,26 @@ class ImuBuffer:
         row[4:7] = accel
         if not math.isfinite(row.sum()):
             return False
-        if spread is not None and self._spread is None:
-            self._spread = np.zeros((len(self._rows), 6))
-        if self._spread is not None:
-            self._spread[self._stop] = 0.0 if spread is None else spread
+        if clipping_sigma is not None and self._clipping_sigma is None:
+            self._clipping_sigma = np.zeros((len(self._rows), 6))
+        if self._clipping_sigma is not None:
+            self._clipping_sigma[self._stop] = 0.0 if clipping_sigma is None else clipping_sigma
         self._stop += 1
         return True
 
-    def replace(self, row: int, six: Sequence[float], spread: Sequence[float]) -> None:
-        """Give a row of `rows` other values, rad/s and m/s^2, and their spread."""
-        if self._spread is None:
-            self._spread = np.zeros((len(self._rows), 6))
+    def replace(self, row: int, six: Sequence[float], clipping_sigma: Sequence[float]) -> None:
+        """Give a row of `rows` other values, rad/s and m/s^2, and their sigma beyond the noise."""
+        if self._clipping_sigma is None:
+            self._clipping_sigma = np.zeros((len(self._rows), 6))
         self._rows[self._start + row, 1:] = six
-        self._spread[self._start + row] = spread
+        self._clipping_sigma[self._start + row] = clipping_sigma
 
     def _make_room(self) -> None:
         length = len(self._rows) * (2 if len(self) > len(self._rows) // 2 else 1)
         live = slice(self._start, self._stop)
         self._rows = _moved(self._rows, live, length)
-        if self._spread is not None:
-            self._spread = _moved(self._spread, live, length)
+        if self._clipping_sigma is not None:
+            self._clipping_sigma = _moved(self._clipping_sigma, live, length)
         self._start, self._stop = 0, len(self)
 
     @property
@@ -167,20 +167,9 @@ class ImuBuffer:
         rise = np.concatenate([change[:1], slope[middle], change[1:]])
         times = np.concatenate([ends[:1], inside[middle, 0], ends[1:]])
         gap = float((t[first + 1 : high + 1] - t[first:high]).max(initial=0.0))
-        spread = self._spread_of(slice(first, last + 1), middle, times)
-        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:], spread)
-
-    def _spread_of(self, rows: slice, middle: slice, times_s: FloatArray) -> FloatArray | None:
-        """Spread at instants: those of some of the rows, and one before and one after, on straight lines."""
-        if self._spread is None:
-            return None
-        spread, t = self._spread[self._start : self._stop][rows], self.rows[rows, 0]
-        if not spread.any():
-            return None
-        share = (times_s[[0, -1]] - t[[0, -2]]) / (t[[1, -1]] - t[[0, -2]])
-        first = spread[0] + share[0] * (spread[1] - spread[0])
-        last = spread[-2] + share[1] * (spread[-1] - spread[-2])
-        return np.concatenate([first[None], spread[middle], last[None]])
+        at, whole = np.arange(low - 1, high + 1) - first, np.array([0, len(times)])
+        sigma = self._clipping_sigma_at(slice(first, last + 1), at, k, ends, whole)
+        return ImuSegment(times, cut[:, :3], cut[:, 3:], gap, rise[:, :3], rise[:, 3:], sigma)
 
     def intervals(self, t_s: FloatArray) -> tuple[ImuSegment, npt.NDArray[np.intp]] | None:
         """Return the readings of each interval between instants, one interval after the other.
@@ -209,22 +198,30 @@ class ImuBuffer:
         for where, which in ((begin[:-1], slice(None, -1)), (begin[1:] - 1, slice(1, None))):
             nodes[where, 0], nodes[where, 1:], rise[where] = t_s[which], value[which], change[which]
         gap = float(np.diff(t[first : last + 1]).max())
-        spread = self._spread_at(slice(first, last + 1), at - first, k, t_s, begin)
-        segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:], spread)
+        sigma = self._clipping_sigma_at(slice(first, last + 1), at - first, k, t_s, begin)
+        segment = ImuSegment(nodes[:, 0], nodes[:, 1:4], nodes[:, 4:], gap, rise[:, :3], rise[:, 3:], sigma)
         return segment, begin[:-1]
 
-    def _spread_at(
+    def _clipping_sigma_at(
         self, rows: slice, at: IntArray, before: IntArray, t_s: FloatArray, begin: IntArray
     ) -> FloatArray | None:
-        """Spread at the nodes of `intervals`: that of rows, and at instants on straight lines between two."""
-        if self._spread is None:
+        """See `ImuSegment`, at the nodes of intervals: that of rows, and at their ends on straight lines.
+
+        Args:
+            rows: Those that count.
+            at: Row of each node among them.
+            before: Row before each instant.
+            t_s: Instants, s, shape (m + 1,).
+            begin: First node of each interval, and the number of nodes, shape (m + 1,).
+        """
+        if self._clipping_sigma is None:
             return None
-        spread, t = self._spread[self._start : self._stop][rows], self.rows[rows, 0]
-        if not spread.any():
+        sigma, t = self._clipping_sigma[self._start : self._stop][rows], self.rows[rows, 0]
+        if not sigma.any():
             return None
         share = ((t_s - t[before]) / (t[before + 1] - t[before]))[:, None]
-        ends = spread[before] + share * (spread[before + 1] - spread[before])
-        nodes = np.take(spread, at, axis=0, mode="clip")
+        ends = sigma[before] + share * (sigma[before + 1] - sigma[before])
+        nodes = np.take(sigma, at, axis=0, mode="clip")
         nodes[begin[:-1]], nodes[begin[1:] - 1] = ends[:-1], ends[1:]
         return np.asarray(nodes)
 

@@ -23,12 +23,12 @@ _AGAIN = 1.5  # times the interval before: the next one confirms it
 
 
 class Reading(NamedTuple):
-    """One inertial reading: stamp as it came, ns; rad/s; m/s^2; `Bridged.spread`."""
+    """One inertial reading: stamp as it came, ns; rad/s; m/s^2; `Bridged.clipping_sigma`."""
 
     t_imu_ns: int
     gyro_rps: FloatArray
     specific_force_mps2: FloatArray
-    spread: Six | None = None
+    clipping_sigma: Six | None = None
 
 
 class ImuIntake:
@@ -152,19 +152,19 @@ class ImuIntake:
             x for t_s, *six in rows for x in bridges.take(round(t_s * 1e9), six, self._limits.at_range(six))
         ]
         for row, x in enumerate([*settled, *bridges.rest()]):
-            if x.spread is not None:
+            if x.clipping_sigma is not None:
                 self.clipped += 1
-                buffer.replace(row, x.six, x.spread)
+                buffer.replace(row, x.six, x.clipping_sigma)
 
     def _place(self, buffer: ImuBuffer, bridged: Bridged) -> list[Reading]:
         """Add a reading to the buffer, or hold it."""
-        t_imu_ns, six, spread = bridged
+        t_imu_ns, six, clipping_sigma = bridged
         t_s = (t_imu_ns - self.base_ns) * 1e-9 + self._set_back_s
         if self.between and t_s < self._newest_s + _APART_S:  # its stamps overlap, or seem to go on
             self.base_ns -= round((self._newest_s + _APART_S - t_s) * 1e9)
             t_s = self._newest_s + _APART_S
         values = np.array(six)
-        return self._in_order(buffer, t_s, Reading(t_imu_ns, values[:3], values[3:], spread))
+        return self._in_order(buffer, t_s, Reading(t_imu_ns, values[:3], values[3:], clipping_sigma))
 
     def _announce_clipping(self, t_s: float) -> None:
         if self._clipping is not None and self._clipping[0] < t_s - _CLIPPED_S:
@@ -221,7 +221,7 @@ class ImuIntake:
     def _add(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> None:
         self._newest_s = t_s
         even_s = self._steps.even(t_s)
-        buffer.append(even_s, reading.gyro_rps, reading.specific_force_mps2, reading.spread)
+        buffer.append(even_s, reading.gyro_rps, reading.specific_force_mps2, reading.clipping_sigma)
 
     def saw_image(self, ahead_s: float) -> None:
         """Learn from an image whether stamps that jumped forwards mean a gap, or a clock that was set.
@@ -245,6 +245,7 @@ class ImuIntake:
         self._believe_gap()
         self._steps, self._set_back_s = StampSteps(), 0.0
         self._spikes.restart()
+        self._limits.restart()
         self._bridges = ClippedReadings()
         self._newest_s = -np.inf if self.buffer is None else self.buffer.newest_s
         self._held, self._repeated_ns, self.between = None, None, True

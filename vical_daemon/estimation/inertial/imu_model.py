@@ -43,14 +43,14 @@ class Strapdown(NamedTuple):
         dv: Integral of the specific force in the start frame, m/s, shape (S, n + 1, 3).
         dp: Double integral, m, shape (S, n + 1, 3).
         t_s: Node times since the start, s, shape (n + 1,).
-        spread: See `ImuSegment`.
+        clipping_sigma: See `ImuSegment`.
     """
 
     dR: FloatArray
     dv: FloatArray
     dp: FloatArray
     t_s: FloatArray
-    spread: FloatArray | None = None
+    clipping_sigma: FloatArray | None = None
 
 
 def strapdown(
@@ -105,7 +105,7 @@ def strapdown(
         moved = h * h * (0.35 * before + 0.15 * after) + (0.05 * slope[:-1] - slope[1:] / 30.0) * (h * h * h)
     np.cumsum(gained, axis=1, out=dv[:, 1:])
     np.cumsum(dv[:, :-1] * h + moved, axis=1, out=dp[:, 1:])
-    return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0], segment.spread)
+    return Strapdown(dR, dv, dp, segment.t_s - segment.t_s[0], segment.clipping_sigma)
 
 
 def products(steps: FloatArray) -> FloatArray:
@@ -190,13 +190,13 @@ class Influence(NamedTuple):
             a force error (three) that act for a second, shape (n + 1, 9, 6).
         weights: Duration that each node stands for (trapezoids), s, shape (n + 1,).
         beyond: By how much trapezoids exaggerate the integral of the squared time to the end, s^3.
-        spread: See `ImuSegment`.
+        clipping_sigma: See `ImuSegment`.
     """
 
     at: FloatArray
     weights: FloatArray
     beyond: float
-    spread: FloatArray | None = None
+    clipping_sigma: FloatArray | None = None
 
     def by_bias(self) -> FloatArray:
         """Return the end by constant biases [gyro 3, accel 3], shape (9, 6); Forster et al. 2017, (69)."""
@@ -212,8 +212,8 @@ class Influence(NamedTuple):
         G = (self.at * roots[:, None, :]).transpose(1, 0, 2).reshape(9, -1)
         covariance = G @ G.T
         covariance[_PLACE, _PLACE] -= noise.accel_density**2 * self.beyond
-        if self.spread is not None:
-            G = np.einsum("kij,kj->ij", self.at, self.weights[:, None] * self.spread)
+        if self.clipping_sigma is not None:
+            G = np.einsum("kij,kj->ij", self.at, self.weights[:, None] * self.clipping_sigma)
             covariance += G @ G.T
         return covariance
 
@@ -244,7 +244,7 @@ def influence(R_start: FloatArray, relative: Strapdown) -> Influence:
     V = relative.dv[0] @ R_start.T
     P = relative.dp[0] @ R_start.T
     at = _influence_at(R, V, P, (t[-1] - t)[:, None], (R[-1], V[-1], P[-1]))
-    return Influence(at, *_trapezoids(t), relative.spread)
+    return Influence(at, *_trapezoids(t), relative.clipping_sigma)
 
 
 def _influence_at(
@@ -309,9 +309,10 @@ def over_intervals(relative: Strapdown, begin: npt.NDArray[np.intp], *, errors: 
     if errors:
         end = np.repeat(last, stop - begin)
         at = _influence_at(R, V, P, (t[end] - t)[:, None], (R[end], V[end], P[end]))
-        spread = [None if relative.spread is None else relative.spread[own] for own in nodes]
+        sigma = relative.clipping_sigma
+        clipping = [None if sigma is None else sigma[own] for own in nodes]
         influences = [
             Influence(at[own], *_trapezoids(t[own]), clipped)
-            for own, clipped in zip(nodes, spread, strict=True)
+            for own, clipped in zip(nodes, clipping, strict=True)
         ]
     return Intervals(t[last] - t[begin], R[last], V[last], P[last], nodes, influences)

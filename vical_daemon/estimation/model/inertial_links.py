@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer, ImuSegment
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import over_intervals, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
@@ -80,7 +80,7 @@ def make_links(
             np.matmul(M_a[of], x[..., None])[..., 0] for x in (force + lag * force_slope, force_slope)
         )
     zero = np.zeros((1, 3))
-    even = ImuSegment(segment.t_s, rate, force, segment.gap_s, turn_slope, force_slope, segment.spread)
+    even = segment._replace(gyro=rate, accel=force, gyro_slope=turn_slope, accel_slope=force_slope)
     motion = over_intervals(strapdown(even, zero, zero), begin, errors=True)
     covariance = np.array([e.noise(noise) for e in motion.influences])[:, _ORDER[:, None], _ORDER]
     try:

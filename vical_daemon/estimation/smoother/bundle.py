@@ -140,7 +140,7 @@ class Bundle:
                 continue
             if cleaned and step.predicted_reduction < _DONE:
                 self._apply(step)
-                settled = not self._doubts_stamps(seen, links)
+                settled = not self._suspects_jitter(seen, links)
                 if settled:
                     break
                 w.bad.clear()  # late images had looked like outliers
@@ -261,11 +261,11 @@ class Bundle:
         w.landmarks = Landmarks(m.ids, m.anchor, bearing, inverse)
 
     # ------------------------------------------------------------------ noise, outliers, result
-    def _doubts_stamps(self, seen: Seen, links: PreintegratedLinks) -> bool:
+    def _suspects_jitter(self, seen: Seen, links: PreintegratedLinks) -> bool:
         """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
         if self.problem.jitter_s:
             return False
-        self.problem.jitter_s = self.problem.stamps_doubted(seen, links)
+        self.problem.jitter_s = self.problem.suspected_jitter_s(seen, links)
         return self.problem.jitter_s > 0.0
 
     def _learn_noise(self, seen: Seen) -> None:

@@ -137,11 +137,11 @@ class FirstWindow:
         found = self._solved(buffer, read_by_columns(bundle.window), None, Noise.of(fit), ())
         if found[2] is None or not (found[2].settled and self._status.fits(found[2], first=True)):
             return None
-        sure = self._status.doubts.rolls(found[2].carry, self._status.factor())
+        sure = self._status.models.rolls(found[2].carry, self._status.factor())
         if not sure or readout_sigmas(found[2].carry) < readout_sigmas(fit.carry):
             return None
         self._prior = self.initializer.prior = replace(self._prior, readout_axis=COLUMNS)
-        self._status.doubts.axis_changed()
+        self._status.models.axis_changed()
         return Begun(found[0], found[2])
 
     def _solved(
@@ -153,9 +153,9 @@ class FirstWindow:
         reopened: Collection[int],
     ) -> tuple[Bundle, MarginalPrior, Fit | None]:
         """Adjust a window with what is known but for some errors."""
-        doubts, held = self._status.doubts, self.initializer.held
+        models, held = self._status.models, self.initializer.held
         carry = initial_prior(
-            window, known, self._active, held, doubts.imu_sigma, self._prior, reopened, doubts.lens
+            window, known, self._active, held, models.imu_sigma, self._prior, reopened, models.lens
         )
         bundle = Bundle(window, carry, *noise)
         return bundle, carry, bundle.solve(buffer, _STEPS)

@@ -259,7 +259,7 @@ class Problem:
         cost += self._add_prior(H, g, order) + self._add_own_lens(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 
-    def stamps_doubted(self, seen: Seen, links: PreintegratedLinks) -> float:
+    def suspected_jitter_s(self, seen: Seen, links: PreintegratedLinks) -> float:
         """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
 
         A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.

@@ -37,7 +37,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 _GYRO = slice(IMU.start, IMU.start + 9)
 
 
-class Doubts(NamedTuple):
+class ReportedModels(NamedTuple):
     """How what is carried is to be reported.
 
     Attributes:
@@ -62,25 +62,29 @@ class Doubts(NamedTuple):
 
 
 def camera_estimate(
-    carry: MarginalPrior, doubts: Doubts, sigma_px: float, rms_px: float, held: FloatArray | None = None
+    carry: MarginalPrior,
+    models: ReportedModels,
+    sigma_px: float,
+    rms_px: float,
+    held: FloatArray | None = None,
 ) -> CameraEstimate:
     """The camera as it is known.
 
     Args:
         carry: What is known.
-        doubts: See there.
+        models: See there.
         sigma_px: Pixel noise.
         rms_px: RMS of the residuals.
         held: Axis of the imu along which the lever arm is not known, unit, shape (3,); None: there is none.
     """
-    camera, covariance = _averaged(carry, doubts)
+    camera, covariance = _averaged(carry, models)
     if held is not None:
         covariance[:3, :3] += held_covariance(np.outer(held, held))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))  # rounding, where nothing is in doubt
     lens, lens_sigma = np.concatenate([camera.intrinsics, camera.distortion]), sigma[LENS]
-    if doubts.lens is not None:
-        lens, lens_sigma = doubts.lens.values, doubts.lens.reported(lens_sigma)
-    if doubts.term:
+    if models.lens is not None:
+        lens, lens_sigma = models.lens.values, models.lens.reported(lens_sigma)
+    if models.term:
         lens, lens_sigma = lens[:-1], lens_sigma[:-1]
         camera = replace(camera, distortion=lens[4:], distortion_model=RADTAN)
     reported = [*range(SHIFT + 1), *range(LENS.start, LENS.start + len(lens))]
@@ -94,29 +98,29 @@ def camera_estimate(
         rms_px=rms_px,
         sigma_px=sigma_px,
         joint=covariance[np.ix_(reported, reported)],
-        rolling=doubts.rolling,
+        rolling=models.rolling,
     )
 
 
-def _averaged(carry: MarginalPrior, doubts: Doubts) -> tuple[CameraState, FloatArray]:
+def _averaged(carry: MarginalPrior, models: ReportedModels) -> tuple[CameraState, FloatArray]:
     """Camera and covariance (n, n) over the models of imu, fixed lens and clock; see `model_mixture`."""
-    d, S = _over_clocks(carry, doubts)
-    every = {name: replace(b, values=b.values + d[b.where]) for name, b in doubts.every.items()}
-    step, S = mixture(S, every, doubts.weights, doubts.factor)
+    d, S = _over_clocks(carry, models)
+    every = {name: replace(b, values=b.values + d[b.where]) for name, b in models.every.items()}
+    step, S = mixture(S, every, models.weights, models.factor)
     d = d + step
     camera, numbers = moved_camera(carry.camera, CAMERA, d), carry.imu + d[INERTIAL]
-    if doubts.gyro_frame:
+    if models.gyro_frame:
         camera, S = _in_gyro_frame(camera, numbers, S)
-    return camera, doubts.factor * (S @ S.T)
+    return camera, models.factor * (S @ S.T)
 
 
-def _over_clocks(carry: MarginalPrior, doubts: Doubts) -> tuple[FloatArray, FloatArray]:
+def _over_clocks(carry: MarginalPrior, models: ReportedModels) -> tuple[FloatArray, FloatArray]:
     """What the mean moves by, shape (n,), and root of the covariance over its factor, over the clocks."""
-    if not doubts.clocks:
+    if not models.clocks:
         return np.zeros(len(carry.active)), calibration_root(carry)
-    d, P = over_clocks(carry, doubts.clocks, doubts.factor)
+    d, P = over_clocks(carry, models.clocks, models.factor)
     scale = np.where(carry.active, np.sqrt(np.maximum(np.diag(P), 1e-300)), 1.0)  # pixels and microseconds
-    values, vectors = np.linalg.eigh(P / np.outer(scale, scale) / doubts.factor)
+    values, vectors = np.linalg.eigh(P / np.outer(scale, scale) / models.factor)
     return d, scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 

@@ -20,9 +20,9 @@ from vical_daemon.estimation.result import (
     TracePoint,
 )
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
+from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
-from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.status.evaluator import (
@@ -82,7 +82,7 @@ class TargetFreeStatus(Evaluator):
         self._bumped = Cause.NONE
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
-        self.doubts = TargetFreeDoubts(camera, asked=options.estimate, rolling=rolling, lens=lens, term=term)
+        self.models = AlternativeModels(camera, asked=options.estimate, rolling=rolling, lens=lens, term=term)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -151,7 +151,7 @@ class TargetFreeStatus(Evaluator):
         self._announce(EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER, cause=why)
         if change is not None:
             self.announce_all(_changes(self.camera, change, self.active))
-        self._bumped, self._quiet, self.doubts.drifting = why, (Cause.NONE, None), False
+        self._bumped, self._quiet, self.models.drifting = why, (Cause.NONE, None), False
         self._started_s, self._windows, self._against_since_s = None, 0, None
         self.believed = False
         self._agreement.clear()
@@ -194,19 +194,19 @@ class TargetFreeStatus(Evaluator):
         self._now_s, self._sigma_px, self.jitter_s = t_s, fit.sigma_px, fit.jitter_s
         self._squares.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
-        self.announce_all(self.doubts.watch(fit.carry, self.factor(), bool(self._agreement)))
+        self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._agreement)))
         if self._trace.due(t_s):
             self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
 
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
         """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
-        carry, events = self.doubts.window_done(carry, self.factor())
+        carry, events = self.models.window_done(carry, self.factor())
         self.announce_all(events)
         return carry
 
     def settled(self, carry: MarginalPrior) -> MarginalPrior:
         """What is known, for a start: the mixture over what may have happened to the clocks."""
-        return self.doubts.settled(carry, self.factor())
+        return self.models.settled(carry, self.factor())
 
     def closed(self) -> None:
         """A window is complete and agreed."""
@@ -227,7 +227,7 @@ class TargetFreeStatus(Evaluator):
         """
         # at the first image, where the change was taken; of the clocks by what most likely happened to them
         after = fit.carry.at(carry.t_cam_s)
-        clocks = self.doubts.clocks(fit.carry, self.factor())
+        clocks = self.models.clocks(fit.carry, self.factor())
         change, (P_old, P_new) = compared_by(carry, after, fit.change, clocks)
         scale = np.sqrt(np.diag(P_old))
         values, vectors = np.linalg.eigh((P_old - P_new) / np.outer(scale, scale))
@@ -288,8 +288,8 @@ class TargetFreeStatus(Evaluator):
         if camera is not None and carry is not None:
             at = carry.camera.R_imu_cam, carry.bias[:3]
             missing = self._weak(camera, *at)
-            lens_alone = self.doubts.lens is not None and not self._weak(lens_known(camera), *at)
-        doubt = "" if carry is None else self.doubts.reason(carry, self.factor(), believed=self.believed)
+            lens_alone = self.models.lens is not None and not self._weak(lens_known(camera), *at)
+        doubt = "" if carry is None else self.models.reason(carry, self.factor(), believed=self.believed)
         self.believed &= not doubt
         verdict = self._decide(camera is not None, running, missing, doubt, lens_alone=lens_alone)
         if carry is None:
@@ -310,7 +310,7 @@ class TargetFreeStatus(Evaluator):
             self.frames_seen,
             self.imu_samples,
             {} if camera is None else {self.camera: camera},
-            None if carry is None else imu_estimate(carry, matrices_asked=self.doubts.imu_asked),
+            None if carry is None else imu_estimate(carry, matrices_asked=self.models.imu_asked),
             gravity,
             self.nis_per_dof(),
             refused / max(seen, 1),
@@ -321,8 +321,8 @@ class TargetFreeStatus(Evaluator):
     def _camera(self, carry: MarginalPrior) -> CameraEstimate:
         squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
-        doubts = self.doubts.weighed(carry, self._reported_factor(), bool(self._agreement))
-        return camera_estimate(carry, doubts, self._sigma_px, rms_px, self.held)
+        models = self.models.weighed(carry, self._reported_factor(), bool(self._agreement))
+        return camera_estimate(carry, models, self._sigma_px, rms_px, self.held)
 
     def _decide(
         self, known: bool, running: bool, missing: list[WeakDirection], doubt: str, *, lens_alone: bool
@@ -355,7 +355,7 @@ class TargetFreeStatus(Evaluator):
                 return Verdict(Status.CONVERGING, doubt + pause)
             return Verdict(Status.CONVERGED, pause.strip(" ()"))
         if lens_alone:
-            return lens_verdict(missing[0], self.camera, off=self.doubts.lens_off)
+            return lens_verdict(missing[0], self.camera, off=self.models.lens_off)
         patient = self._now_s - (self._started_s or 0.0) > PATIENCE_S
         return lacking_verdict(missing, patient=patient, pause=pause)
 

@@ -49,7 +49,7 @@ class HoldoutCheck:
             return None
         self._copy, self._next_s = None, t_s + _EVERY_S
         segment = buffer.segment(held.state.t_s, t_s)
-        if segment is None or segment.spread is not None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
+        if segment is None or segment.clipping_sigma is not None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
             return None
         held.predict(segment)
         return held.prediction_nis(held.image(frame, t_cam_s, target[frame.ids]))

@@ -42,9 +42,9 @@ def test_a_cubic_motion_is_restored_exactly_and_bounded_by_the_range(sign) -> No
     rate = sign * (1.3 - 12.0 * (t - 0.25) ** 2 - 10.0 * (t - 0.25) ** 3)
     out = bridged(rate)
     np.testing.assert_allclose([x.six[0] for x in out], rate, atol=1e-9)
-    spread = {round(x.spread[0], 9) for x in out if x.spread is not None}
-    assert spread == {round(float(np.abs(rate).max() - RAIL) / np.sqrt(3.0), 9)}
-    assert [x.spread is not None for x in out] == (np.abs(rate) > RAIL).tolist()
+    clipping_sigma = {round(x.clipping_sigma[0], 9) for x in out if x.clipping_sigma is not None}
+    assert clipping_sigma == {round(float(np.abs(rate).max() - RAIL) / np.sqrt(3.0), 9)}
+    assert [x.clipping_sigma is not None for x in out] == (np.abs(rate) > RAIL).tolist()
 
 
 def test_two_channels_wait_for_each_other_and_keep_their_own_runs() -> None:
@@ -52,7 +52,7 @@ def test_two_channels_wait_for_each_other_and_keep_their_own_runs() -> None:
     a, b = 1.3 * np.sin(8.0 * t), 1.2 * np.sin(8.0 * t + 0.6)
     out = bridged(a, b)
     for channel, rate in ((0, a), (1, b)):
-        uncertain = np.array([x.spread is not None and x.spread[channel] > 0.0 for x in out])
+        uncertain = np.array([x.clipping_sigma is not None and x.clipping_sigma[channel] > 0.0 for x in out])
         assert (uncertain == (np.abs(rate) > RAIL)).all()
         error = np.array([x.six[channel] for x in out]) - rate
         assert np.abs(error).max() < 0.06
@@ -63,8 +63,8 @@ def test_a_run_without_an_end_is_released_and_may_be_twice_the_range() -> None:
     rate = np.concatenate([np.linspace(0.0, 0.99, 50), np.full(500, 1.5)])
     out = bridged(rate)
     assert out[-1].six[0] == 1.5 * RAIL
-    assert out[-1].spread is not None
-    assert out[-1].spread[0] == pytest.approx(0.5 * RAIL / np.sqrt(3.0))
+    assert out[-1].clipping_sigma is not None
+    assert out[-1].clipping_sigma[0] == pytest.approx(0.5 * RAIL / np.sqrt(3.0))
     bridges = ClippedReadings()
     held = [len(bridges.take(k * PERIOD_NS, (RAIL, 0.0, 0.0, 0.0, 0.0, 9.8), (0,))) for k in range(500)]
     assert sum(held) >= 500 - 202  # one second
@@ -76,21 +76,21 @@ def test_a_reading_that_comes_off_the_range_for_a_moment_keeps_its_value() -> No
     rate[50] = 0.95
     out = bridged(rate)
     assert out[50].six[0] == 0.95
-    assert out[50].spread is None
-    assert out[49].spread is not None
+    assert out[50].clipping_sigma is None
+    assert out[49].clipping_sigma is not None
 
 
-def test_intervals_have_the_spread_of_their_segments():
+def test_intervals_have_the_sigma_of_their_segments():
     rng, buffer = np.random.default_rng(0), ImuBuffer(0)
     for k in range(100):
-        spread = rng.random(6).tolist() if 40 < k < 60 else None
-        buffer.append(0.01 * k, rng.standard_normal(3), rng.standard_normal(3), spread)
+        clipping_sigma = rng.random(6).tolist() if 40 < k < 60 else None
+        buffer.append(0.01 * k, rng.standard_normal(3), rng.standard_normal(3), clipping_sigma)
     t_s = np.array([0.353, 0.4021, 0.47, 0.553, 0.6604])
     found, begin = buffer.intervals(t_s)
     alone = [buffer.segment(a, b) for a, b in pairwise(t_s)]
-    expected = [np.zeros((len(x.t_s), 6)) if x.spread is None else x.spread for x in alone]
+    expected = [np.zeros((len(x.t_s), 6)) if x.clipping_sigma is None else x.clipping_sigma for x in alone]
     np.testing.assert_allclose(found.t_s, np.concatenate([x.t_s for x in alone]))
-    np.testing.assert_allclose(found.spread, np.concatenate(expected))
+    np.testing.assert_allclose(found.clipping_sigma, np.concatenate(expected))
     assert [int(k) for k in begin] == np.cumsum([0, *(len(x.t_s) for x in alone[:-1])]).tolist()
 
 

@@ -136,11 +136,11 @@ def test_clipping_is_announced_once_with_its_share_and_bridged_as_far_as_it_goes
     error = intake.buffer.rows - np.column_stack([np.arange(len(six)) / RATE_HZ, true])[: len(intake.buffer)]
     segment = intake.buffer.segment(0.0, intake.buffer.newest_s)
     assert segment is not None
-    assert segment.spread is not None
-    uncertain = segment.spread > 0.0
+    assert segment.clipping_sigma is not None
+    uncertain = segment.clipping_sigma > 0.0
     assert np.count_nonzero(error[:, 1:][~uncertain]) <= 1  # the first of all
     assert (uncertain.any(axis=1) == beyond[: len(uncertain)]).mean() > 0.999
-    ratio = np.abs(error[:, 1:][uncertain]) / segment.spread[uncertain]
+    ratio = np.abs(error[:, 1:][uncertain]) / segment.clipping_sigma[uncertain]
     assert np.sqrt(np.mean(ratio**2)) < 1.0
     assert np.sqrt(np.mean(error[:, 1:][uncertain] ** 2)) < 0.1  # of up to 0.5 rad/s beyond
 
@@ -152,3 +152,13 @@ def test_spikes_leave_no_event_and_no_gap() -> None:
     assert kinds == [] and intake.left_out["imu_spikes"] == 1
     assert intake.buffer is not None and len(intake.buffer) == len(six) - 1
     assert not intake.buffer.gap_within(3.4, 3.6)
+
+
+def test_readings_that_wait_are_dropped_when_another_recording_follows() -> None:
+    limits: RangeLimits[int] = RangeLimits()
+    rates = [0.0, 0.001, *(0.1 * k for k in range(1, 12)), 1.1]  # at last twice the same: it may be the end
+    for k, rate in enumerate(rates):
+        decided = limits.sift((rate, 0.0, 0.0, 0.0, 0.0, 9.8), k)
+    assert decided == []
+    limits.restart()
+    assert [k for _, k, _ in limits.sift((0.0, 0.0, 0.0, 0.0, 0.0, 9.8), 99)] == [99]

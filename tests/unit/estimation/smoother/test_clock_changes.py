@@ -15,6 +15,7 @@ from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.priors import CLOCK_CHANGES_HZ, OFF, SKEW_SIGMA, STEP_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.clock_changes import (
     REMEMBERED,
     forgotten,
@@ -24,7 +25,6 @@ from vical_daemon.estimation.smoother.clock_changes import (
     settled,
     what_happened,
 )
-from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
 from vical_daemon.estimation.smoother.marginal_prior import (
     CALIBRATION,
     DRIFT,
@@ -75,15 +75,15 @@ def after_window(carry, shift_s, rng, noise_s=NOISE_S):
 
 def followed(shift_s, windows, seed):
     """Announcements, and z of the time shift, of clocks that are followed as the calibrator does."""
-    doubts, carry = TargetFreeDoubts("cam0", asked=frozenset(), rolling=False), started()
+    models, carry = AlternativeModels("cam0", asked=frozenset(), rolling=False), started()
     rng, events, z = np.random.default_rng(seed), [], []
     for _ in range(windows):
         carry = after_window(carry, shift_s, rng)
-        events += [(carry.t_cam_s, e) for e in doubts.watch(carry, 1.0, compared=False)]
-        d, P = over_clocks(carry, doubts.clocks(carry, 1.0))
+        events += [(carry.t_cam_s, e) for e in models.watch(carry, 1.0, compared=False)]
+        d, P = over_clocks(carry, models.clocks(carry, 1.0))
         error = carry.camera.timeshift_s + d[SHIFT] - shift_s(carry.t_cam_s)
         z.append(float(error / np.sqrt(P[SHIFT, SHIFT])))
-        carry, more = doubts.window_done(carry, 1.0)
+        carry, more = models.window_done(carry, 1.0)
         events += [(carry.t_cam_s, e) for e in more]
         carry = opened(carry)
     return events, np.array(z)

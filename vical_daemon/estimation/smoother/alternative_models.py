@@ -37,7 +37,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     MarginalPrior,
     calibration_root,
 )
-from vical_daemon.estimation.smoother.snapshot import Doubts
+from vical_daemon.estimation.smoother.snapshot import ReportedModels
 
 _TERM = "lens_term"
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
@@ -51,7 +51,7 @@ def _shown(clocks: list[Clock], complete: int) -> list[Clock]:
     return [c for c in clocks if c.jump < 0 or c.jump < complete - _WINDOWS_SHOW]
 
 
-class TargetFreeDoubts:
+class AlternativeModels:
     """Follows what the windows say about clocks, imu and shutter.
 
     Args:
@@ -202,7 +202,7 @@ class TargetFreeDoubts:
         """What is known without the unknowns of past changes: the mixture over what may have happened."""
         return settled(carry, self.clocks(carry, factor))
 
-    def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> Doubts:
+    def weighed(self, carry: MarginalPrior, factor: float, compared: bool) -> ReportedModels:
         """How likely each model is, for the report; arguments as for `watch`."""
         weights = self._weights(carry, factor)
         specified = max(weights, key=len)
@@ -210,7 +210,7 @@ class TargetFreeDoubts:
             others = 0.5 / max(1.0 - weights[specified], 1e-300)
             weights = {true: 0.5 if true == specified else others * p for true, p in weights.items()}
         every = self._blocks(carry)
-        return Doubts(
+        return ReportedModels(
             factor,
             tuple(self.clocks(carry, factor)),
             every,

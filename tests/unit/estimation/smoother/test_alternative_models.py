@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.doubts import TargetFreeDoubts
+from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.marginal_prior import (
     CALIBRATION,
     IMU,
@@ -80,10 +80,10 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     known, P = carry(seed, off)
     x = np.zeros(N)
     x[NUMBERS] = known.imu
-    doubts = TargetFreeDoubts("cam0", asked=frozenset(), rolling=True)
-    doubts.drifting = True
+    models = AlternativeModels("cam0", asked=frozenset(), rolling=True)
+    models.drifting = True
     reported = camera_estimate(
-        known, doubts.weighed(known, 1.0, compared=True)._replace(gyro_frame=False), 0.5, 0.5
+        known, models.weighed(known, 1.0, compared=True)._replace(gyro_frame=False), 0.5, 0.5
     )
     mean, covariance = mixture(P, x)
     assert np.array(reported.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(mean[:3], abs=1e-9)
@@ -94,18 +94,18 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
 
 def test_what_is_asked_for_is_never_taken_as_stated():
     known, _ = carry(5, 0.0)
-    doubts = TargetFreeDoubts("cam0", asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
-    assert doubts.weighed(known, 1.0, compared=True).weights == {(): 1.0}
+    models = AlternativeModels("cam0", asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
+    assert models.weighed(known, 1.0, compared=True).weights == {(): 1.0}
 
 
 def test_until_windows_can_be_compared_the_imu_is_as_likely_true_as_not():
     known, _ = carry(6, 8.0)
-    doubts = TargetFreeDoubts("cam0", asked=frozenset(), rolling=False)
+    models = AlternativeModels("cam0", asked=frozenset(), rolling=False)
     for compared, least in ((False, 0.5), (True, 0.0)):
-        shares = doubts.weighed(known, 1.0, compared=compared).weights
+        shares = models.weighed(known, 1.0, compared=compared).weights
         assert shares["imu_intrinsics", "accel_lag"] == pytest.approx(least, abs=1e-6)
         assert sum(shares.values()) == pytest.approx(1.0)
-    kinds = {event.kind for event in doubts.watch(known, 1.0, compared=False)}
+    kinds = {event.kind for event in models.watch(known, 1.0, compared=False)}
     assert EventKind.IMU_INTRINSICS not in kinds
-    assert EventKind.IMU_INTRINSICS in {event.kind for event in doubts.watch(known, 1.0, compared=True)}
-    assert doubts.watch(known, 1.0, compared=True) == []  # said once
+    assert EventKind.IMU_INTRINSICS in {event.kind for event in models.watch(known, 1.0, compared=True)}
+    assert models.watch(known, 1.0, compared=True) == []  # said once
