@@ -33,7 +33,7 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
         ways, innovation = rows if lin.curved.size else (fit.ways, fit.r)
         level = f.consistency[image.camera].level
         by_shared = ways @ (lin.by_error @ shared_ways(f.state, f.layout, image.camera))
-        shared.learn(innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
+        shared.learn(image.t_cam_s, innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
     if where.intrinsics is not None and where.distortion is not None and agreement is not None:
         by_lens = lin.by_error[:, where.intrinsics.start : where.distortion.stop]
         _ask_lens(f, agreement, image.camera, lin, rows, by_lens)

@@ -35,7 +35,7 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         rms_px=reprojection_rms_px,
         sigma_px=f.corner_noise[name].sigma_px,
         joint=_calibration_covariance(f, name, spread, lens_sigma),
-        jitter_s=f.shared[name].jitter_s if name in f.shared else 0.0,
+        jitter_s=f.shared[name].jitter_found_s if name in f.shared else 0.0,
     )
 
 

@@ -1,7 +1,7 @@
 """The start by one window: the first seconds are adjusted, and a filter takes their images about the result.
 
-What the corners of an image share (late stamps, shifts of the whole image) is measured in the window, by
-comparing each image with what all others say of it. [docs/math/filter.md, eq. (20) and (21)]
+What the corners of an image share (late stamps, shifts of the whole image) is measured in the window.
+[docs/math/filter.md, eq. (12), (20) and (21)]
 """
 
 from __future__ import annotations
@@ -16,16 +16,22 @@ from scipy.linalg import cho_solve, cholesky
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.board_window import BoardWindow, Frames, View
+from vical_daemon.estimation.init.board_window import BoardWindow, Frames, Present
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.model.state import State
-from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
+from vical_daemon.estimation.noise.shared_errors import (
+    JITTERS_S,
+    SHIFTS_PX,
+    WAYS,
+    SharedErrors,
+    shared_ways,
+)
+from vical_daemon.estimation.noise.variance_components import of_window
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
-_MOST_RATIO = 5.0  # of one image's squared innovation over its prediction
 _FAR = 0.03  # a target so much larger or smaller is another one: its prior is too narrow
 
 Step = Callable[[CalibrationFilter, PointsFrame, float], FrameReport | None]
@@ -85,8 +91,6 @@ def window_start(
         return None
     out = window.filter(make(deepcopy(state)))
     out.corner_noise, out.shared, out.consistency = trial.corner_noise, trial.shared, trial.consistency
-    for shared in out.shared.values():
-        shared.begin()
     for consistency in out.consistency.values():
         consistency.settle()
     return WindowStart(out, _size(trial.plain(), stated))
@@ -105,55 +109,43 @@ def _size(f: CalibrationFilter, stated: float) -> float | None:
     return size if abs(size - 1.0) > max(_FAR, SURE_SIGMAS * sigma) else None
 
 
-class _Apart(NamedTuple):
-    """One image against all others, over its noise; see `SharedErrors.learn`.
-
-    Attributes:
-        innovation: Shape (2n,).
-        by_shared: Shape (2n, 3).
-        by_states: Shape (3, k).
-        ratio: Squared innovation over its prediction, by degree of freedom.
-    """
-
-    innovation: FloatArray
-    by_shared: FloatArray
-    by_states: FloatArray
-    ratio: float
-
-
 def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
-    """What the corners of an image share, from how it differs from what all other images say of it."""
+    """What the corners of an image share, by the likelihood of all images of the window together.
+
+    With u what they share (three errors an image), the normal equations are extended by u, and motion and
+    constants are eliminated from them: S u = s + noise of covariance S. [docs/math/filter.md, eq. (12)]
+    """
     out = {name: SharedErrors() for name in window.sigma_px}
     now = window.present()
     if now is None:
         return out
-    H, _ = window.normal(now)
-    P = cho_solve((cholesky(H, lower=True), True), np.eye(len(H)))
-    seen: dict[str, list[_Apart]] = {name: [] for name in out}
-    for view in now.views:
-        seen[view.camera].append(_apart(window, view, P))
-    for name, images in seen.items():
-        # as in `Consistency`: where images of any kind miss, that in these ways is nothing of its own
-        level = float(np.mean([min(x.ratio, _MOST_RATIO) for x in images] or [1.0]))
-        for x in images:
-            out[name].learn(x.innovation, x.by_shared, x.by_states, max(level, 1.0))
-        out[name].begin()
+    S, s = _shared_information(window, now)
+    camera = np.repeat([list(out).index(view.camera) for view in now.views], WAYS)
+    for _ in range(2 if len(out) > 1 else 1):  # each camera with what the others were found to have
+        for k, shared in enumerate(out.values()):
+            own, others = camera == k, camera != k
+            sigmas = np.concatenate([list(out.values())[c].sigmas for c in camera[others][::WAYS]] or [[]])
+            T = S[np.ix_(own, others)] * sigmas
+            A = np.eye(len(sigmas)) + sigmas[:, None] * S[np.ix_(others, others)] * sigmas
+            known = np.linalg.solve(A, np.column_stack([T.T, sigmas * s[others]]))
+            information, right = S[np.ix_(own, own)] - T @ known[:, :-1], s[own] - T @ known[:, -1]
+            last_s = max(t for node in window.nodes for t, _ in node.frames)
+            shared.begin(of_window(information, right, JITTERS_S, SHIFTS_PX), last_s)
     return out
 
 
-def _apart(window: BoardWindow, view: View, P: FloatArray) -> _Apart:
-    """An image against all others; `P`: covariance of all unknowns."""
-    W, r = window.whitened(view)
-    A, b = W.T @ W, W.T @ r
-    at = window.places(view.node)
-    spread = view.by_error @ P[at[:, None], at] @ view.by_error.T
-    others = np.linalg.solve(np.eye(len(A)) - spread @ A, spread)  # (spread^-1 - A)^-1
-    values, vectors = np.linalg.eigh(0.5 * (others + others.T))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    innovation = r + W @ (others @ b)
-    node = window.nodes[view.node]
-    by_shared = W @ view.by_error @ shared_ways(window.at(node, view.camera), window.layout, view.camera)
-    moved, M = W.T @ innovation, A @ root
-    explained, _, rank, _ = np.linalg.lstsq(A + M @ M.T, moved, rcond=None)
-    ratio = float(moved @ explained) / max(int(rank), 1)
-    return _Apart(innovation, by_shared, (by_shared.T @ W) @ root, ratio)
+def _shared_information(window: BoardWindow, now: Present) -> tuple[FloatArray, FloatArray]:
+    """Information on what corners share in each image, and right side; motion and constants eliminated."""
+    H, g = window.normal(now)
+    n = WAYS * len(now.views)
+    across, own, right = np.zeros((n, len(H))), np.zeros((n, n)), np.zeros(n)
+    for k, view in enumerate(now.views):
+        W, r = window.whitened(view)
+        state = window.at(window.nodes[view.node], view.camera)
+        ways = W @ (view.by_error @ shared_ways(state, window.layout, view.camera))
+        here = slice(WAYS * k, WAYS * k + WAYS)
+        across[here, window.places(view.node)] = (ways.T @ W) @ view.by_error
+        own[here, here], right[here] = ways.T @ ways, ways.T @ r
+    solved = cho_solve((cholesky(H, lower=True), True), np.column_stack([across.T, g]))
+    S = own - across @ solved[:, :-1]
+    return 0.5 * (S + S.T), right - across @ solved[:, -1]

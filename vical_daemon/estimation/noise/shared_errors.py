@@ -3,28 +3,27 @@
 A stamp that is late by e moves every corner by e times its speed in the image; a camera that shakes, or a
 detector that is drawn to one side, moves all alike. How much one image moved in these ways is known as well
 as corners and predicted pose are; how much images vary beyond that are the variances here. Both are
-estimated together, since each can be taken for the other, and each is 0 until it is significant: good images
-pay nothing.
+estimated together, since each can be taken for the other.
 [docs/math/filter.md, eq. (12)]
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
-from vical_daemon.estimation.noise.variance_components import Observed, variances
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
+from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
 _MEMORY = 400  # images
-_LEAST = 20
-_EVERY = 5  # images between two looks at all that is remembered
-_SELDOM_FROM, _SELDOM = 100, 4  # later it changes little: one look in so many
-_STILL_SIGNIFICANT = 1.0  # to go on with what was found
-_FLOOR = np.array([2e-5, 5e-3])  # s, px
+_EVERY = 20  # images that are added together; nothing is said before, unless a start said it
+JITTERS_S = grid(5e-5)  # up to 8 ms
+SHIFTS_PX = grid(2e-2)  # up to 3 px
+_ABSENT = 1e-3  # a jitter is reported where the probability that there is none is less
 _TELLING = 100  # images; the correlation of neighbours is then known to 0.1
 _PERSISTENT = 0.5  # of the variance: nearer to that of a model error (1) than to that of a jitter (0)
 WAYS = 3  # late, to the side, down
@@ -35,27 +34,41 @@ class SharedErrors:
     """Running estimate of one camera.
 
     Attributes:
-        jitter_s: Standard deviation of a stamp, s; 0 while it cannot be distinguished from none.
-        shift_px: Standard deviation by which a whole image is off, per axis, px; 0 likewise.
+        jitter_s: Standard deviation of a stamp, s: root of the mean variance.
+        shift_px: Standard deviation by which a whole image is off, per axis, px; likewise.
         images: Images taken in.
+        until_s: Stamp (s) up to which images are known from the start, and are not to count again.
     """
 
     jitter_s: float = 0.0
     shift_px: float = 0.0
     images: int = 0
+    until_s: float = -math.inf
+    _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
+    _absent: FloatArray = field(default_factory=lambda: np.ones(2))
     _A: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
     _C: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
     _b: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS)))
 
-    def begin(self) -> None:
-        """Go on with what was learnt, in a filter that has used none of these images."""
-        if self.images >= _LEAST:
-            self._look_again()
+    def begin(self, likelihood: FloatArray, until_s: float) -> None:
+        """Go on from what the images of a start say together.
+
+        Args:
+            likelihood: See `variance_components.of_window`.
+            until_s: Stamp of the last of them, s.
+        """
+        self._likelihood, self.until_s = likelihood, until_s
+        self._look()
 
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations in the three ways, shape (3,)."""
         return np.array([self.jitter_s, self.shift_px, self.shift_px])
+
+    @property
+    def jitter_found_s(self) -> float:
+        """The jitter where there surely is one, s; else 0."""
+        return self.jitter_s if self._absent[0] < _ABSENT else 0.0
 
     @property
     def stamps_jitter(self) -> bool:
@@ -66,7 +79,7 @@ class SharedErrors:
         """
         n = min(self.images, _MEMORY)
         size = self._A[:n, 0, 0]
-        if n < _TELLING or not self.jitter_s or not (size > 0.0).all():
+        if n < _TELLING or not self.jitter_found_s or not (size > 0.0).all():
             return False
         late, usual = self._b[:n, 0] / size, self._C[:n, 0, 0] / size**2
         weight = 1.0 / (usual + self.jitter_s**2)
@@ -79,10 +92,13 @@ class SharedErrors:
         alike = float((pairs * late[1:] * late[:-1]).sum() / pairs.sum())
         return alike < _PERSISTENT * self.jitter_s**2
 
-    def learn(self, innovation: FloatArray, ways: FloatArray, state: FloatArray, level: float = 1.0) -> None:
+    def learn(
+        self, t_cam_s: float, innovation: FloatArray, ways: FloatArray, state: FloatArray, level: float = 1.0
+    ) -> None:
         """Take in one image before it is used.
 
         Args:
+            t_cam_s: Its stamp, s.
             innovation: Measured minus predicted, over the corner noise, shape (m,).
             ways: Derivatives of the whitened pixels by a late stamp (1/s; zeros where the time shift is
                 held) and by shifts (1/px), shape (m, 3).
@@ -91,30 +107,27 @@ class SharedErrors:
                 that in these ways is nothing of its own.
         """
         A = ways.T @ ways
-        if not A.any():
+        if t_cam_s <= self.until_s or not A.any():
             return
         place = self.images % _MEMORY
         self._A[place], self._b[place] = A, innovation @ ways
         self._C[place] = level * (A + state @ state.T)
         self.images += 1
-        every = _EVERY * (_SELDOM if self.images > _SELDOM_FROM else 1)
-        if self.images >= _LEAST and self.images % every == 0:
-            self._look_again()
+        if self.images % _EVERY == 0:
+            self._add(slice(place + 1 - _EVERY, place + 1))
 
-    def _look_again(self) -> None:
-        """Estimate both, where they show."""
-        jitters, shifts = self.jitter_s > 0.0, self.shift_px > 0.0
-        self._look(
-            _STILL_SIGNIFICANT if jitters else SURE_SIGMAS,
-            _STILL_SIGNIFICANT if shifts else SURE_SIGMAS,
-        )
+    def _add(self, new: slice) -> None:
+        """Add images to the likelihood; those of long ago are forgotten."""
+        if self.images > _MEMORY:
+            self._likelihood *= 1.0 - _EVERY / _MEMORY
+        observed = Observed(self._b[new], self._A[new], self._C[new])
+        self._likelihood = self._likelihood + of_images(observed, JITTERS_S, SHIFTS_PX)
+        self._look()
 
-    def _look(self, jitter_needs: float, shift_needs: float) -> None:
-        """Estimate both from all that is remembered."""
-        n = min(self.images, _MEMORY)
-        observed = Observed(self._b[:n], self._A[:n], self._C[:n])
-        sigma = np.sqrt(variances(observed, (jitter_needs, shift_needs)))
-        self.jitter_s, self.shift_px = np.where(sigma > _FLOOR, sigma, 0.0).tolist()
+    def _look(self) -> None:
+        known = posterior(self._likelihood, JITTERS_S, SHIFTS_PX)
+        self._absent = known.absent
+        self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
 
 
 def shared_ways(state: State, layout: Layout, camera: str) -> FloatArray:

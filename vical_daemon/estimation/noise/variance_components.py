@@ -1,8 +1,9 @@
 """Two variances from many small sums: that of the first way in which an image moves, and that of the others.
 
-Each image gives b = A e + noise with e ~ N(0, diag(v0, v1, v1)) and noise of covariance C. Maximum likelihood
-by Fisher scoring; a variance is 0 unless its score at 0 is significant. [Harville, "Maximum likelihood
-approaches to variance component estimation and to related problems", 1977, section 4]
+An image gives b = A e + noise with e ~ N(0, diag(v0, v1, v1)) and noise of covariance C. The likelihood of
+both variances is added up over images on a grid of standard deviations. What is used are means of the
+posterior: few images leave open which of the two makes them differ, and then both are allowed for.
+[Harville, "Maximum likelihood approaches to variance component estimation and to related problems", 1977]
 """
 
 from __future__ import annotations
@@ -10,12 +11,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import cholesky, solve_triangular
 
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
-_ROUNDS = 10
-_SETTLED = 0.01
+STEP = 1.2
+"""Ratio of neighbours on the grid: a sigma between two is met to a tenth."""
+SIZE = 30
+"""Standard deviations on the grid: none, and 29 that span a factor of 165."""
+_COARSE = 4  # each fourth is enough for the likelihood of a window, which is a few images wide
+PRESENT = 0.5
+"""Prior probability that an error is there at all."""
 
 
 class Observed(NamedTuple):
@@ -32,79 +40,129 @@ class Observed(NamedTuple):
     C: FloatArray
 
 
-def variances(observed: Observed, needed: tuple[float, float]) -> FloatArray:
-    """Both variances; each 0 unless it shows.
+class Variances(NamedTuple):
+    """What is known of both variances.
+
+    Attributes:
+        mean: Of the posterior, shape (2,).
+        absent: Posterior probability that there is no such error, shape (2,).
+    """
+
+    mean: FloatArray
+    absent: FloatArray
+
+
+def grid(least: float) -> FloatArray:
+    """Standard deviations from `least` on, with 0 first, shape (SIZE,)."""
+    return np.concatenate([[0.0], least * STEP ** np.arange(SIZE - 1)])
+
+
+def of_images(observed: Observed, first: FloatArray, others: FloatArray) -> FloatArray:
+    """Logarithm of the likelihood over that without either, summed over images.
+
+    With G = A C^-1 A and h = A C^-1 b, log det(1 + D G) and h' (D^-1 + G)^-1 h, D = diag(v0, v1, v1), are
+    ratios of polynomials in the two variances. An outlier counts as if it were no larger.
 
     Args:
-        observed: The sums.
-        needed: Standard deviations of chance by which each must show, with the other as it is.
+        observed: The images.
+        first: Standard deviations of the first way, shape (p,).
+        others: Of the other two, shape (q,).
 
     Returns:
-        (v0, v1), shape (2,).
+        Shape (p, q).
     """
-    v, chosen = np.zeros(2), np.zeros(2, dtype=bool)
-    limits = np.array(needed)
-    for _ in range(2):
-        score, information = _score(observed, v)
-        z = np.where(chosen, -np.inf, _standard(score, information, chosen))
-        best = int(np.argmax(z - limits))
-        if not z[best] > limits[best]:
-            break
-        chosen[best] = True
-        v = _fitted(observed, v, chosen)
-    return v
-
-
-def _fitted(observed: Observed, v: FloatArray, chosen: BoolArray) -> FloatArray:
-    """Maximum likelihood of the chosen ones."""
-    for _ in range(_ROUNDS):
-        score, information = _score(observed, v)
-        new = np.maximum(v + _step(score, information, chosen & ((v > 0.0) | (score > 0.0))), 0.0)
-        moved = np.abs(new - v) > _SETTLED * new
-        v = new
-        if not moved.any():
-            break
-    return v
-
-
-def _step(score: FloatArray, information: FloatArray, free: BoolArray) -> FloatArray:
-    step = np.zeros(2)
-    index = np.flatnonzero(free & (np.diag(information) > 0.0))
-    if len(index):
-        unit = np.sqrt(np.diag(information)[index])
-        scaled = information[np.ix_(index, index)] / np.outer(unit, unit) + 1e-9 * np.eye(len(index))
-        step[index] = np.linalg.solve(scaled, score[index] / unit) / unit
-    return step
-
-
-def _standard(score: FloatArray, information: FloatArray, chosen: BoolArray) -> FloatArray:
-    """Score of each over its standard deviation, once the chosen ones are fitted."""
-    spread = np.diag(information).copy()
-    for k in np.flatnonzero(chosen):
-        if information[k, k] > 0.0:
-            spread -= information[:, k] ** 2 / information[k, k]
-    return np.asarray(score / np.sqrt(np.where(spread > 0.0, spread, np.inf)))
-
-
-def _score(observed: Observed, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivative of the log-likelihood by both variances, and its Fisher information."""
     b, A, C = observed
-    V = C + (A * np.array([v[0], v[1], v[1]])) @ A
-    whiten = _inverse(V)
-    PA = whiten @ A
-    T = A @ PA
-    h = np.matmul(b[:, None], PA)[:, 0]
-    size = np.einsum("ni,nij,nj->n", b, whiten, b)
-    square = h * h * np.minimum(1.0, OUTLIER_SIGMAS**2 / np.maximum(size, 1e-30))[:, None]
-    over = square - np.diagonal(T, axis1=1, axis2=2)
-    T2 = (T * T).sum(axis=0)
-    score = 0.5 * np.array([over[:, 0].sum(), over[:, 1:].sum()])
-    return score, 0.5 * np.array([[T2[0, 0], T2[0, 1:].sum()], [T2[0, 1:].sum(), T2[1:, 1:].sum()]])
+    PA = _inverse(C) @ A
+    G, h = A @ PA, np.matmul(b[:, None], PA)[:, 0]
+    x, y = np.meshgrid(first**2, others**2, indexing="ij")
+    powers = np.stack([x, y, x * y, y * y, x * y * y]).reshape(5, -1)
+    det = 1.0 + _determinant(G) @ powers
+    explained = (_quadratic(G, h) @ powers) / det
+    size = np.einsum("ni,nij,nj->n", b, _inverse(C), b)
+    far = size > OUTLIER_SIGMAS**2
+    if far.any():
+        before = size[far, None]
+        explained[far] = _clipped(before) - _clipped(np.maximum(before - explained[far], 0.0))
+    return np.asarray(0.5 * (explained.sum(axis=0) - np.log(det).sum(axis=0)).reshape(x.shape))
+
+
+def of_window(S: FloatArray, s: FloatArray, first: FloatArray, others: FloatArray) -> FloatArray:
+    """The same of images that have a motion in common: s = S e + noise of covariance S.
+
+    Args:
+        S: Information on the errors of all images, [3 each], without motion and constants, shape (3n, 3n).
+        s: Right side, shape (3n,).
+        first: See `grid`, shape (SIZE,).
+        others: Likewise.
+
+    Returns:
+        Shape (SIZE, SIZE).
+    """
+    few = np.concatenate([[0], np.arange(1, SIZE, _COARSE)])
+    out = np.zeros((len(few), len(few)))
+    kind = np.arange(len(s)) % 3 > 0
+    for i, a in enumerate(first[few]):
+        for j, c in enumerate(others[few]):
+            root = np.where(kind, c, a)
+            M = root[:, None] * S * root
+            M[np.diag_indices_from(M)] += 1.0
+            L = cholesky(M, lower=True, overwrite_a=True, check_finite=False)
+            z = solve_triangular(L, root * s, lower=True, check_finite=False)
+            out[i, j] = 0.5 * float(z @ z) - float(np.log(np.diag(L)).sum())
+    for _ in range(2):  # along one axis, then along the other
+        fine = CubicSpline(few[1:], out[1:])(np.arange(1, SIZE))
+        out = np.concatenate([out[:1], fine]).T
+    return out
+
+
+def posterior(log_likelihood: FloatArray, first: FloatArray, others: FloatArray) -> Variances:
+    """Mean variances, and whether there are any; sizes are equally likely by their logarithm before."""
+    prior = np.full(SIZE, PRESENT / (SIZE - 1))
+    prior[0] = 1.0 - PRESENT
+    weight = np.exp(log_likelihood - log_likelihood.max()) * np.outer(prior, prior)
+    weight /= weight.sum()
+    by_first, by_others = weight.sum(axis=1), weight.sum(axis=0)
+    mean = np.array([by_first @ first**2, by_others @ others**2])
+    return Variances(mean, np.array([by_first[0], by_others[0]]))
+
+
+def _clipped(square: FloatArray) -> FloatArray:
+    """Squared sizes, of which those of outliers grow by their logarithm only."""
+    limit = OUTLIER_SIGMAS**2
+    return np.where(square > limit, limit * (1.0 + np.log(np.maximum(square, limit) / limit)), square)
+
+
+def _determinant(G: FloatArray) -> FloatArray:
+    """Coefficients of det(1 + D G) - 1 for x, y, x y, y^2, x y^2; shape (n, 5)."""
+    a, b, c, d, e, f = _entries(G)
+    m01, m02, m12 = a * d - b * b, a * f - c * c, d * f - e * e
+    whole = a * m12 - b * (b * f - c * e) + c * (b * e - c * d)
+    return np.stack([a, d + f, m01 + m02, m12, whole], axis=1)
+
+
+def _quadratic(G: FloatArray, h: FloatArray) -> FloatArray:
+    """Coefficients of h' (D^-1 + G)^-1 h times that determinant, likewise."""
+    a, b, c, d, e, f = _entries(G)
+    x, y, z = h.T
+    both = x * x * (d + f) + (y * y + z * z) * a - 2.0 * x * (y * b + z * c)
+    plane = y * y * f + z * z * d - 2.0 * y * z * e
+    whole = (
+        x * x * (d * f - e * e)
+        + y * y * (a * f - c * c)
+        + z * z * (a * d - b * b)
+        - 2.0 * (x * y * (b * f - c * e) + x * z * (c * d - b * e) + y * z * (a * e - b * c))
+    )
+    return np.stack([x * x, y * y + z * z, both, plane, whole], axis=1)
+
+
+def _entries(G: FloatArray) -> FloatArray:
+    """The six of symmetric matrices (n, 3, 3), row by row, shape (6, n)."""
+    return np.ascontiguousarray(G.reshape(-1, 9).T)[[0, 1, 2, 4, 5, 8]]
 
 
 def _inverse(V: FloatArray) -> FloatArray:
     """Inverses of covariances, shape (n, 3, 3), by cofactors: half the time of LAPACK's for each of them."""
-    a, b, c, d, e, f = np.ascontiguousarray(V.reshape(-1, 9).T)[[0, 1, 2, 4, 5, 8]]
+    a, b, c, d, e, f = _entries(V)
     ridge = 1e-12 * (a + d + f)
     a, d, f = a + ridge, d + ridge, f + ridge
     out = np.empty((3, 3, len(V)))
