@@ -36,16 +36,17 @@ class SharedErrors:
     Attributes:
         jitter_s: Standard deviation of a stamp, s: root of the mean variance.
         shift_px: Standard deviation by which a whole image is off, per axis, px; likewise.
+        jitter_found_s: The jitter where there surely is one, s; else 0.
         images: Images taken in.
         until_s: Stamp (s) up to which images are known from the start, and are not to count again.
     """
 
     jitter_s: float = 0.0
     shift_px: float = 0.0
+    jitter_found_s: float = 0.0
     images: int = 0
     until_s: float = -math.inf
     _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
-    _absent: FloatArray = field(default_factory=lambda: np.ones(2))
     _A: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
     _C: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
     _b: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS)))
@@ -64,33 +65,6 @@ class SharedErrors:
     def sigmas(self) -> FloatArray:
         """Standard deviations in the three ways, shape (3,)."""
         return np.array([self.jitter_s, self.shift_px, self.shift_px])
-
-    @property
-    def jitter_found_s(self) -> float:
-        """The jitter where there surely is one, s; else 0."""
-        return self.jitter_s if self._absent[0] < _ABSENT else 0.0
-
-    @property
-    def stamps_jitter(self) -> bool:
-        """Whether what looks like a jitter of the stamps is one: images are late independently of each other.
-
-        A lens, a board or an imu that is off makes images look late or early, too, but neighbours
-        alike. False as well while too few images are known.
-        """
-        n = min(self.images, _MEMORY)
-        size = self._A[:n, 0, 0]
-        if n < _TELLING or not self.jitter_found_s or not (size > 0.0).all():
-            return False
-        late, usual = self._b[:n, 0] / size, self._C[:n, 0, 0] / size**2
-        weight = 1.0 / (usual + self.jitter_s**2)
-        most = OUTLIER_SIGMAS / np.sqrt(weight)  # one outlier is no correlation
-        late = np.clip(late, -most, most)
-        pairs = weight[1:] * weight[:-1]
-        newest = self.images % _MEMORY  # where the oldest follows the newest
-        if self.images > _MEMORY and newest:
-            pairs[newest - 1] = 0.0
-        alike = float((pairs * late[1:] * late[:-1]).sum() / pairs.sum())
-        return alike < _PERSISTENT * self.jitter_s**2
 
     def learn(
         self, t_cam_s: float, innovation: FloatArray, ways: FloatArray, state: FloatArray, level: float = 1.0
@@ -126,8 +100,30 @@ class SharedErrors:
 
     def _look(self) -> None:
         known = posterior(self._likelihood, JITTERS_S, SHIFTS_PX)
-        self._absent = known.absent
         self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
+        surely = known.absent[0] < _ABSENT and self._independent()
+        self.jitter_found_s = self.jitter_s if surely else 0.0
+
+    def _independent(self) -> bool:
+        """Whether images are late independently of each other.
+
+        A lens, a board or an imu that is off makes images look late or early, too, but neighbours
+        alike. False as well while too few images are known.
+        """
+        n = min(self.images, _MEMORY)
+        size = self._A[:n, 0, 0]
+        if n < _TELLING or not (size > 0.0).all():
+            return False
+        late, usual = self._b[:n, 0] / size, self._C[:n, 0, 0] / size**2
+        weight = 1.0 / (usual + self.jitter_s**2)
+        most = OUTLIER_SIGMAS / np.sqrt(weight)  # one outlier is no correlation
+        late = np.clip(late, -most, most)
+        pairs = weight[1:] * weight[:-1]
+        newest = self.images % _MEMORY  # where the oldest follows the newest
+        if self.images > _MEMORY and newest:
+            pairs[newest - 1] = 0.0
+        alike = float((pairs * late[1:] * late[:-1]).sum() / pairs.sum())
+        return alike < _PERSISTENT * self.jitter_s**2
 
 
 def shared_ways(state: State, layout: Layout, camera: str) -> FloatArray:

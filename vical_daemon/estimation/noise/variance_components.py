@@ -11,10 +11,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.linalg import cholesky, solve_triangular
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
 STEP = 1.2
@@ -110,8 +109,7 @@ def of_window(S: FloatArray, s: FloatArray, first: FloatArray, others: FloatArra
             z = solve_triangular(L, root * s, lower=True, check_finite=False)
             out[i, j] = 0.5 * float(z @ z) - float(np.log(np.diag(L)).sum())
     for _ in range(2):  # along one axis, then along the other
-        fine = CubicSpline(few[1:], out[1:])(np.arange(1, SIZE))
-        out = np.concatenate([out[:1], fine]).T
+        out = np.concatenate([out[:1], _between(few[1:], np.arange(1, SIZE)) @ out[1:]]).T
     return out
 
 
@@ -124,6 +122,18 @@ def posterior(log_likelihood: FloatArray, first: FloatArray, others: FloatArray)
     by_first, by_others = weight.sum(axis=1), weight.sum(axis=0)
     mean = np.array([by_first @ first**2, by_others @ others**2])
     return Variances(mean, np.array([by_first[0], by_others[0]]))
+
+
+def _between(nodes: IntArray, places: IntArray) -> FloatArray:
+    """Weights of values at `nodes` that interpolate at `places`: cubics through the four nearest."""
+    out = np.zeros((len(places), len(nodes)))
+    first = np.clip(np.searchsorted(nodes, places) - 2, 0, len(nodes) - 4)
+    for row, at, place in zip(out, first, places, strict=True):
+        x = nodes[at : at + 4]
+        for k in range(4):
+            others = np.delete(x, k)
+            row[at + k] = np.prod((place - others) / (x[k] - others))
+    return out
 
 
 def _clipped(square: FloatArray) -> FloatArray:

@@ -132,9 +132,8 @@ class StatusEvaluator(Evaluator):
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
-        shared = f.shared[report.camera]
-        jitter_s = shared.jitter_s
-        if jitter_s >= ANNOUNCED_S and shared.stamps_jitter:
+        jitter_s = f.shared[report.camera].jitter_found_s
+        if jitter_s >= ANNOUNCED_S:
             event = Event(EventKind.STAMP_JITTER, report.camera, float(jitter_s))
             self.announce(event, once=f"jitter {report.camera}")
         lens = f.agreement[report.camera]
