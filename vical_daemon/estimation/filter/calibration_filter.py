@@ -21,7 +21,7 @@ from vical_daemon.estimation.filter.image_update import (
     rows_of,
     solve,
 )
-from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, LeverArmScore
+from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, UNCERTAIN, LeverArmScore
 from vical_daemon.estimation.filter.linearise import (
     Image,
     Linear,
@@ -54,7 +54,7 @@ from vical_daemon.estimation.model.state import (
 from vical_daemon.estimation.noise.consistency import Consistency, normalised
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
-from vical_daemon.estimation.noise.shared_errors import SharedErrors, shared_ways
+from vical_daemon.estimation.noise.shared_errors import WAYS, SharedErrors, shared_ways
 
 _TINY = 1e-30 * np.eye(9)  # noise densities may be given as zero
 _TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
@@ -84,6 +84,7 @@ class CalibrationFilter:
         stamp_sigma_s: How well the imu's stamps are known as a whole, by its driver, s.
         began_s: When the data of this filter begin, s.
         arm_score: Bias of lever arms by noise of the gyro; None: no image yet, or the motion was lost.
+        arm_scores: What it has given so far, 1/m, shape (3 cameras,); 0: nothing yet.
     """
 
     state: State
@@ -103,6 +104,7 @@ class CalibrationFilter:
     stamp_sigma_s: float = 0.0
     began_s: float = 0.0
     arm_score: LeverArmScore | None = None
+    arm_scores: FloatArray | float = 0.0
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
     _view_straight: dict[str, LinearityMonitor] = field(default_factory=dict)
 
@@ -181,7 +183,9 @@ class CalibrationFilter:
             )
         self.nis_level += 0.05 * (level - self.nis_level)
         noise_updates.learn(self, image, lin, fit)
-        self._accept(fit.S, fit.dx + self._step_by(self._arm_score(image, lin, fit), fit.S))
+        score = self._arm_score(image, lin, fit)
+        self.arm_scores = self.arm_scores + score
+        self._accept(fit.S, fit.dx + self._step_by(score, fit.S))
         noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
@@ -293,10 +297,22 @@ class CalibrationFilter:
         ways, by_error = lin.ways, lin.by_error
         if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
             ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
-        kept = ways[rows_of(fit.keep), :6] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
+        kept = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
+        information, shared = kept[:, :6].T @ kept[:, :6], self.shared.get(image.camera)
+        if shared is not None:  # what corners share is noise, too
+            alike = kept @ (by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas))
+            across = kept[:, :6].T @ alike
+            information -= across @ np.linalg.solve(unscented.unit(WAYS) + alike.T @ alike, across.T)
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
-        return self.arm_score.update(kept.T @ kept, by_error[:6, :MOTION_ERRORS], to_cam, at)
+        return self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)
+
+    def allowing_for_arm_bias(self) -> CalibrationFilter:
+        """The filter with sigmas that allow for what is not known of the bias that was subtracted."""
+        if not np.any(self.arm_scores):
+            return self
+        left = UNCERTAIN * self._step_by(np.asarray(self.arm_scores), self.S)
+        return replace(self, S=unscented.lower_root(np.concatenate([self.S, left[:, None]], axis=1)))
 
     def _step_by(self, score: FloatArray, S: FloatArray) -> FloatArray:
         """Step of the state by a score of all lever arms, shape (3 cameras,), with the covariance S S'."""

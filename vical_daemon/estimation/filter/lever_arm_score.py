@@ -23,6 +23,8 @@ from vical_daemon.estimation.model.state import ACCEL_BIAS, ATTITUDE, MOTION
 
 MOTION_ERRORS = ACCEL_BIAS.stop
 """Number of errors of attitude, position, velocity and biases."""
+UNCERTAIN = 0.5
+"""Share of the bias: it goes with the square of the gyro's noise, which a data sheet gives to a quarter."""
 _STEP_M = 1e-3  # of a lever arm, for differences: log det S is straight over a hundred times that
 
 

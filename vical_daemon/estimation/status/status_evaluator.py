@@ -196,7 +196,7 @@ class StatusEvaluator(Evaluator):
 
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter to be reported: mean and covariance over all models of imu, target and clocks."""
-        f = model_selection.averaged(f)
+        f = model_selection.averaged(f).allowing_for_arm_bias()
         return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
