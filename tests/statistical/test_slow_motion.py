@@ -42,7 +42,7 @@ def test_noise_of_the_gyro_does_not_bias_the_lever_arm(noise):
 
 
 def test_sigmas_allow_for_a_gyro_that_is_quieter_than_its_data_sheet():
-    """By a third: the bias is predicted 2.25 times too large. Without an allowance errors are 2.4 sigma RMS."""
+    """By a third: the bias is predicted 2.25 times too large. Without an allowance z is 2.4 RMS."""
     z = []
     for seed in range(3):
         rig = reference_rig(seed, mean_rate_dps=10.0, timeshift_cam_imu_s=0.02)
