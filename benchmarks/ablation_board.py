@@ -33,8 +33,8 @@ from vical_daemon.estimation.filter.image_intake import ImageIntake
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.inertial.stamp_steps import StampSteps
-from vical_daemon.estimation.init import initial_filter
 from vical_daemon.estimation.init.rig_model import RigModel
+from vical_daemon.estimation.model import start_sigmas
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
@@ -68,7 +68,7 @@ def _not_moved(self: Any) -> None:
 
 def _no_drift() -> list[tuple[Any, ...]]:
     return [
-        (initial_filter, "SKEW_SIGMA", HARDLY * initial_filter.SKEW_SIGMA),
+        (start_sigmas, "SKEW_SIGMA", HARDLY * start_sigmas.SKEW_SIGMA),
         (clock_drift, "_evidence", gives(0.0)),
     ]
 

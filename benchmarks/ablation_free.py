@@ -14,22 +14,19 @@ from benchmarks.ablation_patches import (
     WRONG,
     Mechanism,
     gives,
-    then,
 )
 from vical_daemon.estimation import target_free
+from vical_daemon.estimation.model import start_sigmas
 from vical_daemon.estimation.smoother import (
     bundle,
     handover,
     normal,
     quality,
-    target_free_initializer,
     target_free_status,
 )
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Bundle
-from vical_daemon.estimation.smoother.marginal_prior import DRIFT
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
-from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 
 def _own_factor(self: TargetFreeStatus) -> float:
@@ -57,12 +54,9 @@ def _compared() -> list[tuple[Any, ...]]:
     ]
 
 
-def _no_free_drift(self: Any) -> None:
-    self.active[DRIFT] = False
-
-
-def _both_blocks(*_args: Any) -> tuple[int, ...]:
-    return target_free.BOTH
+def _both_blocks(*args: Any) -> tuple[int, ...]:
+    layout = args[3]
+    return target_free.mounting(layout) + target_free.clock(layout)
 
 
 def _as_it_is(carry: Any) -> Any:
@@ -83,7 +77,7 @@ FREE: dict[str, Mechanism] = {
     "free: clock drift": Mechanism(
         MOVED,
         "a state for the drift of the time shift",
-        lambda: [then(TargetFreeCalibrator, "__init__", _no_free_drift)],
+        lambda: [(start_sigmas, "SKEW_SIGMA", HARDLY * start_sigmas.SKEW_SIGMA)],
         free=True,
         faults=("free: skew 100 ppm",),
         disturbances=("nothing", DRIFTS),
@@ -179,7 +173,7 @@ FREE: dict[str, Mechanism] = {
     "free: lag of the accelerometer": Mechanism(
         SMALL,
         "the delay between gyro and accelerometer as an unknown",
-        lambda: [(target_free_initializer, "LAG_SIGMA_S", HARDLY * target_free_initializer.LAG_SIGMA_S)],
+        lambda: [(start_sigmas, "LAG_SIGMA_S", HARDLY * start_sigmas.LAG_SIGMA_S)],
         free=True,
         faults=("free: accelerometer 0.3 ms late",),
     ),

@@ -13,7 +13,6 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.smoother.marginal_prior import IMU
 
 pytestmark = pytest.mark.statistical
 TRIALS, SECONDS, CAMERA_HZ = 6, 9.0, 8.0
@@ -89,7 +88,8 @@ def with_blocks(seed):
             (np.array(estimate.imu.accel_matrix) - lower)[np.tril_indices(3)],
         ]
     )
-    P = carry.calibration()[IMU, IMU]
+    entries = slice(carry.layout.core, carry.layout.dynamic - 1)  # and then the lag
+    P = carry.covariance()[entries, entries]
     return (
         nees(last.error, last.covariance, 7),
         ((camera.readout_s - rig.readout_s) / camera.readout_sigma_s) ** 2,

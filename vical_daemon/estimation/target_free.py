@@ -18,25 +18,19 @@ from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.filter.unobservable_directions import has_turned
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
+from vical_daemon.estimation.model.state import make_layout
 from vical_daemon.estimation.noise.lens_misfit import LensMisfit
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
+from vical_daemon.estimation.selection.model_selection import IMU, LAG
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
-from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
+from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.clock_changes import opened
 from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
 from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
-from vical_daemon.estimation.smoother.marginal_prior import (
-    DRIFT,
-    LENS,
-    SHIFT,
-    MarginalPrior,
-    calibration_difference,
-    length,
-)
+from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, calibration_difference
 from vical_daemon.estimation.smoother.reports import window_reports
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer, with_next_term
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
@@ -52,6 +46,7 @@ _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _STEPS_GROW = 12
+_ALWAYS = frozenset({IMU, LAG, "readout"})  # is estimated besides what is asked for
 _PATIENCE_S = 15.0  # in which a changed mounting or clock is looked for; then anything may have changed
 
 
@@ -76,17 +71,18 @@ class TargetFreeCalibrator:
         self.options = options
         self.camera, given = next(iter(cameras.items()))
         prior = with_next_term(given)
-        self.active = np.ones(length(starting_camera(prior)), dtype=bool)
-        self.active[:6] = "extrinsics" not in options.fix
-        self.active[[SHIFT, DRIFT]] = "timeshift" not in options.fix
         lens = FixedLens.considered(prior, options.fix)
-        self.active[LENS] = "intrinsics" not in options.fix or lens is not None
+        self.layout = make_layout(
+            {self.camera: prior.distortion_model},
+            fix=options.fix,
+            estimate=_ALWAYS,
+            held=None if lens is None else {self.camera: lens},
+            core=CORE,
+        )
         rolling = "readout" in options.estimate or prior.readout_s != 0.0
         term = prior is not given
-        self.evaluator = TargetFreeStatus(
-            options, self.camera, self.active, rolling=rolling, lens=lens, term=term
-        )
-        self._first = FirstWindow(options, prior, self.active, self.evaluator)
+        self.evaluator = TargetFreeStatus(options, self.layout, rolling=rolling, term=term)
+        self._first = FirstWindow(options, prior, self.layout, self.evaluator)
         self.window: Window | None = None
         self.carry: MarginalPrior | None = None  # before the window
         self.latest: MarginalPrior | None = None  # after its last adjustment
@@ -269,7 +265,8 @@ class TargetFreeCalibrator:
         window = self.initializer.window_anew(buffer, frames, known)
         if isinstance(window, str):
             return begun
-        free = self._first.adjusted(buffer, window, known, self._noise, BOTH)
+        arm, shift = mounting(self.layout), clock(self.layout)
+        free = self._first.adjusted(buffer, window, known, self._noise, arm + shift)
         if free is None:
             return begun
         known = known.at(window.frames[0][0])
@@ -277,25 +274,26 @@ class TargetFreeCalibrator:
         change = calibration_difference(window, known)
         reopened = changed_blocks(
             change,
-            found.calibration(),
-            known.calibration(),
-            self.active,
+            found.covariance(),
+            known.covariance(),
+            self.layout,
             self.evaluator.excess,
         )
         if self._seek_shift:
-            reopened = tuple({*reopened, *CLOCK})
-        if MOUNTING[0] in reopened and not self.evaluator.proven:
+            reopened = tuple({*reopened, *shift})
+        moved = not set(reopened).isdisjoint(arm)
+        if moved and not self.evaluator.proven:
             self._forget()
             return begun
         ended = self._first.adjusted(buffer, window, known, self._noise, reopened)
         if ended is None:
             return begun
         change = calibration_difference(window, known)
-        change[[k for k in BOTH if k not in reopened]] = 0.0
-        if MOUNTING[0] in reopened:
+        change[[k for k in arm + shift if k not in reopened]] = 0.0
+        if moved:
             self.evaluator.changed(change)
         elif reopened and not self._seek_shift:
-            self.evaluator.stepped(float(change[SHIFT]))
+            self.evaluator.stepped(float(change[shift[0]]))
         self._seek_shift = self._confirmed = False
         return ended
 
@@ -383,7 +381,7 @@ class TargetFreeCalibrator:
     def _walked(self, carry: MarginalPrior, span_s: float) -> MarginalPrior:
         """What goes into the next window: biases and delay walk."""
         drifting, noise = self.evaluator.models.drifting, self.options.imu_noise
-        return with_process_noise(carry, noise, self.active, span_s, drifting=drifting)
+        return with_process_noise(carry, noise, span_s, drifting=drifting)
 
     def _forget(self) -> None:
         """What was kept over a change contradicts the images, too: start over."""

@@ -20,10 +20,10 @@ from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 from vical_mocks.trajectory import one_axis, still
 
+from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import ROLLING, EventKind
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.smoother.marginal_prior import LENS
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
@@ -245,9 +245,7 @@ def test_waits_through_darkness_and_goes_on_with_what_it_knew():
 
 
 def test_after_a_change_of_the_rig_its_clock_is_judged_anew():
-    evaluator = TargetFreeStatus(
-        CalibrationOptions(target_free=True), "cam0", np.ones(LENS.start + 8, dtype=bool)
-    )
+    evaluator = TargetFreeStatus(CalibrationOptions(target_free=True), window_layout())
     evaluator.models.drifting = True
     evaluator.changed()
     assert not evaluator.models.drifting

@@ -9,7 +9,6 @@ from vical_mocks.tracks import simulate_tracks
 
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
-from vical_daemon.estimation.smoother.marginal_prior import IMU, LAG
 from vical_daemon.estimation.target_free import TargetFreeCalibrator
 from vical_daemon.estimation.wording import event_text
 
@@ -59,12 +58,18 @@ def test_a_readout_nobody_told_is_found(readout_s):
     assert abs(camera.readout_s - rig.readout_s) < 4.0 * camera.readout_sigma_s
 
 
+def imu_covariance(carry):
+    """Of the entries of the matrices, which come first; the lag follows."""
+    entries = slice(carry.layout.core, carry.layout.dynamic - 1)
+    return carry.covariance()[entries, entries]
+
+
 def test_scale_and_misalignment_of_the_imu_are_found():
     rig, calibrator, record = followed(4, {"imu_intrinsics"}, **crooked(4))
     for shot in record.snapshots:
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-5, 7), shot.t_s
     error = matrix_errors(rig, calibrator.estimate().imu)
-    P = calibrator.latest.calibration()[IMU, IMU]
+    P = imu_covariance(calibrator.latest)
     assert error @ np.linalg.solve(P, error) < chi2.isf(1e-4, 15)
     assert np.sqrt(np.diag(P)).max() < 0.006  # from one percent, after nine seconds
 
@@ -103,7 +108,7 @@ def test_an_accelerometer_out_of_step_is_told_and_every_answer_is_right(lag_s):
     assert where in event_text(event)
     for shot in record.snapshots:
         assert nees(shot.error, shot.covariance, 7) < chi2.isf(1e-4, 7), shot.t_s
-    found, sigma = calibrator.latest.imu[15], np.sqrt(calibrator.latest.calibration()[LAG, LAG][0, 0])
+    found, sigma = calibrator.latest.imu[15], calibrator.latest.sigma(calibrator.layout.accel_lag)
     assert sigma < 1e-4
     assert abs(found - lag_s) < 3.0 * sigma
 
@@ -116,7 +121,7 @@ def test_what_was_found_outlasts_darkness():
     last = record.snapshots[-1]
     assert nees(last.error, last.covariance, 7) < chi2.isf(1e-4, 7)
     estimate = calibrator.estimate()
-    error, P = matrix_errors(rig, estimate.imu), calibrator.latest.calibration()[IMU, IMU]
+    error, P = matrix_errors(rig, estimate.imu), imu_covariance(calibrator.latest)
     assert error @ np.linalg.solve(P, error) < chi2.isf(1e-4, 15)
     camera = estimate.cameras["cam0"]
     assert abs(camera.readout_s - 0.02) < 4.0 * camera.readout_sigma_s

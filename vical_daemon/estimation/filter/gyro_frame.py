@@ -7,33 +7,43 @@ accelerometer's lower triangular in another; the mounting is known twice as well
 
 from __future__ import annotations
 
-from copy import copy
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry.so3 import exp_one, hat
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import CameraState, Layout
 
 
-def in_gyro_frame(f: CalibrationFilter) -> CalibrationFilter:
-    """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries."""
-    if f.layout.gyro_matrix is None:
-        return f
-    turned = turn(f.S[f.layout.gyro_matrix].reshape(3, 3, -1))
-    back = exp_one(-turn(f.state.gyro_matrix))
-    S, cameras = f.S.copy(), dict(f.state.cameras)
-    for name, slices in f.layout.cameras.items():
-        if slices.position is None or slices.rotation is None:
+def in_gyro_frame(
+    layout: Layout, gyro_matrix: FloatArray, cameras: Mapping[str, CameraState], S: FloatArray
+) -> tuple[dict[str, CameraState], FloatArray]:
+    """Mounting and lever arm in the frame in which M_g is symmetric, to first order in its entries.
+
+    Args:
+        layout: Where the errors live.
+        gyro_matrix: M_g.
+        cameras: By name.
+        S: Square root of the covariance, shape (n, m).
+
+    Returns:
+        Cameras and square root in that frame.
+    """
+    found = dict(cameras)
+    if layout.gyro_matrix is None:
+        return found, S
+    turned = turn(S[layout.gyro_matrix].reshape(3, 3, -1))
+    back, S = exp_one(-turn(gyro_matrix)), S.copy()
+    for name, where in layout.cameras.items():
+        if where.position is None or where.rotation is None:
             continue
-        cam = cameras[name]
-        S[slices.rotation] -= cam.R_imu_cam.T @ turned
-        S[slices.position] += hat(cam.p_imu_cam) @ turned
-        cameras[name] = replace(cam, R_imu_cam=back @ cam.R_imu_cam, p_imu_cam=back @ cam.p_imu_cam)
-    state = copy(f.state)
-    state.cameras = cameras
-    return replace(f, state=state, S=S)
+        cam = found[name]
+        S[where.rotation] -= cam.R_imu_cam.T @ turned
+        S[where.position] += hat(cam.p_imu_cam) @ turned
+        found[name] = replace(cam, R_imu_cam=back @ cam.R_imu_cam, p_imu_cam=back @ cam.p_imu_cam)
+    return found, S
 
 
 def turn(M: FloatArray) -> FloatArray:

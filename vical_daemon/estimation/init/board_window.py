@@ -23,10 +23,11 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
+from vical_daemon.estimation.model.imu_scale import numbers_of
 from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_links
 from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.retract import orthonormal, retract
-from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, LOWER, MOTION, State
+from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH, OUTLIER_SIGMAS
 
@@ -384,10 +385,7 @@ def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: Im
 
 def _numbers(s: State) -> FloatArray:
     """[biases, entries of the imu's matrices, lag] as links take them, shape (22,)."""
-    gyro, accel = s.gyro_matrix - np.eye(3), s.accel_matrix - np.eye(3)
-    return np.concatenate(
-        [s.gyro_bias, s.accel_bias, gyro.ravel(), accel[LOWER[:, 0], LOWER[:, 1]], [s.accel_lag_s]]
-    )
+    return np.concatenate([s.gyro_bias, s.accel_bias, numbers_of(s)])
 
 
 def _integrated(

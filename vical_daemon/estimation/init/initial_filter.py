@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
@@ -19,13 +17,12 @@ from vical_daemon.estimation.model.priors import (
     GYRO_BIAS_SIGMA_RPS,
     KNOWN_OFF_SIGMA,
     KNOWN_SIZE_SIGMA,
-    LAG_SIGMA_S,
     PARTIAL_START_RAD,
     POSITION_SHARE,
     SIZE_SIGMA,
-    SKEW_SIGMA,
     START_POSITION_M,
 )
+from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -63,7 +60,7 @@ def initial_filter(
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
     off = {IMU, LAG, SIZE, TARGET} & options.estimate
-    root = np.diag(start_sigmas(state, layout, partial=still_axes is not None, off=off))
+    root = np.diag(filter_sigmas(state, layout, off, partial=still_axes is not None))
     unobservable = None if still_axes is None else UnobservableDirections(still_axes, turn_axis_cam)
     if unobservable is not None:
         for where in layout.cameras.values():
@@ -90,39 +87,27 @@ def _before_board_m(state: State, camera: str) -> float:
     return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
 
 
-def start_sigmas(state: State, layout: Layout, *, partial: bool, off: Collection[str]) -> FloatArray:
+def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
     The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
     """
-    s = np.zeros(layout.size)
     # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
-    start = FILTER_START
-    lever_arm, position, angle = UNKNOWN_M, 3.0 * UNKNOWN_M, PARTIAL_START_RAD
-    if not partial:
+    start, position = FILTER_START, 3.0 * UNKNOWN_M
+    if partial:
+        angle = PARTIAL_START_RAD
+        start = start._replace(lever_arm_m=UNKNOWN_M, attitude_rad=angle, rotation_rad=angle)
+    else:
         before_m = min(_before_board_m(state, name) for name in layout.cameras)
-        lever_arm, angle = min(start.lever_arm_m, ARM_SHARE * before_m), start.attitude_rad
+        start = start._replace(lever_arm_m=min(start.lever_arm_m, ARM_SHARE * before_m))
         position = min(START_POSITION_M, POSITION_SHARE * before_m)
-    s[ATTITUDE], s[POSITION], s[VELOCITY] = angle, position, start.velocity_mps
+    s = start_sigmas(
+        layout,
+        state.cameras,
+        start,
+        imu_sigma=KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA,
+        size_sigma=KNOWN_SIZE_SIGMA if SIZE in off else SIZE_SIGMA,
+    )
+    s[ATTITUDE], s[POSITION], s[VELOCITY] = start.attitude_rad, position, start.velocity_mps
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD
-    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        s[layout.gyro_matrix] = s[layout.accel_matrix] = KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA
-    if layout.accel_lag is not None:
-        s[layout.accel_lag] = LAG_SIGMA_S
-    if layout.target_scale is not None:
-        s[layout.target_scale] = KNOWN_SIZE_SIGMA if SIZE in off else SIZE_SIGMA
-    if layout.target_modes is not None and layout.target_shape is not None:
-        s[layout.target_shape] = layout.target_modes.sigma_m
-    for name, where in layout.cameras.items():
-        focal = float(state.cameras[name].intrinsics[0])
-        if where.position is not None and where.rotation is not None:
-            s[where.position], s[where.rotation] = lever_arm, angle
-        if where.timeshift is not None and where.skew is not None:
-            s[where.timeshift], s[where.skew] = start.timeshift_s, SKEW_SIGMA
-        if where.intrinsics is not None and where.distortion is not None:
-            s[where.intrinsics], s[where.distortion] = start.focal * focal, start.distortion
-            if name in layout.held:
-                s[where.intrinsics.start : where.distortion.stop] = layout.held[name].off_sigma
-        if where.readout is not None:
-            s[where.readout] = start.readout_s
     return s

@@ -11,10 +11,16 @@ import numpy as np
 
 from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.state import LOWER
+from vical_daemon.estimation.model.state import LOWER, State
 
 ENTRIES = 15
 NUMBERS = ENTRIES + 1
+
+
+def numbers_of(state: State) -> FloatArray:
+    """Those of a state, shape (16,)."""
+    gyro, accel = state.gyro_matrix - np.eye(3), state.accel_matrix - np.eye(3)
+    return np.concatenate([gyro.ravel(), accel[LOWER[:, 0], LOWER[:, 1]], [state.accel_lag_s]])
 
 
 def matrices(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:

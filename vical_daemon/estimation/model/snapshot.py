@@ -3,26 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.model.state import CameraSlices, CameraState
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, PoseEstimate
+
+
+def joint_covariance(S: FloatArray, where: CameraSlices, length: int) -> FloatArray:
+    """Covariance of [lever arm, rotation, time shift, lens], zeros where not estimated, shape (7 + n, 7 + n).
+
+    Args:
+        S: Square root of the covariance of the errors.
+        where: Of the camera.
+        length: n, of its lens.
+    """
+    shift = None if where.timeshift is None else slice(where.timeshift, where.timeshift + 1)
+    places = (where.position, where.rotation, shift, where.intrinsics, where.distortion)
+    rows = np.zeros((7 + length, S.shape[1]))
+    for place, (begin, end) in zip(places, pairwise((0, 3, 6, 7, 11, 7 + length)), strict=True):
+        if place is not None:
+            rows[begin:end] = S[place][: end - begin]
+    return np.asarray(rows @ rows.T)
 
 
 def camera_snapshot(
     camera: CameraState,
     *,
-    pose: FloatArray,
-    timeshift_sigma_s: float,
+    joint: FloatArray,
     lens: FloatArray,
     lens_sigma: FloatArray,
     readout_sigma_s: float,
     rms_px: float,
     sigma_px: float,
-    joint: FloatArray,
     rolling: bool = True,
     jitter_s: float = 0.0,
 ) -> CameraEstimate:
@@ -30,22 +46,20 @@ def camera_snapshot(
 
     Args:
         camera: Its nominal values.
-        pose: Covariance of T_imu_cam, order [px py pz rx ry rz], shape (6, 6).
-        timeshift_sigma_s: Of the time shift, s.
+        joint: See `joint_covariance`.
         lens: fx fy cx cy and the distortion as reported, shape (n,).
         lens_sigma: Standard deviations, shape (n,).
         readout_sigma_s: Of the readout, s.
         rms_px: RMS of the residuals, px.
         sigma_px: Corner or feature noise, px.
-        joint: Covariance of [pose, time shift, lens], shape (7 + n, 7 + n).
         rolling: Its shutter is known to roll, or taken to: its readout is reported.
         jitter_s: Of its stamps, s.
     """
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
-        T_imu_cam=PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), pose.tolist()),
+        T_imu_cam=PoseEstimate(camera.p_imu_cam.tolist(), q.tolist(), joint[:6, :6].tolist()),
         timeshift_cam_imu_s=float(camera.timeshift_s),
-        timeshift_sigma_s=float(timeshift_sigma_s),
+        timeshift_sigma_s=float(np.sqrt(joint[6, 6])),
         intrinsics=lens[:4].tolist(),
         intrinsics_sigma=lens_sigma[:4].tolist(),
         distortion_model=camera.distortion_model,

@@ -26,7 +26,7 @@ VELOCITY = slice(6, 9)  # m/s, in world
 GYRO_BIAS = slice(9, 12)  # rad/s
 ACCEL_BIAS = slice(12, 15)  # m/s^2
 GRAVITY = slice(15, 17)  # rad, tilt of the direction of gravity
-_CORE = 17
+CORE = 17
 
 LOWER = np.array([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)])  # entries of the accelerometer matrix
 
@@ -46,9 +46,12 @@ class CameraSlices:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Order of the error state: [core 17 | imu matrices | accel lag | cameras | target scale | target shape].
+    """Order of the error state: [core | imu matrices | accel lag | cameras | target scale | target shape].
+
+    The core is what moves, biases and gravity: of the filter as above, of a window see `MarginalPrior`.
 
     Attributes:
+        core: Length of the core.
         size: Length of the error state.
         dynamic: Number of leading errors that enter the propagation (core, imu matrices and lag).
         gyro_matrix: 9 entries, row-major, of M_g - I; None: not estimated.
@@ -62,6 +65,7 @@ class Layout:
         held: Lenses that are held and whose errors are states all the same, by camera.
     """
 
+    core: int
     size: int
     dynamic: int
     gyro_matrix: slice | None
@@ -72,6 +76,17 @@ class Layout:
     target_shape: slice | None = None
     target_modes: TargetModes | None = None
     held: Mapping[str, FixedLens] = field(default_factory=dict)
+
+    @property
+    def inertial(self) -> slice:
+        """Imu matrices and lag of the accelerometer, as far as they are estimated; see `imu_scale`."""
+        return slice(self.core, self.dynamic)
+
+    @property
+    def camera(self) -> CameraSlices:
+        """Of the only camera."""
+        (only,) = self.cameras.values()
+        return only
 
     def lens(self, camera: str) -> slice:
         """Where fx fy cx cy and the distortion of a lens lie, which must be among the errors."""
@@ -92,6 +107,7 @@ def make_layout(
     estimate: frozenset[str],
     target_m: FloatArray | None = None,
     held: Mapping[str, FixedLens] | None = None,
+    core: int = CORE,
 ) -> Layout:
     """Lay the error state out.
 
@@ -101,8 +117,9 @@ def make_layout(
         estimate: Likewise.
         target_m: Points of the target, m, shape (n, 3); None: no target.
         held: Lenses whose errors are states although they are in `fix`, by camera.
+        core: Length of what comes before the constants.
     """
-    places, held = _Places(_CORE), dict(held or {})
+    places, held = _Places(core), dict(held or {})
     imu = "imu_intrinsics" in estimate
     gyro_matrix, accel_matrix = places.block(imu, 9), places.block(imu, 6)
     accel_lag = places.one("accel_lag" in estimate)
@@ -115,7 +132,7 @@ def make_layout(
     modes = None if target_m is None else TargetModes.of(target_m)
     shape = places.block(modes is not None and "target_shape" in estimate, MODES)
     return Layout(
-        places.used, dynamic, gyro_matrix, accel_matrix, accel_lag, blocks, scale, shape, modes, held
+        core, places.used, dynamic, gyro_matrix, accel_matrix, accel_lag, blocks, scale, shape, modes, held
     )
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.imu_scale import ENTRIES, numbers_of
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S, OFF, SIZE_SIGMA
 from vical_daemon.estimation.model.retract import retract
-from vical_daemon.estimation.model.state import LOWER
+from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.selection import model_mixture
 from vical_daemon.estimation.selection.model_mixture import Block, Weights, lens_block, mixture, not_zero
 
@@ -22,27 +24,32 @@ IN_DOUBT = {
 }
 
 
+def imu_and_lenses(
+    layout: Layout, numbers: FloatArray, cameras: Mapping[str, CameraState]
+) -> dict[str, Block]:
+    """Imu and fixed lenses, as far as they are estimated; `numbers` of the imu: see `imu_scale`."""
+    found: dict[str, Block] = {}
+    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
+        where = slice(layout.gyro_matrix.start, layout.accel_matrix.stop)
+        found[IMU] = Block.of(where, numbers[:ENTRIES], ENTRY_SIGMA)
+    if layout.accel_lag is not None:
+        where = slice(layout.accel_lag, layout.accel_lag + 1)
+        found[LAG] = Block.of(where, numbers[ENTRIES:], LAG_SIGMA_S)
+    for name, lens in layout.held.items():
+        now = np.concatenate([cameras[name].intrinsics, cameras[name].distortion])
+        found[lens_block(name)] = Block.of_lens(layout.lens(name), lens, now)
+    return found
+
+
 def blocks(f: CalibrationFilter) -> dict[str, Block]:
     """What a filter estimates apart from the calibration, by its name in `CalibrationOptions.estimate`."""
     layout, state = f.layout, f.state
-    found: dict[str, Block] = {}
-    if layout.gyro_matrix is not None and layout.accel_matrix is not None:
-        off = state.accel_matrix - np.eye(3)
-        entries = np.concatenate([(state.gyro_matrix - np.eye(3)).ravel(), off[LOWER[:, 0], LOWER[:, 1]]])
-        where = slice(layout.gyro_matrix.start, layout.accel_matrix.stop)
-        found[IMU] = Block.of(where, entries, ENTRY_SIGMA)
-    if layout.accel_lag is not None:
-        where = slice(layout.accel_lag, layout.accel_lag + 1)
-        found[LAG] = Block.of(where, np.array([state.accel_lag_s]), LAG_SIGMA_S)
+    found = imu_and_lenses(layout, numbers_of(state), state.cameras)
     if layout.target_scale is not None:
         where = slice(layout.target_scale, layout.target_scale + 1)
         found[SIZE] = Block.of(where, np.array([state.target_scale - 1.0]), SIZE_SIGMA)
     if layout.target_shape is not None and layout.target_modes is not None:
         found[TARGET] = Block.of(layout.target_shape, state.target_shape, layout.target_modes.sigma_m)
-    for name, lens in layout.held.items():
-        camera = state.cameras[name]
-        now = np.concatenate([camera.intrinsics, camera.distortion])
-        found[lens_block(name)] = Block.of_lens(layout.lens(name), lens, now)
     return found
 
 

@@ -6,15 +6,14 @@ import numpy as np
 
 from vical_daemon.estimation.events import ROLLING, Event, EventKind
 from vical_daemon.estimation.measurements import ROWS
-from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import (
     ENTRY_SIGMA,
     KNOWN_OFF_SIGMA,
-    LAG_SIGMA_S,
     OFF,
     SURE,
     WINDOW_START,
 )
+from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.selection import model_selection
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 from vical_daemon.estimation.selection.model_acceptance import known_off, lens_off
@@ -28,20 +27,11 @@ from vical_daemon.estimation.smoother.clock_changes import (
     stepped_s,
     what_happened,
 )
-from vical_daemon.estimation.smoother.marginal_prior import (
-    DRIFT,
-    IMU,
-    LAG,
-    LENS,
-    READOUT,
-    MarginalPrior,
-    calibration_root,
-)
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import ReportedModels
 
 _TERM = "lens_term"
 _SHORTEST_S = 1e-3  # of a readout that is worth a word
-_SIGMA = {model_selection.IMU: ENTRY_SIGMA, model_selection.LAG: LAG_SIGMA_S}
 
 _WINDOWS_SHOW = 2  # beginning with that in which something changed, until what it was is clear
 
@@ -55,15 +45,14 @@ class AlternativeModels:
     """Follows what the windows say about clocks, imu and shutter.
 
     Args:
-        camera: Name of the camera.
+        layout: Where the errors live.
         asked: What is asked for (`CalibrationOptions.estimate`): estimated whatever the evidence.
         rolling: The shutter is said to be a rolling one, or its readout is asked for.
-        lens: The lens, where it is fixed; None: it is estimated, or taken as exact.
         term: Its last coefficient is one more than its model has.
 
     Attributes:
         drifting: The camera's clock is known to run apart from the imu's.
-        lens: See above.
+        lens: The lens, where it is fixed; None: it is estimated, or taken as exact.
         imu_asked: The imu's matrices are asked for.
         imu_sigma: Prior of the entries of the imu's matrices.
         rolling: The shutter is known to be a rolling one.
@@ -72,15 +61,15 @@ class AlternativeModels:
 
     def __init__(
         self,
-        camera: str,
+        layout: Layout,
         *,
         asked: frozenset[str],
         rolling: bool,
-        lens: FixedLens | None = None,
         term: bool = False,
     ) -> None:
-        self._camera, self.lens, self._lens_block, self._term = camera, lens, lens_block(camera), term
-        self._off = asked & set(_SIGMA)
+        (self._camera,) = layout.cameras
+        self._term, self.lens = term, layout.held.get(self._camera)
+        self._off = asked & {model_selection.IMU, model_selection.LAG}
         self.imu_asked = model_selection.IMU in asked
         self.imu_sigma = KNOWN_OFF_SIGMA if self.imu_asked else ENTRY_SIGMA
         self.drifting = False
@@ -98,13 +87,12 @@ class AlternativeModels:
             compared: Windows could be compared; before, what looks like the imu may as well be the images.
         """
         events = self._news_of_drift(carry, self.clocks(carry, factor), len(carry.jump_t_s) - 1)
-        sigmas = np.sqrt(factor * np.diag(carry.calibration()))
         if not self.rolling:
             self.rolling = self.rolls(carry, factor)
             if self.rolling:
                 kind = ROLLING[carry.camera.readout_axis or ROWS]
-                readout_s = float(carry.camera.readout_s)
-                events.append(Event(kind, self._camera, readout_s, float(sigmas[READOUT])))
+                sigma_s = float(np.sqrt(factor)) * carry.sigma(carry.layout.camera.readout)
+                events.append(Event(kind, self._camera, float(carry.camera.readout_s), sigma_s))
         if compared:
             weights = self._weights(carry, factor)
             every = self._blocks(carry)
@@ -115,7 +103,7 @@ class AlternativeModels:
         return events
 
     def _known_off(self, name: str, block: Block, carry: MarginalPrior, factor: float) -> Event:
-        covariance = factor * carry.calibration()[block.where, block.where]
+        covariance = factor * carry.covariance()[block.where, block.where]
         if self.lens is not None and block.held:
             return lens_off(self._camera, self.lens, block, covariance, carry.camera)
         if name == _TERM:
@@ -125,7 +113,7 @@ class AlternativeModels:
     @property
     def lens_off(self) -> bool:
         """Whether images contradict the fixed lens beyond doubt."""
-        return self._lens_block in self._off
+        return lens_block(self._camera) in self._off
 
     def axis_changed(self) -> None:
         """What was seen of a readout was seen with the wrong axis."""
@@ -134,7 +122,7 @@ class AlternativeModels:
     @staticmethod
     def rolls(carry: MarginalPrior, factor: float = 1.0) -> bool:
         """Whether a readout is beyond doubt; `factor`: measured variance over the stated one."""
-        sigma_s = float(np.sqrt(factor * carry.calibration()[READOUT, READOUT]))
+        sigma_s = float(np.sqrt(factor)) * carry.sigma(carry.layout.camera.readout)
         return abs(carry.camera.readout_s) > max(SURE_SIGMAS * sigma_s, _SHORTEST_S)
 
     def reason(self, carry: MarginalPrior, factor: float, *, believed: bool) -> str:
@@ -195,8 +183,9 @@ class AlternativeModels:
     def _drift(self, kind: EventKind, carry: MarginalPrior, clocks: list[Clock]) -> Event:
         """The clocks drift, from now on for sure; the announcement."""
         self.drifting, self._announced_s = True, carry.jump_t_s
-        d, P = over_clocks(carry, clocks)
-        return Event(kind, self._camera, float(carry.camera.skew + d[DRIFT]), float(np.sqrt(P[DRIFT, DRIFT])))
+        (d, P), at = over_clocks(carry, clocks), carry.layout.camera.skew
+        assert at is not None  # or there would be no clocks
+        return Event(kind, self._camera, float(carry.camera.skew + d[at]), float(np.sqrt(P[at, at])))
 
     def settled(self, carry: MarginalPrior, factor: float) -> MarginalPrior:
         """What is known without the unknowns of past changes: the mixture over what may have happened."""
@@ -217,7 +206,6 @@ class AlternativeModels:
             weights,
             gyro_frame=not self.imu_asked,
             rolling=self.rolling,
-            lens=self.lens,
             term=self._term,
         )
 
@@ -228,19 +216,13 @@ class AlternativeModels:
         worth less by as much again.
         """
         doubtful = {name: block for name, block in self._blocks(carry).items() if name not in self._off}
-        return hypotheses(calibration_root(carry), doubtful, factor**2)
+        return hypotheses(carry.S, doubtful, factor**2)
 
     def _blocks(self, carry: MarginalPrior) -> dict[str, Block]:
         """What is estimated apart from the calibration, by its name in `CalibrationOptions.estimate`."""
-        entries = carry.imu[: IMU.stop - IMU.start]
-        found = {
-            model_selection.IMU: Block.of(IMU, entries, ENTRY_SIGMA),
-            model_selection.LAG: Block.of(LAG, carry.imu[len(entries) :], LAG_SIGMA_S),
-        }
-        if self.lens is not None:
-            now = np.concatenate([carry.camera.intrinsics, carry.camera.distortion])
-            found[self._lens_block] = Block.of_lens(LENS, self.lens, now)
-        elif self._term and carry.active[-1]:
-            where, now = slice(len(carry.active) - 1, len(carry.active)), carry.camera.distortion[-1:]
-            found[_TERM] = Block(where, now, np.array([WINDOW_START.distortion]), np.zeros(1), held=True)
+        (name,), where = carry.layout.cameras, carry.layout.camera.distortion
+        found = model_selection.imu_and_lenses(carry.layout, carry.imu, {name: carry.camera})
+        if self._term and self.lens is None and where is not None:
+            last, now = slice(where.stop - 1, where.stop), carry.camera.distortion[-1:]
+            found[_TERM] = Block(last, now, np.array([WINDOW_START.distortion]), np.zeros(1), held=True)
         return found

@@ -22,12 +22,9 @@ from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
-    CAMERA,
-    INERTIAL,
     MarginalPrior,
     calibration_difference,
     carried_out,
-    length,
 )
 from vical_daemon.estimation.smoother.normal import Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
@@ -57,8 +54,8 @@ class Fit(NamedTuple):
         steps: Iterations done.
         settled: The last of them changed nothing to speak of.
         used, refused: Observations.
-        change: Calibration found minus the one carried in, at the first image; active errors, then jumps,
-            shape (k + 2 m,).
+        change: Constants and jumps found minus those carried in, at the first image, as errors of
+            `MarginalPrior`, shape (d,); zero for tilt, speed and biases.
         landmarks: How many.
         parallax_deg: Typical angle under which a landmark's rays cross.
         own_lens: Covariance of the window's own lens, shape (n, n), or (0, 0).
@@ -248,9 +245,9 @@ class Bundle:
         w.R = orthonormal(w.R @ so3.exp(d[:, :3]))
         w.p, w.v = w.p + d[:, 3:6], w.v + d[:, 6:]
         w.bias = w.bias + dx[order.knots]
-        full = np.zeros(length(w.camera))
-        full[self.problem.active] = dx[order.calib]
-        w.camera, w.imu = moved_camera(w.camera, CAMERA, full), w.imu + full[INERTIAL][: len(w.imu)]
+        layout = self.carry.layout
+        full = np.concatenate([np.zeros(layout.core), dx[order.constants]])
+        w.camera, w.imu = moved_camera(w.camera, layout.camera, full), w.imu + full[layout.inertial]
         w.jumps = w.jumps + dx[order.jumps]
         if self.problem.own:
             w.own_lens = w.own_lens + dx[order.own]
@@ -318,8 +315,7 @@ class Bundle:
         inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
-        change = calibration_difference(w, self.carry)[self.problem.active]
-        change = np.concatenate([change, w.jumps - self.carry.jumps])
+        change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])
         return Fit(
             carried_out(w, covariance[own:, own:], self.carry),
             squares,

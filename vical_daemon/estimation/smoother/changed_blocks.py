@@ -16,20 +16,27 @@ from itertools import combinations
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.smoother.marginal_prior import SHIFT
+from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import Layout
 
-MOUNTING: tuple[int, ...] = tuple(range(6))
-CLOCK: tuple[int, ...] = (SHIFT,)
-BOTH: tuple[int, ...] = MOUNTING + CLOCK
-"""Blocks of the calibration's errors that may change by themselves; see `carry`."""
+
+def mounting(layout: Layout) -> tuple[int, ...]:
+    """Errors of lever arm and mounting; empty where they are not estimated."""
+    p, r = layout.camera.position, layout.camera.rotation
+    return () if p is None or r is None else (*range(p.start, p.stop), *range(r.start, r.stop))
+
+
+def clock(layout: Layout) -> tuple[int, ...]:
+    """Error of the time shift; empty where it is not estimated."""
+    shift = layout.camera.timeshift
+    return () if shift is None else (shift,)
 
 
 def changed_blocks(
     found: FloatArray,
     found_covariance: FloatArray,
     known_covariance: FloatArray,
-    active: BoolArray,
+    layout: Layout,
     excess: Callable[[float, int], float],
 ) -> tuple[int, ...]:
     """The fewest blocks that must have changed; of as many, those that leave the rest fit best.
@@ -37,20 +44,20 @@ def changed_blocks(
     Args:
         found: Calibration of a window that knew nothing of the blocks, minus the one known before,
             shape (n,).
-        found_covariance: Of it, zero where not estimated, shape (n, n).
+        found_covariance: Of it, shape (n, n).
         known_covariance: Of what was known before, likewise.
-        active: Which errors are estimated, shape (n,).
+        layout: Where the errors live.
         excess: Of a sum of squares and its degrees of freedom: above 1, it is no chance.
 
     Returns:
         Errors to reopen; empty: none has changed.
     """
-    blocks = [block for block in (MOUNTING, CLOCK) if active[list(block)].any()]
-    rest = [int(k) for k in np.flatnonzero(active) if k not in BOTH]
+    blocks = [block for block in (mounting(layout), clock(layout)) if block]
+    rest = [k for k in range(layout.core, layout.size) if not any(k in block for block in blocks)]
     for count in range(len(blocks)):
         scored = []
         for reopened in combinations(blocks, count):
-            kept = [k for block in blocks if block not in reopened for k in block if active[k]]
+            kept = [k for block in blocks if block not in reopened for k in block]
             square = _square(found, found_covariance, known_covariance, kept, rest)
             scored.append((excess(square, len(kept)), sum(reopened, ())))
         least, best = min(scored)
@@ -64,7 +71,6 @@ def _square(
 ) -> float:
     """The sum of squares of the test above, with as many degrees of freedom as `kept` is long."""
     scale = np.sqrt(np.diag(known))  # pixels and microseconds
-    scale = np.where(scale > 0.0, scale, 1.0)
     whole, P, d = known / np.outer(scale, scale), P / np.outer(scale, scale), found / scale
     K = np.linalg.solve(whole[np.ix_(rest, rest)], whole[np.ix_(rest, kept)]).T
     C = whole[np.ix_(kept, kept)] - K @ whole[np.ix_(rest, kept)]

@@ -23,11 +23,9 @@ from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.selection.clock_drift import stamps_variance
 from vical_daemon.estimation.smoother.marginal_prior import (
     BIASES,
-    CALIBRATION,
-    CAMERA,
-    DRIFT,
-    INERTIAL,
-    SHIFT,
+    CORE,
+    SPEED,
+    TILT,
     MarginalPrior,
     root_of,
 )
@@ -90,11 +88,12 @@ class Clock(NamedTuple):
 
 def opened(carry: MarginalPrior) -> MarginalPrior:
     """The same for a window before which the relation of the clocks may have changed."""
-    if not carry.active[[SHIFT, DRIFT]].all():
+    shift, skew = carry.layout.camera.timeshift, carry.layout.camera.skew
+    if shift is None or skew is None:
         return carry
     P = carry.covariance()
     n = len(P)
-    at, new = [_place(carry, SHIFT), _place(carry, DRIFT)], [n, n + 1]
+    at, new = [shift, skew], [n, n + 1]
     whole = np.zeros((n + 2, n + 2))
     whole[:n, :n] = P
     for rows in (at, new):
@@ -123,7 +122,7 @@ def what_happened(
     Returns:
         With probabilities; empty: the drift is not estimated.
     """
-    if not carry.active[DRIFT]:
+    if carry.layout.camera.skew is None:
         return []
     (u, P), sigma = _unknowns(carry)[1:], _sigmas(carry)
     noise = [stamps_variance(stamp_sigma_s, elapsed_s)]
@@ -170,15 +169,11 @@ def _changes(carry: MarginalPrior) -> list[tuple[int, bool, bool, bool, float]]:
     return [(-1, False, False, False, 1.0), *either]
 
 
-def _place(carry: MarginalPrior, error: int) -> int:
-    return CALIBRATION + int(np.count_nonzero(carry.active[:error]))
-
-
 def _unknowns(carry: MarginalPrior) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Covariance of a carry's errors with the clock's unknowns, (d, n); these, (n,); their own, (n, n)."""
     P, m2 = carry.covariance(), len(carry.jumps)
     rows = np.zeros((1 + m2, len(P)))
-    rows[0, _place(carry, DRIFT)] = 1.0
+    rows[0, carry.layout.camera.skew] = 1.0
     rows[0, len(P) - m2 + 1 :: 2] = -1.0  # before all jumps
     rows[1:, len(P) - m2 :] = np.eye(m2)
     u = np.concatenate([[carry.camera.skew - carry.jumps[1::2].sum()], carry.jumps])
@@ -228,31 +223,27 @@ def mixed(carry: MarginalPrior, weighed: Weighed, factor: float = 1.0) -> tuple[
 def over_clocks(
     carry: MarginalPrior, clocks: Sequence[Clock], factor: float = 1.0
 ) -> tuple[FloatArray, FloatArray]:
-    """What `mixed` says of the calibration, zero where not estimated, shapes (n,) and (n, n)."""
+    """What `mixed` says of all errors but the jumps, shapes (n,) and (n, n)."""
     dx, P = mixed(carry, [(c.probability, c.free) for c in clocks], factor)
-    at, own = np.flatnonzero(carry.active), slice(CALIBRATION, len(dx) - len(carry.jumps))
-    mean, full = np.zeros(len(carry.active)), np.zeros((len(carry.active),) * 2)
-    mean[at], full[np.ix_(at, at)] = dx[own], P[own, own]
-    return mean, full
+    n = carry.layout.size
+    return dx[:n], P[:n, :n]
 
 
 def _without_jumps(carry: MarginalPrior, weighed: Weighed, out: Collection[int]) -> MarginalPrior:
     """A carry without some of its jumps, as the mixture over hypotheses about them."""
     dx, P = mixed(carry, weighed)
-    d, m2 = len(P), len(carry.jumps)
+    n, layout = carry.layout.size, carry.layout
     left = [k for k in range(len(carry.jump_t_s)) if k not in out]
-    own = np.array([2 * k + n for k in left for n in (0, 1)], np.intp)
-    keep = np.concatenate([np.arange(d - m2), d - m2 + own])
-    full = np.zeros(len(carry.active))
-    full[carry.active] = dx[CALIBRATION : d - m2]
+    own = np.array([2 * k + which for k in left for which in (0, 1)], np.intp)
+    keep = np.concatenate([np.arange(n), n + own])
     return replace(
         carry,
-        R=carry.R @ so3.exp(tangents(carry.R[2][None])[0] @ dx[:2]),
-        speed=carry.speed + dx[2:5],
+        R=carry.R @ so3.exp(tangents(carry.R[2][None])[0] @ dx[TILT]),
+        speed=carry.speed + dx[SPEED],
         bias=carry.bias + dx[BIASES],
-        camera=moved_camera(carry.camera, CAMERA, full),
-        imu=carry.imu + full[INERTIAL][: len(carry.imu)],
-        jumps=(carry.jumps + dx[d - m2 :])[own],
+        camera=moved_camera(carry.camera, layout.camera, dx),
+        imu=carry.imu + dx[layout.inertial],
+        jumps=(carry.jumps + dx[n:])[own],
         jump_t_s=tuple(carry.jump_t_s[k] for k in left),
         root=root_of(P[np.ix_(keep, keep)]),
     )
@@ -269,7 +260,7 @@ def settled(carry: MarginalPrior, clocks: Sequence[Clock]) -> MarginalPrior:
 def stepped_s(carry: MarginalPrior, clock: Clock) -> float:
     """By how much the time shift stepped, s, if a hypothesis is true by which it did."""
     dx, _ = mixed(carry, [(1.0, clock.free)])
-    steps_s, drifts = (carry.jumps + dx[len(dx) - len(carry.jumps) :]).reshape(-1, 2).T
+    steps_s, drifts = (carry.jumps + dx[carry.layout.size :]).reshape(-1, 2).T
     whole_s = float(steps_s[clock.jump])
     if clock.within:
         t0_s, t1_s = carry.jump_t_s[clock.jump : clock.jump + 2]
@@ -304,7 +295,7 @@ def compared_by(
     Args:
         before: Carried into the window.
         after: Out of it, at the same image.
-        change: Of calibration and jumps with all jumps open, shape (k + 2 m,).
+        change: See `Fit`; with all jumps open.
         clocks: Hypotheses with probabilities, after the window.
 
     Returns:
@@ -315,7 +306,7 @@ def compared_by(
         (dx, P), (dy, Q) = ((np.zeros(len(x.root)), x.covariance()) for x in (before, after))
     else:
         (dx, P), (dy, Q) = (mixed(x, [(1.0, free)]) for x in (before, after))
-    k = len(P) - len(before.jumps)
-    kept = np.array([*range(CALIBRATION, k), *(k + at - 1 for at, *_ in free if at)], np.intp)
-    moved = (change + (dy - dx)[CALIBRATION:])[kept - CALIBRATION]
+    n = before.layout.size
+    kept = np.array([*range(CORE, n), *(n + at - 1 for at, *_ in free if at)], np.intp)
+    moved = (change + dy - dx)[kept]
     return moved, (P[np.ix_(kept, kept)], Q[np.ix_(kept, kept)])

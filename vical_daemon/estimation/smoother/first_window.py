@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import COLUMNS, BoolArray, CalibrationOptions, CameraPrior
+from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions, CameraPrior
+from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
@@ -61,7 +62,7 @@ class FirstWindow:
     Args:
         options: Switches and noise.
         prior: What is known about the camera.
-        active: Which of the calibration errors are estimated, shape (n,).
+        layout: Where the errors live.
         status: Says whether a window fits, and agrees with what was known.
 
     Attributes:
@@ -69,9 +70,9 @@ class FirstWindow:
     """
 
     def __init__(
-        self, options: CalibrationOptions, prior: CameraPrior, active: BoolArray, status: TargetFreeStatus
+        self, options: CalibrationOptions, prior: CameraPrior, layout: Layout, status: TargetFreeStatus
     ) -> None:
-        self._options, self._prior, self._active, self._status = options, prior, active, status
+        self._options, self._prior, self._layout, self._status = options, prior, layout, status
         self.initializer = TargetFreeInitializer(options, prior)
 
     def begin(
@@ -154,14 +155,12 @@ class FirstWindow:
     ) -> tuple[Bundle, MarginalPrior, Fit | None]:
         """Adjust a window with what is known but for some errors."""
         models, held = self._status.models, self.initializer.held
-        carry = initial_prior(
-            window, known, self._active, held, models.imu_sigma, self._prior, reopened, models.lens
-        )
+        carry = initial_prior(window, known, self._layout, held, models.imu_sigma, self._prior, reopened)
         bundle = Bundle(window, carry, *noise)
         return bundle, carry, bundle.solve(buffer, _STEPS)
 
     def anew(self) -> None:
         """Seek everything anew, from what was given; the mounting that was given is no longer the rig's."""
-        if self._active[0]:
+        if self._layout.camera.position is not None:
             self._prior = replace(self._prior, T_imu_cam=None)
         self.initializer = TargetFreeInitializer(self._options, self._prior)

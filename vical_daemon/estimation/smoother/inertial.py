@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
@@ -15,31 +15,32 @@ _LEAST_JITTER_S = 3e-5
 class Order:
     """Places of the unknowns.
 
-    Images but the last, knots but the last, the window's own lens, last image, last knot, calibration.
+    Images but the last, knots but the last, the window's own lens, last image, last knot, constants, jumps.
 
     Args:
         F: Images.
         K: Knots.
-        of_imu: Which of the calibration's errors are numbers of the imu (`imu_scale`), shape (k,).
+        constants: Of camera and imu.
+        of_imu: The first so many of them are numbers of the imu (`imu_scale`), which move no pixel.
         own: Errors of the window's own lens.
-        jumps: Numbers of the clocks' jumps, after all others.
+        jumps: Numbers of the clocks' jumps.
 
     Attributes:
-        camera: Those that move pixels: of the calibration, and the window's own lens.
+        camera: Those that move pixels: of the constants, and the window's own lens.
     """
 
-    def __init__(self, F: int, K: int, of_imu: BoolArray, own: int = 0, jumps: int = 0) -> None:
-        self.size = 9 * F + 6 * K + own + len(of_imu) + jumps
+    def __init__(self, F: int, K: int, constants: int, of_imu: int = 0, own: int = 0, jumps: int = 0) -> None:
+        self.size = 9 * F + 6 * K + own + constants + jumps
         self.tail = 9 * (F - 1) + 6 * (K - 1) + own
         self.own = self.tail - own + np.arange(own)
         frames = np.arange(9 * (F - 1)).reshape(F - 1, 9)
         knots = 9 * (F - 1) + np.arange(6 * (K - 1)).reshape(K - 1, 6)
         self.frames = np.concatenate([frames, self.tail + np.arange(9)[None]])
         self.knots = np.concatenate([knots, self.tail + 9 + np.arange(6)[None]])
-        self.calib = self.tail + 15 + np.arange(len(of_imu))
-        self.jumps = self.tail + 15 + len(of_imu) + np.arange(jumps)
-        self.imu = self.calib[of_imu]
-        self.camera = np.concatenate([self.calib[~of_imu], self.own])
+        self.constants = self.tail + 15 + np.arange(constants)
+        self.jumps = self.tail + 15 + constants + np.arange(jumps)
+        self.imu = self.constants[:of_imu]
+        self.camera = np.concatenate([self.constants[of_imu:], self.own])
 
     def of_links(self, knots: IntArray) -> IntArray:
         """Where the states of each link live: both images, knot, entries; shape (F - 1, 24 or 40)."""

@@ -19,13 +19,9 @@ from vical_daemon.estimation.noise.stamp_jitter import excess
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
 from vical_daemon.estimation.smoother.jitter import first_guess
 from vical_daemon.estimation.smoother.marginal_prior import (
-    ARM,
-    DRIFT,
-    INERTIAL,
-    LENS,
-    READOUT,
-    SHIFT,
-    TURN,
+    BIASES,
+    SPEED,
+    TILT,
     MarginalPrior,
     calibration_difference,
 )
@@ -79,21 +75,18 @@ class Problem:
     ) -> None:
         self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
         self.jitter_s, self.lens_px = jitter_s, lens_px
-        self.own = len(window.own_lens) if carry.active[LENS].all() else 0
+        self.own = 0 if carry.layout.camera.intrinsics is None else len(window.own_lens)
         uv = np.concatenate([frame.uv_px for _, frame in window.frames])
         seen = patches_seen(uv, carry.camera.resolution)
         self.lens_root = (
             patches(carry.camera, seen) / lens_px
         )  # of the information in the prior of the own lens
-        self.active = np.flatnonzero(carry.active)
-        places = np.arange(len(carry.active))
-        self._of_imu = (places >= INERTIAL.start) & (places < INERTIAL.stop)  # they do not move pixels
-        self._columns = _slice(np.flatnonzero(carry.active[~self._of_imu]))
 
     def order(self) -> Order:
         """Places of the unknowns."""
-        w = self.window
-        return Order(len(w.frames), len(w.bias), self._of_imu[self.active], self.own, len(w.jumps))
+        w, layout = self.window, self.carry.layout
+        of_imu = layout.dynamic - layout.core
+        return Order(len(w.frames), len(w.bias), layout.size - layout.core, of_imu, self.own, len(w.jumps))
 
     # ------------------------------------------------------------------ pixels
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -156,19 +149,32 @@ class Problem:
         Rt = np.ascontiguousarray(np.swapaxes(R, 1, 2))  # three times as fast below
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
         JW = JR @ Rt  # by the point in the world
+        by_shift = self._by_shift(seen, JR, R, x_imu, rates)
         Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
-        Jc = np.empty((len(e), 2, INERTIAL.start + Jlens.shape[2]))
-        Jc[:, :, ARM], Jc[:, :, TURN] = -rho * JR, cross(Jy, y[:, None])
-        Jc[:, :, SHIFT] = self._by_shift(seen, JR, R, x_imu, rates)
-        Jc[:, :, INERTIAL.start :] = Jlens
-        Jc[:, :, DRIFT] = Jc[:, :, SHIFT] * self._since()[seen.frame, None]
-        Jc[:, :, READOUT] = Jc[:, :, SHIFT] * seen.row[:, None]
-        Jc = np.concatenate([Jc[:, :, self._columns], Jlens[:, :, : self.own]], axis=2)
+        Jc = self._by_camera(seen, -rho * JR, cross(Jy, y[:, None]), by_shift, Jlens)
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
         by_rho = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
         Jl = np.concatenate([JW @ basis, by_rho[..., None]], axis=2)
         return self._assemble(seen, links, e, Jf, Jc, Jl, cost)
+
+    def _by_camera(
+        self, seen: Seen, by_arm: FloatArray, by_turn: FloatArray, by_shift: FloatArray, by_lens: FloatArray
+    ) -> FloatArray:
+        """How pixels move with those constants that move them, and with the window's own lens, (N, 2, c)."""
+        layout, where = self.carry.layout, self.carry.layout.camera
+        J = np.empty((len(by_shift), 2, layout.size + self.own))
+        if where.position is not None and where.rotation is not None:
+            J[:, :, where.position], J[:, :, where.rotation] = by_arm, by_turn
+        if where.timeshift is not None and where.skew is not None:
+            J[:, :, where.timeshift] = by_shift
+            J[:, :, where.skew] = by_shift * self._since()[seen.frame, None]
+        if where.intrinsics is not None and where.distortion is not None:
+            J[:, :, where.intrinsics.start : where.distortion.stop] = by_lens
+        if where.readout is not None:
+            J[:, :, where.readout] = by_shift * seen.row[:, None]
+        J[:, :, layout.size :] = by_lens[:, :, : self.own]
+        return J[:, :, layout.dynamic :]
 
     def _by_shift(
         self, seen: Seen, JR: FloatArray, R: FloatArray, x_imu: FloatArray, rates: FloatArray
@@ -230,7 +236,7 @@ class Problem:
         w = self.window
         F, k, L = len(w.frames), Jc.shape[2], len(seen.begin)
         order = self.order()
-        calib = order.camera
+        camera = order.camera
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
         begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
         Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
@@ -239,12 +245,12 @@ class Problem:
         pose = order.frames[:, :6]
         at = pose[fw]
         H[at[:, :, None], at[:, None, :]] += blocks[:, :, :6]
-        H[at[:, :, None], calib] += blocks[:, :, 6:-1]
-        H[calib[:, None], at.reshape(1, -1)] += blocks[:, :, 6:-1].reshape(-1, k).T
+        H[at[:, :, None], camera] += blocks[:, :, 6:-1]
+        H[camera[:, None], at.reshape(1, -1)] += blocks[:, :, 6:-1].reshape(-1, k).T
         g[at] += blocks[:, :, -1]
         flat = Jc.reshape(-1, k)
-        H[calib[:, None], calib] += flat.T @ flat
-        g[calib] += flat.T @ e.reshape(-1)
+        H[camera[:, None], camera] += flat.T @ flat
+        g[camera] += flat.T @ e.reshape(-1)
         own = _products(Jl, np.concatenate([Jl, Jall[:, :, 6:]], axis=2), begin)
         V = own[:, :, :3].copy()
         V[:, 2, 2] += _INVERSE_SIGMA**-2
@@ -276,20 +282,17 @@ class Problem:
         up, now = c.R[2], R0[2]
         B = tangents(up[None])[0]
         speed = R0.T @ v0
-        calibration = calibration_difference(w, c)[self.active]
-        e = np.concatenate(
-            [B.T @ np.cross(now, up), speed - c.speed, w.bias[0] - c.bias, calibration, w.jumps - c.jumps]
-        )
-        J = np.zeros((len(e), len(e) + 4))
-        J[:2, :3] = B.T
-        J[2:5, :3], J[2:5, 6:9] = so3.hat(speed), R0.T
-        J[5:11, 9:15] = np.eye(6)
-        J[11:, 15:] = np.eye(len(e) - 11)
+        e = np.concatenate([calibration_difference(w, c), w.jumps - c.jumps])
+        e[TILT], e[SPEED], e[BIASES] = B.T @ np.cross(now, up), speed - c.speed, w.bias[0] - c.bias
+        J = np.zeros((len(e), len(e) + 4))  # an image has four errors more than tilt and speed
+        J[TILT, :3] = B.T
+        J[SPEED, :3], J[SPEED, 6:9] = so3.hat(speed), R0.T
+        J[BIASES.start :, 9:] = np.eye(len(e) - BIASES.start)
         return c.root @ e, c.root @ J
 
     def _add_prior(self, H: FloatArray, g: FloatArray, order: Order) -> float:
         e, J = self._prior_errors()
-        at = np.concatenate([order.frames[0], order.knots[0], order.calib, order.jumps])
+        at = np.concatenate([order.frames[0], order.knots[0], order.constants, order.jumps])
         H[at[:, None], at] += J.T @ J
         g[at] += J.T @ e
         # where the origin lies and which way is north cannot be seen: held, at no cost
@@ -307,11 +310,6 @@ class Problem:
         H[order.own[:, None], order.own] += self.lens_root.T @ self.lens_root
         g[order.own] += self.lens_root.T @ e
         return float(e @ e)
-
-
-def _slice(index: IntArray) -> IntArray | slice:
-    """The same places as a slice where they are the first ones: that copies nothing."""
-    return slice(len(index)) if np.array_equal(index, np.arange(len(index))) else index
 
 
 def _products(A: FloatArray, B: FloatArray, begin: IntArray) -> FloatArray:

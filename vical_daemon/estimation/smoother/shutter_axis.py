@@ -5,12 +5,10 @@ from __future__ import annotations
 from copy import deepcopy
 from dataclasses import replace
 
-import numpy as np
-
 from vical_daemon.estimation.measurements import COLUMNS
 from vical_daemon.estimation.significance import COLUMNS_TRIED, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
-from vical_daemon.estimation.smoother.marginal_prior import READOUT, MarginalPrior
+from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.window import Window
 
 
@@ -31,7 +29,7 @@ def readout_sigmas(carry: MarginalPrior) -> float:
 
     Its square is by how much the squared errors, over their noise, grow with a global shutter. [Wald 1943]
     """
-    return abs(carry.camera.readout_s) / float(np.sqrt(carry.calibration()[READOUT, READOUT]))
+    return abs(carry.camera.readout_s) / carry.sigma(carry.layout.camera.readout)
 
 
 def read_by_columns(window: Window) -> Window:

@@ -11,15 +11,14 @@ import numpy as np
 
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import EQUIDISTANT, PLUMB_BOB, RADTAN
+from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.attempts import Attempts
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
-from vical_daemon.estimation.model.held_lens import FixedLens
-from vical_daemon.estimation.model.imu_scale import ENTRIES, NUMBERS
-from vical_daemon.estimation.model.priors import EQUIDISTANT_SIGMA, LAG_SIGMA_S, SKEW_SIGMA, WINDOW_START
+from vical_daemon.estimation.model.imu_scale import NUMBERS
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
@@ -293,27 +292,6 @@ def prior_centre(found: CameraState, given: CameraPrior) -> CameraState:
     if given.intrinsics is None:
         lens = np.concatenate([found.intrinsics[:2], lens[2:]])
     return replace(found, p_imu_cam=before.p_imu_cam, intrinsics=lens, distortion=before.distortion)
-
-
-def start_sigmas(camera: CameraState, imu_sigma: float, fixed: FixedLens | None = None) -> FloatArray:
-    """How far each calibration error may be off at a start: many times what it is worth; shape (n,).
-
-    Args:
-        camera: Its focal length counts.
-        imu_sigma: Of the entries of the imu's matrices.
-        fixed: The lens, where it is fixed and its errors are considered.
-    """
-    start, f = WINDOW_START, float(camera.intrinsics[0])
-    pose = [start.lever_arm_m] * 3 + [start.rotation_rad] * 3
-    lens = [start.focal * f] * 2 + [start.centre * f] * 2
-    distortion = [start.distortion] * 2 + [start.higher_distortion] * 2
-    if camera.distortion_model == EQUIDISTANT:
-        distortion = [EQUIDISTANT_SIGMA] * 4
-    elif camera.distortion_model == PLUMB_BOB:
-        distortion.append(start.distortion)
-    imu = [imu_sigma] * ENTRIES + [LAG_SIGMA_S]
-    of_lens = [*lens, *distortion] if fixed is None else fixed.off_sigma
-    return np.array([*pose, start.timeshift_s, SKEW_SIGMA, start.readout_s, *imu, *of_lens])
 
 
 def _known(known: MarginalPrior) -> _Found:

@@ -9,8 +9,8 @@ import numpy as np
 
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.guidance import WeakDirection
-from vical_daemon.estimation.measurements import BoolArray, CalibrationOptions, FloatArray
-from vical_daemon.estimation.model.held_lens import FixedLens
+from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 from vical_daemon.estimation.result import (
@@ -50,25 +50,21 @@ class TargetFreeStatus(Evaluator):
 
     Args:
         options: Switches and targets.
-        camera: Name of the camera.
-        active: Which of the calibration errors are estimated, shape (n,).
+        layout: Where the errors live.
         rolling: The camera is said to have a rolling shutter, or its readout is asked for.
-        lens: The lens, where it is fixed and its errors are considered.
         term: Its last coefficient is one more than its model has.
     """
 
     def __init__(
         self,
         options: CalibrationOptions,
-        camera: str,
-        active: BoolArray,
+        layout: Layout,
         *,
         rolling: bool = False,
-        lens: FixedLens | None = None,
         term: bool = False,
     ) -> None:
         super().__init__(options, "no features have been followed yet: is the picture dark or blurred?")
-        self.camera, self.active = camera, active
+        (self.camera,), self.layout = layout.cameras, layout
         self.misfit: tuple[Cause, float] = Cause.NONE, 0.0
         self._against_since_s: float | None = None  # images contradict what is known since then
         self._now_s = 0.0
@@ -82,7 +78,7 @@ class TargetFreeStatus(Evaluator):
         self._bumped = Cause.NONE
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
-        self.models = AlternativeModels(camera, asked=options.estimate, rolling=rolling, lens=lens, term=term)
+        self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling, term=term)
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -146,11 +142,11 @@ class TargetFreeStatus(Evaluator):
         return self._windows >= _ENOUGH_WINDOWS
 
     def changed(self, change: FloatArray | None = None) -> None:
-        """The rig is not what it was; `change`: of the calibration's errors, shape (n,), where known."""
+        """The rig is not what it was; `change`: of the errors, shape (n,), where known."""
         why = Cause.CALIBRATION_CONTRADICTED
         self._announce(EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER, cause=why)
         if change is not None:
-            self.announce_all(_changes(self.camera, change, self.active))
+            self.announce_all(_changes(self.camera, change, self.layout))
         self._bumped, self._quiet, self.models.drifting = why, (Cause.NONE, None), False
         self._started_s, self._windows, self._against_since_s = None, 0, None
         self.believed = False
@@ -366,12 +362,12 @@ def _measured_over_stated(windows: Iterable[tuple[float, int]]) -> float:
     return max(1.0, squares / dof) if dof else 1.0
 
 
-def _changes(camera: str, full: FloatArray, active: BoolArray) -> list[Event]:
+def _changes(camera: str, change: FloatArray, layout: Layout) -> list[Event]:
     """A change of the calibration, shape (n,), as events: what moved by how much; zero: it did not."""
-    found = []
-    if active[0]:
-        found.append((EventKind.CAMERA_MOVED, float(np.linalg.norm(full[:3]))))
-        found.append((EventKind.CAMERA_TURNED, float(np.linalg.norm(full[3:6]))))
-    if active[6]:
-        found.append((EventKind.TIMESHIFT_CHANGED, float(full[6])))
+    found, where = [], layout.cameras[camera]
+    if where.position is not None and where.rotation is not None:
+        found.append((EventKind.CAMERA_MOVED, float(np.linalg.norm(change[where.position]))))
+        found.append((EventKind.CAMERA_TURNED, float(np.linalg.norm(change[where.rotation]))))
+    if where.timeshift is not None:
+        found.append((EventKind.TIMESHIFT_CHANGED, float(change[where.timeshift])))
     return [Event(kind, camera, value) for kind, value in found if value]

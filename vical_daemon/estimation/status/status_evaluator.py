@@ -197,7 +197,10 @@ class StatusEvaluator(Evaluator):
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
         """The filter to be reported: mean and covariance over all models of imu, target and clocks."""
         f = model_selection.averaged(f).allowing_for_arm_bias()
-        return clock_drift.averaged(f if self._imu_asked else in_gyro_frame(f))
+        if not self._imu_asked:
+            cameras, S = in_gyro_frame(f.layout, f.state.gyro_matrix, f.state.cameras, f.S)
+            f = replace(f, state=replace(f.state, cameras=cameras), S=S)
+        return clock_drift.averaged(f)
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
         square = self._square.get(name, ())

@@ -4,35 +4,30 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.model.priors import ENTRY_SIGMA, LAG_SIGMA_S
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
-from vical_daemon.estimation.smoother.marginal_prior import (
-    CALIBRATION,
-    IMU,
-    INERTIAL,
-    LAG,
-    LENS,
-    MarginalPrior,
-    root_of,
-)
+from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, root_of
 from vical_daemon.estimation.smoother.snapshot import camera_estimate
 
 PRIOR = np.array([ENTRY_SIGMA] * 15 + [LAG_SIGMA_S])
-N = LENS.start + 8  # errors of the calibration with a radtan lens
-NUMBERS = np.arange(N)[INERTIAL]
-STATED = {"both": NUMBERS, "imu": np.arange(N)[IMU], "lag": np.arange(N)[LAG], "none": NUMBERS[:0]}
+LAYOUT = window_layout()
+N = LAYOUT.size - CORE
+NUMBERS = np.arange(16)  # of the imu, the first of the constants
+STATED = {"both": NUMBERS, "imu": NUMBERS[:15], "lag": NUMBERS[15:], "none": NUMBERS[:0]}
+POSE, SHIFT = slice(16, 22), 22
 
 
 def carry(seed, off):
     """A calibration in which what is known of the imu hangs together with all the rest."""
     rng = np.random.default_rng(seed)
-    size = np.array([1e-3] * 6 + [1e-4, 1e-5, 1e-4, *PRIOR] + [1.0] * 4 + [1e-3] * 4)
+    size = np.array([*PRIOR] + [1e-3] * 6 + [1e-4, 1e-5] + [1.0] * 4 + [1e-3] * 4 + [1e-4])
     half = rng.standard_normal((N, N + 4)) / np.sqrt(N)
     P = half @ half.T * np.outer(size, size) * 0.3
-    whole = np.eye(CALIBRATION + N)
-    whole[CALIBRATION:, CALIBRATION:] = P
+    whole = np.eye(CORE + N)
+    whole[CORE:, CORE:] = P
     imu = off * np.sqrt(np.diag(P))[NUMBERS] * rng.standard_normal(16)
     camera = CameraState(
         np.eye(3),
@@ -43,8 +38,7 @@ def carry(seed, off):
         "radtan",
         (640, 480),
     )
-    active = np.ones(N, dtype=bool)
-    return MarginalPrior(np.eye(3), np.zeros(3), np.zeros(6), camera, root_of(whole), active, 0.0, imu), P
+    return MarginalPrior(np.eye(3), np.zeros(3), np.zeros(6), camera, root_of(whole), LAYOUT, 0.0, imu), P
 
 
 def given_stated(P, x, at):
@@ -63,7 +57,7 @@ def mixture(P, x):
     odds, parts = {}, {}
     for name, at in STATED.items():
         k = {"both": 2, "imu": 1, "lag": 1, "none": 0}[name]
-        sigma = PRIOR[at - NUMBERS[0]]
+        sigma = PRIOR[at]
         posterior = multivariate_normal.pdf(np.zeros(len(at)), x[at], P[np.ix_(at, at)]) if k else 1.0
         prior = multivariate_normal.pdf(np.zeros(len(at)), None, np.diag(sigma**2)) if k else 1.0
         odds[name] = 0.95**k * 0.05 ** (2 - k) * posterior / prior
@@ -80,27 +74,31 @@ def test_what_is_told_is_the_mixture_of_dense_gaussians(seed, off):
     known, P = carry(seed, off)
     x = np.zeros(N)
     x[NUMBERS] = known.imu
-    models = AlternativeModels("cam0", asked=frozenset(), rolling=True)
+    models = AlternativeModels(LAYOUT, asked=frozenset(), rolling=True)
     models.drifting = True
     reported = camera_estimate(
         known, models.weighed(known, 1.0, compared=True)._replace(gyro_frame=False), 0.5, 0.5
     )
     mean, covariance = mixture(P, x)
-    assert np.array(reported.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(mean[:3], abs=1e-9)
-    assert reported.timeshift_cam_imu_s - 0.01 == pytest.approx(mean[6], abs=1e-12)
-    assert np.array(reported.T_imu_cam.covariance) == pytest.approx(covariance[:6, :6], rel=1e-6, abs=1e-13)
-    assert reported.timeshift_sigma_s == pytest.approx(np.sqrt(covariance[6, 6]), rel=1e-6)
+    assert np.array(reported.T_imu_cam.p_m) - known.camera.p_imu_cam == pytest.approx(
+        mean[POSE][:3], abs=1e-9
+    )
+    assert reported.timeshift_cam_imu_s - 0.01 == pytest.approx(mean[SHIFT], abs=1e-12)
+    assert np.array(reported.T_imu_cam.covariance) == pytest.approx(
+        covariance[POSE, POSE], rel=1e-6, abs=1e-13
+    )
+    assert reported.timeshift_sigma_s == pytest.approx(np.sqrt(covariance[SHIFT, SHIFT]), rel=1e-6)
 
 
 def test_what_is_asked_for_is_never_taken_as_stated():
     known, _ = carry(5, 0.0)
-    models = AlternativeModels("cam0", asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
+    models = AlternativeModels(LAYOUT, asked=frozenset({"imu_intrinsics", "accel_lag"}), rolling=False)
     assert models.weighed(known, 1.0, compared=True).weights == {(): 1.0}
 
 
 def test_until_windows_can_be_compared_the_imu_is_as_likely_true_as_not():
     known, _ = carry(6, 8.0)
-    models = AlternativeModels("cam0", asked=frozenset(), rolling=False)
+    models = AlternativeModels(LAYOUT, asked=frozenset(), rolling=False)
     for compared, least in ((False, 0.5), (True, 0.0)):
         shares = models.weighed(known, 1.0, compared=compared).weights
         assert shares["imu_intrinsics", "accel_lag"] == pytest.approx(least, abs=1e-6)

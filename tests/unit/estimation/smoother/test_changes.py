@@ -10,10 +10,11 @@ from vical_mocks.rig import Bump, reference_rig
 from vical_mocks.tracks import room_landmarks, simulate_tracks
 
 from benchmarks import gaps
+from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import CalibrationOptions
-from vical_daemon.estimation.smoother.changed_blocks import BOTH, CLOCK, MOUNTING, changed_blocks
-from vical_daemon.estimation.smoother.marginal_prior import LENS
+from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
+from vical_daemon.estimation.smoother.marginal_prior import CORE
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 
 DISTURBANCES = {
@@ -119,9 +120,9 @@ def test_a_crowd_that_walks_past_is_no_bump():
 
 
 # ---------------------------------------------------------------------- arithmetic
-N = LENS.start + 8  # errors of the calibration with a radtan lens
-ACTIVE = np.zeros(N, dtype=bool)
-ACTIVE[:11] = True
+LAYOUT = window_layout(estimate=())
+MOUNTING, CLOCK = mounting(LAYOUT), clock(LAYOUT)
+BOTH = MOUNTING + CLOCK
 
 
 def spd(rng, n):
@@ -129,19 +130,20 @@ def spd(rng, n):
     return A @ A.T
 
 
-def answers(rng, moved):
-    """A prior over x (7) and r (4), a true rig, and what a window says that knows r alone before."""
-    known = spd(rng, 11)
-    true = np.linalg.cholesky(known) @ rng.standard_normal(11)
-    true[:7] += moved
-    H = rng.standard_normal((30, 11))
-    y = H @ true + rng.standard_normal(30)
+def answers(rng, moved, layout=LAYOUT):
+    """A prior over x (as `moved`) and the rest r, a true rig, and what a window says that knows r before."""
+    n, k = layout.size - CORE, len(moved)
+    known = spd(rng, n)
+    true = np.linalg.cholesky(known) @ rng.standard_normal(n)
+    true[:k] += moved
+    H = rng.standard_normal((40, n))
+    y = H @ true + rng.standard_normal(40)
     information = H.T @ H
-    information[7:, 7:] += np.linalg.inv(known[7:, 7:])
+    information[k:, k:] += np.linalg.inv(known[k:, k:])
     P = np.linalg.inv(information)
-    found, covariance, prior = np.zeros(N), np.zeros((N, N)), np.zeros((N, N))
-    found[:11] = P @ H.T @ y
-    covariance[:11, :11], prior[:11, :11] = P, known
+    found = np.concatenate([np.zeros(CORE), P @ H.T @ y])
+    covariance, prior = np.eye(layout.size), np.eye(layout.size)
+    covariance[CORE:, CORE:], prior[CORE:, CORE:] = P, known
     return found, covariance, prior
 
 
@@ -162,7 +164,7 @@ def excess(square, dof):
 def test_the_block_that_changed_is_named(moved, said):
     for seed in range(20):
         found, covariance, prior = answers(np.random.default_rng(seed), moved)
-        assert changed_blocks(found, covariance, prior, ACTIVE, excess) == said
+        assert changed_blocks(found, covariance, prior, LAYOUT, excess) == said
 
 
 def test_what_has_not_changed_gives_a_chi_square_variable():
@@ -174,15 +176,14 @@ def test_what_has_not_changed_gives_a_chi_square_variable():
         return 0.0
 
     for seed in range(400):
-        changed_blocks(*answers(np.random.default_rng(seed), np.zeros(7)), ACTIVE, listen)
+        changed_blocks(*answers(np.random.default_rng(seed), np.zeros(7)), LAYOUT, listen)
     assert np.mean(squares) == pytest.approx(7.0, abs=5.0 * np.sqrt(14.0 / 400.0))
 
 
 def test_what_is_held_fixed_never_changed():
-    active = ACTIVE.copy()
-    active[:6] = False
-    found, covariance, prior = answers(np.random.default_rng(3), 100.0 * np.eye(7)[6])
-    assert changed_blocks(found, covariance, prior, active, excess) == CLOCK
+    layout = window_layout(fix=("extrinsics",), estimate=())
+    found, covariance, prior = answers(np.random.default_rng(3), np.array([100.0]), layout)
+    assert changed_blocks(found, covariance, prior, layout, excess) == clock(layout)
 
 
 class _Spin:

@@ -12,7 +12,6 @@ from vical_mocks.tracks import simulate_tracks
 from vical_daemon.estimation.events import EventKind
 from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions
 from vical_daemon.estimation.smoother import first_window
-from vical_daemon.estimation.smoother.marginal_prior import READOUT
 from vical_daemon.estimation.smoother.shutter_axis import readout_sigmas, shows_columns
 
 
@@ -28,9 +27,8 @@ def test_columns_are_tried_where_they_explain_more_than_chance(gain, misfit, wor
 
 
 def test_a_readout_counts_by_its_sigmas():
-    covariance = np.zeros((READOUT + 1, READOUT + 1))
-    covariance[READOUT, READOUT] = 4e-6
-    carry = SimpleNamespace(camera=SimpleNamespace(readout_s=-0.03), calibration=lambda: covariance)
+    where = SimpleNamespace(camera=SimpleNamespace(readout=7))
+    carry = SimpleNamespace(camera=SimpleNamespace(readout_s=-0.03), layout=where, sigma={7: 2e-3}.get)
     assert readout_sigmas(carry) == pytest.approx(15.0)
 
 

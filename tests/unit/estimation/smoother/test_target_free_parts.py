@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from vical_mocks.rig import reference_rig
 from vical_mocks.tracks import simulate_tracks
 
+from tests.unit.estimation.some_layout import NAME, POSE_AND_CLOCK, window_layout
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.geometry.so3 import tangents
@@ -15,28 +16,26 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.retract import camera_difference, moved_camera
+from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.bundle import Bundle
 from vical_daemon.estimation.smoother.handover import initial_prior
 from vical_daemon.estimation.smoother.inertial import Order
 from vical_daemon.estimation.smoother.jitter import StampOffsets
-from vical_daemon.estimation.smoother.marginal_prior import (
-    CAMERA,
-    DRIFT,
-    INERTIAL,
-    LENS,
-    first_carry,
-    later,
-    length,
-)
+from vical_daemon.estimation.smoother.marginal_prior import CORE, first_carry, later
 from vical_daemon.estimation.smoother.quality import correlation
-from vical_daemon.estimation.smoother.target_free_initializer import start_sigmas
 from vical_daemon.estimation.smoother.track_start import ArmPrior, TrackStart
 from vical_daemon.estimation.temporal.epipolar_fit import epipolar_fit
 
 SHIFT_S = 0.013
-N = LENS.start + 8  # errors of the calibration with a radtan lens
+
+
+def bundle_of(window, layout, sigma_px):
+    """A window about which next to nothing is known, to be adjusted."""
+    sigmas = start_sigmas(layout, {NAME: window.camera}, WINDOW_START, imu_sigma=0.01)
+    return Bundle(window, first_carry(window, window.camera, layout, sigmas), sigma_px)
 
 
 class Scene:
@@ -169,13 +168,13 @@ def test_the_first_prior_is_about_what_was_given_and_not_about_what_the_same_dat
     window = scene.window()
     found = window.camera.intrinsics * 1.5
     window.camera = replace(window.camera, intrinsics=found, p_imu_cam=np.array([0.9, -1.0, 0.4]))
-    active = np.ones(N, dtype=bool)
-    carry = initial_prior(window, None, active, None, 2e-3, CameraPrior((640, 480), given))
+    layout = window_layout()
+    carry = initial_prior(window, None, layout, None, 2e-3, CameraPrior((640, 480), given))
     np.testing.assert_array_equal(carry.camera.p_imu_cam, np.zeros(3))
     middle = [319.5, 239.5]  # of the picture
     np.testing.assert_allclose(carry.camera.intrinsics, given or [*found[:2], *middle])
     np.testing.assert_array_equal(carry.camera.R_imu_cam, window.camera.R_imu_cam)
-    assert np.sqrt(carry.calibration()[LENS, LENS][0, 0]) == pytest.approx(0.05 * carry.camera.intrinsics[0])
+    assert carry.sigma(layout.camera.intrinsics.start) == pytest.approx(0.05 * carry.camera.intrinsics[0])
 
 
 @pytest.mark.parametrize("seed", [0, 4, 9])
@@ -223,29 +222,26 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
     distortion = np.resize([*window.camera.distortion, 0.01], coefficients)
     window.camera = replace(window.camera, readout_s=readout_s, distortion=distortion, distortion_model=model)
     window.own_lens = 1e-6 * np.ones(4 + coefficients)
-    active = np.ones(length(window.camera), dtype=bool)
-    problem = Bundle(
-        window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 50.0
-    ).problem
+    layout = window_layout(model)
+    problem = bundle_of(window, layout, 50.0).problem
     seen, links = window.observe(), window.stacked()
     normal, order = problem.normal(seen, links), problem.order()
     rng = np.random.default_rng(2)
-    scales = np.array([1e-4] * 6 + [1e-5] * 3 + [1e-6] * 15 + [1e-5] + [0.01] * 4 + [1e-5] * coefficients)
-    for k in range(len(active)):
-        step = np.zeros(len(active))
-        step[k] = scales[k] * rng.choice([-1.0, 1.0])
+    of_lens = np.array([0.01] * 4 + [1e-5] * coefficients)
+    scales = np.array([1e-6] * 15 + [1e-5] + [1e-4] * 6 + [1e-5] * 2 + [*of_lens, 1e-5])
+    for k, at in enumerate(order.constants):
+        step = np.zeros(layout.size)
+        size = step[CORE + k] = scales[k] * rng.choice([-1.0, 1.0])
         camera, costs = window.camera, []
         for d in (step, -step):
-            window.camera, window.imu = moved_camera(camera, CAMERA, d), d[INERTIAL]
+            window.camera, window.imu = moved_camera(camera, layout.camera, d), d[layout.inertial]
             costs.append(problem.normal(seen, links).cost)
         window.camera, window.imu = camera, np.zeros(16)
         up, down = costs
-        slope, wanted = (up - down) / 2.0 / step[k] / 2.0, normal.g[order.calib[k]]
-        assert slope == pytest.approx(
-            wanted, rel=0.02, abs=0.02 * np.sqrt(normal.H[order.calib[k], order.calib[k]])
-        ), k
+        slope = (up - down) / 2.0 / size / 2.0
+        assert slope == pytest.approx(normal.g[at], rel=0.02, abs=0.02 * np.sqrt(normal.H[at, at])), k
     own = window.own_lens
-    for k, size in enumerate(scales[LENS]):
+    for k, size in enumerate(of_lens):
         step, costs = size * np.eye(len(own))[k], []
         for d in (step, -step):
             window.own_lens = own + d
@@ -258,7 +254,7 @@ def test_late_images_move_the_errors_of_links_as_told(scene):
     window = scene.window()
     links, knots = window.stacked(), window.knots()
     e, J = links.errors(window.R, window.p, window.v, window.bias[knots], window.gravity)
-    order = Order(len(window.frames), len(window.bias), np.zeros(0, bool))
+    order = Order(len(window.frames), len(window.bias), 0)
     at = np.concatenate([order.frames[:-1], order.frames[1:], order.knots[knots]], axis=1)
     rates, push = window.rates(), np.gradient(window.v, [t for t, _ in window.frames], axis=0)
     late = np.random.default_rng(4).normal(0.0, 1e-5, len(window.frames))[:, None]
@@ -307,14 +303,11 @@ def test_late_images_move_the_errors_of_links_as_told(scene):
 
 def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     window = scene.window()
-    active = np.arange(N) < 7
-    bundle = Bundle(
-        window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 1.0
-    )
-    fit = bundle.solve(scene.buffer, 25)
-    error = camera_difference(fit.carry.camera, scene.camera, CAMERA, N)[:7]
-    P = fit.carry.covariance()[11:, 11:]
-    assert error @ np.linalg.solve(P, error) < 24.3  # chi-square, 7 degrees of freedom, 99.9 %
+    layout = POSE_AND_CLOCK
+    fit = bundle_of(window, layout, 1.0).solve(scene.buffer, 25)
+    error = camera_difference(fit.carry.camera, scene.camera, layout.camera, layout.size)[CORE:]
+    P = fit.carry.covariance()[CORE:, CORE:]
+    assert error @ np.linalg.solve(P, error) < 26.1  # chi-square, 8 degrees of freedom, 99.9 %
     assert np.sqrt(np.diag(P))[:3].max() < 2e-3
     assert fit.sigma_px == pytest.approx(0.5, rel=0.06)
     assert fit.spread < 1.15
@@ -322,39 +315,32 @@ def test_adjusted_window_is_right_within_its_own_sigmas(scene):
 
 def test_a_drift_carries_into_the_time_shift_of_the_next_window(scene):
     window = scene.window()
-    active = (np.arange(N) < 7) | (np.arange(N) == DRIFT)
-    fit = Bundle(
-        window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 1.0
-    ).solve(scene.buffer, 25)
+    fit = bundle_of(window, POSE_AND_CLOCK, 1.0).solve(scene.buffer, 25)
     first, carry = window.camera, fit.carry
     assert carry.camera.timeshift_s == pytest.approx(
         first.timeshift_s + first.skew * window.span_s, abs=1e-12
     )
-    at_end, shift, drift = carry.calibration(), 6, DRIFT
-    back = later(active, -window.span_s)
-    k = np.flatnonzero(active)
-    at_first = back @ at_end[np.ix_(k, k)] @ back.T
+    at_end, shift, drift = carry.covariance(), carry.layout.camera.timeshift, carry.layout.camera.skew
+    back = later(carry.layout, -window.span_s)
+    at_first = back @ at_end @ back.T
     # drift and shift: an uncertain slope about the middle of the data
     assert at_end[shift, drift] > 0.0 > at_first[shift, drift]
     assert abs(first.skew) < 4.0 * np.sqrt(at_end[drift, drift])
 
 
 def test_where_north_and_origin_are_changes_nothing(scene):
-    active = np.arange(N) < 7
     results = []
     for turn in (0.0, 2.0):
         window = scene.window()
         world = Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
         window.R, window.v = world @ window.R, window.v @ world.T
         window.p = window.p @ world.T + turn * np.array([3.0, -1.0, 0.5])
-        fit = Bundle(
-            window, first_carry(window, window.camera, active, start_sigmas(window.camera, 0.01)), 0.5
-        ).solve(scene.buffer, 25)
-        results.append(fit)
+        results.append(bundle_of(window, POSE_AND_CLOCK, 0.5).solve(scene.buffer, 25))
     a, b = (np.sqrt(np.diag(r.carry.covariance())) for r in results)
     np.testing.assert_allclose(a, b, rtol=0.02)
-    change = camera_difference(results[0].carry.camera, results[1].carry.camera, CAMERA, N)[:7]
-    assert np.abs(change / a[11:]).max() < 0.05
+    layout = POSE_AND_CLOCK
+    change = camera_difference(*(r.carry.camera for r in results), layout.camera, layout.size)[CORE:]
+    assert np.abs(change / a[CORE:]).max() < 0.05
 
 
 def test_errors_that_last_are_counted_once():

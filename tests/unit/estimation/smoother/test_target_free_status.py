@@ -5,30 +5,32 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.smoother.marginal_prior import CALIBRATION, LENS, MarginalPrior, root_of
+from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, root_of
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 
-N = LENS.start + 8  # errors of the calibration with a radtan lens
-SIGMA = np.array([1e-2] * 3 + [1e-3] * 3 + [1e-4] + [1e-5, 1e-4] + [1e-3] * 16 + [2.0] * 4 + [1e-3] * 4)
+LAYOUT = window_layout()
+SIGMA = np.array([1e-3] * 16 + [1e-2] * 3 + [1e-3] * 3 + [1e-4, 1e-5] + [2.0] * 4 + [1e-3] * 4 + [1e-4])
 CAMERA = CameraState(
     np.eye(3), np.zeros(3), 0.01, np.array([500.0, 500.0, 320.0, 240.0]), np.zeros(4), "radtan", (640, 480)
 )
 
 
 def carry(shrunk=1.0):
-    whole = np.eye(CALIBRATION + N)
-    whole[CALIBRATION:, CALIBRATION:] = shrunk * np.diag(SIGMA**2)
-    active = np.ones(N, dtype=bool)
+    whole = np.eye(LAYOUT.size)
+    whole[CORE:, CORE:] = shrunk * np.diag(SIGMA**2)
     return MarginalPrior(
-        np.eye(3), np.zeros(3), np.zeros(6), CAMERA, root_of(whole), active, 0.0, np.zeros(16)
+        np.eye(3), np.zeros(3), np.zeros(6), CAMERA, root_of(whole), LAYOUT, 0.0, np.zeros(16)
     )
 
 
 def fit(times):
     """A window that halves the variance, and moves the calibration by `times` what it should."""
-    return SimpleNamespace(change=times * np.sqrt(0.5) * SIGMA, carry=carry(0.5))
+    return SimpleNamespace(
+        change=np.concatenate([np.zeros(CORE), times * np.sqrt(0.5) * SIGMA]), carry=carry(0.5)
+    )
 
 
 def focal_sigma(status):
@@ -37,7 +39,7 @@ def focal_sigma(status):
 
 @pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (4.0, 4.0), (30.0, 30.0)])
 def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(times, wider):
-    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(N, dtype=bool))
+    status = TargetFreeStatus(CalibrationOptions(), LAYOUT)
     assert focal_sigma(status) == pytest.approx(np.sqrt(0.5) * 2.0)
     status.closed()
     status.agrees(fit(times), carry(), complete=False)
@@ -48,7 +50,7 @@ def test_a_second_window_that_disagrees_widens_the_sigmas_at_once_and_in_full(ti
 
 @pytest.mark.parametrize(("times", "wider"), [(0.7, 1.0), (3.0, 3.0)])
 def test_two_complete_windows_widen_the_sigmas_by_all_that_they_disagree_by(times, wider):
-    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(N, dtype=bool))
+    status = TargetFreeStatus(CalibrationOptions(), LAYOUT)
     for _ in range(2):
         status.closed()
         status.agrees(fit(times), carry(), complete=True)
@@ -57,7 +59,7 @@ def test_two_complete_windows_widen_the_sigmas_by_all_that_they_disagree_by(time
 
 
 def test_two_windows_that_agree_are_believed_again():
-    status = TargetFreeStatus(CalibrationOptions(), "cam0", np.ones(N, dtype=bool))
+    status = TargetFreeStatus(CalibrationOptions(), LAYOUT)
     status.closed()
     status.agrees(fit(1.5), carry(), complete=True)
     status.closed()
