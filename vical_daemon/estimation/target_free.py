@@ -110,7 +110,7 @@ class TargetFreeCalibrator:
     def add_imu(self, t_imu_ns: int, gyro_rps: Sequence[float], specific_force_mps2: Sequence[float]) -> None:
         """Take one reading (imu clock, ns; rad/s; m/s^2); old or non-finite ones are only counted."""
         for reading in self._intake.take_imu(t_imu_ns, gyro_rps, specific_force_mps2):
-            self.evaluator.saw_imu(reading.t_imu_ns, reading.gyro_rps)
+            self.evaluator.saw_reading(*reading[:3])
         self.evaluator.announce_all(self._intake.imu_news())
 
     @property
@@ -468,9 +468,7 @@ class TargetFreeCalibrator:
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return how the calibration developed."""
-        if camera != self.camera:
-            return []
-        return self._intake.trace_by_present_stamps(self.evaluator.trace(), camera)
+        return self._intake.trace_by_present_stamps(self.evaluator.trace(camera), camera)
 
 
 def _full(window: Window) -> bool:

@@ -26,7 +26,7 @@ class Trace:
         e: CameraEstimate,
         nis_per_dof: float,
         status: Status,
-        imu: ImuEstimate | None = None,
+        imu: ImuEstimate,
     ) -> None:
         """Put an estimate down.
 
@@ -35,7 +35,7 @@ class Trace:
             e: What was known then.
             nis_per_dof: Consistency then.
             status: And where the calibration stood.
-            imu: Biases then; None: not kept.
+            imu: Biases then.
         """
         sigma = np.sqrt(np.diag(np.array(e.T_imu_cam.covariance)))
         pose = e.T_imu_cam
@@ -50,14 +50,11 @@ class Trace:
                 e.timeshift_sigma_s,
                 nis_per_dof,
                 str(status),
-                *_biases(imu),
+                imu.gyro_bias_rps,
+                imu.gyro_bias_sigma_rps,
+                imu.accel_bias_mps2,
+                imu.accel_bias_sigma_mps2,
             )
         )
         if len(self.points) > _MOST:
             del self.points[1 : _MOST // 2 : 2]
-
-
-def _biases(imu: ImuEstimate | None) -> tuple[list[float], ...]:
-    if imu is None:
-        return ()
-    return imu.gyro_bias_rps, imu.gyro_bias_sigma_rps, imu.accel_bias_mps2, imu.accel_bias_sigma_mps2

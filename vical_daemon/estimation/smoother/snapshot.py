@@ -12,7 +12,7 @@ from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.unobservable_directions import held_covariance
 from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.imu_scale import matrices
+from vical_daemon.estimation.model.imu_scale import matrices as matrices_of
 from vical_daemon.estimation.model.retract import moved_camera
 from vical_daemon.estimation.model.snapshot import camera_snapshot, imu_snapshot, joint_covariance
 from vical_daemon.estimation.model.state import CameraState
@@ -94,7 +94,7 @@ def _averaged(carry: MarginalPrior, models: ReportedModels) -> tuple[CameraState
     d = d + step
     camera = moved_camera(carry.camera, layout.camera, d)
     if models.gyro_frame:
-        gyro_matrix = matrices(carry.imu + d[layout.inertial])[0]
+        gyro_matrix = matrices_of(carry.imu + d[layout.inertial])[0]
         cameras, S = in_gyro_frame(layout, gyro_matrix, {name: camera}, S)
         camera = cameras[name]
     return camera, S
@@ -111,7 +111,7 @@ def _over_clocks(carry: MarginalPrior, models: ReportedModels) -> tuple[FloatArr
     return d, scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def imu_estimate(carry: MarginalPrior, *, matrices_asked: bool) -> ImuEstimate:
+def imu_estimate(carry: MarginalPrior, *, matrices: bool) -> ImuEstimate:
     """Biases and their sigmas; where asked for, the matrices."""
     sigma = np.sqrt(np.diag(carry.covariance())[BIASES])
-    return imu_snapshot(carry.bias, sigma, matrices(carry.imu) if matrices_asked else ())
+    return imu_snapshot(carry.bias, sigma, matrices_of(carry.imu) if matrices else ())

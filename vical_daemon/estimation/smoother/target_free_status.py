@@ -12,29 +12,16 @@ from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
-from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
-from vical_daemon.estimation.result import (
-    CalibrationEstimate,
-    CameraEstimate,
-    Status,
-    TracePoint,
-)
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import camera_estimate, imu_estimate
-from vical_daemon.estimation.status.evaluator import (
-    LOST,
-    PATIENCE_S,
-    Evaluator,
-    lacking_verdict,
-    lens_known,
-    lens_verdict,
-)
-from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
-from vical_daemon.estimation.wording import cause_text, direction_line, guidance_text
+from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
+from vical_daemon.estimation.status.steady_status import Verdict
+from vical_daemon.estimation.wording import cause_text
 
 _ENOUGH_WINDOWS = 2
 _MOST_SIGMA_PX = 3.0
@@ -63,19 +50,17 @@ class TargetFreeStatus(Evaluator):
         rolling: bool = False,
         term: bool = False,
     ) -> None:
-        super().__init__(options, "no features have been followed yet: is the picture dark or blurred?")
+        super().__init__(options, "no features have been followed yet: is the picture dark or blurred?", 40)
         (self.camera,), self.layout = layout.cameras, layout
         self.misfit: tuple[Cause, float] = Cause.NONE, 0.0
         self._against_since_s: float | None = None  # images contradict what is known since then
         self._now_s = 0.0
-        self._agreement: deque[tuple[float, int]] = deque(maxlen=40)
         self._growing = 0.0, 0  # the same of the window that is not complete yet
         self._windows = 0
-        self._squares: deque[tuple[float, int]] = deque(maxlen=10)
+        self._pixels: deque[tuple[float, int]] = deque(maxlen=10)
         self._refused: deque[tuple[int, int]] = deque(maxlen=10)
         self._sigma_px = self.jitter_s = 0.0
-        self._trace = Trace()
-        self._bumped = Cause.NONE
+        self._trace[self.camera] = Trace()
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
         self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling, term=term)
@@ -92,9 +77,7 @@ class TargetFreeStatus(Evaluator):
         self.reason = ""
         if self._started_s is None:
             self._started_s = t_s
-        if self._bumped:
-            self._announce(EventKind.STARTED_ANEW)
-            self._bumped = Cause.NONE
+        self._after_change(self.camera)
         if self._quiet[0]:
             cause, value = self._quiet
             self._announce(EventKind.WENT_ON, cause=cause, cause_value=value)
@@ -119,7 +102,7 @@ class TargetFreeStatus(Evaluator):
         if kept is None:
             self._started_s, self._windows, self._given_up = None, 0, (why, value)
             self._against_since_s = None
-            self._agreement.clear()
+            self._squares.clear()
             self._growing = 0.0, 0
 
     def next_recording(self) -> None:
@@ -144,15 +127,13 @@ class TargetFreeStatus(Evaluator):
     def changed(self, change: FloatArray | None = None) -> None:
         """The rig is not what it was; `change`: of the errors, shape (n,), where known."""
         why = Cause.CALIBRATION_CONTRADICTED
-        self._announce(EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER, cause=why)
+        self._change(why, Status.CONVERGING, self.camera)
         if change is not None:
             self.announce_all(_changes(self.camera, change, self.layout))
-        self._bumped, self._quiet, self.models.drifting = why, (Cause.NONE, None), False
-        self._started_s, self._windows, self._against_since_s = None, 0, None
-        self.believed = False
-        self._agreement.clear()
+        self._quiet, self.models.drifting = (Cause.NONE, None), False
+        self._windows, self._against_since_s = 0, None
+        self._squares.clear()
         self._growing = 0.0, 0
-        self._steady.reset(Status.CONVERGING)
 
     def stepped(self, step_s: float) -> None:
         """The time shift stepped, s; all else is kept."""
@@ -164,12 +145,10 @@ class TargetFreeStatus(Evaluator):
         kind: EventKind,
         value: float | None = None,
         *,
-        once: str = "",
         cause: Cause = Cause.NONE,
         cause_value: float | None = None,
     ) -> None:
-        event = Event(kind, self.camera, value, cause=cause, cause_value=cause_value)
-        self.announce(event, once)
+        self.announce(Event(kind, self.camera, value, cause=cause, cause_value=cause_value))
 
     # ------------------------------------------------------------------ windows
     def fits(self, fit: Fit, *, first: bool = False) -> bool:
@@ -188,11 +167,13 @@ class TargetFreeStatus(Evaluator):
     def saw_fit(self, fit: Fit, t_s: float) -> None:
         """Take the result of an adjustment."""
         self._now_s, self._sigma_px, self.jitter_s = t_s, fit.sigma_px, fit.jitter_s
-        self._squares.append((fit.squares, fit.dof))
+        self._pixels.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
-        self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._agreement)))
-        if self._trace.due(t_s):
-            self._trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status)
+        self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._squares)))
+        trace = self._trace[self.camera]
+        if trace.due(t_s):
+            imu = imu_estimate(fit.carry, matrices=False)
+            trace.add(t_s, self._camera(fit.carry), self.nis_per_dof(), self.status, imu)
 
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
         """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
@@ -208,8 +189,7 @@ class TargetFreeStatus(Evaluator):
         """A window is complete and agreed."""
         self._windows, self._given_up = self._windows + 1, (Cause.NONE, None)
         self._against_since_s = None
-        if self.jitter_s >= ANNOUNCED_S:
-            self._announce(EventKind.STAMP_JITTER, self.jitter_s, once="jitter", cause=Cause.IMAGES_SHIFTED)
+        self._announce_jitter(self.camera, self.jitter_s, Cause.IMAGES_SHIFTED)
 
     def agrees(self, fit: Fit, carry: MarginalPrior, *, complete: bool) -> bool:
         """Compare how far a window moved the calibration with how far its own data may move it.
@@ -235,7 +215,7 @@ class TargetFreeStatus(Evaluator):
         agree = self.excess(statistic, dof) <= 1.0
         self._growing = (0.0, 0) if complete else (statistic, dof)
         if complete:
-            self._agreement.append((min(statistic, self._limit(dof)), dof))
+            self._squares.append((min(statistic, self._limit(dof)), dof))
         return agree
 
     def excess(self, square: float, dof: int) -> float:
@@ -254,7 +234,7 @@ class TargetFreeStatus(Evaluator):
 
     def factor(self) -> float:
         """Measured variance over the stated one, at least 1: what windows disagree by counts in full."""
-        return _measured_over_stated(self._agreement)
+        return _measured_over_stated(self._squares)
 
     def _reported_factor(self) -> float:
         """What the variances are multiplied by when they are reported.
@@ -263,77 +243,54 @@ class TargetFreeStatus(Evaluator):
         """
         if self.proven:
             return self.factor()
-        return max(self.factor(), _measured_over_stated([*self._agreement, self._growing]))
+        return max(self.factor(), _measured_over_stated([*self._squares, self._growing]))
 
     # ------------------------------------------------------------------ what is said
-    def trace(self) -> list[TracePoint]:
-        """The development of the calibration."""
-        return list(self._trace.points)
-
-    def nis_per_dof(self) -> float:
-        """Agreement of the windows: squared change over what it should be; 1 when consistent."""
-        dof = sum(n for _, n in self._agreement)
-        return sum(s for s, _ in self._agreement) / dof if dof else 0.0
-
     def estimate(
         self, carry: MarginalPrior | None, *, running: bool, gravity: list[float]
     ) -> CalibrationEstimate:
         """Put everything together."""
-        camera = None if carry is None else self._camera(carry)
-        missing, lens_alone = [], False
-        if camera is not None and carry is not None:
-            at = carry.camera.R_imu_cam, carry.bias[:3]
-            missing = self._weak(camera, *at)
-            lens_alone = self.models.lens is not None and not self._weak(lens_known(camera), *at)
-        doubt = "" if carry is None else self.models.reason(carry, self.factor(), believed=self.believed)
-        self.believed &= not doubt
-        verdict = self._decide(camera is not None, running, missing, doubt, lens_alone=lens_alone)
+        cameras, missing, imu = {}, {}, None
         if carry is None:
-            reported = self._published(verdict)
+            reported = self._published(self._before_start())
         else:
-            reported = self._followed(verdict, carry.camera.R_imu_cam, carry.bias[:3])
-        if camera is not None and self.status == Status.DEGENERATE:
-            camera.withheld.extend(m for m in missing if m.excess > LOST)
-            camera.unobservable.extend(direction_line(m) for m in camera.withheld)
-        refused, seen = (sum(x) for x in zip(*self._refused, strict=True)) if self._refused else (0, 0)
-        return CalibrationEstimate(
-            self.newest_ns,
-            self.status,
-            reported.reason,
-            self._progress(self.status, camera is not None, missing),
-            guidance_text(reported.guidance),
-            self.elapsed_s,
-            self.frames_seen,
-            self.imu_samples,
-            {} if camera is None else {self.camera: camera},
-            None if carry is None else imu_estimate(carry, matrices_asked=self.models.imu_asked),
-            gravity,
-            self.nis_per_dof(),
-            refused / max(seen, 1),
-            self._events.take(),
-            reported.guidance,
+            camera, at = self._camera(carry), (carry.camera.R_imu_cam, carry.bias[:3])
+            weak = self._weak(camera, *at)
+            lens_alone = self.models.lens is not None and not self._weak(lens_known(camera), *at)
+            doubt = self.models.reason(carry, self.factor(), believed=self.believed)
+            self.believed &= not doubt
+            reported = self._followed(self._decide(running, weak, doubt, lens_alone=lens_alone), *at)
+            cameras, missing = {self.camera: camera}, {self.camera: weak}
+            imu = imu_estimate(carry, matrices=self.models.imu_asked)
+        refused, seen = (sum(x) for x in zip((0, 0), *self._refused, strict=True))
+        return self._put_together(
+            reported,
+            cameras,
+            missing,
+            partial=False,
+            frames=self.frames_seen,
+            imu=imu,
+            gravity=gravity,
+            refused=refused / max(seen, 1),
         )
 
     def _camera(self, carry: MarginalPrior) -> CameraEstimate:
-        squares, dof = sum(s for s, _ in self._squares), sum(n for _, n in self._squares)
+        squares, dof = sum(s for s, _ in self._pixels), sum(n for _, n in self._pixels)
         rms_px = self._sigma_px * float(np.sqrt(squares / max(dof, 1)))
-        models = self.models.weighed(carry, self._reported_factor(), bool(self._agreement))
+        models = self.models.weighed(carry, self._reported_factor(), bool(self._squares))
         return camera_estimate(carry, models, self._sigma_px, rms_px, self.held)
 
     def _decide(
-        self, known: bool, running: bool, missing: list[WeakDirection], doubt: str, *, lens_alone: bool
+        self, running: bool, missing: list[WeakDirection], doubt: str, *, lens_alone: bool
     ) -> Verdict:
         """By the data up to now.
 
         Args:
-            known: There is a calibration.
             running: Images are being used.
             missing: Directions that are not known well enough.
             doubt: What may not be as it is taken to be, or nothing.
             lens_alone: Nothing would be missing if the fixed lens were known.
         """
-        if not known:
-            return self._before_start(self._bumped)
         if not running and self._windows == 0:
             return Verdict(Status.INITIALISING, self.reason)
         if self._against_since_s is not None:
@@ -341,19 +298,14 @@ class TargetFreeStatus(Evaluator):
         pause = "" if running else f" (paused: {self.reason or cause_text(*self._quiet)})"
         missing = self._steady.counted(missing)
         if not missing:
-            if self._windows < _ENOUGH_WINDOWS:
-                return Verdict(Status.CONVERGING, CONFIRMING + pause)
-            if self.factor() > _MOST_FACTOR:
+            if self.proven and self.factor() > _MOST_FACTOR:
                 return Verdict(
                     Status.INCONSISTENT, "stretches of the data disagree more than their sigmas say"
                 )
-            if doubt:
-                return Verdict(Status.CONVERGING, doubt + pause)
-            return Verdict(Status.CONVERGED, pause.strip(" ()"))
+            return self._once_known(enough=self.proven, doubt=doubt, pause=pause)
         if lens_alone:
             return lens_verdict(missing[0], self.camera, off=self.models.lens_off)
-        patient = self._now_s - (self._started_s or 0.0) > PATIENCE_S
-        return lacking_verdict(missing, patient=patient, pause=pause)
+        return lacking_verdict(missing, shown_s=self._now_s - (self._started_s or 0.0), pause=pause)
 
 
 def _measured_over_stated(windows: Iterable[tuple[float, int]]) -> float:

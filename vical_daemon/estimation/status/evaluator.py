@@ -1,30 +1,40 @@
-"""What both evaluators share, and what is said of a calibration that is not there yet."""
+"""What both evaluators share: counts, events, verdicts, and how an estimate is put together."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from vical_daemon.estimation.events import Cause, Event, EventLog
+from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
-from vical_daemon.estimation.result import CameraEstimate, Status
+from vical_daemon.estimation.model.trace import Trace
+from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
+from vical_daemon.estimation.result import (
+    CalibrationEstimate,
+    CameraEstimate,
+    ImuEstimate,
+    Status,
+    TracePoint,
+)
 from vical_daemon.estimation.status.excitation import (
     ALL_WAYS,
     RunningMotion,
     excitation_advice,
     weak_directions,
 )
-from vical_daemon.estimation.status.steady_status import SteadyStatus, Verdict
-from vical_daemon.estimation.wording import cause_text, direction_sigma
+from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
+from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
 
 PATIENCE_S = 15.0
 """So long after it could first have shown, a direction that the motion does not show is called that."""
 _RIDGE = 1e-12  # of a variance, against rounding
 LOST = 3.0
 """A direction whose sigma is this many times its limit after the patience is called unobservable."""
+_EVERY_READINGS = 16  # the size of one in so many is kept
 
 
 class Evaluator:
@@ -33,6 +43,7 @@ class Evaluator:
     Args:
         options: Switches and targets.
         nothing_seen: What is said while no image shows anything.
+        squares: How many sums of squares the consistency is the mean of.
 
     Attributes:
         imu_samples: Readings so far.
@@ -42,11 +53,12 @@ class Evaluator:
         reason: Why there is no start yet.
         motion_missing: More motion, not more time, would help.
         motion: What the gyro shows of the motion.
+        bumped: Why the calibration before was given up, until there is another one.
         believed: It was `converged`, and no data have spoken against its model since. Gaps and steps of a
             clock leave that as it is.
     """
 
-    def __init__(self, options: CalibrationOptions, nothing_seen: str) -> None:
+    def __init__(self, options: CalibrationOptions, nothing_seen: str, squares: int) -> None:
         self.options, self._nothing_seen = options, nothing_seen
         self.imu_samples = self.frames_seen = 0
         self.newest_ns = self._first_ns = 0
@@ -55,16 +67,22 @@ class Evaluator:
         self.motion = RunningMotion()
         self._events, self._steady = EventLog(), SteadyStatus()
         self._started_s: float | None = None
+        self.bumped = Cause.NONE
+        self._size: deque[float] = deque(maxlen=400)
+        self._squares: deque[tuple[float, int]] = deque(maxlen=squares)
+        self._trace: dict[str, Trace] = {}
         self._ever_converged = self.believed = False
 
-    def saw_imu(self, t_ns: int, gyro: FloatArray) -> None:
-        """Count one inertial reading."""
+    def saw_reading(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
+        """Count one inertial reading, and keep the size of some."""
         if not self.imu_samples:
             self._first_ns = t_ns
         self.imu_samples += 1
         self.newest_ns = t_ns
         self._events.now_s = self.elapsed_s
         self.motion.add(self.elapsed_s, gyro)
+        if self.imu_samples % _EVERY_READINGS == 1:
+            self._size.append(float(np.sqrt(accel @ accel)))
 
     def saw_points(self, t_s: float, count: int) -> None:
         """Count one image with `count` points or tracks in it."""
@@ -96,6 +114,33 @@ class Evaluator:
         for event in events:
             self._events.add(event)
 
+    def trace(self, camera: str) -> list[TracePoint]:
+        """The development of one camera."""
+        return list(self._trace[camera].points) if camera in self._trace else []
+
+    def nis_per_dof(self) -> float:
+        """Consistency: mean of normalised squares per degree of freedom; 1 when consistent."""
+        dof = sum(n for _, n in self._squares)
+        return sum(s for s, _ in self._squares) / dof if dof else 0.0
+
+    def _announce_jitter(self, camera: str, jitter_s: float, cause: Cause = Cause.NONE) -> None:
+        if jitter_s >= ANNOUNCED_S:
+            event = Event(EventKind.STAMP_JITTER, camera, float(jitter_s), cause=cause)
+            self.announce(event, once=f"jitter {camera}")
+
+    def _change(self, why: Cause, status: Status, camera: str = "") -> None:
+        """The rig is not what it was: the calibration is being taken anew."""
+        self.bumped, self.believed, self._started_s = why, False, None
+        kind = EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER
+        self.announce(Event(kind, camera, cause=why))
+        self._steady.reset(status)
+
+    def _after_change(self, camera: str = "") -> None:
+        """There is a calibration: if another one was given up, that is over."""
+        if self.bumped:
+            self.announce(Event(EventKind.STARTED_ANEW, camera))
+            self.bumped = Cause.NONE
+
     def _weak(self, e: CameraEstimate, R_imu_cam: FloatArray, gyro_bias: FloatArray) -> list[WeakDirection]:
         """Directions of a camera's pose, and its time shift, that are not known well enough."""
         covariance, targets = np.array(e.T_imu_cam.covariance), self.options.targets
@@ -114,25 +159,79 @@ class Evaluator:
             self._ever_converged = self.believed = True
         return reported
 
-    def _before_start(self, changed: Cause, trouble: str = "") -> Verdict:
-        """What is said before there is a calibration.
-
-        Args:
-            changed: Why the one before was given up; none: there was none.
-            trouble: What is wrong with the readings; empty: nothing.
-        """
-        if changed:
-            return Verdict(Status.INCONSISTENT, f"{cause_text(changed)}; calibrating anew: {self.reason}")
+    def _before_start(self) -> Verdict:
+        """What is said before there is a calibration."""
+        if self.bumped:
+            return Verdict(Status.INCONSISTENT, f"{cause_text(self.bumped)}; calibrating anew: {self.reason}")
         if not self.imu_samples:
             return Verdict(Status.WAITING, "no inertial data yet")
-        if trouble:
-            return Verdict(Status.INCONSISTENT, trouble)
+        size = float(np.median(self._size)) if len(self._size) >= 20 else 0.0
+        if 0.7 < size < 1.4:
+            trouble = f"specific force has a median size of {size:.2f}: "
+            return Verdict(Status.INCONSISTENT, trouble + "is the accelerometer in g instead of m/s^2?")
         if self.first_frame_s is None:
             return Verdict(Status.WAITING, self._nothing_seen)
         if self.motion_missing and self.elapsed_s - self.first_frame_s > PATIENCE_S:
             advice = excitation_advice(self.motion, None) or ALL_WAYS
             return Verdict(Status.DEGENERATE, self.reason, advice)
         return Verdict(Status.INITIALISING, self.reason or "collecting the first seconds")
+
+    @staticmethod
+    def _once_known(*, enough: bool, doubt: str, pause: str = "") -> Verdict:
+        """What is said where all directions are known well enough.
+
+        Args:
+            enough: There are data enough to confirm them.
+            doubt: What may not be as it is taken to be; empty: nothing.
+            pause: As for `lacking_verdict`.
+        """
+        if not enough or doubt:
+            return Verdict(Status.CONVERGING, (doubt if enough else CONFIRMING) + pause)
+        return Verdict(Status.CONVERGED, pause.strip(" ()"))
+
+    def _put_together(
+        self,
+        reported: Verdict,
+        cameras: dict[str, CameraEstimate],
+        missing: dict[str, list[WeakDirection]],
+        *,
+        partial: bool,
+        frames: int,
+        imu: ImuEstimate | None,
+        gravity: list[float],
+        refused: float,
+    ) -> CalibrationEstimate:
+        """The estimate as it is published; takes the events along.
+
+        Args:
+            reported: Verdict as published.
+            cameras: What is known.
+            missing: Directions not known well enough, of cameras that are calibrated now.
+            partial: The lost ones among them are withheld whatever the status.
+            frames: Images used.
+            imu: Biases.
+            gravity: In the world, m/s^2; empty: not known.
+            refused: Share of measurements that were not used.
+        """
+        if missing and (partial or self.status == Status.DEGENERATE):
+            cameras = {name: _withheld(e, missing[name]) for name, e in cameras.items()}
+        return CalibrationEstimate(
+            self.newest_ns,
+            self.status,
+            reported.reason,
+            self._progress(self.status, bool(missing), [g for gs in missing.values() for g in gs]),
+            guidance_text(reported.guidance),
+            self.elapsed_s,
+            frames,
+            self.imu_samples,
+            cameras,
+            imu,
+            gravity,
+            self.nis_per_dof(),
+            refused,
+            self._events.take(),
+            reported.guidance,
+        )
 
     def _progress(self, status: Status, known: bool, weak: list[WeakDirection]) -> float:
         """How far the calibration is, 0 to 1: logarithmic in the largest sigma over its limit."""
@@ -142,6 +241,11 @@ class Evaluator:
             return min(0.1, 0.001 * self.frames_seen)
         worst = max((direction.excess for direction in weak), default=1.0)
         return float(np.clip(1.0 - 0.9 * np.log(max(worst, 1.0)) / np.log(100.0), 0.1, 0.95))
+
+
+def _withheld(e: CameraEstimate, missing: list[WeakDirection]) -> CameraEstimate:
+    lost = [m for m in missing if m.excess > LOST]
+    return replace(e, unobservable=[direction_line(m) for m in lost], withheld=lost)
 
 
 def lens_known(e: CameraEstimate) -> CameraEstimate:
@@ -163,16 +267,16 @@ def lens_verdict(worst: WeakDirection, camera: str, *, off: bool) -> Verdict:
     return Verdict(Status.CONVERGING, text)
 
 
-def lacking_verdict(lacking: list[WeakDirection], *, patient: bool, pause: str = "") -> Verdict:
+def lacking_verdict(lacking: list[WeakDirection], *, shown_s: float, pause: str = "") -> Verdict:
     """What is said of directions that are not known well enough, the worst first.
 
     Args:
         lacking: These, at least one.
-        patient: They have had `PATIENCE_S` to show.
+        shown_s: For how long they could have shown, s.
         pause: Why images are not used at present, in words; empty: they are.
     """
     worst = lacking[0]
-    if patient and worst.excess > LOST:
+    if shown_s > PATIENCE_S and worst.excess > LOST:
         names = "; ".join(direction_sigma(g) for g in lacking[:3])
         return Verdict(Status.DEGENERATE, f"the motion does not show: {names}" + pause, worst.guidance)
     return Verdict(Status.CONVERGING, direction_sigma(worst) + pause, worst.guidance)

@@ -13,36 +13,20 @@ from vical_daemon.estimation.filter.gyro_frame import in_gyro_frame
 from vical_daemon.estimation.filter.snapshot import camera_estimate, imu_estimate
 from vical_daemon.estimation.geometry.camera_model import RADTAN
 from vical_daemon.estimation.guidance import WeakDirection
-from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
-from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
-from vical_daemon.estimation.result import (
-    CalibrationEstimate,
-    CameraEstimate,
-    HeldOutCheck,
-    Status,
-    TracePoint,
-)
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
-from vical_daemon.estimation.status.evaluator import (
-    LOST,
-    PATIENCE_S,
-    Evaluator,
-    lacking_verdict,
-    lens_known,
-    lens_verdict,
-)
+from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
 from vical_daemon.estimation.status.excitation import ALL_WAYS
 from vical_daemon.estimation.status.holdout_check import imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
-from vical_daemon.estimation.status.steady_status import CONFIRMING, Verdict
-from vical_daemon.estimation.wording import direction_line, guidance_text
+from vical_daemon.estimation.status.steady_status import Verdict
 
 _ENOUGH_FRAMES = 60
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
-_EVERY_READINGS = 16  # the size of one in so many is kept
 _NIS_BAD = 4.0
 _RECENT = 60
 _KEPT_CHECKS = 2400  # one every 1.5 s: an hour
@@ -57,40 +41,28 @@ class StatusEvaluator(Evaluator):
     """
 
     def __init__(self, options: CalibrationOptions, layout: Layout) -> None:
-        super().__init__(options, "the target has not been seen yet: show the whole board to the camera")
+        super().__init__(options, "the target has not been seen yet: show the whole board to the camera", 300)
         self.layout = layout
         self._imu_asked = "imu_intrinsics" in options.estimate
         self.frames = 0
-        self.bumped = Cause.NONE
         self.in_doubt = ""
         self._partial = ""
         self._reopened_s = -np.inf
         self._points = [0, 0]
-        self._nis: deque[tuple[float, int]] = deque(maxlen=300)
         self._recent_used: deque[bool] = deque(maxlen=_RECENT)
         self._held_back: deque[float] = deque(maxlen=40)
         self.held_out: deque[HeldOutCheck] = deque(maxlen=_KEPT_CHECKS)
-        self._square: dict[str, deque[tuple[float, int]]] = {}
-        self._trace: dict[str, Trace] = {}
-        self._size: deque[float] = deque(maxlen=400)
+        self._residuals: dict[str, deque[tuple[float, int]]] = {}
         self._cover = Cover()
 
     # ------------------------------------------------------------------ what happens
-    def saw_reading(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
-        """Count one inertial reading, and keep the size of some."""
-        self.saw_imu(t_ns, gyro)
-        if self.imu_samples % _EVERY_READINGS == 1:
-            self._size.append(float(np.sqrt(accel @ accel)))
-
     def started(self, t_s: float, partial: str = "") -> None:
         """The filter runs from `t_s` on; `partial`: what the motion did not show, and was guessed."""
         self.reason, self._started_s, self._partial = "", t_s, partial
         self._recent_used.clear()
-        self._nis.clear()
+        self._squares.clear()
         self._held_back.clear()
-        if self.bumped:
-            self.announce(Event(EventKind.STARTED_ANEW))
-            self.bumped = Cause.NONE
+        self._after_change()
 
     def reopened(self, t_s: float) -> None:
         """Something that was known has to be found anew: patience begins again at `t_s`."""
@@ -99,11 +71,7 @@ class StatusEvaluator(Evaluator):
 
     def changed(self, why: Cause) -> None:
         """The rig is not what it was: the calibration is being taken anew."""
-        self.bumped, self.believed = why, False
-        kind = EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER
-        self.announce(Event(kind, cause=why))
-        self._started_s = None
-        self._steady.reset(Status.INCONSISTENT)
+        self._change(why, Status.INCONSISTENT)
 
     def held_back(self, ratio: float, scale: float) -> None:
         """Take in how well the imu alone predicted an image.
@@ -126,16 +94,13 @@ class StatusEvaluator(Evaluator):
         if not report.used:
             return
         self.frames += 1
-        self._nis.append((report.nis, report.dof))
-        square = self._square.setdefault(report.camera, deque(maxlen=400))
+        self._squares.append((report.nis, report.dof))
+        square = self._residuals.setdefault(report.camera, deque(maxlen=400))
         good = report.residual_px[report.accepted]
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
-        jitter_s = f.shared[report.camera].jitter_found_s
-        if jitter_s >= ANNOUNCED_S:
-            event = Event(EventKind.STAMP_JITTER, report.camera, float(jitter_s))
-            self.announce(event, once=f"jitter {report.camera}")
+        self._announce_jitter(report.camera, f.shared[report.camera].jitter_found_s)
         lens = f.agreement[report.camera]
         if lens.model == RADTAN and lens.moved.any() and f.layout.lens_free(report.camera):
             self.announce(Event(EventKind.LENS_TERM_MISSING, report.camera), once=f"lens {report.camera}")
@@ -148,15 +113,6 @@ class StatusEvaluator(Evaluator):
             trace.add(f.state.t_s, self._camera(camera, known), self.nis_per_dof(), self.status, imu)
 
     # ------------------------------------------------------------------ what is said
-    def nis_per_dof(self) -> float:
-        """Mean normalised innovation squared per degree of freedom over the last frames."""
-        dof = sum(d for _, d in self._nis)
-        return sum(n for n, _ in self._nis) / dof if dof else 0.0
-
-    def trace(self, camera: str) -> list[TracePoint]:
-        """The development of one camera."""
-        return list(self._trace[camera].points) if camera in self._trace else []
-
     def estimate(
         self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
     ) -> CalibrationEstimate:
@@ -171,27 +127,17 @@ class StatusEvaluator(Evaluator):
         else:
             first = next(iter(f.state.cameras.values()))
             reported = self._followed(verdict, first.R_imu_cam, f.state.gyro_bias)
-        advice = reported.guidance
-        if not advice and f is not None and self.status != Status.INCONSISTENT:
-            advice = self._cover.advice()
-        if f is not None and (self.status == Status.DEGENERATE or f.unobservable is not None):
-            cameras = {name: self._withheld(e, missing[name]) for name, e in cameras.items()}
-        return CalibrationEstimate(
-            self.newest_ns,
-            self.status,
-            reported.reason,
-            self._progress(self.status, bool(missing), [g for gs in missing.values() for g in gs]),
-            guidance_text(advice),
-            self.elapsed_s,
-            self.frames,
-            self.imu_samples,
+            if not reported.guidance and self.status != Status.INCONSISTENT:
+                reported = reported._replace(guidance=self._cover.advice())
+        return self._put_together(
+            reported,
             cameras,
-            None if shown is None else imu_estimate(shown, matrices=self._imu_asked),
-            [] if shown is None else shown.state.gravity.tolist(),
-            self.nis_per_dof(),
-            self._points[0] / max(self._points[1], 1),
-            self._events.take(),
-            advice,
+            missing,
+            partial=f is not None and f.unobservable is not None,
+            frames=self.frames,
+            imu=None if shown is None else imu_estimate(shown, matrices=self._imu_asked),
+            gravity=[] if shown is None else shown.state.gravity.tolist(),
+            refused=self._points[0] / max(self._points[1], 1),
         )
 
     def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
@@ -203,7 +149,7 @@ class StatusEvaluator(Evaluator):
         return clock_drift.averaged(f)
 
     def _camera(self, name: str, f: CalibrationFilter) -> CameraEstimate:
-        square = self._square.get(name, ())
+        square = self._residuals.get(name, ())
         count = sum(n for _, n in square)
         rms = float(np.sqrt(sum(s for s, _ in square) / count)) if count else 0.0
         return camera_estimate(f, name, rms)
@@ -214,15 +160,10 @@ class StatusEvaluator(Evaluator):
             return []
         return self._weak(e, f.state.cameras[name].R_imu_cam, f.state.gyro_bias)
 
-    @staticmethod
-    def _withheld(e: CameraEstimate, missing: list[WeakDirection]) -> CameraEstimate:
-        lost = [m for m in missing if m.excess > LOST]
-        return replace(e, unobservable=[direction_line(m) for m in lost], withheld=lost)
-
     def _decide(self, f: CalibrationFilter | None, missing: dict[str, list[WeakDirection]]) -> Verdict:
         """Status, reason and guidance by the data up to now."""
         if f is None:
-            return self._before_start(self.bumped, self._unit_trouble())
+            return self._before_start()
         trouble = self._trouble()
         if trouble:
             return Verdict(Status.INCONSISTENT, trouble)
@@ -232,16 +173,13 @@ class StatusEvaluator(Evaluator):
         if not lacking:
             if self._partial:
                 return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)
-            if self.frames < _ENOUGH_FRAMES or span < _ENOUGH_S:
-                return Verdict(Status.CONVERGING, CONFIRMING)
-            if self.in_doubt:
-                return Verdict(Status.CONVERGING, self.in_doubt)
-            return Verdict(Status.CONVERGED)
+            enough = self.frames >= _ENOUGH_FRAMES and span >= _ENOUGH_S
+            return self._once_known(enough=enough, doubt=self.in_doubt)
         lens = self._lens_to_blame(f, missing)
         if lens:
             return lens_verdict(lacking[0], lens, off=model_mixture.lens_block(lens) in f.off)
-        patient = f.state.t_s - max(self._started_s or 0.0, self._reopened_s) > PATIENCE_S
-        return lacking_verdict(lacking, patient=patient)
+        since_s = max(self._started_s or 0.0, self._reopened_s)
+        return lacking_verdict(lacking, shown_s=f.state.t_s - since_s)
 
     def _lens_to_blame(self, f: CalibrationFilter, missing: dict[str, list[WeakDirection]]) -> str:
         """The camera whose fixed lens is the only reason why something is missing; empty: there is none."""
@@ -250,21 +188,11 @@ class StatusEvaluator(Evaluator):
             return ""
         return max(missing, key=lambda n: max((m.excess for m in missing[n]), default=0.0))
 
-    def _unit_trouble(self) -> str:
-        if len(self._size) < 20:
-            return ""
-        size = float(np.median(self._size))
-        if 0.7 < size < 1.4:
-            return (
-                f"specific force has a median size of {size:.2f}: is the accelerometer in g instead of m/s^2?"
-            )
-        return ""
-
     def _trouble(self) -> str:
         """Why the filter cannot be believed at present; empty when it can."""
         refused = self._recent_used.count(False)
         if len(self._recent_used) >= 20 and refused > len(self._recent_used) // 3:
             return f"{refused} of the last {len(self._recent_used)} images do not fit the motion"
-        if len(self._nis) >= 40 and self.nis_per_dof() > _NIS_BAD:
+        if len(self._squares) >= 40 and self.nis_per_dof() > _NIS_BAD:
             return f"innovations are {self.nis_per_dof():.1f} times what they should be"
         return ""

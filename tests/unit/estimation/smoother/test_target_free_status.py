@@ -8,6 +8,7 @@ import pytest
 from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import CameraState
+from vical_daemon.estimation.result import Status
 from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, root_of
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 
@@ -68,3 +69,12 @@ def test_two_windows_that_agree_are_believed_again():
         fit(4.0), carry(), complete=False
     )  # of a third one nothing is believed until it is complete
     assert focal_sigma(status) == before
+
+
+def test_an_accelerometer_in_g_is_named_before_the_start():
+    status = TargetFreeStatus(CalibrationOptions(), LAYOUT)
+    for k in range(400):
+        status.saw_reading(5_000_000 * k, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    estimate = status.estimate(None, running=False, gravity=[])
+    assert estimate.status == Status.INCONSISTENT
+    assert "in g instead of m/s^2" in estimate.reason
