@@ -37,6 +37,7 @@ from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 from vical_daemon.estimation.smoother.thinning import Thinning
 from vical_daemon.estimation.smoother.waiting_tracks import SLACK_S, STEP_S, Ready, Stamped, cleaned, ready
 from vical_daemon.estimation.smoother.window import Window
+from vical_daemon.estimation.status.evaluator import PATIENCE_S
 
 MAX_RATE_HZ = 23.0  # images beyond are thinned
 WINDOW_FRAMES = 61  # a window is closed at this many images or at this age: its cost grows with the cube
@@ -47,7 +48,6 @@ _LATE_S = 0.02  # inertial data must reach this far beyond an image
 _LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _STEPS_GROW = 12
 _ALWAYS = frozenset({IMU, LAG, "readout"})  # is estimated besides what is asked for
-_PATIENCE_S = 15.0  # in which a changed mounting or clock is looked for; then anything may have changed
 
 
 class TargetFreeCalibrator:
@@ -254,7 +254,7 @@ class TargetFreeCalibrator:
             return begun
         if begun is DOES_NOT_FIT:
             self.evaluator.contradicted(frames[-1][0] - frames[0][0])
-        if self.evaluator.against_s > _PATIENCE_S:  # neither mounting nor clock: all is looked for
+        if self.evaluator.against_s > PATIENCE_S:  # neither mounting nor clock: all is looked for
             held, anew = self.initializer.held, self._first.begin(buffer, frames, None, self._noise)
             if isinstance(anew, Begun):
                 self._closed, self._confirmed, self._seek_shift = 0, False, False

@@ -38,6 +38,7 @@ from vical_daemon.estimation.inertial.imu_model import Influence
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.model.inertial_links import ROUNDING
 from vical_daemon.estimation.model.rates import Rates, rates_after
 from vical_daemon.estimation.model.retract import orthonormal, retract
 from vical_daemon.estimation.model.state import (
@@ -56,7 +57,6 @@ from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import WAYS, SharedErrors, shared_ways
 
-_TINY = 1e-30 * np.eye(9)  # noise densities may be given as zero
 _TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 _MAX_ARM_M, _MAX_SPEED_MPS, _MAX_SHIFT_S = 3.0, 30.0, 60.0
 
@@ -146,7 +146,7 @@ class CalibrationFilter:
 
     def _noise(self, influence: Influence) -> FloatArray:
         """Covariance of the noise gathered on the way, shape (9, 9)."""
-        return influence.noise(self.imu_noise) + _TINY
+        return influence.noise(self.imu_noise) + ROUNDING
 
     def _grow(self, moved: Propagated, Q: FloatArray) -> None:
         """Assemble the columns of the new square root and make it triangular."""

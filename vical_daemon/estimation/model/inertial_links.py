@@ -18,7 +18,7 @@ from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
 
 _MAX_HOLE_S = 0.1  # between readings; nothing is made up for longer
-_ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
+ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 
 
@@ -84,7 +84,7 @@ def make_links(
     motion = over_intervals(strapdown(even, zero, zero), begin, errors=True)
     covariance = np.array([e.noise(noise) for e in motion.influences])[:, _ORDER[:, None], _ORDER]
     try:
-        root = np.linalg.inv(np.linalg.cholesky(covariance + _ROUNDING))
+        root = np.linalg.inv(np.linalg.cholesky(covariance + ROUNDING))
     except np.linalg.LinAlgError:
         return None
     by_imu = [e.by_bias() for e in motion.influences]

@@ -46,7 +46,7 @@ class StartSigmas(NamedTuple):
     Attributes:
         attitude_rad: Of the imu in the world; without a target only its tilt counts.
         velocity_mps: Of the imu.
-        lever_arm_m: Of each component.
+        lever_arm_m: Of each component: a robot's, not a telephone's.
         rotation_rad: Of the mounting.
         timeshift_s: Of the camera.
         focal, centre: Of fx fy and of cx cy, over the focal length.

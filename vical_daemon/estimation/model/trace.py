@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.result import CameraEstimate, ImuEstimate, Status, TracePoint
+from vical_daemon.estimation.significance import EVERY_S
 
-_EVERY_S = 1.0
 _MOST = 7200
 
 
@@ -18,7 +18,7 @@ class Trace:
 
     def due(self, t_s: float) -> bool:
         """Whether a second has passed since the last entry."""
-        return not self.points or t_s - self.points[-1].t_s >= _EVERY_S
+        return not self.points or t_s - self.points[-1].t_s >= EVERY_S
 
     def add(
         self,

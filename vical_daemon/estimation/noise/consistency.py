@@ -26,7 +26,7 @@ from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 MODES = 8
-_MIN_CORNERS = 8
+TELLING = 100  # images; the correlation of neighbours is then known to 0.1
 _LAGS = 20
 _TAPER = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
 _FLOOR = 0.5
@@ -68,7 +68,7 @@ def normalised(
     Returns:
         Shape (8,), clipped at six; None where the corners do not span the modes.
     """
-    if len(uv) < _MIN_CORNERS:
+    if len(uv) < MODES:
         return None
     W = np.concatenate([modes(uv), ways, innovation.reshape(-1, 1)], axis=1)
     W /= np.repeat(sigma, 2)[:, None]
@@ -168,7 +168,7 @@ class Consistency:
         self._weight += 1.0
         self._recent.append(normal)
         self._lagged[: len(self._recent)] += (np.array(self._recent) @ normal)[::-1]
-        if self._weight < 100.0:
+        if self._weight < TELLING:
             return
         total = 2.0 * float(_TAPER @ self._lagged[1:] / self._lagged[0])
         noise = 2.0 * float(np.sqrt(_TAPER @ _TAPER / (MODES * self._weight)))

@@ -19,7 +19,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 
 _SIZES_PX = SYSTEMATIC_PX * 1.1 ** np.arange(80)  # to 5.6 px: lenses guessed from the resolution are nearer
-_WINDOWS = 40  # the newest, as many as `TargetFreeStatus` compares
+WINDOWS = 40  # the newest that count, here and for their agreement
 
 
 class LensMisfit:
@@ -31,7 +31,7 @@ class LensMisfit:
 
     def __init__(self) -> None:
         self.px = SYSTEMATIC_PX
-        self._logs: deque[FloatArray] = deque(maxlen=_WINDOWS)
+        self._logs: deque[FloatArray] = deque(maxlen=WINDOWS)
 
     def learn(self, root: FloatArray, information: FloatArray, weighted: FloatArray) -> None:
         """Take in what one window says of its own lens, apart from the prior of that.

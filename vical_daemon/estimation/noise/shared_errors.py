@@ -16,6 +16,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
+from vical_daemon.estimation.noise.consistency import TELLING
 from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
@@ -24,7 +25,6 @@ _EVERY = 20  # images that are added together; nothing is said before, unless a 
 JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
 _ABSENT = 1e-3  # a jitter is reported where the probability that there is none is less
-_TELLING = 100  # images; the correlation of neighbours is then known to 0.1
 _PERSISTENT = 0.5  # of the variance: nearer to that of a model error (1) than to that of a jitter (0)
 WAYS = 3  # late, to the side, down
 
@@ -112,7 +112,7 @@ class SharedErrors:
         """
         n = min(self.images, _MEMORY)
         size = self._A[:n, 0, 0]
-        if n < _TELLING or not (size > 0.0).all():
+        if n < TELLING or not (size > 0.0).all():
             return False
         late, usual = self._b[:n, 0] / size, self._C[:n, 0, 0] / size**2
         weight = 1.0 / (usual + self.jitter_s**2)

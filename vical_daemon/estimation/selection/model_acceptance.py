@@ -14,13 +14,13 @@ from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIG
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.noise.consistency import TELLING
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.selection.model_mixture import Block, lens_block, not_zero
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, blocks, factor, weights
 from vical_daemon.estimation.significance import EVERY_S
 
 _MEASURED = 400  # images
-_SEEN = 100  # images, as many as `consistency` wants
 _KINDS = {
     IMU: EventKind.IMU_INTRINSICS,
     LAG: EventKind.ACCEL_LAG,
@@ -109,7 +109,7 @@ def _needed(name: str, every: dict[str, Block], shares: dict[tuple[str, ...], fl
         return 0
     if name == LAG or any(not_zero(shares, other) > OFF for other in held):
         return _MEASURED
-    return _SEEN if held else 0
+    return TELLING if held else 0
 
 
 def _off(f: CalibrationFilter, name: str) -> Event:

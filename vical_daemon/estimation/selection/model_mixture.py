@@ -24,7 +24,7 @@ from vical_daemon.estimation.model.unscented import root, solve_lower
 
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
-_RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as given has none
+RIDGE = 1e-12  # of the variance of a lens that is off: one that is surely as given has none
 
 Weights = dict[tuple[str, ...], float]
 """Probability of each hypothesis, named by the blocks that are as specified."""
@@ -155,7 +155,7 @@ def lenses_known(S: FloatArray, every: Mapping[str, Block]) -> FloatArray:
     if not scaled:
         return S
     rows = np.concatenate(scaled)
-    L = root(rows @ rows.T + _RIDGE * np.eye(len(rows)))
+    L = root(rows @ rows.T + RIDGE * np.eye(len(rows)))
     U = solve_lower(L, rows)
     return np.asarray(S - (S @ U.T) @ U)
 

@@ -13,12 +13,12 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.smoother.track_start import ArmPrior, NoStartError, TrackStart
+from vical_daemon.estimation.smoother.track_start import ROUNDS, ArmPrior, NoStartError, TrackStart
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _STEP_RAD = float(np.deg2rad(15.0))
 _FINE_RAD = float(np.deg2rad(4.0))
-_ROUGH_ROUNDS, _ROUNDS = 4, 8
+_ROUGH_ROUNDS = 4
 _APART_RAD = float(np.deg2rad(45.0))
 _CONTRAST = 3.0  # so much worse must mountings fit that are turned far from the best
 
@@ -53,7 +53,7 @@ def mounting_about(start: TrackStart, axis: FloatArray, R_imu_cam: FloatArray, a
     """
     angles = np.arange(-np.pi, np.pi - 1e-9, _STEP_RAD)
 
-    def misfit(angle: float, rounds: int) -> float:
+    def misfit(angle: float, rounds: int = ROUNDS) -> float:
         return start.misfit(so3.exp(angle * axis) @ R_imu_cam, arm, rounds)
 
     found = np.array([misfit(a, _ROUGH_ROUNDS) for a in angles])
@@ -65,7 +65,7 @@ def mounting_about(start: TrackStart, axis: FloatArray, R_imu_cam: FloatArray, a
             " or turn the rig about a second axis"
         )
     for step in (_STEP_RAD / 2.0, _FINE_RAD):
-        best += _vertex(step, *(misfit(best + x, _ROUNDS) ** 2 for x in (-step, 0.0, step)))
+        best += _vertex(step, *(misfit(best + x) ** 2 for x in (-step, 0.0, step)))
     return np.asarray(so3.exp(best * axis) @ R_imu_cam)
 
 

@@ -30,7 +30,7 @@ from vical_daemon.estimation.temporal.epipolar_pairs import LAGS_S
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 from vical_daemon.estimation.temporal.td_icp import td_icp
-from vical_daemon.estimation.temporal.track_orientations import track_orientations
+from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES, track_orientations
 
 Frames = list[tuple[float, PointsFrame]]
 
@@ -48,7 +48,6 @@ _SPAN_S, _LONG_SPAN_S = 5.0, 8.0
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
-_MIN_TRACKS = 12
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _FULL_FITS = 2
 _ROUGH_STEPS = 8
@@ -337,7 +336,7 @@ def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -
     """The last images without a hole between them; of very many every second or third."""
     out: Frames = []
     for t, frame in reversed(frames):
-        if t > end_s or len(frame.ids) < _MIN_TRACKS:
+        if t > end_s or len(frame.ids) < MIN_FEATURES:
             continue
         if t < begin_s or (out and (out[-1][0] - t > _MAX_HOLE_S or out[0][0] - t > span_s)):
             break

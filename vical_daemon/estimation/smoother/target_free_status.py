@@ -12,6 +12,7 @@ from vical_daemon.estimation.guidance import WeakDirection
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
+from vical_daemon.estimation.noise.lens_misfit import WINDOWS
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
@@ -50,7 +51,9 @@ class TargetFreeStatus(Evaluator):
         rolling: bool = False,
         term: bool = False,
     ) -> None:
-        super().__init__(options, "no features have been followed yet: is the picture dark or blurred?", 40)
+        super().__init__(
+            options, "no features have been followed yet: is the picture dark or blurred?", WINDOWS
+        )
         (self.camera,), self.layout = layout.cameras, layout
         self.misfit: tuple[Cause, float] = Cause.NONE, 0.0
         self._against_since_s: float | None = None  # images contradict what is known since then

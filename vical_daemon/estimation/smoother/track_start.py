@@ -25,7 +25,7 @@ from vical_daemon.estimation.significance import MEDIAN_ABSOLUTE
 from vical_daemon.estimation.smoother.marginal_prior import HELD_M
 from vical_daemon.estimation.smoother.window import FARTHEST_M, NEAREST_M, Landmarks, Window, rays_of
 
-_ROUNDS = 8
+ROUNDS = 8
 _MIN_FEATURES = 15
 _MAX_ARM_M = 1.5
 _MOST_BEHIND = 0.3  # share of the observations
@@ -132,7 +132,7 @@ class TrackStart:
         Raises:
             NoStartError: Speed, scale or lever arm do not show.
         """
-        found = self._solve(self.camera.R_imu_cam, arm, _ROUNDS)
+        found = self._solve(self.camera.R_imu_cam, arm, ROUNDS)
         if found is None:
             raise NoStartError(
                 "speed and scale are not visible yet: move the rig to and fro while turning it"

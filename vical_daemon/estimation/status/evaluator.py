@@ -20,6 +20,7 @@ from vical_daemon.estimation.result import (
     Status,
     TracePoint,
 )
+from vical_daemon.estimation.selection.model_mixture import RIDGE
 from vical_daemon.estimation.status.excitation import (
     ALL_WAYS,
     RunningMotion,
@@ -30,8 +31,8 @@ from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatu
 from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
 
 PATIENCE_S = 15.0
-"""So long after it could first have shown, a direction that the motion does not show is called that."""
-_RIDGE = 1e-12  # of a variance, against rounding
+"""So long after it could first have shown, a direction that the motion does not show is called that; and so
+long a changed mounting or clock is looked for before anything may have changed."""
 LOST = 3.0
 """A direction whose sigma is this many times its limit after the patience is called unobservable."""
 _EVERY_READINGS = 16  # the size of one in so many is kept
@@ -254,7 +255,7 @@ def lens_known(e: CameraEstimate) -> CameraEstimate:
     lens = 7 + np.flatnonzero(np.diag(joint)[7:])
     scale = np.sqrt(np.diag(joint)[lens])  # pixels and coefficients
     rows = joint[lens] / scale[:, None]
-    own = rows[:, lens] / scale + _RIDGE * np.eye(len(lens))
+    own = rows[:, lens] / scale + RIDGE * np.eye(len(lens))
     known = joint[:7, :7] - rows[:, :7].T @ np.linalg.solve(own, rows[:, :7])
     pose = replace(e.T_imu_cam, covariance=known[:6, :6].tolist())
     return replace(e, T_imu_cam=pose, timeshift_sigma_s=float(np.sqrt(max(known[6, 6], 0.0))))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
 LAGS_S = (0.1, 0.25, 0.5)
-_MIN_SHARED = 12
 
 
 @dataclass(slots=True)
@@ -53,7 +53,7 @@ def make_pairs(
                 continue
             a, b = frames[i][1], frames[j][1]
             shared, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-            if len(ka) < _MIN_SHARED:
+            if len(ka) < MIN_FEATURES:
                 continue
             first.append(i)
             second.append(j)

@@ -27,7 +27,7 @@ _GRID_S = 0.02
 _LONGEST_S = 12.0  # with more data the grid of stretches would have to be finer
 _TURNS = 80  # enough to tell factors apart
 _AGREE = 0.6
-_BETTER = 0.6  # misfit over that of the stamps as they are
+BETTER = 0.6  # misfit over that of the data as they are
 
 
 def estimate_clock_rate(
@@ -66,7 +66,7 @@ def estimate_clock_rate(
     start, plain = (coarse_start(curve, middle + t / factor, q, shifts_s) for factor in (best, 1.0))
     if start is None or not _agrees(start):
         return None
-    if plain is not None and not plain.mirrored and start.misfit_share > _BETTER * plain.misfit_share:
+    if plain is not None and not plain.mirrored and start.misfit_share > BETTER * plain.misfit_share:
         return None  # noisy orientations fit as badly at any factor
     return best
 

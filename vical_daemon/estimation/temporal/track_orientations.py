@@ -22,7 +22,7 @@ from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 FloatArray = npt.NDArray[np.float64]
 
-_MIN_FEATURES = 12
+MIN_FEATURES = 12  # that two images share: below, they do not show how the camera turned
 _MAX_GAP_NS = 400_000_000
 _STEPS = 12
 _PLAIN_STEPS = 6  # before outliers are put aside
@@ -90,7 +90,7 @@ def _matched(before: _Rays, now: _Rays) -> Pair | None:
     if not 0 < now.t_ns - before.t_ns < _MAX_GAP_NS:
         return None
     _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
-    return (before.rays[i], now.rays[j]) if len(i) >= _MIN_FEATURES else None
+    return (before.rays[i], now.rays[j]) if len(i) >= MIN_FEATURES else None
 
 
 def relative_rotations(pairs: list[Pair]) -> list[tuple[FloatArray, FloatArray] | None]:

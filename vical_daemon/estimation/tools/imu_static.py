@@ -21,8 +21,8 @@ from scipy.optimize import least_squares
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.model.state import LOWER
 
-LOWER = np.tril_indices(3)
 POSITIONS_MIN = 9  # unknowns of the accelerometer
 MOTIONS_MIN = 6  # twelve directions for nine unknowns of the gyro
 ANGLE_FLOOR_RAD = 1e-5
@@ -173,7 +173,7 @@ def calibrate_accelerometer(rests: list[Rest], gravity_mps2: float = 9.80665) ->
         force = (measured - x[6:]) @ _lower(x[:6]).T
         return np.asarray((np.linalg.norm(force, axis=1) - gravity_mps2) / noise)
 
-    start = np.concatenate([np.eye(3)[LOWER], np.zeros(3)])
+    start = np.concatenate([np.eye(3)[LOWER[:, 0], LOWER[:, 1]], np.zeros(3)])
     x, sigma, rms = _solve(residuals, start)
     if not np.all(np.isfinite(sigma)) or np.max(sigma[:6]) > 0.02:
         raise PoorMotionError(
@@ -234,7 +234,7 @@ def _solve(
 
 def _lower(x: FloatArray) -> FloatArray:
     matrix = np.zeros((3, 3))
-    matrix[LOWER] = x
+    matrix[LOWER[:, 0], LOWER[:, 1]] = x
     return matrix
 
 
@@ -302,6 +302,6 @@ def _turn_noise(motions: list[tuple[Rest, Rest]], rate_hz: float, accel: SensorC
         drift = np.mean(a.gyro_sigma**2 + b.gyro_sigma**2) * (0.5 * duration) ** 2
         direction = np.mean(a.accel_sigma**2 + b.accel_sigma**2) / np.sum(a.accel_mps2**2)
         # The accelerometer's own calibration error turns both directions.
-        matrix = np.mean(accel.matrix_sigma[LOWER] ** 2)
+        matrix = np.mean(accel.matrix_sigma[LOWER[:, 0], LOWER[:, 1]] ** 2)
         noise.append(np.sqrt(integrated + drift + direction + matrix + ANGLE_FLOOR_RAD**2))
     return np.array(noise)
