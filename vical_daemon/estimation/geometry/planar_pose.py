@@ -101,25 +101,20 @@ class _Views(NamedTuple):
         return _Views(*(x[which] for x in self))
 
 
-def planar_pose(points_m: FloatArray, xy: FloatArray, sigma: float | None = None) -> PlanarPoses:
-    """Find the poses of a planar target from undistorted image points.
-
-    Args:
-        points_m: Points in the target frame with z = 0, m, shape (n, 3) or (n, 2), n >= 4.
-        xy: Undistorted normalised coordinates X/Z, Y/Z, shape (n, 2).
-        sigma: Noise of xy per axis (pixels / fx); None: taken from the residuals of the best pose.
-
-    Returns:
-        Up to two poses, best first; a second that is clearly worse is refined only so far that this is sure.
-        None where the points are too few, on a line or behind the camera.
-    """
-    return planar_poses([points_m], [xy], sigma)[0]
-
-
 def planar_poses(
     points_m: Sequence[FloatArray], xy: Sequence[FloatArray], sigma: float | None = None
 ) -> list[PlanarPoses]:
-    """Find the poses of a planar target in each of several views, see `planar_pose`."""
+    """Find the poses of a planar target from undistorted image points, in each of several views.
+
+    Args:
+        points_m: By view, points in the target frame with z = 0, m, shape (n, 3) or (n, 2), n >= 4.
+        xy: Likewise, undistorted normalised coordinates X/Z, Y/Z, shape (n, 2).
+        sigma: Noise of xy per axis (pixels / fx); None: taken from the residuals of the best pose.
+
+    Returns:
+        By view, up to two poses, best first; a second that is clearly worse is refined only so far that this
+        is sure. None where the points are too few, on a line or behind the camera.
+    """
     if not len(xy):
         return []
     if len(xy) > _TOGETHER:

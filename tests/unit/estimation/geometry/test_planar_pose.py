@@ -5,9 +5,14 @@ import numpy as np
 import pytest
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.planar_pose import planar_pose, planar_poses
+from vical_daemon.estimation.geometry.planar_pose import planar_poses
 
 SIGMA = 0.3 / 460
+
+
+def planar_pose(points_m, xy, sigma=None):
+    """Of one view."""
+    return planar_poses([points_m], [xy], sigma)[0]
 
 
 def _board(columns=12, rows=12, size=0.03):
