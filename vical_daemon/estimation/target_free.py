@@ -28,9 +28,10 @@ from vical_daemon.estimation.selection.model_selection import IMU, LAG
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.changed_blocks import changed_blocks, clock, mounting
 from vical_daemon.estimation.smoother.clock_changes import opened
-from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow, Noise
+from vical_daemon.estimation.smoother.first_window import DOES_NOT_FIT, Begun, FirstWindow
 from vical_daemon.estimation.smoother.handover import next_window, with_process_noise
 from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, calibration_difference
+from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.reports import window_reports
 from vical_daemon.estimation.smoother.target_free_initializer import TargetFreeInitializer, with_next_term
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
@@ -87,7 +88,7 @@ class TargetFreeCalibrator:
         self.carry: MarginalPrior | None = None  # before the window
         self.latest: MarginalPrior | None = None  # after its last adjustment
         self._closed = 0
-        self._noise = Noise(options.corner_sigma_px)
+        self._noise = ImageNoise(options.corner_sigma_px)
         self._misfit = LensMisfit()
         self._intake = SensorIntake()
         self._pending: list[Stamped] = []
@@ -228,7 +229,7 @@ class TargetFreeCalibrator:
         self._fitted_s = last = window.frames[-1][0]
         self._pending = [x for x in self._pending if x[0] > last]
         self.window, self.carry, self.latest = window, begun.bundle.carry, fit.carry
-        self._noise = Noise.of(fit)
+        self._noise = fit.noise
         self._anew = False
         self.evaluator.held = self.initializer.held
         self.evaluator.started(window.frames[0][0])
@@ -311,7 +312,7 @@ class TargetFreeCalibrator:
         against_s = frames[-1][0] - self._fitted_s
         if len(window.frames) < 8:
             return
-        bundle = Bundle(window, self.carry, *self._noise)
+        bundle = Bundle(window, self.carry, self._noise)
         fit = bundle.solve(self._buffer, 2 * _STEPS_GROW if _full(window) else _STEPS_GROW)
         if fit is None:
             self._lost(Cause.TOO_FEW_FEATURES)
@@ -329,7 +330,7 @@ class TargetFreeCalibrator:
         if self._closed and not self._agrees(fit, self.carry, complete=_full(window)):
             self._lost(Cause.WINDOW_CONTRADICTED, against_s=against_s)
             return
-        self.latest, self._noise = fit.carry, Noise.of(fit)
+        self.latest, self._noise = fit.carry, fit.noise
         self._fitted_s = window.frames[-1][0]
         self.evaluator.saw_fit(fit, self._fitted_s + window.shift_s)
         if _full(window):
@@ -358,7 +359,7 @@ class TargetFreeCalibrator:
             self.evaluator.lost(Cause.COLUMNS_READ, None, None)
             self.evaluator.started(window.frames[0][0])
             self.evaluator.saw_fit(fit, window.frames[-1][0] + window.shift_s)
-            self.latest, self._noise = fit.carry, Noise.of(fit)
+            self.latest, self._noise = fit.carry, fit.noise
         self._closed += 1
         self.evaluator.closed()
         self._learn_lens(window, bundle, fit)
@@ -375,7 +376,7 @@ class TargetFreeCalibrator:
             return
         root, information = bundle.problem.lens_root, np.linalg.inv(fit.own_lens)
         own, weighted = information - root.T @ root, information @ window.own_lens
-        self._misfit.learn(root * fit.lens_px, own, weighted)
+        self._misfit.learn(root * fit.noise.lens_px, own, weighted)
         self._noise = self._noise._replace(lens_px=self._misfit.px)
 
     def _walked(self, carry: MarginalPrior, span_s: float) -> MarginalPrior:

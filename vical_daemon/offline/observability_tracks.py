@@ -111,7 +111,7 @@ def _rebuilt(
         camera.distortion_model,
         camera.resolution,
         estimate=blocks,
-        corner_sigma_px=max(fit.sigma_px * fit.spread, 0.05),
+        corner_sigma_px=max(fit.noise.sigma_px * fit.noise.spread, 0.05),
         seen=tuple(seen[k] for k in chosen),
         readout_axis=camera.readout_axis or ROWS,
     )

@@ -18,7 +18,6 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
@@ -26,7 +25,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     calibration_difference,
     carried_out,
 )
-from vical_daemon.estimation.smoother.normal import Normal, Problem
+from vical_daemon.estimation.smoother.normal import ImageNoise, Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
@@ -48,9 +47,7 @@ class Fit(NamedTuple):
         squares: Sum of squared whitened pixel errors of the observations kept.
         dof: Their degrees of freedom.
         inertial: Squared whitened errors of the links over their number of rows.
-        sigma_px: Pixel noise that was found.
-        spread: Square root of the images that share an error.
-        jitter_s: Standard deviation of the images' stamps, s; 0 where none is seen.
+        noise: Of the images, as it was found; of the lens model, as it was taken to be.
         steps: Iterations done.
         settled: The last of them changed nothing to speak of.
         used, refused: Observations.
@@ -59,16 +56,13 @@ class Fit(NamedTuple):
         landmarks: How many.
         parallax_deg: Typical angle under which a landmark's rays cross.
         own_lens: Covariance of the window's own lens, shape (n, n), or (0, 0).
-        lens_px: Misfit of the lens model, as it was taken to be, px.
     """
 
     carry: MarginalPrior
     squares: float
     dof: int
     inertial: float
-    sigma_px: float
-    spread: float
-    jitter_s: float
+    noise: ImageNoise
     steps: int
     settled: bool
     used: int
@@ -77,7 +71,6 @@ class Fit(NamedTuple):
     landmarks: int
     parallax_deg: float
     own_lens: FloatArray
-    lens_px: float
 
 
 class _Step(NamedTuple):
@@ -97,23 +90,12 @@ class Bundle:
     Args:
         window: Is changed in place.
         carry: What was known before.
-        sigma_px: Pixel noise, first guess.
-        spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
-        jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
-        lens_px: Misfit of the lens model, see `lens_misfit`, px.
+        noise: Of the images, first guess.
     """
 
-    def __init__(
-        self,
-        window: Window,
-        carry: MarginalPrior,
-        sigma_px: float,
-        spread: float = 1.0,
-        jitter_s: float = 0.0,
-        lens_px: float = SYSTEMATIC_PX,
-    ) -> None:
+    def __init__(self, window: Window, carry: MarginalPrior, noise: ImageNoise) -> None:
         self.window, self.carry = window, carry
-        self.problem = Problem(window, carry, sigma_px, spread, jitter_s, lens_px)
+        self.problem = Problem(window, carry, noise)
         self.seen: Seen | None = None
 
     # ------------------------------------------------------------------ the loop
@@ -260,10 +242,11 @@ class Bundle:
     # ------------------------------------------------------------------ noise, outliers, result
     def _suspects_jitter(self, seen: Seen, links: PreintegratedLinks) -> bool:
         """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
-        if self.problem.jitter_s:
+        problem = self.problem
+        if problem.noise.jitter_s:
             return False
-        self.problem.jitter_s = self.problem.suspected_jitter_s(seen, links)
-        return self.problem.jitter_s > 0.0
+        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(seen, links))
+        return problem.noise.jitter_s > 0.0
 
     def _learn_noise(self, seen: Seen) -> None:
         """Pixel noise such that the kept errors have the size that they should have."""
@@ -273,10 +256,10 @@ class Bundle:
             return
         # degrees of freedom used up by the fit
         share = np.sqrt(max(self._dof(seen) / max(2 * int(ok.sum()), 1), 0.05))
-        self.problem.sigma_px = float(
-            np.clip(self.problem.sigma_px * np.median(size) / MEDIAN_RAYLEIGH / share, 0.02, 20.0)
-        )
-        self.problem.spread = float(np.sqrt(correlation(np.where(ok[:, None], e, 0.0), seen)))
+        noise = self.problem.noise
+        sigma_px = float(np.clip(noise.sigma_px * np.median(size) / MEDIAN_RAYLEIGH / share, 0.02, 20.0))
+        spread = float(np.sqrt(correlation(np.where(ok[:, None], e, 0.0), seen)))
+        self.problem.noise = noise._replace(sigma_px=sigma_px, spread=spread)
 
     def _dof(self, seen: Seen) -> int:
         return 2 * len(seen.frame) - 3 * len(seen.begin) - 2 * len(self.window.frames)
@@ -312,7 +295,7 @@ class Bundle:
             return None
         e, ok, _ = self.problem.pixel_errors(seen)
         self.seen = seen
-        inertial, jitter_s = links_left(w, links, self.problem.jitter_s, order, np.tril(root))
+        inertial, jitter_s = links_left(w, links, self.problem.noise.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])
@@ -321,9 +304,7 @@ class Bundle:
             squares,
             max(self._dof(seen), 1),
             inertial,
-            self.problem.sigma_px,
-            self.problem.spread,
-            jitter_s,
+            self.problem.noise._replace(jitter_s=jitter_s),
             steps,
             settled,
             int(good.sum()),
@@ -332,7 +313,6 @@ class Bundle:
             len(seen.begin),
             parallax_deg(w, seen),
             covariance[:own, :own],
-            self.problem.lens_px,
         )
 
 

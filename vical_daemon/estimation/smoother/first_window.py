@@ -9,10 +9,10 @@ from typing import NamedTuple
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, CalibrationOptions, CameraPrior
 from vical_daemon.estimation.model.state import Layout
-from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.handover import initial_prior, of_another_recording
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
+from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.shutter_axis import (
     read_by_columns,
     readout_sigmas,
@@ -26,27 +26,6 @@ from vical_daemon.estimation.smoother.window import Window
 _STEPS = 30  # of the adjustment, at most
 _INDEPENDENT = 2.0  # images; pixel errors that last for more than half a window: its model is wrong
 DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
-
-
-class Noise(NamedTuple):
-    """Noise of the images as the last window measured it.
-
-    Attributes:
-        sigma_px: Of a feature, px.
-        spread: How long its errors last.
-        jitter_s: Of the stamps, s.
-        lens_px: Misfit of the lens model, px.
-    """
-
-    sigma_px: float
-    spread: float = 1.0
-    jitter_s: float = 0.0
-    lens_px: float = SYSTEMATIC_PX
-
-    @classmethod
-    def of(cls, fit: Fit) -> Noise:
-        """Return that of an adjusted window."""
-        return cls(fit.sigma_px, fit.spread, fit.jitter_s, fit.lens_px)
 
 
 class Begun(NamedTuple):
@@ -76,7 +55,7 @@ class FirstWindow:
         self.initializer = TargetFreeInitializer(options, prior)
 
     def begin(
-        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None, noise: Noise
+        self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior | None, noise: ImageNoise
     ) -> Begun | str:
         """Start a window from a stretch, with the calibration of before where there is one; or why not."""
         window = self.initializer.window(buffer, frames, known)
@@ -101,7 +80,7 @@ class FirstWindow:
         buffer: ImuBuffer,
         window: Window,
         known: MarginalPrior | None,
-        noise: Noise,
+        noise: ImageNoise,
         reopened: Collection[int] = (),
     ) -> Begun | None:
         """Adjust a first window with what is known but for some errors; None where it does not fit."""
@@ -113,7 +92,7 @@ class FirstWindow:
                 bundle, carry, fit = by_columns
         if fit is None or not (fit.settled and self._status.fits(fit, first=True)):
             return None
-        if len(bundle.window.frames) < _INDEPENDENT * fit.spread**2:
+        if len(bundle.window.frames) < _INDEPENDENT * fit.noise.spread**2:
             return None
         if known is not None and not self._status.agrees(fit, carry, complete=False):
             return None
@@ -135,7 +114,7 @@ class FirstWindow:
         """
         if not self._seeks_axis or not shows_columns(bundle, fit):
             return None
-        found = self._solved(buffer, read_by_columns(bundle.window), None, Noise.of(fit), ())
+        found = self._solved(buffer, read_by_columns(bundle.window), None, fit.noise, ())
         if found[2] is None or not (found[2].settled and self._status.fits(found[2], first=True)):
             return None
         sure = self._status.models.rolls(found[2].carry, self._status.factor())
@@ -150,13 +129,13 @@ class FirstWindow:
         buffer: ImuBuffer,
         window: Window,
         known: MarginalPrior | None,
-        noise: Noise,
+        noise: ImageNoise,
         reopened: Collection[int],
     ) -> tuple[Bundle, MarginalPrior, Fit | None]:
         """Adjust a window with what is known but for some errors."""
         models, held = self._status.models, self.initializer.held
         carry = initial_prior(window, known, self._layout, held, models.imu_sigma, self._prior, reopened)
-        bundle = Bundle(window, carry, *noise)
+        bundle = Bundle(window, carry, noise)
         return bundle, carry, bundle.solve(buffer, _STEPS)
 
     def anew(self) -> None:

@@ -52,34 +52,38 @@ class Normal(NamedTuple):
     cost: float
 
 
+class ImageNoise(NamedTuple):
+    """Noise of the images of a window, as taken to be or as measured.
+
+    Attributes:
+        sigma_px: Of a feature, px.
+        spread: Square root of how many neighbouring images share an error of the pixels; see `correlation`.
+        jitter_s: Standard deviation of the images' stamps, s; 0: they are believed until links contradict.
+        lens_px: Misfit of the lens model, see `lens_misfit`, px.
+    """
+
+    sigma_px: float
+    spread: float = 1.0
+    jitter_s: float = 0.0
+    lens_px: float = SYSTEMATIC_PX
+
+
 class Problem:
     """Whitened errors of a window and their derivatives.
 
     Args:
         window: Present values.
         carry: What was known before.
-        sigma_px: Pixel noise.
-        spread: Square root of how many neighbouring images share an error of the pixels.
-        jitter_s: Standard deviation of the images' stamps, s.
-        lens_px: Misfit of the lens model, see `lens_misfit`, px.
+        noise: Of the images.
     """
 
-    def __init__(
-        self,
-        window: Window,
-        carry: MarginalPrior,
-        sigma_px: float,
-        spread: float,
-        jitter_s: float = 0.0,
-        lens_px: float = SYSTEMATIC_PX,
-    ) -> None:
-        self.window, self.carry, self.sigma_px, self.spread = window, carry, sigma_px, spread
-        self.jitter_s, self.lens_px = jitter_s, lens_px
+    def __init__(self, window: Window, carry: MarginalPrior, noise: ImageNoise) -> None:
+        self.window, self.carry, self.noise = window, carry, noise
         self.own = 0 if carry.layout.camera.intrinsics is None else len(window.own_lens)
         uv = np.concatenate([frame.uv_px for _, frame in window.frames])
         seen = patches_seen(uv, carry.camera.resolution)
         self.lens_root = (
-            patches(carry.camera, seen) / lens_px
+            patches(carry.camera, seen) / noise.lens_px
         )  # of the information in the prior of the own lens
 
     def order(self) -> Order:
@@ -126,7 +130,7 @@ class Problem:
 
     def _weigh(self, seen: Seen, uv: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
         ok: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
-        e = np.where(ok[:, None], (np.where(ok[:, None], uv, 0.0) - seen.uv) / self.sigma_px, 0.0)
+        e = np.where(ok[:, None], (np.where(ok[:, None], uv, 0.0) - seen.uv) / self.noise.sigma_px, 0.0)
         size = np.sqrt((e**2).sum(axis=1))
         weight = np.where(ok, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
         return e, ok, weight
@@ -138,12 +142,12 @@ class Problem:
         with np.errstate(all="ignore"):
             uv, Jy, Jlens = project_jacobians(y, *w.lens)
         e, ok, weight = self._weigh(seen, uv)
-        root = np.sqrt(weight) / (self.sigma_px * self.spread)
+        root = np.sqrt(weight) / (self.noise.sigma_px * self.noise.spread)
         Jy = np.where(ok[:, None, None], Jy, 0.0) * root[:, None, None]
         Jlens = np.where(ok[:, None, None], Jlens, 0.0) * root[:, None, None]
         e = e * np.sqrt(weight)[:, None]
-        cost = self._robust_cost(e, weight) / self.spread**2
-        e = e / self.spread
+        cost = self._robust_cost(e, weight) / self.noise.spread**2
+        e = e / self.noise.spread
         marks = w.landmarks
         rho = marks.inverse[seen.landmark][:, None, None]
         Rt = np.ascontiguousarray(np.swapaxes(R, 1, 2))  # three times as fast below
@@ -192,7 +196,7 @@ class Problem:
         size = np.bincount(seen.frame, (by_shift**2).sum(axis=1), F)
         late = np.bincount(seen.frame, (by_shift * e).sum(axis=1), F)
         shown = size > 0.0
-        return late[shown] / size[shown], self.spread**2 / size[shown]
+        return late[shown] / size[shown], self.noise.spread**2 / size[shown]
 
     def late_by_columns(self, seen: Seen) -> float:
         """By how much at least the squared errors would fall if columns were read one after the other.
@@ -203,7 +207,7 @@ class Problem:
         by_shift, e = self._whitened_by_shift(seen)
         by_column = by_shift * read_share(seen.uv, self.window.camera.resolution, COLUMNS)[:, None]
         size = float((by_column**2).sum())
-        return float((by_column * e).sum()) ** 2 / max(size, 1e-300) / self.spread**2
+        return float((by_column * e).sum()) ** 2 / max(size, 1e-300) / self.noise.spread**2
 
     def _whitened_by_shift(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
         """How pixels move with the exposure's time, and their errors, both over their noise, (N, 2) each."""
@@ -214,7 +218,7 @@ class Problem:
         e, ok, weight = self._weigh(seen, uv)
         JR = (np.where(ok[:, None, None], Jy, 0.0).reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)
         root = np.sqrt(weight)[:, None]
-        return self._by_shift(seen, JR, R, x_imu, rates) * root / self.sigma_px, e * root
+        return self._by_shift(seen, JR, R, x_imu, rates) * root / self.noise.sigma_px, e * root
 
     def _robust_cost(self, e: FloatArray, weight: FloatArray) -> float:
         """Sum of the Huber losses (e is weighted already: weight * size^2)."""
@@ -261,7 +265,7 @@ class Problem:
         W[:, :, 6 * F :] = own[:, :, 3:-1]
         by_frame = W[:, :, : 6 * F].reshape(L, 3, F, 6)  # the same memory
         by_frame[seen.landmark, :, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf  # seen once in an image
-        cost += add_links(w, links, self.jitter_s, order, H, g)
+        cost += add_links(w, links, self.noise.jitter_s, order, H, g)
         cost += self._add_prior(H, g, order) + self._add_own_lens(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 

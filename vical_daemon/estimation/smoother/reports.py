@@ -21,7 +21,7 @@ def window_reports(problem: Problem, seen: Seen) -> list[FrameReport]:
     """
     window = problem.window
     e, ok, _ = problem.pixel_errors(seen)
-    residual = np.where(ok[:, None], -e * problem.sigma_px, np.nan)
+    residual = np.where(ok[:, None], -e * problem.noise.sigma_px, np.nan)
     out = []
     ends = np.append(seen.frame_begin[1:], len(seen.frame))
     for frame, begin, end in zip(seen.frames_with, seen.frame_begin, ends, strict=True):
@@ -39,7 +39,7 @@ def window_reports(problem: Problem, seen: Seen) -> list[FrameReport]:
                 True,
                 squares,
                 2 * int(ok[rows].sum()),
-                problem.sigma_px,
+                problem.noise.sigma_px,
             )
         )
     return out

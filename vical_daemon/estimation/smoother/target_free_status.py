@@ -159,8 +159,8 @@ class TargetFreeStatus(Evaluator):
         share = fit.refused / max(fit.used + fit.refused, 1)
         usual = _MOST_SIGMA_PX if first or not self._sigma_px else max(_MOST_SIGMA_PX, 3.0 * self._sigma_px)
         self.misfit = Cause.NONE, 0.0
-        if fit.sigma_px > usual:
-            self.misfit = Cause.FEATURES_MISS, float(fit.sigma_px)
+        if fit.noise.sigma_px > usual:
+            self.misfit = Cause.FEATURES_MISS, float(fit.noise.sigma_px)
         elif fit.inertial > _MOST_INERTIAL:
             self.misfit = Cause.INERTIAL_MISFIT, float(fit.inertial)
         elif share > _MOST_REFUSED:
@@ -169,7 +169,7 @@ class TargetFreeStatus(Evaluator):
 
     def saw_fit(self, fit: Fit, t_s: float) -> None:
         """Take the result of an adjustment."""
-        self._now_s, self._sigma_px, self.jitter_s = t_s, fit.sigma_px, fit.jitter_s
+        self._now_s, self._sigma_px, self.jitter_s = t_s, fit.noise.sigma_px, fit.noise.jitter_s
         self._pixels.append((fit.squares, fit.dof))
         self._refused.append((fit.refused, fit.used + fit.refused))
         self.announce_all(self.models.watch(fit.carry, self.factor(), bool(self._squares)))

@@ -25,6 +25,7 @@ from vical_daemon.estimation.smoother.handover import initial_prior
 from vical_daemon.estimation.smoother.inertial import Order
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.marginal_prior import CORE, first_carry, later
+from vical_daemon.estimation.smoother.normal import ImageNoise
 from vical_daemon.estimation.smoother.quality import correlation
 from vical_daemon.estimation.smoother.track_start import ArmPrior, TrackStart
 from vical_daemon.estimation.temporal.epipolar_fit import epipolar_fit
@@ -35,7 +36,7 @@ SHIFT_S = 0.013
 def bundle_of(window, layout, sigma_px):
     """A window about which next to nothing is known, to be adjusted."""
     sigmas = start_sigmas(layout, {NAME: window.camera}, WINDOW_START, imu_sigma=0.01)
-    return Bundle(window, first_carry(window, window.camera, layout, sigmas), sigma_px)
+    return Bundle(window, first_carry(window, window.camera, layout, sigmas), ImageNoise(sigma_px))
 
 
 class Scene:
@@ -309,8 +310,8 @@ def test_adjusted_window_is_right_within_its_own_sigmas(scene):
     P = fit.carry.covariance()[CORE:, CORE:]
     assert error @ np.linalg.solve(P, error) < 26.1  # chi-square, 8 degrees of freedom, 99.9 %
     assert np.sqrt(np.diag(P))[:3].max() < 2e-3
-    assert fit.sigma_px == pytest.approx(0.5, rel=0.06)
-    assert fit.spread < 1.15
+    assert fit.noise.sigma_px == pytest.approx(0.5, rel=0.06)
+    assert fit.noise.spread < 1.15
 
 
 def test_a_drift_carries_into_the_time_shift_of_the_next_window(scene):
