@@ -14,11 +14,16 @@ from benchmarks.ablation_patches import (
     WRONG,
     Mechanism,
     gives,
+    put,
+    then,
 )
 from vical_daemon.estimation import target_free
 from vical_daemon.estimation.model import start_sigmas
+from vical_daemon.estimation.noise.lens_misfit import LensMisfit
 from vical_daemon.estimation.smoother import (
+    alternative_models,
     bundle,
+    clock_changes,
     handover,
     normal,
     quality,
@@ -89,6 +94,53 @@ FREE: dict[str, Mechanism] = {
         free=True,
         faults=("free: skew 100 ppm",),
         disturbances=("nothing", DRIFTS, "5 ms"),
+    ),
+    "free: step within a stretch": Mechanism(
+        MOVED,
+        "a step between two boundaries is a hypothesis of its own",
+        lambda: [(clock_changes, "_KINDS", clock_changes._KINDS[:2] + clock_changes._KINDS[3:])],
+        free=True,
+        disturbances=("nothing", DRIFTS, "5 ms", "20 ms"),
+    ),
+    "free: eight jumps": Mechanism(
+        MOVED,
+        "of the clocks at boundaries between windows; without: three",
+        lambda: [(clock_changes, "REMEMBERED", 3)],
+        free=True,
+        faults=("free: skew 100 ppm",),
+        disturbances=("nothing", DRIFTS, "5 ms", "20 ms"),
+    ),
+    "free: windows show": Mechanism(
+        MOVED,
+        "a change is decided when two windows follow it",
+        lambda: [(alternative_models, "_WINDOWS_SHOW", 0)],
+        free=True,
+        faults=("free: skew 100 ppm",),
+        disturbances=("nothing", DRIFTS, "5 ms", "20 ms"),
+    ),
+    "free: own lens": Mechanism(
+        SMALL,
+        "each window has a lens of its own about the common one",
+        lambda: [then(normal.Problem, "__init__", put(own=0))],
+        **_RULE,
+    ),
+    "free: own lens, size": Mechanism(
+        SMALL,
+        "how far it may be from the common one is measured",
+        lambda: [(LensMisfit, "learn", gives(None))],
+        **_RULE,
+    ),
+    "free: own lens, where seen": Mechanism(
+        SMALL,
+        "patches without features do not count",
+        lambda: [(normal, "patches_seen", gives(None))],
+        **_RULE,
+    ),
+    "free: parallax": Mechanism(
+        WRONG,
+        "windows whose rays hardly cross are given up",
+        lambda: [(target_free, "_MIN_PARALLAX_DEG", 0.0)],
+        **_RULE,
     ),
     "free: walk of the delay": Mechanism(
         MOVED,

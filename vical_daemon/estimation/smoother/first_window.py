@@ -24,7 +24,6 @@ from vical_daemon.estimation.smoother.waiting_tracks import Stamped
 from vical_daemon.estimation.smoother.window import Window
 
 _STEPS = 30  # of the adjustment, at most
-_INDEPENDENT = 2.0  # images; pixel errors that last for more than half a window: its model is wrong
 DOES_NOT_FIT = "the first seconds do not fit together yet: keep moving in all directions"
 
 
@@ -91,8 +90,6 @@ class FirstWindow:
             if by_columns[2] is not None and readout_sigmas(by_columns[2].carry) > readout_sigmas(fit.carry):
                 bundle, carry, fit = by_columns
         if fit is None or not (fit.settled and self._status.fits(fit, first=True)):
-            return None
-        if len(bundle.window.frames) < _INDEPENDENT * fit.noise.spread**2:
             return None
         if known is not None and not self._status.agrees(fit, carry, complete=False):
             return None
