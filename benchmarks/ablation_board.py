@@ -213,10 +213,10 @@ BOARD: dict[str, Mechanism] = {
         lambda: [(calibrator, "_PROVEN_S", 0.0)],
         disturbances=KEPT,
     ),
-    "plausible state": Mechanism(
+    "finite state": Mechanism(
         WRONG,
-        "a state no rig can have: start anew",
-        lambda: [(CalibrationFilter, "plausible", gives(True))],
+        "numbers that are not finite: start anew",
+        lambda: [(CalibrationFilter, "finite", gives(True))],
         disturbances=STEPS,
     ),
     "status: refused or large innovations": Mechanism(

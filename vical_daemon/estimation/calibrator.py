@@ -324,7 +324,7 @@ class Calibrator:
         needed_s = min(f.state.t_s, self._initializer.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
         self._ask_held_back(f, frame, t_cam_s)
-        if not f.plausible():
+        if not f.finite():
             self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
             self._restart(f)
             return [report]
@@ -413,7 +413,7 @@ class Calibrator:
             self._initializer.anew()
             return
         before = self._past.filter(f)
-        sound = before if before.plausible() and f.state.t_s > self._kept_until_s else None
+        sound = before if before.finite() and f.state.t_s > self._kept_until_s else None
         if sound is not None:
             self.rig.start_from_lenses_of(sound.state)
         self._unproven = None

@@ -237,7 +237,7 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.STORED_DIFFERS: lambda _: "since the stored calibration",
     Cause.IMAGES_REFUSED: lambda _: "images no longer fit the motion, even with the pose taken anew",
     Cause.IMAGES_DISAGREE: lambda _: "images have come to disagree with the motion: the camera moved",
-    Cause.ESTIMATE_IMPLAUSIBLE: lambda _: "the estimate left the range of what a rig can be",
+    Cause.ESTIMATE_IMPLAUSIBLE: lambda _: "the estimate is not finite",
     Cause.CALIBRATION_CONTRADICTED: lambda _: (
         "the last seconds move the calibration by more than the sigmas allow"
     ),

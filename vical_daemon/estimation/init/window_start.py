@@ -87,7 +87,7 @@ def window_start(
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
-    if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().plausible():
+    if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().finite():
         return None
     out = window.filter(make(deepcopy(state)))
     out.corner_noise, out.shared, out.consistency = trial.corner_noise, trial.shared, trial.consistency

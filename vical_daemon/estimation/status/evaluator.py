@@ -166,16 +166,23 @@ class Evaluator:
             return Verdict(Status.INCONSISTENT, f"{cause_text(self.bumped)}; calibrating anew: {self.reason}")
         if not self.imu_samples:
             return Verdict(Status.WAITING, "no inertial data yet")
-        size = float(np.median(self._size)) if len(self._size) >= 20 else 0.0
-        if 0.7 < size < 1.4:
-            trouble = f"specific force has a median size of {size:.2f}: "
-            return Verdict(Status.INCONSISTENT, trouble + "is the accelerometer in g instead of m/s^2?")
+        trouble = self._unit_trouble()
+        if trouble:
+            return Verdict(Status.INCONSISTENT, trouble)
         if self.first_frame_s is None:
             return Verdict(Status.WAITING, self._nothing_seen)
         if self.motion_missing and self.elapsed_s - self.first_frame_s > PATIENCE_S:
             advice = excitation_advice(self.motion, None) or ALL_WAYS
             return Verdict(Status.DEGENERATE, self.reason, advice)
         return Verdict(Status.INITIALISING, self.reason or "collecting the first seconds")
+
+    def _unit_trouble(self) -> str:
+        size = float(np.median(self._size)) if len(self._size) >= 20 else 0.0
+        if 0.7 < size < 1.4:
+            return (
+                f"specific force has a median size of {size:.2f}: is the accelerometer in g instead of m/s^2?"
+            )
+        return ""
 
     @staticmethod
     def _once_known(*, enough: bool, doubt: str, pause: str = "") -> Verdict:
