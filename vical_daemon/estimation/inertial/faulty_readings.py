@@ -143,27 +143,55 @@ class SpikeFilter(Generic[T]):
     a shock shows in gyro and accelerometer, and a motion goes on. If the next one is not back, either, the
     one after them decides about both.
 
+    The first readings say how large errors of the prediction usually are, so they are taken at once and looked
+    at when there are enough of them: backwards in time, then forwards.
+
+    Args:
+        usual: Error of the prediction, gyro rad/s, accelerometer m/s^2; None: the first readings say it.
+
     Attributes:
         held: The readings that are held, two at most, with whatever was given along.
         spikes: Readings left out.
+        late: Items of those of them that had been taken.
     """
 
-    def __init__(self) -> None:
-        self.held: list[tuple[Six, T]] = []
+    def __init__(self, usual: tuple[float, float] | None = None) -> None:
         self.spikes = 0
+        self._begin(usual)
+
+    def _begin(self, usual: tuple[float, float] | None) -> None:
+        self.held: list[tuple[Six, T]] = []
+        self.late: list[T] = []
+        self._first: list[tuple[Six, T]] | None = [] if usual is None else None
         self._last: Six = (math.nan,) * 6
         self._before: Six = (math.nan,) * 6
-        self._largest = [0.0, 0.0]  # error of prediction of late: gyro rad/s, accelerometer m/s^2
-        self._first: list[tuple[float, float]] = []
-        self._count = 0
+        self._largest = usual or (0.0, 0.0)  # error of prediction of late: gyro rad/s, accelerometer m/s^2
 
     def restart(self) -> None:
         """Another recording follows: its first readings do not go on from the last ones."""
-        self.held, self._count = [], 0
-        self._last = self._before = (math.nan,) * 6
+        self._begin(None)
 
     def sift(self, six: Six, item: T) -> list[T]:
         """Take a reading (rad/s, m/s^2) and return the items of those that are good, in order."""
+        if self._first is None:
+            return self._sifted(six, item)
+        self._first.append((six, item))
+        if len(self._first) < LEARN:
+            return [item]
+        first, self._first = self._first, None
+        missed = [_apart(first[k][0], _line(first[k - 1][0], first[k - 2][0])) for k in range(2, LEARN)]
+        gyro, accel = (2.0 * np.median(missed, axis=0)).tolist()
+        self._largest = gyro, accel
+        backwards: SpikeFilter[tuple[Six, T]] = SpikeFilter(self._largest)
+        good = [x for one in reversed(first) for x in backwards.sift(one[0], one)]
+        taken = [x for one in reversed(good) for x in self._sifted(*one)]
+        self.held = [x for x in self.held if x[1] == item]
+        out = [x for _, x in first if x not in taken and not (self.held and x == item)]
+        self.spikes += len(out)
+        self.late = [x for x in out if x != item]
+        return [item] if item in taken else []
+
+    def _sifted(self, six: Six, item: T) -> list[T]:
         if self.held:
             first = self.held[0][0]
             back, off = _apart(six, self._last), _apart(first, self._last)
@@ -183,7 +211,7 @@ class SpikeFilter(Generic[T]):
                 self._note(good, self._missed(good))
             return [x for _, x in released]
         missed = self._missed(six)
-        if len(self._first) >= LEARN and self._stands_out(missed):
+        if self._stands_out(missed):
             self.held = [(six, item)]
             return []
         self._note(six, missed)
@@ -200,24 +228,23 @@ class SpikeFilter(Generic[T]):
 
         A straight line over several steps misses a bend of the motion by the sum of their numbers.
         """
-        line = [a + steps * (a - b) for a, b in zip(self._last, self._before, strict=True)]
-        gyro, accel = _apart(six, line)
+        gyro, accel = _apart(six, _line(self._last, self._before, steps))
         more = 0.5 * steps * (steps + 1)
         return gyro / more, accel / more
 
     def _note(self, six: Six, missed: tuple[float, float]) -> None:
-        if self._count >= 2:
-            if len(self._first) < LEARN:  # there may be spikes among the first readings
-                self._first.append(missed)
-                self._largest = (2.0 * np.median(self._first, axis=0)).tolist()
-            else:  # one that was not noticed at most doubles it
-                (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
-                self._largest = [
-                    max(min(gyro, 2.0 * usual_gyro), _FADES * usual_gyro),
-                    max(min(accel, 2.0 * usual_accel), _FADES * usual_accel),
-                ]
+        if not math.isnan(missed[0]):  # one that was not noticed at most doubles it
+            (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
+            self._largest = (
+                max(min(gyro, 2.0 * usual_gyro), _FADES * usual_gyro),
+                max(min(accel, 2.0 * usual_accel), _FADES * usual_accel),
+            )
         self._before, self._last = self._last, six
-        self._count += 1
+
+
+def _line(last: Six, before: Six, steps: int = 1) -> Six:
+    """Where a straight line through two readings is some steps later."""
+    return [a + steps * (a - b) for a, b in zip(last, before, strict=True)]
 
 
 def _apart(a: Six, b: Six) -> tuple[float, float]:

@@ -126,6 +126,9 @@ class ImuIntake:
         for good_ns, good in self._spikes.sift(six, (t_imu_ns, six)):
             for bridged in self._bridged_over(self.buffer, good_ns, good):
                 added += self._place(self.buffer, bridged)
+        for spike_ns, _ in self._spikes.late:
+            self.buffer.remove((spike_ns - self.base_ns) * 1e-9 + self._set_back_s)
+        self._spikes.late = []
         return added
 
     def _bridged_over(self, buffer: ImuBuffer, t_imu_ns: int, six: Six) -> list[Bridged]:
