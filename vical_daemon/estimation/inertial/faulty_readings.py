@@ -143,8 +143,8 @@ class SpikeFilter(Generic[T]):
     a shock shows in gyro and accelerometer, and a motion goes on. If the next one is not back, either, the
     one after them decides about both.
 
-    The first readings say how large errors of the prediction usually are, so they are taken at once and looked
-    at when there are enough of them: backwards in time, then forwards.
+    The first readings say how large errors of the prediction usually are, so they are taken at once, and
+    looked at when there are enough of them: backwards in time, then forwards.
 
     Args:
         usual: Error of the prediction, gyro rad/s, accelerometer m/s^2; None: the first readings say it.
