@@ -88,6 +88,11 @@ class _Run:
         """Whether its end is no longer waited for."""
         return self._apart_ns(0) > _LONGEST_NS
 
+    @property
+    def has_just_begun(self) -> bool:
+        """Whether the motion cannot be far beyond the range yet."""
+        return self._apart_ns(0) < _SIDE_NS
+
     def _apart_ns(self, first: int) -> int:
         return self.readings[-1].t_ns - self.readings[first].t_ns
 
@@ -162,17 +167,16 @@ class ClippedReadings:
         t_ns = np.array([*(t for t, _ in run.before), *(x.t_ns for x in run.readings)])
         values = np.array([*(x for _, x in run.before), *(x.six[channel] for x in run.readings)])
         clipped = np.array([False] * len(run.before) + run.clipped)
-        beyond, missed = (
-            np.full(len(t_ns), 0.5 * abs(rail)),
-            0.0,
-        )  # without an end: anything up to twice the range
+        # without an end: anything up to twice the range, and just beyond it where the run has only begun
+        half, missed = 0.5 * abs(rail), 0.0
+        beyond = np.full(len(t_ns), 0.0 if run.has_just_begun else half)
         if run.after >= _LEAST and len(run.before) >= _LEAST:
             u = (t_ns - t_ns[0]) / (t_ns[-1] - t_ns[0])
             powers = np.stack([np.ones_like(u), u, u * u, u**3], axis=1)
             cubic = powers @ np.linalg.pinv(powers[~clipped])
             beyond = np.copysign(1.0, rail) * (cubic @ values[~clipped] - rail)
-            missed = self._missed(channel, clipped, cubic)
-        sigma = math.hypot(_EVEN * float(np.abs(beyond[clipped]).max()), missed)
+            half, missed = float(np.abs(beyond[clipped]).max()), self._missed(channel, clipped, cubic)
+        sigma = math.hypot(_EVEN * half, missed)
         for reading, off, is_clipped in zip(
             run.readings, beyond[len(run.before) :], run.clipped, strict=True
         ):

@@ -22,6 +22,8 @@ _AT_RANGE = 8
 so many steps of its resolution at once to get there: a coarse channel at rest repeats its extreme, too."""
 _STOPS = 4
 """A channel in motion that stops for so many readings is at its range: noise and motion would go on."""
+_MOST = 0.75
+"""Of the first readings, in which the other channels must change while one stops."""
 _OFTEN = 4.0
 """Times as often as a value close to it must the extreme occur: without clipping it is the rarest of them."""
 _NEAR = 0.9
@@ -45,7 +47,8 @@ class RangeLimits(Generic[T]):
     The six channels are followed upwards and downwards. A value that comes back again and again as the
     extreme of one of them is the end of the range, for all three channels of that sensor. So is one at which
     a channel stops in full motion: it comes there over many of its steps at once, and stays. Readings that
-    repeat such a value are held until it is decided. A larger value later shows that it was not the end.
+    repeat such a value are held until it is decided. A stream whose first readings repeat one channel, while
+    the others of that sensor change, begins at the end. A larger value later shows that it was not the end.
 
     Attributes:
         found: How often an end was found.
@@ -61,6 +64,7 @@ class RangeLimits(Generic[T]):
         self._step = [math.inf] * 2  # smallest change of a channel of each sensor: its resolution, or more
         self._previous: Six = (math.nan,) * 6
         self._held: list[tuple[Six, T]] = []
+        self._first: list[Six] = []
         self.found = 0
 
     def sift(self, six: Six, item: T) -> list[tuple[Six, T, tuple[int, ...]]]:
@@ -83,6 +87,9 @@ class RangeLimits(Generic[T]):
                     waiting = max(waiting, self._stays[i])
             elif self._stays[i]:
                 self._stays[i] = 0
+        if len(self._first) <= _AT_RANGE:
+            self._first.append(six)
+            self._begins_at_range()
         self._previous = six
         self._held.append((six, item))
         decided = max(len(self._held) - waiting, 0)
@@ -127,6 +134,17 @@ class RangeLimits(Generic[T]):
             clips = self._stays[i] >= _STOPS or self._returns(i)
             self.found += clips and not self._clips[i]
             self._clips[i] |= clips
+
+    def _begins_at_range(self) -> None:
+        """Find out whether a channel has been at the end of its range since the stream began."""
+        if len(self._first) <= _AT_RANGE:
+            return
+        changes = np.count_nonzero(np.diff(self._first, axis=0), axis=0)
+        for channel in np.flatnonzero(changes == 0).tolist():
+            others = np.delete(changes[channel // 3 * 3 :][:3], channel % 3)
+            if others.min() >= _MOST * _AT_RANGE:
+                self._clips[channel if self._first[0][channel] > 0.0 else channel + 6] = True
+                self.found += 1
 
     def _returns(self, i: int) -> bool:
         """Whether the extreme of a channel has come back more often than an extreme does."""

@@ -218,7 +218,7 @@ class Influence(NamedTuple):
         return covariance
 
     def by_clipping(self) -> FloatArray | None:
-        """Return one sigma of the end by what clipped readings of each channel miss, shape (9, 6), or None."""
+        """Return one sigma of the end by what clipped readings of a channel miss, shape (9, 6), or None."""
         if self.clipping_sigma is None:
             return None
         return np.asarray(np.einsum("kij,kj->ij", self.at, self.weights[:, None] * self.clipping_sigma))

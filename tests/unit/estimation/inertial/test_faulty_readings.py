@@ -65,6 +65,27 @@ def test_a_larger_value_shows_that_the_range_is_wider() -> None:
     assert found[len(six) // 2 + 200 :].mean() < 0.01
 
 
+@pytest.mark.parametrize(("noise", "sign"), [(1e-3, 1.0), (0.0, -1.0)])
+def test_a_stream_that_begins_at_the_end_of_its_range_shows_it(noise, sign) -> None:
+    six = motion()[:100]
+    six[:, 0] = 1.5 * np.cos(np.arange(100) * 0.05)
+    six[:, 1:] += np.random.default_rng(5).normal(0.0, noise, (100, 5))
+    clipped = six[:, 0] > 1.0
+    six[:, 0] = sign * np.minimum(six[:, 0], 1.0)
+    intake, _ = take(six)
+    assert intake.left_out["imu_clipped"] == clipped.sum()
+
+
+def test_a_coarse_sensor_that_rests_at_first_is_not_at_its_range() -> None:
+    six = np.tile([0.01, 0.01, 0.01, 9.81, 0.01, 0.01], (300, 1))
+    six[100:, 2] -= 0.1 * np.arange(200) % 1.0  # turns about one axis, and tilts at last
+    six[200:, 0] -= 0.2
+    limits: RangeLimits[int] = RangeLimits()
+    assert not any(
+        0 in channels for k, row in enumerate(six.tolist()) for *_, channels in limits.sift(row, k)
+    )
+
+
 def sifted(six: np.ndarray) -> list[int]:
     spikes: SpikeFilter[int] = SpikeFilter()
     taken = [k for i, row in enumerate(six.tolist()) for k in spikes.sift(row, i)]
