@@ -145,7 +145,7 @@ class ClippedReadings:
                 del self._runs[channel]
 
     def _before(self, t_ns: int, channel: int) -> list[tuple[int, float]]:
-        near = []
+        near: list[tuple[int, float]] = []
         for s, six, _ in reversed(self._recent):
             if s < t_ns - (_SIDE_NS if len(near) >= _LEAST else _LONGEST_NS):
                 break
