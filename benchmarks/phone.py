@@ -1,7 +1,8 @@
 """A tablet held upright, without a board: the whole recording, its halves, and stretches of it.
 
-The recording is `iphone_tracks`, in truth of an iPad. Each stretch is calibrated alone, with nothing known but
-the lens of the file of start values. "z": differences of fx fy cx cy from what is known, over the stated sigmas.
+The recording is `iphone_tracks`, in truth of an iPad. Each stretch is calibrated alone, with nothing known
+but the lens of the file of start values. "z": differences of fx fy cx cy from what is known, over the stated
+sigmas.
 """
 
 from __future__ import annotations
