@@ -195,3 +195,14 @@ def test_a_spike_among_the_first_readings_leaves_the_buffer() -> None:
     assert intake.left_out["imu_spikes"] == 3
     assert intake.buffer is not None
     assert np.array_equal(intake.buffer.rows[:, 1:], np.delete(six, [0, 7, 15], axis=0))
+
+
+def test_more_clipping_than_announced_is_announced_again() -> None:
+    six = motion(40.0)
+    six[2000:, :3] *= 1.5
+    intake, shares = ImuIntake(), []
+    for i, row in enumerate(np.clip(six, [-1.9] * 3 + [-99.0] * 3, [1.9] * 3 + [99.0] * 3)):
+        intake.take(round(i * 1e9 / RATE_HZ), row[:3], row[3:])
+        shares += [event.value for event in intake.news() if event.kind is EventKind.IMU_CLIPPED]
+    assert len(shares) == 2
+    assert shares[1] == pytest.approx((np.abs(six[2000:, :3]) > 1.9).any(axis=1).mean(), abs=0.1)
