@@ -1,7 +1,8 @@
-"""A phone held upright, without a board: the whole recording, its halves, and stretches of it.
+"""A tablet held upright, without a board: the whole recording, its halves, and stretches of it.
 
-The recording is `iphone_tracks`. Each stretch is calibrated alone, with nothing known but the lens of the
-file of start values. "z": differences of fx fy cx cy from what is known, over the stated sigmas.
+The recording is `iphone_tracks`, in truth of an iPad. Each stretch is calibrated alone, with nothing known
+but the lens of the file of start values. "z": differences of fx fy cx cy from what is known, over the stated
+sigmas.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "real" / "iphone_tracks"
 KNOWN_LENS = np.array([567.0, 567.0, 240.0, 320.0])  # published f, centre of the picture
-KNOWN_R = np.diag([1.0, -1.0, -1.0])  # axes of phone and camera, to some degrees
+KNOWN_R = np.diag([1.0, -1.0, -1.0])  # axes of device and camera, to some degrees
 HALF_S = 18.4
 
 

@@ -34,7 +34,7 @@ def announced(record):
     ("seed", "size", "lens_known"),
     [
         *[(1, 0.97, False), (2, 0.97, True), (1, 1.3, False), (3, 1.1, True)],
-        *[(2, 0.2, False), (1, 0.5, True), (3, 2.0, False), (1, 5.0, False)],
+        *[(2, 0.1, False), (1, 0.5, True), (3, 2.0, False), (1, 10.0, False)],
     ],
 )
 def test_it_is_told_and_every_answer_is_right(seed, size, lens_known):

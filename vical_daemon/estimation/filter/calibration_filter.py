@@ -84,6 +84,7 @@ class CalibrationFilter:
         began_s: When the data of this filter begin, s.
         arm_score: Bias of lever arms by noise of the gyro; None: no image yet, or the motion was lost.
         arm_scores: What it has given so far, 1/m, shape (3 cameras,); 0: nothing yet.
+        by_clipping: See `Influence`, of the latest segment.
     """
 
     state: State
@@ -104,6 +105,7 @@ class CalibrationFilter:
     began_s: float = 0.0
     arm_score: LeverArmScore | None = None
     arm_scores: FloatArray | float = 0.0
+    by_clipping: FloatArray | None = None
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
     _view_straight: dict[str, LinearityMonitor] = field(default_factory=dict)
 
@@ -115,6 +117,7 @@ class CalibrationFilter:
             return
         state = self.state
         moved, Q = self._moved(segment)
+        self.by_clipping = moved.influence.by_clipping()
         self._grow(moved, Q)
         self._predict_score(moved, Q)
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
@@ -189,7 +192,12 @@ class CalibrationFilter:
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
         self.consistency[image.camera].learn(
-            lin.z[keep], innovation[keep], lin.ways[rows_of(keep)], lin.moves, image.sigma_px[keep]
+            lin.z[keep],
+            innovation[keep],
+            lin.ways[rows_of(keep)],
+            lin.moves,
+            image.sigma_px[keep],
+            None if self.by_clipping is None else lin.by_error[:, :9] @ self.by_clipping,
         )
         return FrameReport(
             image.t_ns,

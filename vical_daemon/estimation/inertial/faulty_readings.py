@@ -22,6 +22,8 @@ _AT_RANGE = 8
 so many steps of its resolution at once to get there: a coarse channel at rest repeats its extreme, too."""
 _STOPS = 4
 """A channel in motion that stops for so many readings is at its range: noise and motion would go on."""
+_MOST = 0.75
+"""Of the first readings, in which the other channels must change while one stops."""
 _OFTEN = 4.0
 """Times as often as a value close to it must the extreme occur: without clipping it is the rarest of them."""
 _NEAR = 0.9
@@ -45,7 +47,8 @@ class RangeLimits(Generic[T]):
     The six channels are followed upwards and downwards. A value that comes back again and again as the
     extreme of one of them is the end of the range, for all three channels of that sensor. So is one at which
     a channel stops in full motion: it comes there over many of its steps at once, and stays. Readings that
-    repeat such a value are held until it is decided. A larger value later shows that it was not the end.
+    repeat such a value are held until it is decided. A stream whose first readings repeat one channel, while
+    the others of that sensor change, begins at the end. A larger value later shows that it was not the end.
 
     Attributes:
         found: How often an end was found.
@@ -61,6 +64,7 @@ class RangeLimits(Generic[T]):
         self._step = [math.inf] * 2  # smallest change of a channel of each sensor: its resolution, or more
         self._previous: Six = (math.nan,) * 6
         self._held: list[tuple[Six, T]] = []
+        self._first: list[Six] = []
         self.found = 0
 
     def sift(self, six: Six, item: T) -> list[tuple[Six, T, tuple[int, ...]]]:
@@ -83,6 +87,9 @@ class RangeLimits(Generic[T]):
                     waiting = max(waiting, self._stays[i])
             elif self._stays[i]:
                 self._stays[i] = 0
+        if len(self._first) <= _AT_RANGE:
+            self._first.append(six)
+            self._begins_at_range()
         self._previous = six
         self._held.append((six, item))
         decided = max(len(self._held) - waiting, 0)
@@ -128,6 +135,17 @@ class RangeLimits(Generic[T]):
             self.found += clips and not self._clips[i]
             self._clips[i] |= clips
 
+    def _begins_at_range(self) -> None:
+        """Find out whether a channel has been at the end of its range since the stream began."""
+        if len(self._first) <= _AT_RANGE:
+            return
+        changes = np.count_nonzero(np.diff(self._first, axis=0), axis=0)
+        for channel in np.flatnonzero(changes == 0).tolist():
+            others = np.delete(changes[channel // 3 * 3 :][:3], channel % 3)
+            if others.min() >= _MOST * _AT_RANGE:
+                self._clips[channel if self._first[0][channel] > 0.0 else channel + 6] = True
+                self.found += 1
+
     def _returns(self, i: int) -> bool:
         """Whether the extreme of a channel has come back more often than an extreme does."""
         values = self._values[i]
@@ -143,27 +161,55 @@ class SpikeFilter(Generic[T]):
     a shock shows in gyro and accelerometer, and a motion goes on. If the next one is not back, either, the
     one after them decides about both.
 
+    The first readings say how large errors of the prediction usually are, so they are taken at once, and
+    looked at when there are enough of them: backwards in time, then forwards.
+
+    Args:
+        usual: Error of the prediction, gyro rad/s, accelerometer m/s^2; None: the first readings say it.
+
     Attributes:
         held: The readings that are held, two at most, with whatever was given along.
         spikes: Readings left out.
+        late: Items of those of them that had been taken.
     """
 
-    def __init__(self) -> None:
-        self.held: list[tuple[Six, T]] = []
+    def __init__(self, usual: tuple[float, float] | None = None) -> None:
         self.spikes = 0
+        self._begin(usual)
+
+    def _begin(self, usual: tuple[float, float] | None) -> None:
+        self.held: list[tuple[Six, T]] = []
+        self.late: list[T] = []
+        self._first: list[tuple[Six, T]] | None = [] if usual is None else None
         self._last: Six = (math.nan,) * 6
         self._before: Six = (math.nan,) * 6
-        self._largest = [0.0, 0.0]  # error of prediction of late: gyro rad/s, accelerometer m/s^2
-        self._first: list[tuple[float, float]] = []
-        self._count = 0
+        self._largest = usual or (0.0, 0.0)  # error of prediction of late: gyro rad/s, accelerometer m/s^2
 
     def restart(self) -> None:
         """Another recording follows: its first readings do not go on from the last ones."""
-        self.held, self._count = [], 0
-        self._last = self._before = (math.nan,) * 6
+        self._begin(None)
 
     def sift(self, six: Six, item: T) -> list[T]:
         """Take a reading (rad/s, m/s^2) and return the items of those that are good, in order."""
+        if self._first is None:
+            return self._sifted(six, item)
+        self._first.append((six, item))
+        if len(self._first) < LEARN:
+            return [item]
+        first, self._first = self._first, None
+        missed = [_apart(first[k][0], _line(first[k - 1][0], first[k - 2][0])) for k in range(2, LEARN)]
+        gyro, accel = (2.0 * np.median(missed, axis=0)).tolist()
+        self._largest = gyro, accel
+        backwards: SpikeFilter[tuple[Six, T]] = SpikeFilter(self._largest)
+        good = [x for one in reversed(first) for x in backwards.sift(one[0], one)]
+        taken = [x for one in reversed(good) for x in self._sifted(*one)]
+        self.held = [x for x in self.held if x[1] == item]
+        out = [x for _, x in first if x not in taken and not (self.held and x == item)]
+        self.spikes += len(out)
+        self.late = [x for x in out if x != item]
+        return [item] if item in taken else []
+
+    def _sifted(self, six: Six, item: T) -> list[T]:
         if self.held:
             first = self.held[0][0]
             back, off = _apart(six, self._last), _apart(first, self._last)
@@ -183,7 +229,7 @@ class SpikeFilter(Generic[T]):
                 self._note(good, self._missed(good))
             return [x for _, x in released]
         missed = self._missed(six)
-        if len(self._first) >= LEARN and self._stands_out(missed):
+        if self._stands_out(missed):
             self.held = [(six, item)]
             return []
         self._note(six, missed)
@@ -200,24 +246,23 @@ class SpikeFilter(Generic[T]):
 
         A straight line over several steps misses a bend of the motion by the sum of their numbers.
         """
-        line = [a + steps * (a - b) for a, b in zip(self._last, self._before, strict=True)]
-        gyro, accel = _apart(six, line)
+        gyro, accel = _apart(six, _line(self._last, self._before, steps))
         more = 0.5 * steps * (steps + 1)
         return gyro / more, accel / more
 
     def _note(self, six: Six, missed: tuple[float, float]) -> None:
-        if self._count >= 2:
-            if len(self._first) < LEARN:  # there may be spikes among the first readings
-                self._first.append(missed)
-                self._largest = (2.0 * np.median(self._first, axis=0)).tolist()
-            else:  # one that was not noticed at most doubles it
-                (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
-                self._largest = [
-                    max(min(gyro, 2.0 * usual_gyro), _FADES * usual_gyro),
-                    max(min(accel, 2.0 * usual_accel), _FADES * usual_accel),
-                ]
+        if not math.isnan(missed[0]):  # one that was not noticed at most doubles it
+            (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
+            self._largest = (
+                max(min(gyro, 2.0 * usual_gyro), _FADES * usual_gyro),
+                max(min(accel, 2.0 * usual_accel), _FADES * usual_accel),
+            )
         self._before, self._last = self._last, six
-        self._count += 1
+
+
+def _line(last: Six, before: Six, steps: int = 1) -> Six:
+    """Where a straight line through two readings is some steps later."""
+    return [a + steps * (a - b) for a, b in zip(last, before, strict=True)]
 
 
 def _apart(a: Six, b: Six) -> tuple[float, float]:

@@ -113,6 +113,15 @@ class ImuBuffer:
         self._rows[self._start + row, 1:] = six
         self._clipping_sigma[self._start + row] = clipping_sigma
 
+    def remove(self, t_s: float) -> None:
+        """Forget the reading of an instant, s, where there is one."""
+        row = self._start + int(np.searchsorted(self.rows[:, 0], t_s))
+        if row < self._stop and self._rows[row, 0] == t_s:
+            for column in (self._rows, self._clipping_sigma):
+                if column is not None:
+                    column[row : self._stop - 1] = column[row + 1 : self._stop]
+            self._stop -= 1
+
     def _make_room(self) -> None:
         length = len(self._rows) * (2 if len(self) > len(self._rows) // 2 else 1)
         live = slice(self._start, self._stop)

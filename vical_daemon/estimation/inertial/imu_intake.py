@@ -15,7 +15,8 @@ from vical_daemon.estimation.inertial.stamp_steps import LEARN, StampSteps
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
-_CLIPPED_S = 5.0  # after the first clipped reading, their share is announced
+_CLIPPED_S = 5.0  # from the first clipped reading on, their share in each such stretch is looked at
+_MORE = 2.0  # times the share that was announced last is announced, too
 _UNSEEN_S = 0.5
 """After a jump of the stamps an image is waited for so long, s: a slow camera takes two a second."""
 _APART_S = 10.0  # between two recordings on the common time axis: longer than any gap that is bridged
@@ -69,7 +70,9 @@ class ImuIntake:
         self._spikes: SpikeFilter[tuple[int, Six]] = SpikeFilter()
         self._bridges = ClippedReadings()
         self._taken = 0
-        self._clipping: tuple[float, int, int] | None = None  # since when, and counts then
+        self._clipping_s: float | None = None  # when the stretch began of which the share is counted
+        self._at_range = 0  # readings of it
+        self._share = 0.0  # of clipped readings, as announced
         self._news: list[Event] = []
         self._gap: Event | None = None  # forwards, until an image shows whether the clock was set
 
@@ -126,6 +129,9 @@ class ImuIntake:
         for good_ns, good in self._spikes.sift(six, (t_imu_ns, six)):
             for bridged in self._bridged_over(self.buffer, good_ns, good):
                 added += self._place(self.buffer, bridged)
+        for spike_ns, _ in self._spikes.late:
+            self.buffer.remove((spike_ns - self.base_ns) * 1e-9 + self._set_back_s)
+        self._spikes.late = []
         return added
 
     def _bridged_over(self, buffer: ImuBuffer, t_imu_ns: int, six: Six) -> list[Bridged]:
@@ -140,7 +146,7 @@ class ImuIntake:
             self._taken += 1
             if at_range:
                 self.clipped += 1
-                self._clipping = self._clipping or (t_s, self._taken, self.clipped)
+                self._at_range += 1
             self._announce_clipping(t_s)
             out += self._bridges.take(t_ns, reading, at_range)
         return out
@@ -167,11 +173,15 @@ class ImuIntake:
         return self._in_order(buffer, t_s, Reading(t_imu_ns, values[:3], values[3:], clipping_sigma))
 
     def _announce_clipping(self, t_s: float) -> None:
-        if self._clipping is not None and self._clipping[0] < t_s - _CLIPPED_S:
-            _, taken, clipped = self._clipping
-            share = (self.clipped - clipped + 1) / (self._taken - taken + 1)
+        if self._clipping_s is None and self._at_range:
+            self._clipping_s, self._taken = t_s, 1
+        if self._clipping_s is None or t_s <= self._clipping_s + _CLIPPED_S:
+            return
+        share = self._at_range / self._taken
+        if share > _MORE * self._share:
             self._news.append(Event(EventKind.IMU_CLIPPED, value=share))
-            self._clipping = np.inf, 0, 0  # once
+            self._share = share
+        self._clipping_s, self._taken, self._at_range = t_s, 0, 0
 
     def _in_order(self, buffer: ImuBuffer, t_s: float, reading: Reading) -> list[Reading]:
         """Add a reading, hold it, or add it after the one held."""

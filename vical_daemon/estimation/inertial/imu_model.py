@@ -212,10 +212,16 @@ class Influence(NamedTuple):
         G = (self.at * roots[:, None, :]).transpose(1, 0, 2).reshape(9, -1)
         covariance = G @ G.T
         covariance[_PLACE, _PLACE] -= noise.accel_density**2 * self.beyond
-        if self.clipping_sigma is not None:
-            G = np.einsum("kij,kj->ij", self.at, self.weights[:, None] * self.clipping_sigma)
-            covariance += G @ G.T
+        by_clipping = self.by_clipping()
+        if by_clipping is not None:
+            covariance += by_clipping @ by_clipping.T
         return covariance
+
+    def by_clipping(self) -> FloatArray | None:
+        """Return one sigma of the end by what clipped readings of a channel miss, shape (9, 6), or None."""
+        if self.clipping_sigma is None:
+            return None
+        return np.asarray(np.einsum("kij,kj->ij", self.at, self.weights[:, None] * self.clipping_sigma))
 
 
 _PLACE = np.arange(3, 6)

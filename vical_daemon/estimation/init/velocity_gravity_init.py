@@ -17,7 +17,7 @@ from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _STRETCH_S = 10.0
 _FAR_SIZE = 0.1  # from here to the size of a target the filter does not get by itself
-_SIZES = (0.1, 10.0)  # true over stated; beyond, something else is wrong
+_SIZES = (0.02, 50.0)  # true over stated, metres for inches included; beyond, something else is wrong
 _DRIFT_M = 5e-3  # of the double integral over the stretch; with little motion it counts
 
 

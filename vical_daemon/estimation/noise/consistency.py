@@ -61,12 +61,18 @@ def modes(uv: FloatArray) -> FloatArray:
 
 
 def normalised(
-    uv: FloatArray, innovation: FloatArray, ways: FloatArray, moves: FloatArray, sigma: FloatArray
+    uv: FloatArray,
+    innovation: FloatArray,
+    ways: FloatArray,
+    moves: FloatArray,
+    sigma: FloatArray,
+    hidden: FloatArray | None = None,
 ) -> FloatArray | None:
     """Innovation in the eight modes, each over its predicted standard deviation; arguments as `learn`.
 
     Returns:
-        Shape (8,), clipped at six; None where the corners do not span the modes.
+        Shape (8,), or fewer where some are hidden, clipped at six; None where the corners do not span the
+        modes.
     """
     if len(uv) < MODES:
         return None
@@ -81,6 +87,9 @@ def normalised(
     if diagonal.min() < 1e-6 * diagonal.max():
         return None
     along = solve_lower(L, along[:, MODES:])  # Q' of ways and innovation
+    if hidden is not None:
+        directions, size, _ = np.linalg.svd(along[:, :-1] @ hidden)
+        along = directions[:, int(np.count_nonzero(size > 1.0)) :].T @ along
     state = along[:, :-1] @ moves
     out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.einsum("ij,ij->i", state, state))
     return np.minimum(np.maximum(out, -OUTLIER_SIGMAS), OUTLIER_SIGMAS)
@@ -128,7 +137,13 @@ class Consistency:
         return max(1.0, self._lagged[0] / (MODES * self._weight)) if self._weight else 1.0
 
     def learn(
-        self, uv: FloatArray, innovation: FloatArray, ways: FloatArray, moves: FloatArray, sigma: FloatArray
+        self,
+        uv: FloatArray,
+        innovation: FloatArray,
+        ways: FloatArray,
+        moves: FloatArray,
+        sigma: FloatArray,
+        hidden: FloatArray | None = None,
     ) -> None:
         """Take in the innovation of one image.
 
@@ -138,20 +153,25 @@ class Consistency:
             ways: How these corners move in each way in which the image can, px, shape (2n, k).
             moves: Square root of how far the state and what corners share move it, shape (k, c).
             sigma: Corner noise as used, px, shape (n,).
+            hidden: Square root of what clipped readings leave open in each way, shape (k, c), or None. Where
+                that moves the corners by more than their noise, the innovation says nothing about the rest.
         """
-        normal = normalised(uv, innovation, ways, moves, sigma)
+        normal = normalised(uv, innovation, ways, moves, sigma, hidden)
         if normal is None:
             return
         if self._skip > 0:
             self._skip -= 1
             return
         self.images += 1
-        ratio = float(normal @ normal) / MODES
+        ratio = float(normal @ normal) / len(normal)
         # One-sided CUSUM: at the usual level it drifts down by 0.6 an image; the chance that eight
         # degrees of freedom drive it to 9 is below 1e-10 an image.
         self.alarm = max(0.0, self.alarm + min(ratio / self.level, 5.0) - _CUSUM_DRIFT)
         self._move_scale(ratio)
-        self._remember(normal)
+        if len(normal) == MODES:
+            self._remember(normal)
+        else:
+            self._recent.clear()
 
     def _move_scale(self, ratio: float) -> None:
         """Follow the ratio; a level that is 1 within its own scatter stays exactly 1, at no cost."""

@@ -65,9 +65,31 @@ def test_a_larger_value_shows_that_the_range_is_wider() -> None:
     assert found[len(six) // 2 + 200 :].mean() < 0.01
 
 
+@pytest.mark.parametrize(("noise", "sign"), [(1e-3, 1.0), (0.0, -1.0)])
+def test_a_stream_that_begins_at_the_end_of_its_range_shows_it(noise, sign) -> None:
+    six = motion()[:100]
+    six[:, 0] = 1.5 * np.cos(np.arange(100) * 0.05)
+    six[:, 1:] += np.random.default_rng(5).normal(0.0, noise, (100, 5))
+    clipped = six[:, 0] > 1.0
+    six[:, 0] = sign * np.minimum(six[:, 0], 1.0)
+    intake, _ = take(six)
+    assert intake.left_out["imu_clipped"] == clipped.sum()
+
+
+def test_a_coarse_sensor_that_rests_at_first_is_not_at_its_range() -> None:
+    six = np.tile([0.01, 0.01, 0.01, 9.81, 0.01, 0.01], (300, 1))
+    six[100:, 2] -= 0.1 * np.arange(200) % 1.0  # turns about one axis, and tilts at last
+    six[200:, 0] -= 0.2
+    limits: RangeLimits[int] = RangeLimits()
+    assert not any(
+        0 in channels for k, row in enumerate(six.tolist()) for *_, channels in limits.sift(row, k)
+    )
+
+
 def sifted(six: np.ndarray) -> list[int]:
     spikes: SpikeFilter[int] = SpikeFilter()
-    return [k for i, row in enumerate(six.tolist()) for k in spikes.sift(row, i)]
+    taken = [k for i, row in enumerate(six.tolist()) for k in spikes.sift(row, i)]
+    return [k for k in taken if k not in spikes.late]
 
 
 def test_single_spikes_are_left_out_and_nothing_else() -> None:
@@ -88,11 +110,12 @@ def test_two_spikes_in_a_row_are_left_out_and_hide_no_later_ones(second) -> None
     assert sifted(six) == np.setdiff1d(np.arange(len(six)), [300, 301, *later]).tolist()
 
 
-def test_a_spike_among_the_first_readings_does_not_hide_later_ones() -> None:
+@pytest.mark.parametrize("first", [(0, 5, 18), (1, 2), (17, 18), (19, 20), (4, 12)])
+def test_spikes_among_the_first_readings_are_left_out_and_hide_no_later_ones(first) -> None:
     six = motion()
-    for at in (0, 5, 18, 60, 100, 140):
-        six[at, 2] += 10.0
-    assert set(range(len(six))) - set(sifted(six)) >= {60, 100, 140}
+    at = [*first, 60, 100, 140]
+    six[at, 2] += 10.0
+    assert sifted(six) == np.setdiff1d(np.arange(len(six)), at).tolist()
 
 
 def test_a_motion_that_begins_at_once_and_a_shock_are_taken() -> None:
@@ -162,3 +185,24 @@ def test_readings_that_wait_are_dropped_when_another_recording_follows() -> None
     assert decided == []
     limits.restart()
     assert [k for _, k, _ in limits.sift((0.0, 0.0, 0.0, 0.0, 0.0, 9.8), 99)] == [99]
+
+
+def test_a_spike_among_the_first_readings_leaves_the_buffer() -> None:
+    six = motion()[:200]
+    spiked = six.copy()
+    spiked[[0, 7, 15], 2] += 10.0
+    intake, _ = take(spiked)
+    assert intake.left_out["imu_spikes"] == 3
+    assert intake.buffer is not None
+    assert np.array_equal(intake.buffer.rows[:, 1:], np.delete(six, [0, 7, 15], axis=0))
+
+
+def test_more_clipping_than_announced_is_announced_again() -> None:
+    six = motion(40.0)
+    six[2000:, :3] *= 1.5
+    intake, shares = ImuIntake(), []
+    for i, row in enumerate(np.clip(six, [-1.9] * 3 + [-99.0] * 3, [1.9] * 3 + [99.0] * 3)):
+        intake.take(round(i * 1e9 / RATE_HZ), row[:3], row[3:])
+        shares += [event.value for event in intake.news() if event.kind is EventKind.IMU_CLIPPED]
+    assert len(shares) == 2
+    assert shares[1] == pytest.approx((np.abs(six[2000:, :3]) > 1.9).any(axis=1).mean(), abs=0.1)

@@ -38,6 +38,17 @@ def test_larger_innovations_raise_the_scale_to_their_level():
     assert c.factor == 1.0
 
 
+@pytest.mark.parametrize(("told", "level"), [(True, 4.0), (False, 4.0 * 5 / 8)])
+def test_what_clipped_readings_hide_does_not_count_as_a_good_fit(told, level):
+    """Three ways of the image have next to no innovation for what is predicted of them."""
+    c, rng, ways = Consistency(), np.random.default_rng(0), modes(UV)[:, :3]
+    hidden = 20.0 * np.eye(3)
+    for _ in range(1500):
+        innovation = rng.normal(size=UV.shape)
+        c.learn(UV, innovation, ways, hidden, SIGMA * np.sqrt(c.scale), hidden if told else None)
+    assert c.scale == pytest.approx(level, rel=0.15)
+
+
 def test_errors_that_last_raise_the_factor_to_their_long_run_variance():
     rng, rho, n = np.random.default_rng(1), 0.8, 3000
     a = np.zeros((n, 8))
