@@ -79,15 +79,11 @@ class Linear:
     curved: FloatArray
     valid: BoolArray
     shared: FloatArray
-    _moves: FloatArray | None = None
 
     @property
     def moves(self) -> FloatArray:
-        """Square root of how far states and what corners share move the image, (k, at most k); made once."""
-        if self._moves is None:
-            both = np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
-            self._moves = unscented.lower_root(both) if both.shape[1] > len(both) else both
-        return self._moves
+        """Square root of how far states and what corners share move the image, shape (k, c + r)."""
+        return np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
 
 
 def project_errors(
