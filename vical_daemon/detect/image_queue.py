@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from vical_daemon.bus.interface import Sample
 
 QUEUE_BYTES = 32 << 20
-"""Images of one camera that wait, bytes. At 640x480 and 20 Hz these are 5.4 s: the start of the estimator takes
-0.7 s of CPU time, with a quarter of a core 2.8 s, and longer where other programs run."""
+"""Images of one camera that wait, bytes. At 640x480 and 20 Hz these are 5.4 s: the start of the estimator
+takes 0.7 s of CPU time, with a quarter of a core 2.8 s, and longer where other programs run."""
 SHORTER = 0.75
 """A queue that was full is full with so much less the next time; above 0.5, as it is half empty then."""
 OVER_S = 5.0
