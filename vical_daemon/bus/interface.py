@@ -63,7 +63,6 @@ class Bus(Protocol):
         handler: Handler | None = None,
         *,
         depth: int = 1024,
-        newest_bytes: int | None = None,
     ) -> Subscription:
         """Receive the samples of matching keys (``*`` matches one chunk, ``**`` any number).
 
@@ -71,9 +70,7 @@ class Bus(Protocol):
             key_expression: Zenoh key expression.
             handler: Called for each sample (LocalBus: in the publisher's thread, before `publish`
                 returns; zenoh: in a thread of its own). None: the caller takes them with `recv`.
-            depth: Queue length when there is no handler.
-            newest_bytes: The queue holds at most so many bytes, and drops the oldest when full (images for a
-                detector). None: it drops what arrives.
+            depth: Queue length when there is no handler; a full queue drops what arrives.
         """
         ...
 
@@ -109,41 +106,27 @@ def _match(pattern: list[str], chunks: list[str]) -> bool:
 class SampleQueue:
     """A bounded queue between the bus and a reader. Drops and counts what does not fit."""
 
-    def __init__(self, depth: int, newest_bytes: int | None = None) -> None:
+    def __init__(self, depth: int) -> None:
         self._depth = depth
-        self._newest_bytes = newest_bytes
-        self._bytes = 0
         self._queue: deque[Sample] = deque()
         self._ready = threading.Condition()
         self._closed = False
         self.dropped = 0
 
     def put(self, sample: Sample) -> None:
-        """Append a sample; a full queue drops the oldest or this one. Never waits."""
+        """Append a sample; a full queue drops it. Never waits."""
         with self._ready:
-            self._bytes += len(sample.payload)
-            self._queue.append(sample)
-            while self._full:
+            if len(self._queue) >= self._depth:
                 self.dropped += 1
-                dropped = self._queue.pop() if self._newest_bytes is None else self._queue.popleft()
-                self._bytes -= len(dropped.payload)
+                return
+            self._queue.append(sample)
             self._ready.notify()
 
     def recv(self, timeout_s: float | None = None) -> Sample | None:
         """Return the next sample, or None after the timeout or once closed and empty."""
         with self._ready:
             self._ready.wait_for(lambda: self._queue or self._closed, timeout_s)
-            if not self._queue:
-                return None
-            sample = self._queue.popleft()
-            self._bytes -= len(sample.payload)
-            return sample
-
-    @property
-    def _full(self) -> bool:
-        if len(self._queue) > self._depth:
-            return True
-        return self._newest_bytes is not None and self._bytes > self._newest_bytes and len(self._queue) > 1
+            return self._queue.popleft() if self._queue else None
 
     def close(self) -> None:
         """Wake the waiting readers; queued samples can still be taken."""
@@ -155,13 +138,11 @@ class SampleQueue:
 class LocalSubscription:
     """Subscription of a `LocalBus`."""
 
-    def __init__(
-        self, bus: LocalBus, expression: str, handler: Handler | None, depth: int, newest_bytes: int | None
-    ) -> None:
+    def __init__(self, bus: LocalBus, expression: str, handler: Handler | None, depth: int) -> None:
         self.expression = expression
         self._bus = bus
         self._handler = handler
-        self._queue = SampleQueue(depth, newest_bytes)
+        self._queue = SampleQueue(depth)
 
     @property
     def dropped(self) -> int:
@@ -213,10 +194,9 @@ class LocalBus:
         handler: Handler | None = None,
         *,
         depth: int = 1024,
-        newest_bytes: int | None = None,
     ) -> LocalSubscription:
         """See `Bus.subscribe`."""
-        subscription = LocalSubscription(self, key_expression, handler, depth, newest_bytes)
+        subscription = LocalSubscription(self, key_expression, handler, depth)
         with self._lock:
             self._subscriptions.append(subscription)
         return subscription

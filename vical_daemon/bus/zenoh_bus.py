@@ -160,9 +160,9 @@ class _KeyPublisher:
 class ZenohSubscription:
     """Subscription of a `ZenohBus`; zenoh's thread only delivers samples."""
 
-    def __init__(self, handler: Handler | None, depth: int, newest_bytes: int | None) -> None:
+    def __init__(self, handler: Handler | None, depth: int) -> None:
         self._handler = handler
-        self._queue = SampleQueue(depth, newest_bytes)
+        self._queue = SampleQueue(depth)
         self._gaps = 0
         self._failures = 0
         self._expected: dict[tuple[str, int], int] = {}
@@ -286,10 +286,9 @@ class ZenohBus:
         handler: Handler | None = None,
         *,
         depth: int = 1024,
-        newest_bytes: int | None = None,
     ) -> ZenohSubscription:
         """See `Bus.subscribe`."""
-        subscription = ZenohSubscription(handler, depth, newest_bytes)
+        subscription = ZenohSubscription(handler, depth)
         subscription.declare(self._session, key_expression)
         with self._lock:
             self._subscriptions.append(subscription)

@@ -1,4 +1,4 @@
-"""Role detect: images in, target points or feature tracks out. A slow detector drops the oldest images."""
+"""Role detect: images in, target points or feature tracks out. What a slow detector drops: `image_queue`."""
 
 from __future__ import annotations
 
@@ -25,15 +25,13 @@ from vical_daemon.config.model import Config
 from vical_daemon.config.priors import camera_prior
 from vical_daemon.detect.detectors import Detect, make_detector
 from vical_daemon.detect.flow_aid import GyroAid
+from vical_daemon.detect.image_queue import ImageQueue
 from vical_daemon.detect.wanted import WantedImages
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.service import notify
 from vical_daemon.service.health import StatusSender
 from vical_daemon.service.wall_clock import WallClock, service_clock
 
-QUEUE_BYTES = 16 << 20
-"""Images of one camera that wait for the detector, bytes. At 640x480 and 20 Hz these are 2.7 s: the start of
-the estimator takes 0.7 s of CPU time, and 2.8 s with a quarter of a core."""
 _NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 JOIN_S = 3.0
 STUCK_S = 20.0
@@ -198,79 +196,102 @@ def run(config: Config, bus: Bus, stop: threading.Event, *, clock: WallClock | N
         clock: Monotonic to UNIX time; None: the clock that all processes of the service share.
     """
     clock = clock or service_clock()
-    workers = [_Worker(config, name, bus, stop) for name in config.calibration_cameras]
-    for worker in workers:
-        worker.thread.start()
-    StatusSender(config.rig, "detect", bus, clock).run_until(stop, lambda: [w.status() for w in workers])
-    for worker in workers:
-        worker.close()
+    detectors = _Detectors(config, bus, stop)
+    detectors.thread.start()
+    StatusSender(config.rig, "detect", bus, clock).run_until(stop, detectors.statuses)
+    detectors.close()
 
 
-class _Worker:
-    """Thread of one camera: takes images, detects, publishes.
+class _Detectors:
+    """Thread that takes the images of all cameras in turn, detects, and publishes.
 
-    With `mode: verify` it does so only while images are wanted, and has no subscription otherwise.
+    Threads of one process hardly compute in parallel in Python. With one for each camera, four cameras left
+    the estimator in the same process a fifth of what it needed.
     """
 
-    def __init__(self, config: Config, camera: str, bus: Bus, stop: threading.Event) -> None:
-        self._role, self._bus, self._stop = DetectRole(config, camera), bus, stop
-        self._since_s: float | None = None  # start of the current image
-        self._aid: list[Subscription] = []
-        self._key = topics.IMAGE.key(config.rig, camera)
-        self._dropped = 0
-        self._images: Subscription | None = None
-        self._wanted: WantedImages | None = None
-        if config.mode == "verify":
-            self._wanted = WantedImages(bus, topics.VERIFY.key(config.rig, camera))
-        else:
-            self._open()
-        self.thread = threading.Thread(target=self._run, name=f"detect/{camera}", daemon=True)
+    def __init__(self, config: Config, bus: Bus, stop: threading.Event) -> None:
+        self._bus, self._stop = bus, stop
+        self._queue = ImageQueue(config.calibration_cameras)
+        self._cameras = {name: _Camera(config, name, bus, self._queue) for name in config.calibration_cameras}
+        self._busy: tuple[str, float] | None = None  # camera of the current image, and since when
+        self.thread = threading.Thread(target=self._run, name="detect", daemon=True)
 
     def close(self) -> None:
         """End the subscriptions and wait for the thread."""
+        for camera in self._cameras.values():
+            camera.close()
+        self.thread.join(JOIN_S)
+
+    def statuses(self) -> list[DiagnosticStatus]:
+        """Return the health of each camera's detector."""
+        name, since_s = self._busy or ("", 0.0)
+        busy_s = time.monotonic() - since_s
+        return [camera.status(busy_s if k == name else 0.0) for k, camera in self._cameras.items()]
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            for camera in self._cameras.values():
+                camera.follow_wishes()
+            taken = self._queue.take(0.2)
+            if taken is not None:
+                name, sample = taken
+                self._busy = name, time.monotonic()  # stays set if the thread ends or hangs
+                publish(self._bus, self._cameras[name].role.points(sample))
+                self._busy = None
+
+
+class _Camera:
+    """One camera: its detector, and its images put into a queue.
+
+    With `mode: verify` it has a subscription only while images are wanted.
+    """
+
+    def __init__(self, config: Config, name: str, bus: Bus, queue: ImageQueue) -> None:
+        self.role = DetectRole(config, name)
+        self._bus, self._queue, self._name = bus, queue, name
+        self._key = topics.IMAGE.key(config.rig, name)
+        self._lost = 0  # on the bus, by subscriptions that were closed
+        self._images: Subscription | None = None
+        self._aid: list[Subscription] = []
+        self._wanted: WantedImages | None = None
+        if config.mode == "verify":
+            self._wanted = WantedImages(bus, topics.VERIFY.key(config.rig, name))
+        else:
+            self._open()
+
+    def close(self) -> None:
+        """End all subscriptions."""
         self._shut()
         if self._wanted is not None:
             self._wanted.close()
-        self.thread.join(JOIN_S)
 
-    def status(self) -> DiagnosticStatus:
-        since_s, images = self._since_s, self._images
-        busy_s = 0.0 if since_s is None else time.monotonic() - since_s
-        return self._role.status(self._dropped + (images.dropped if images else 0), busy_s)
+    def status(self, busy_s: float) -> DiagnosticStatus:
+        """Return its health; `busy_s`: time spent on its current image, s."""
+        lost, images = self._lost + self._queue.dropped[self._name], self._images
+        return self.role.status(lost + (images.dropped if images else 0), busy_s)
+
+    def follow_wishes(self) -> None:
+        """Open or close the subscription as images are wanted."""
+        if self._wanted is None:
+            return
+        rate_hz = self._wanted.rate_hz
+        if rate_hz > 0.0:
+            self.role.rate_hz = rate_hz
+            if self._images is None:
+                self._open()
+        elif self._images is not None:
+            self._shut()
 
     def _open(self) -> None:
-        self._images = self._bus.subscribe(self._key, newest_bytes=QUEUE_BYTES)
-        self._aid = attach_aid(self._bus, self._role)
+        self._images = self._bus.subscribe(self._key, lambda sample: self._queue.put(self._name, sample))
+        self._aid = attach_aid(self._bus, self.role)
 
     def _shut(self) -> None:
         images, self._images = self._images, None
         if images is not None:
-            self._dropped += images.dropped
+            self._lost += images.dropped
             images.close()
         for subscription in self._aid:
             subscription.close()
         self._aid = []
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            if self._wanted is not None and not self._follow(self._wanted):
-                continue
-            images = self._images
-            sample = images.recv(0.2) if images is not None else None
-            if sample is not None:
-                self._since_s = time.monotonic()  # stays set if the thread ends or hangs
-                publish(self._bus, self._role.points(sample))
-                self._since_s = None
-
-    def _follow(self, wanted: WantedImages) -> bool:
-        """Open or close the subscription as images are wanted; False: none are, after a short wait."""
-        rate_hz = wanted.rate_hz
-        if rate_hz > 0.0:
-            self._role.rate_hz = rate_hz
-            if self._images is None:
-                self._open()
-            return True
-        if self._images is not None:
-            self._shut()
-        wanted.wait(0.2)
-        return False
+        self._queue.clear(self._name)

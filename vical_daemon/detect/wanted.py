@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 
 from vical_daemon.bus.interface import Bus, Sample
@@ -19,7 +18,6 @@ class WantedImages:
     """
 
     def __init__(self, bus: Bus, key: str) -> None:
-        self._changed = threading.Event()
         self._wish = (0.0, -float("inf"))  # images per second, when
         self._subscription = bus.subscribe(key, self._take)
 
@@ -28,11 +26,6 @@ class WantedImages:
         """Images per second that are wanted now; 0: none."""
         rate_hz, at_s = self._wish
         return rate_hz if time.monotonic() - at_s < FRESH_S else 0.0
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait for a wish."""
-        self._changed.wait(timeout_s)
-        self._changed.clear()
 
     def close(self) -> None:
         """Stop following."""
@@ -44,5 +37,3 @@ class WantedImages:
         except MessageError:
             return
         self._wish = rate_hz, time.monotonic()
-        if rate_hz > 0.0:
-            self._changed.set()

@@ -153,11 +153,12 @@ def pixel_noise(gray: Gray) -> float:
     left, middle, right = (
         gray[::every, k : gray.shape[1] - 2 + k : every].astype(np.int16) for k in range(3)
     )
-    size = np.sort(np.abs(left - 2 * middle + right), axis=None)
+    up_to = np.cumsum(np.bincount(np.abs(left - 2 * middle + right).ravel()))  # samples of at most each size
     # The median of whole numbers, interpolated within its step.
-    level = int(size[len(size) // 2])
-    below, up_to = np.searchsorted(size, [level, level + 1])
-    share = (len(size) / 2 - below) / max(up_to - below, 1)
+    half = left.size / 2
+    level = int(np.searchsorted(up_to, int(half), side="right"))
+    below = int(up_to[level - 1]) if level else 0
+    share = (half - below) / max(int(up_to[level]) - below, 1)
     spread = max(level - 0.5 + share, 0.0)
     return float(np.hypot(spread / 0.6745 / np.sqrt(6.0), QUANTISATION_DN))
 

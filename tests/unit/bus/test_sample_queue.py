@@ -16,29 +16,15 @@ def filled(queue, sizes):
     return queue
 
 
-@pytest.mark.parametrize(
-    ("depth", "newest_bytes", "numbers"),
-    [
-        (10, None, [0, 1, 2, 3, 4]),
-        (2, None, [0, 1]),
-        (2, 1000, [3, 4]),
-        (10, 300, [2, 3, 4]),
-        (10, 299, [3, 4]),
-    ],
-)
-def test_it_keeps_so_many_samples_and_bytes_and_counts_the_rest(depth, newest_bytes, numbers):
-    queue = filled(SampleQueue(depth, newest_bytes), [100] * 5)
+@pytest.mark.parametrize(("depth", "numbers"), [(10, [0, 1, 2, 3, 4]), (2, [0, 1])])
+def test_it_keeps_so_many_samples_and_counts_the_rest(depth, numbers):
+    queue = filled(SampleQueue(depth), [100] * 5)
     assert queue.dropped == 5 - len(numbers)
     assert kept(queue) == numbers
 
 
-def test_one_sample_is_kept_however_large():
-    queue = filled(SampleQueue(10, 50), [40, 100])
-    assert kept(queue) == [1]
-
-
 def test_what_was_taken_leaves_room():
-    queue = SampleQueue(10, 300)
+    queue = SampleQueue(3)
     for _ in range(20):
         assert kept(filled(queue, [100] * 3)) == [0, 1, 2]
     assert queue.dropped == 0

@@ -73,25 +73,25 @@ class TestDetect:
         (text,) = events
         assert "cornerSubPix" in text and len(text.splitlines()) == 1
 
-    def test_a_worker_that_hangs_is_not_called_alive(
+    def test_a_detector_that_hangs_is_not_called_alive(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         hang, stop, bus = threading.Event(), threading.Event(), LocalBus()
         monkeypatch.setattr(detect, "STUCK_S", 0.1)
         monkeypatch.setattr(detect, "make_detector", lambda *_: lambda picture, t_ns: hang.wait(60) and None)
-        worker = detect._Worker(config, "cam0", bus, stop)
-        worker.thread.start()
+        detectors = detect._Detectors(config, bus, stop)
+        detectors.thread.start()
         bus.publish(IMAGE, image(NOW).payload)
         end_s = time.monotonic() + 30
-        while worker.status().level is not Level.STALE:
+        while detectors.statuses()[0].level is not Level.STALE:
             assert time.monotonic() < end_s
             time.sleep(0.01)
         hang.set()
-        while worker.status().level is Level.STALE:
+        while detectors.statuses()[0].level is Level.STALE:
             assert time.monotonic() < end_s
             time.sleep(0.01)
         stop.set()
-        worker.close()
+        detectors.close()
 
     def test_with_mode_verify_it_works_only_while_images_are_wanted(
         self, config: Config, monkeypatch: pytest.MonkeyPatch
@@ -100,8 +100,8 @@ class TestDetect:
         seen: list[int] = []
         monkeypatch.setattr(detect, "make_detector", lambda *_: lambda picture, t_ns: seen.append(t_ns))
         monkeypatch.setattr(wanted, "FRESH_S", 0.5)
-        worker = detect._Worker(replace(config, mode="verify"), "cam0", bus, stop)
-        worker.thread.start()
+        detectors = detect._Detectors(replace(config, mode="verify"), bus, stop)
+        detectors.thread.start()
         key, count = topics.VERIFY.key("rover", "cam0"), 0
 
         def send(seconds: float, rate_hz: float | None) -> int:
@@ -128,4 +128,4 @@ class TestDetect:
         send(0.7, None)  # whoever asked has gone
         assert send(0.3, None) == 0
         stop.set()
-        worker.close()
+        detectors.close()

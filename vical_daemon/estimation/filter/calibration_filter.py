@@ -301,14 +301,14 @@ class CalibrationFilter:
         if self.arm_score is None:
             covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
-        ways, by_error = lin.ways, lin.by_error
+        ways, by_error = fit.ways, lin.by_error
         if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
             ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
-        kept = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
-        information, shared = kept[:, :6].T @ kept[:, :6], self.shared.get(image.camera)
+            ways = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
+        information, shared = ways[:, :6].T @ ways[:, :6], self.shared.get(image.camera)
         if shared is not None:  # what corners share is noise, too
-            alike = kept @ (by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas))
-            across = kept[:, :6].T @ alike
+            alike = ways @ (by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas))
+            across = ways[:, :6].T @ alike
             information -= across @ np.linalg.solve(unscented.unit(WAYS) + alike.T @ alike, across.T)
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T

@@ -79,8 +79,8 @@ def whitened(image: Image, lin: Linear, keep: BoolArray) -> tuple[FloatArray, Fl
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     """Chi-square gate of each corner with its predicted variance (per axis, both axes together)."""
-    moved = lin.ways @ lin.moves
-    var = np.einsum("ij,ij->i", moved, moved)
+    moves = lin.moves
+    var = np.einsum("ij,ij->i", lin.ways @ (moves @ moves.T), lin.ways)
     if lin.curved.size:
         var += np.einsum("ij,ij->i", lin.curved, lin.curved)
     var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]

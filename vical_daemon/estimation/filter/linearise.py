@@ -17,7 +17,6 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
-from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.camera_rays import read_share
@@ -79,15 +78,11 @@ class Linear:
     curved: FloatArray
     valid: BoolArray
     shared: FloatArray
-    _moves: FloatArray | None = None
 
     @property
     def moves(self) -> FloatArray:
-        """Square root of how far states and what corners share move the image, (k, at most k); made once."""
-        if self._moves is None:
-            both = np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
-            self._moves = unscented.lower_root(both) if both.shape[1] > len(both) else both
-        return self._moves
+        """Square root of how far states and what corners share move the image, shape (k, c + r)."""
+        return np.concatenate([self.spread, self.shared], axis=1) if self.shared.size else self.spread
 
 
 def project_errors(
@@ -195,7 +190,7 @@ def view_derivatives(
         uv, J, J_lens = project_jacobians(x_cam, cam.intrinsics, cam.distortion, cam.distortion_model)
     by_error = _pose_by_error(state, layout, rates, image.camera, ahead_s, turn)
     ways = np.empty((2 * len(J), len(by_error)))
-    ways[:, :3] = cross(J, x_cam[:, None]).reshape(-1, 3)  # j' (x x phi) = (j x x)' phi
+    ways[:, :3] = (J @ so3.hat(x_cam)).reshape(-1, 3)  # j' (x x phi)
     np.negative(J.reshape(-1, 3), out=ways[:, 3:6])
     if where.intrinsics is not None and where.distortion is not None:
         n = J_lens.shape[-1]

@@ -155,7 +155,7 @@ class LinearisedFilter(CalibrationFilter):
             views[key] = derive(self.state, self.layout, self.rates, image, self.S)
         lin = views[key]
         z = lin.z + (lin.ways @ (lin.by_error @ self.offset)).reshape(-1, 2)
-        return self._with_shared(image, replace(lin, z=z, spread=lin.by_error @ self.S, _moves=None))
+        return self._with_shared(image, replace(lin, z=z, spread=lin.by_error @ self.S))
 
     def _belonging(self, image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
         """By the reference: it has been adjusted to all images, while the mean may have lost its way."""

@@ -49,9 +49,9 @@ def _ask_lens(
 ) -> None:
     """What an image would have the lens be: with the target as in its file until it is known not to be."""
     ways, innovation = rows
-    shape = f.layout.target_shape
+    shape, mean = f.layout.target_shape, f.mean
     if shape is not None and "target_shape" not in f.off:
-        innovation = innovation + ways @ (lin.by_error[:, shape] @ f.mean.target_shape)
-    camera = f.mean.cameras[name]
+        innovation = innovation + ways @ (lin.by_error[:, shape] @ mean.target_shape)
+    camera = mean.cameras[name]
     values = np.concatenate([camera.intrinsics, camera.distortion])
     agreement.learn(f.state.t_s, innovation, ways @ lin.by_error[:, :6], ways @ by_lens, values)
