@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import START
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import POSITION, CameraSlices
 from vical_daemon.estimation.significance import EVERY_S
 
@@ -31,7 +31,7 @@ STILL_RAD = 0.05
 """RMS turn of an axis below which it has shown nothing of a lever arm along it."""
 HELD_M = 1e-3
 """Sigma with which a lever arm is held at zero along such an axis, m."""
-UNKNOWN_M = START.lever_arm_m
+UNKNOWN_M = WINDOW_START.lever_arm_m
 """Sigma of a lever arm that nothing is known of, m."""
 BENT_M = 1e-3
 """By how much holding one axis bends the others, m: the axis is known to a milliradian, what is held along it

@@ -11,7 +11,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
     GYRO_BIAS_SIGMA_RPS,
-    START,
+    WINDOW_START,
 )
 from vical_daemon.estimation.temporal.rotation_turns import evenly, turns_apart
 
@@ -138,6 +138,6 @@ def _other_unknowns(
     by_force = np.concatenate([gravity, lever, -bias], axis=2) / accel_sigma[:, None, None]
     out[: 3 * nw, :9] = by_force.reshape(-1, 9)
     out[3 * nw : -PRIORS, 9:] = -(span_by_sigma[:, None, None] * np.eye(3)).reshape(-1, 3)
-    sigmas = np.repeat([START.lever_arm_m, ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS], 3)
+    sigmas = np.repeat([WINDOW_START.lever_arm_m, ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS], 3)
     out[-PRIORS:, 3:] = np.diag(1.0 / sigmas)
     return out

@@ -5,19 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
-from vical_daemon.estimation.filter.unobservable_directions import UnobservableDirections
+from vical_daemon.estimation.filter.unobservable_directions import UNKNOWN_M, UnobservableDirections
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
+    ARM_SHARE,
     ENTRY_SIGMA,
+    FILTER_START,
     GRAVITY_SIGMA_RAD,
     GYRO_BIAS_SIGMA_RPS,
     KNOWN_OFF_SIGMA,
     KNOWN_SIZE_SIGMA,
     PARTIAL_START_RAD,
+    POSITION_SHARE,
     SIZE_SIGMA,
-    START,
+    START_POSITION_M,
 )
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import (
@@ -79,14 +82,25 @@ def initial_filter(
     )
 
 
+def _before_board_m(state: State, camera: str) -> float:
+    """How far a camera is from the plane of the board: sigma points must not put it behind."""
+    return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
+
+
 def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
     The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
     """
-    start = START
-    if partial:  # whoever does not know the lever arm must not bend it by a wide attitude
-        start = start._replace(attitude_rad=PARTIAL_START_RAD, rotation_rad=PARTIAL_START_RAD)
+    # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
+    start, position = FILTER_START, 3.0 * UNKNOWN_M
+    if partial:
+        angle = PARTIAL_START_RAD
+        start = start._replace(lever_arm_m=UNKNOWN_M, attitude_rad=angle, rotation_rad=angle)
+    else:
+        before_m = min(_before_board_m(state, name) for name in layout.cameras)
+        start = start._replace(lever_arm_m=min(start.lever_arm_m, ARM_SHARE * before_m))
+        position = min(START_POSITION_M, POSITION_SHARE * before_m)
     s = start_sigmas(
         layout,
         state.cameras,
@@ -94,7 +108,6 @@ def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool)
         imu_sigma=KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA,
         size_sigma=KNOWN_SIZE_SIGMA if SIZE in off else SIZE_SIGMA,
     )
-    s[ATTITUDE], s[VELOCITY] = start.attitude_rad, start.velocity_mps
-    s[POSITION] = 3.0 * START.lever_arm_m  # whoever does not know the arm must not know where the imu is
+    s[ATTITUDE], s[POSITION], s[VELOCITY] = start.attitude_rad, position, start.velocity_mps
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD
     return s

@@ -10,8 +10,8 @@ from vical_daemon.estimation.model.priors import (
     ENTRY_SIGMA,
     KNOWN_OFF_SIGMA,
     OFF,
-    START,
     SURE,
+    WINDOW_START,
 )
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.selection import model_selection
@@ -224,5 +224,5 @@ class AlternativeModels:
         found = model_selection.imu_and_lenses(carry.layout, carry.imu, {name: carry.camera})
         if self._term and self.lens is None and where is not None:
             last, now = slice(where.stop - 1, where.stop), carry.camera.distortion[-1:]
-            found[_TERM] = Block(last, now, np.array([START.distortion]), np.zeros(1), held=True)
+            found[_TERM] = Block(last, now, np.array([WINDOW_START.distortion]), np.zeros(1), held=True)
         return found

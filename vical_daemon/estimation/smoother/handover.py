@@ -18,7 +18,7 @@ from vical_daemon.estimation.model.priors import (
     GYRO_BIAS_SIGMA_RPS,
     SHIFT_WALK,
     SKEW_WALK,
-    START,
+    WINDOW_START,
 )
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import Layout
@@ -58,7 +58,7 @@ def initial_prior(
     centre = prior_centre(window.camera, given)
     (name,) = layout.cameras
     wide = first_carry(
-        window, centre, layout, start_sigmas(layout, {name: centre}, START, imu_sigma=imu_sigma)
+        window, centre, layout, start_sigmas(layout, {name: centre}, WINDOW_START, imu_sigma=imu_sigma)
     )
     if known is None:
         return wide if held is None else held_along(wide, held)

@@ -13,7 +13,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, START
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.model.retract import camera_difference
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.smoother.window import Window
@@ -107,7 +107,7 @@ def first_carry(window: Window, camera: CameraState, layout: Layout, sigmas: Flo
         sigmas: Of the constants, shape (n,).
     """
     wide = sigmas.copy()
-    wide[TILT], wide[SPEED] = START.attitude_rad, START.velocity_mps
+    wide[TILT], wide[SPEED] = WINDOW_START.attitude_rad, WINDOW_START.velocity_mps
     wide[BIASES] = np.repeat([GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2], 3)
     R, t_s = window.R[0], window.frames[0][0]
     root, speed = np.diag(1.0 / wide), R.T @ window.v[0]

@@ -18,7 +18,7 @@ from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_s
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.imu_scale import NUMBERS
-from vical_daemon.estimation.model.priors import START
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.partial import mounting_about, still_axis
@@ -223,7 +223,7 @@ class TargetFreeInitializer:
             return reason or why
         camera = camera_by_rotations(prior, self.options.fix, best.R_imu_cam, best.timeshift_s)
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
-        sigma = START.lever_arm_m if given is None else 1e-4
+        sigma = WINDOW_START.lever_arm_m if given is None else 1e-4
         return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + NUMBERS)]), sigma, about)
 
     def _seeds(

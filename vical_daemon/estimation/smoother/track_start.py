@@ -19,7 +19,7 @@ from vical_daemon.estimation.inertial.imu_model import products
 from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
-from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, START
+from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import MEDIAN_ABSOLUTE
 from vical_daemon.estimation.smoother.marginal_prior import HELD_M
@@ -47,7 +47,7 @@ class ArmPrior:
     """
 
     p_imu_cam: FloatArray
-    sigma_m: float = START.lever_arm_m
+    sigma_m: float = WINDOW_START.lever_arm_m
     held: FloatArray | None = None
 
     def information(self) -> FloatArray:

@@ -23,14 +23,14 @@ from vical_daemon.estimation.model.inertial_links import (
     PreintegratedLinks,
     make_links,
 )
-from vical_daemon.estimation.model.priors import START
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 
 KNOT_S = 1.0  # biases are constant over this long and walk from one to the next
 MAX_LANDMARKS = 220
 _MIN_SEEN = 4
 NEAREST_M, FARTHEST_M = 0.1, 200.0
-_HALF_S = START.readout_s
+_HALF_S = WINDOW_START.readout_s
 """Rates hold for so long before and after an image: exact at the first and last row of a readout of 30 ms."""
 
 IntArray = npt.NDArray[np.intp]

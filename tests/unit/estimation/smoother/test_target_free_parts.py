@@ -16,7 +16,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import COLUMNS, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
-from vical_daemon.estimation.model.priors import START
+from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.retract import camera_difference, moved_camera
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import CameraState
@@ -35,7 +35,7 @@ SHIFT_S = 0.013
 
 def bundle_of(window, layout, sigma_px):
     """A window about which next to nothing is known, to be adjusted."""
-    sigmas = start_sigmas(layout, {NAME: window.camera}, START, imu_sigma=0.01)
+    sigmas = start_sigmas(layout, {NAME: window.camera}, WINDOW_START, imu_sigma=0.01)
     return Bundle(window, first_carry(window, window.camera, layout, sigmas), ImageNoise(sigma_px))
 
 
