@@ -156,12 +156,18 @@ def test_a_change_is_announced_as_what_it_is_and_followed(bump, announced, not_a
 def test_a_knock_does_not_make_an_imu_true_nor_its_accelerometer_in_step():
     matrix = np.eye(3) + 5e-3 * np.array([[1.0, 0.4, -0.6], [0.4, -1.1, 0.8], [-0.6, 0.8, 0.3]])
     rig = reference_rig(2, bumps=(Bump(22.0, (0.0, 0.03, 0.0)),), gyro_matrix=matrix, accel_matrix=matrix)
-    filters, shots = [], []
+    filters, shots, known = [], [], []
 
     def each(c):
         shots.append(c.estimate())
-        if c.filter is not None and c.filter not in filters:
+        if c.filter is None:
+            return
+        sigmas = c.filter.sigmas()[c.filter.layout.inertial]
+        if c.filter not in filters:
             filters.append(c.filter)
+            known.append(sigmas)
+        elif len(filters) == 1:
+            known[0] = sigmas
 
     calibrate(simulate(2, 34.0, rig=rig, accel_lag_s=1e-3), each=each)
     kinds = [e.kind for shot in shots for e in shot.events]
@@ -170,6 +176,7 @@ def test_a_knock_does_not_make_an_imu_true_nor_its_accelerometer_in_step():
     assert kinds.count(EventKind.ACCEL_LAG) == 1
     assert len(filters) == 2
     assert filters[1].off == {"imu_intrinsics", "accel_lag"}  # and not found out again
+    assert (known[1] < 1.5 * known[0]).all()  # matrices and lag are as well known as a few seconds before
     assert shots[-1].status == Status.CONVERGED
 
 

@@ -77,6 +77,10 @@ class Layout:
     target_modes: TargetModes | None = None
     held: Mapping[str, FixedLens] = field(default_factory=dict)
 
+    def __deepcopy__(self, memo: object) -> Layout:
+        """Itself: it does not change, and a copy of a filter has the layout of the filter."""
+        return self
+
     @property
     def inertial(self) -> slice:
         """Imu matrices and lag of the accelerometer, as far as they are estimated; see `imu_scale`."""
