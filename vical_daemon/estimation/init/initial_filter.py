@@ -18,9 +18,7 @@ from vical_daemon.estimation.model.priors import (
     KNOWN_OFF_SIGMA,
     KNOWN_SIZE_SIGMA,
     PARTIAL_START_RAD,
-    POSITION_SHARE,
     SIZE_SIGMA,
-    START_POSITION_M,
 )
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
 from vical_daemon.estimation.model.state import (
@@ -100,7 +98,6 @@ def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool)
     else:
         before_m = min(_before_board_m(state, name) for name in layout.cameras)
         start = start._replace(lever_arm_m=min(start.lever_arm_m, ARM_SHARE * before_m))
-        position = min(START_POSITION_M, POSITION_SHARE * before_m)
     s = start_sigmas(
         layout,
         state.cameras,
