@@ -122,14 +122,16 @@ def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
     S, s = _shared_information(window, now)
     camera = np.repeat([list(out).index(view.camera) for view in now.views], WAYS)
     for _ in range(2 if len(out) > 1 else 1):  # each camera with what the others were found to have
-        for k, shared in enumerate(out.values()):
+        for k, (name, shared) in enumerate(out.items()):
             own, others = camera == k, camera != k
+            if not own.any():
+                continue
             sigmas = np.concatenate([list(out.values())[c].sigmas for c in camera[others][::WAYS]] or [[]])
             T = S[np.ix_(own, others)] * sigmas
             A = np.eye(len(sigmas)) + sigmas[:, None] * S[np.ix_(others, others)] * sigmas
             known = np.linalg.solve(A, np.column_stack([T.T, sigmas * s[others]]))
             information, right = S[np.ix_(own, own)] - T @ known[:, :-1], s[own] - T @ known[:, -1]
-            last_s = max(t for node in window.nodes for t, _ in node.frames)
+            last_s = max(t for node in window.nodes for t, f in node.frames if f.camera == name)
             shared.begin(of_window(information, right, JITTERS_S, SHIFTS_PX), last_s)
     return out
 

@@ -38,7 +38,8 @@ class SharedErrors:
         shift_px: Standard deviation by which a whole image is off, per axis, px; likewise.
         jitter_found_s: The jitter where there surely is one, s; else 0.
         images: Images taken in.
-        until_s: Stamp (s) up to which images are known from the start, and are not to count again.
+        until_s: Stamp (s) up to which images are known from the start, and are not to count again; -inf once
+            they have passed.
     """
 
     jitter_s: float = 0.0
@@ -80,8 +81,11 @@ class SharedErrors:
             level: By how much innovations of any kind exceed their variances: where the model does not fit,
                 that in these ways is nothing of its own.
         """
+        if t_cam_s <= self.until_s:
+            return
+        self.until_s = -math.inf  # a clock that is set back later hides no image
         A = ways.T @ ways
-        if t_cam_s <= self.until_s or not A.any():
+        if not A.any():
             return
         place = self.images % _MEMORY
         self._A[place], self._b[place] = A, innovation @ ways

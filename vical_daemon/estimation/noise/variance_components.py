@@ -71,13 +71,14 @@ def of_images(observed: Observed, first: FloatArray, others: FloatArray) -> Floa
         Shape (p, q).
     """
     b, A, C = observed
-    PA = _inverse(C) @ A
+    whiten = _inverse(C)
+    PA = whiten @ A
     G, h = A @ PA, np.matmul(b[:, None], PA)[:, 0]
     x, y = np.meshgrid(first**2, others**2, indexing="ij")
     powers = np.stack([x, y, x * y, y * y, x * y * y]).reshape(5, -1)
     det = 1.0 + _determinant(G) @ powers
     explained = (_quadratic(G, h) @ powers) / det
-    size = np.einsum("ni,nij,nj->n", b, _inverse(C), b)
+    size = np.einsum("ni,nij,nj->n", b, whiten, b)
     far = size > OUTLIER_SIGMAS**2
     if far.any():
         before = size[far, None]
