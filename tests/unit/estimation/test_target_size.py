@@ -8,6 +8,7 @@ from vical_mocks.points import board_points, simulate
 from vical_mocks.rig import reference_rig
 
 from vical_daemon.estimation.events import EventKind
+from vical_daemon.estimation.init import velocity_gravity_init
 from vical_daemon.estimation.measurements import CalibrationOptions
 
 
@@ -70,3 +71,11 @@ def test_noise_in_slow_motion_does_not_make_it_another_size():
     record = feed(run, subject)
     assert record.snapshots
     assert record.events == []
+
+
+def test_another_size_is_tried_only_where_the_one_in_the_file_does_not_fit(monkeypatch):
+    """The closed form is wrong by ten of its sigmas in slow motion (`verify_week`, robot 52: 0.42)."""
+    monkeypatch.setattr(velocity_gravity_init, "_other_size", lambda *_: 0.42)
+    record, calibrator = calibrated(1, 1.0)
+    assert record.events == []
+    assert calibrator.filter.state.target_scale == pytest.approx(1.0, abs=0.01)

@@ -26,9 +26,10 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import numbers_of
 from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_links
 from vical_daemon.estimation.model.rates import Rates
-from vical_daemon.estimation.model.retract import orthonormal, retract
+from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
+from vical_daemon.estimation.noise.shared_errors import shared_ways
 from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH, OUTLIER_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
@@ -63,6 +64,7 @@ class View(NamedTuple):
         seen: Corners that can be predicted, shape (n,).
         ways: See `Linear`, shape (2n, k).
         by_error: See `Linear`, shape (k, size).
+        alike: Pixels by what corners share, each of unit variance, px, shape (2n, 3); (2n, 0): nothing.
     """
 
     node: int
@@ -72,6 +74,26 @@ class View(NamedTuple):
     seen: BoolArray
     ways: FloatArray
     by_error: FloatArray
+    alike: FloatArray
+
+
+class Whitened(NamedTuple):
+    """One image over its noise.
+
+    Attributes:
+        ways: Of `View`, shape (2n, k).
+        alike: Likewise.
+        residual: Shape (2n,).
+        left: Residuals without what corners share, px, shape (n, 2).
+        square: Sum of squares of the residuals without what corners share, and of that; of corners that do
+            not belong only a part (Geman and McClure).
+    """
+
+    ways: FloatArray
+    alike: FloatArray
+    residual: FloatArray
+    left: FloatArray
+    square: float
 
 
 class Linked(NamedTuple):
@@ -98,6 +120,8 @@ class BoardWindow:
         layout: Of the filter's errors; the constants are all but the motion.
         offset: Of the constants from the mean of the prior, shape (c,).
         sigma_px: Corner noise by camera.
+        shared: Standard deviations of what the corners of an image share, see `shared_errors`, shape (3,), of
+            the cameras for which they are known.
     """
 
     def __init__(
@@ -114,8 +138,9 @@ class BoardWindow:
         self.layout, self._noise, self._S = prior.layout, prior.imu_noise, prior.S
         root = np.linalg.inv(prior.S[MOTION.stop :, MOTION.stop :])
         self._information = root.T @ root
-        self.offset = np.zeros(len(root))
+        self.offset = difference(state, prior.state, prior.layout)[MOTION.stop :]
         self.sigma_px = {name: noise.sigma_px for name, noise in prior.corner_noise.items()}
+        self.shared: dict[str, FloatArray] = {}
         self._derivatives = Derivatives()  # of the filters about the window, once it is solved
         self._measured = (np.zeros((0, 3)),) * 3  # rate, specific force, derivative of the rate
 
@@ -151,11 +176,13 @@ class BoardWindow:
     def solve(self) -> bool:
         """Levenberg-Marquardt until nothing changes; False where that is not reached."""
         now, damping = self.present(), 0.0
+        images = [] if now is None else self.whitened(now)
         for _ in range(_MOST_STEPS):
             if now is None:
                 return False
-            self._learn_noise(now.views)
-            H, g = self.normal(now)
+            self._learn_noise(now.views, images)
+            images = self.whitened(now)
+            H, g = self.normal(now, images)
             H[np.diag_indices_from(H)] *= 1.0 + damping
             try:
                 root = cholesky(H, lower=True, overwrite_a=True, check_finite=False)
@@ -163,13 +190,14 @@ class BoardWindow:
                 damping = max(10.0 * damping, 1e-9)
                 continue
             dx = cho_solve((root, True), g, check_finite=False)
-            cost = self._cost(now)
+            cost = self._cost(now, images)
             before = self.state, self.offset, [n.at for n in self.nodes], self._links, self._measured
             self._move(dx)
             if self._stale() and not self._relink():
                 return False
             trial = self.present()
-            if trial is None or not self._cost(trial) < cost + _DONE:
+            beyond = [] if trial is None else self.whitened(trial)
+            if trial is None or not self._cost(trial, beyond) < cost + _DONE:
                 self.state, self.offset, motion, self._links, self._measured = before
                 for node, at in zip(self.nodes, motion, strict=True):
                     node.at = at
@@ -178,7 +206,7 @@ class BoardWindow:
                 continue
             if float(g @ dx) < _DONE and not damping:
                 return self._relink()
-            now, damping = trial, 0.1 * damping if damping > 1e-9 else 0.0
+            now, images, damping = trial, beyond, 0.1 * damping if damping > 1e-9 else 0.0
         return False
 
     def filter(self, prior: CalibrationFilter) -> LinearisedFilter:
@@ -249,10 +277,15 @@ class BoardWindow:
     def _move(self, dx: FloatArray) -> None:
         motion, constants = dx[: -len(self.offset)].reshape(-1, 9), dx[-len(self.offset) :]
         full = np.concatenate([np.zeros(MOTION.stop), constants])
+        before = self.state.cameras
         self.state, self.offset = retract(self.state, self.layout, full), self.offset + constants
         for node, d in zip(self.nodes, motion, strict=True):
             t_s, R, p, v = node.at
-            node.at = Instant(t_s, orthonormal(R @ so3.exp_one(d[:3])), p + d[3:6], v + d[6:])
+            turned, camera = orthonormal(R @ so3.exp_one(d[:3])), node.frames[0][1].camera
+            arm, now = before[camera].p_imu_cam, self.state.cameras[camera].p_imu_cam
+            # the camera goes where the step has it; arm and turn multiplied would move it
+            seen = p + d[3:6] + R @ (now + np.cross(d[:3], arm))
+            node.at = Instant(t_s, turned, seen - turned @ now, v + d[6:])
         self._find_rates()
 
     # ------------------------------------------------------------------ one linearisation
@@ -282,7 +315,10 @@ class BoardWindow:
             return None
         residual = np.where(seen[:, None], frame.uv_px - np.where(seen[:, None], uv, 0.0), 0.0)
         ways = np.where(np.repeat(seen, 2)[:, None], ways, 0.0)
-        return View(k, name, residual, relative, seen, ways, by_error)
+        alike = np.zeros((len(ways), 0))
+        if name in self.shared:
+            alike = ways @ (by_error @ (shared_ways(state, self.layout, name) * self.shared[name]))
+        return View(k, name, residual, relative, seen, ways, by_error, alike)
 
     def _linked(self) -> Linked:
         s, layout, links = self.state, self.layout, self._links
@@ -301,8 +337,16 @@ class BoardWindow:
             full[:, :, layout.accel_lag] = J[:, :, 39]
         return Linked(e, J[:, :, :18], full[:, :, MOTION.stop :])
 
-    def normal(self, now: Present) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix and right side of the step."""
+    def normal(
+        self, now: Present, images: list[Whitened], *, together: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix and right side of the step.
+
+        Args:
+            now: Where to linearise.
+            images: Its images over their noise.
+            together: With the errors that corners share; False: as if corners were independent.
+        """
         F = 9 * len(self.nodes)
         n = F + len(self.offset)
         H, g = np.zeros((n, n)), np.zeros(n)
@@ -317,9 +361,13 @@ class BoardWindow:
             g[own] += b[:k]
             g[F:] += b[k:]
 
-        for view in now.views:
-            W, r = self.whitened(view)
-            add(view.by_error.T @ (W.T @ W) @ view.by_error, view.by_error.T @ (W.T @ r), 9 * view.node)
+        for view, (W, A, r, *_) in zip(now.views, images, strict=True):
+            information, right = W.T @ W, W.T @ r
+            if together:
+                across = A.T @ W
+                known = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, np.column_stack([across, A.T @ r]))
+                information, right = information - across.T @ known[:, :-1], right - across.T @ known[:, -1]
+            add(view.by_error.T @ information @ view.by_error, view.by_error.T @ right, 9 * view.node)
         for k, (e, by_motion, by_constants) in enumerate(zip(*now.linked, strict=True)):
             J = np.concatenate([by_motion, by_constants], axis=1)
             add(J.T @ J, -J.T @ e, 9 * k)
@@ -332,29 +380,37 @@ class BoardWindow:
         first = 9 * len(self.nodes)
         return np.concatenate([np.arange(9 * node, 9 * node + 9), np.arange(first, first + len(self.offset))])
 
-    def whitened(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """Ways and residuals over the noise; corners that do not belong hardly count (Geman and McClure)."""
+    def whitened(self, now: Present) -> list[Whitened]:
+        """All images over the noise; corners that do not belong hardly count (Geman and McClure)."""
+        return [self._whitened(view) for view in now.views]
+
+    def _whitened(self, view: View) -> Whitened:
         sigma = self.sigma_px[view.camera] * view.relative
-        far = (view.residual**2).sum(axis=1) / sigma**2
-        weight = np.where(view.seen, 1.0 / (1.0 + far / OUTLIER_SIGMAS**2), 0.0) / sigma
-        return view.ways * np.repeat(weight, 2)[:, None], (view.residual * weight[:, None]).ravel()
+        left = view.residual
+        for _ in range(2 if view.alike.size else 1):
+            far = (left**2).sum(axis=1) / sigma**2
+            weight = np.where(view.seen, 1.0 / (1.0 + far / OUTLIER_SIGMAS**2), 0.0) / sigma
+            twice = np.repeat(weight, 2)
+            A, r = view.alike * twice[:, None], view.residual.ravel() * twice
+            shared = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ r)
+            left = view.residual - (view.alike @ shared).reshape(-1, 2)
+        far = (left**2).sum(axis=1) / sigma**2
+        # what is lost from sight costs as much as a gross outlier
+        cost = np.where(view.seen, far / (1.0 + far / OUTLIER_SIGMAS**2), OUTLIER_SIGMAS**2)
+        return Whitened(view.ways * twice[:, None], A, r, left, float(cost.sum() + shared @ shared))
 
-    def _cost(self, now: Present) -> float:
-        """Sum of squares; of corners that do not belong only a part (Geman and McClure)."""
+    def _cost(self, now: Present, images: list[Whitened]) -> float:
+        """Sum of squares."""
         cost = float((now.linked.e**2).sum() + self.offset @ self._information @ self.offset)
-        for view in now.views:
-            far = (view.residual**2).sum(axis=1) / (self.sigma_px[view.camera] * view.relative) ** 2
-            # what is lost from sight costs as much as a gross outlier
-            cost += float(np.where(view.seen, far / (1.0 + far / OUTLIER_SIGMAS**2), OUTLIER_SIGMAS**2).sum())
-        return cost
+        return cost + sum(image.square for image in images)
 
-    def _learn_noise(self, views: list[View]) -> None:
+    def _learn_noise(self, views: list[View], images: list[Whitened]) -> None:
         """Corner noise from the median of the residuals, as far as poses have not taken them up."""
         for name in self.sigma_px:
-            own = [v for v in views if v.camera == name]
+            own = [(v, w.left) for v, w in zip(views, images, strict=True) if v.camera == name]
             if not own:
                 continue
-            lengths = [np.linalg.norm(v.residual[v.seen], axis=1) / v.relative[v.seen] for v in own]
+            lengths = [np.linalg.norm(left[v.seen], axis=1) / v.relative[v.seen] for v, left in own]
             size = np.concatenate(lengths)
             share = max(1.0 - 6.0 * len(own) / (2.0 * len(size)), 0.05)
             sigma = float(np.median(size)) / MEDIAN_RAYLEIGH / np.sqrt(share)

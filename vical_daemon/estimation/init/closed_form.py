@@ -79,7 +79,7 @@ def attempt(data: StartData, *, may_be_partial: bool) -> StartResult:
             return StartResult(None, "", rolling=(name, axis))
         seen[name] = found
     result = _complete(data, seen)
-    if result.state is None and result.motion_missing and may_be_partial:
+    if result.state is None and result.size is None and result.motion_missing and may_be_partial:
         return _partial(data, seen, result.reason)
     return result
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
@@ -10,7 +12,6 @@ from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
-    ARM_SHARE,
     ENTRY_SIGMA,
     FILTER_START,
     GRAVITY_SIGMA_RAD,
@@ -47,6 +48,8 @@ def initial_filter(
 ) -> CalibrationFilter:
     """Build a filter about a start, with sigmas many times what the start is worth.
 
+    Lever arms have the prior of any rig, about zero: in slow motion the closed form may be half a metre off.
+
     Args:
         state: The start.
         layout: Where the errors live.
@@ -54,6 +57,11 @@ def initial_filter(
         still_axes: Of a partial start, see `StartResult`.
         turn_axis_cam: Likewise.
     """
+    cameras = {
+        name: camera if layout.cameras[name].position is None else replace(camera, p_imu_cam=np.zeros(3))
+        for name, camera in state.cameras.items()
+    }
+    state = replace(state, cameras=cameras)
     noise = {name: CornerNoise(options.corner_sigma_px) for name in layout.cameras}
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
@@ -80,11 +88,6 @@ def initial_filter(
     )
 
 
-def _before_board_m(state: State, camera: str) -> float:
-    """How far a camera is from the plane of the board: sigma points must not put it behind."""
-    return max(abs(float((state.p_world_imu + state.R_world_imu @ state.cameras[camera].p_imu_cam)[2])), 0.02)
-
-
 def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
@@ -93,11 +96,7 @@ def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool)
     # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
     start, position = FILTER_START, 3.0 * UNKNOWN_M
     if partial:
-        angle = PARTIAL_START_RAD
-        start = start._replace(lever_arm_m=UNKNOWN_M, attitude_rad=angle, rotation_rad=angle)
-    else:
-        before_m = min(_before_board_m(state, name) for name in layout.cameras)
-        start = start._replace(lever_arm_m=min(start.lever_arm_m, ARM_SHARE * before_m))
+        start = start._replace(attitude_rad=PARTIAL_START_RAD, rotation_rad=PARTIAL_START_RAD)
     s = start_sigmas(
         layout,
         state.cameras,

@@ -136,10 +136,9 @@ class Initializer:
         result = start.attempt(data, may_be_partial=may_be_partial)
         if result.rolling is not None:
             return Attempt(None, [], "", rolling=result.rolling)
-        if result.size is not None:
-            return Attempt(None, [], "", size=size * result.size)
+        other = None if result.size is None else Attempt(None, [], "", size=size * result.size)
         if result.state is None:
-            return _none(result.reason, result.motion_missing)
+            return other or _none(result.reason, result.motion_missing)
         frames = self._frames_from(result.state)
         make = partial(
             initial_filter,
@@ -152,6 +151,8 @@ class Initializer:
         found = window_start(
             result.state, result.poses, frames, make, self._step, buffer, self._target, stated=stated
         )
+        if found is None and other is not None:
+            return other
         if found is None:
             why = "the first seconds do not fit together yet: keep the board in view and moving"
             return _none(result.reason or why, result.still_axes is not None)

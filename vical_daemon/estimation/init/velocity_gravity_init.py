@@ -34,8 +34,8 @@ class StartResult:
         turn_axis_cam: Of a rig that turned about it at one rate all the time, camera frame, shape (3,): the
             delay and the mounting about this axis are guessed, too; None: not so.
         poses: Of all images used, by camera and in order.
-        size: True size of the target over the stated one, where it seems to be by far another; None: it may
-            be as in its file.
+        size: True size of the target over the stated one, where it seems to be by far another; to be tried
+            where a window does not fit with the stated one. None: it may be as in its file.
         rolling: A camera that has a rolling shutter of which nothing was said, and what it reads one after
             the other (`ROWS`, `COLUMNS`); None: there is none.
     """
@@ -89,6 +89,7 @@ def motion_start(
     """
     state: State | None = None
     size, still = 0.0, None
+    other: float | None = None
     used: list[TargetPose] = []
     cameras = {name: x.camera for name, x in known.items()}
     for name, x in known.items():
@@ -106,13 +107,11 @@ def motion_start(
             axes = still_axes(R.mean(axis=0)) if turn_axis_cam is None else np.eye(3)
         motion = LinearMotion.between(buffer, t, R, gyro_bias)
         if motion is not None and may_resize and not partial:
-            other = _other_size(motion, p, sigma, options.gravity_mps2)
-            if other is not None:
-                return StartResult(None, "", size=other)
+            other = other or _other_size(motion, p, sigma, options.gravity_mps2)
         linear = None if motion is None else linear_start(motion, p, sigma, axes)
         if linear is None or (float(np.max(linear.sigma_p_imu_cam)) > 0.1 and not partial):
             why = f"{name}: lever arm not yet visible: turn the rig about two axes"
-            return StartResult(None, why, motion_missing=True)
+            return StartResult(None, why, motion_missing=True, size=other)
         if "extrinsics" not in options.fix:
             camera.p_imu_cam = linear.p_imu_cam
         if state is None:
@@ -123,15 +122,15 @@ def motion_start(
             f"gravity comes out as {size:.2f} m/s^2 instead of {options.gravity_mps2:.2f}: "
             "check the target's size in its YAML and the unit of the accelerometer"
         )
-        return StartResult(None, why)
-    return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used)
+        return StartResult(None, why, size=other)
+    return StartResult(state, "", still_axes=still, turn_axis_cam=turn_axis_cam, poses=used, size=other)
 
 
 def _other_size(motion: LinearMotion, p: FloatArray, sigma: FloatArray, gravity_mps2: float) -> float | None:
     """Size of the target over the stated one, where positions and accelerations suggest another one.
 
-    It is to be confirmed (see `window_start`): noise of the positions, which the size multiplies, and of the
-    attitudes make it wrong by ten of its sigmas where the rig moves slowly.
+    Noise of the positions, which the size multiplies, and of the attitudes make it wrong by ten of its sigmas
+    where the rig moves slowly.
     Gravity must come out right with it: an accelerometer in g, too, makes the world look another size.
     """
     found = linear_start(motion, p, sigma, free_size=True)

@@ -79,13 +79,17 @@ def window_start(
         The start, or None where the data do not hold together.
     """
     window = BoardWindow.begin(state, poses, frames, make(deepcopy(state)), buffer, target)
-    if window is None or not window.solve():
+    if window is None:
         return None
-    trial = window.filter(make(deepcopy(state)))
-    try:
-        trial.shared = shared_errors(window)
+    try:  # as if corners were independent a shift of the image would count as motion
+        window.shared = {name: shared.sigmas for name, shared in shared_errors(window).items()}
+        if not window.solve():
+            return None
+        shared = shared_errors(window)
     except np.linalg.LinAlgError:  # an image that nothing else says anything of
         return None
+    trial = window.filter(make(deepcopy(state)))
+    trial.shared = shared
     reports = [r for t, frame in frames if (r := step(trial, frame, t)) is not None]
     if 2 * sum(r.used for r in reports) < len(reports) or not trial.plain().finite():
         return None
@@ -138,11 +142,11 @@ def shared_errors(window: BoardWindow) -> dict[str, SharedErrors]:
 
 def _shared_information(window: BoardWindow, now: Present) -> tuple[FloatArray, FloatArray]:
     """Information on what corners share in each image, and right side; motion and constants eliminated."""
-    H, g = window.normal(now)
+    images = window.whitened(now)
+    H, g = window.normal(now, images, together=False)
     n = WAYS * len(now.views)
     across, own, right = np.zeros((n, len(H))), np.zeros((n, n)), np.zeros(n)
-    for k, view in enumerate(now.views):
-        W, r = window.whitened(view)
+    for k, (view, (W, _, r, *_)) in enumerate(zip(now.views, images, strict=True)):
         state = window.at(window.nodes[view.node], view.camera)
         ways = W @ (view.by_error @ shared_ways(state, window.layout, view.camera))
         here = slice(WAYS * k, WAYS * k + WAYS)
