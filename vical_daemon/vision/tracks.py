@@ -44,11 +44,11 @@ class TrackOptions:
 
     max_features: int = 80
     cells: tuple[int, int] = (10, 8)
-    window_px: int = 9
+    window_px: int = 11
     back_window_px: int = 5
     levels: int = 2
     back_px: float = 0.7
-    align_px: float = 0.7
+    align_px: float = 1.0
     unlike: float = 0.45
     epipolar_px: float = 1.5
     fast_threshold: int = 18
@@ -138,7 +138,7 @@ class FeatureTracker:
             self._follow(self._last, now, gray.shape)
             self._align(smooth)
             self._check_epipolar()
-        self._refill(now, smooth)
+        self._refill(gray, smooth)
         self._last = now
         if not len(self._features.ids):
             return None
@@ -231,12 +231,12 @@ class FeatureTracker:
                 features.keep(keep)
         features.old_uv = features.uv.copy()
 
-    def _refill(self, now: _Picture, smooth: Float32) -> None:
-        """Begin features in empty cells, best corner of each: of those seen at half the size, too."""
+    def _refill(self, gray: Gray, smooth: Float32) -> None:
+        """Begin features in empty cells, best corner of each."""
         options, features = self.options, self._features
         columns, rows = options.cells
         room = options.max_features - len(features.ids)
-        height, width = smooth.shape
+        height, width = gray.shape
         scale = np.array([columns / width, rows / height])
         taken = np.zeros((rows, columns), bool)
         cell = np.floor(features.uv * scale).astype(int)
@@ -244,10 +244,10 @@ class FeatureTracker:
         wanted = min(room, int(np.sum(~taken)))
         if wanted < 1 or (wanted < 0.2 * taken.size and self._frame % 3):
             return
-        found = self._fast.detect(now.half)
+        found = self._fast.detect(gray)
         if not found:
             return
-        uv = 2.0 * np.asarray(cv2.KeyPoint.convert(found), np.float64)
+        uv = np.asarray(cv2.KeyPoint.convert(found), np.float64)
         response = np.array([k.response for k in found])
         border = options.border_px
         inside = ((uv > border) & (uv < np.array([width, height]) - 1 - border)).all(axis=1)
