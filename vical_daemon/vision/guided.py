@@ -180,12 +180,8 @@ def _look(
 
 def _consistent(layout: BoardLayout, look: _Look, model: GridModel, tried_px: FloatArray) -> BoardFix | None:
     """Drop the corners that stand out from the model and their neighbours; None below four."""
-    predicted, found = model.predict(layout.xy_m), look.found
-    for _ in range(2):
-        wrong = outliers(look.uv_px - predicted, found, layout.neighbours)
-        if not wrong.any():
-            break
-        found = found & ~wrong
+    predicted = model.predict(layout.xy_m)
+    found = look.found & ~outliers(look.uv_px - predicted, look.found, layout.neighbours)
     if found.sum() < 4:
         return None
     places = predict_with_residuals(layout, model, predicted, look.uv_px, found)
