@@ -80,21 +80,16 @@ class SaddleImage:
 
     def __init__(self, gray: Gray, around_px: FloatArray | None = None) -> None:
         self.shape = gray.shape
-        self._low = np.zeros(2)  # first pixel of the part, u and v
+        rows, columns = slice(0, gray.shape[0]), slice(0, gray.shape[1])
         if around_px is not None:
-            last = np.array(gray.shape[::-1]) - 1
-            low, high = around_px.min(axis=0) - AROUND_PX, around_px.max(axis=0) + AROUND_PX
-            left, top = np.clip(low, 0, last).astype(int).tolist()
-            right, bottom = np.clip(high, 0, last).astype(int).tolist()
-            self._low = np.array([left, top], np.float64)
-            gray_part = gray[top : bottom + 1, left : right + 1]
-        else:
-            gray_part = gray
-        self._high = self._low + gray_part.shape[::-1] - 1.0
+            (left, top), (right, bottom) = around_px.min(axis=0).tolist(), around_px.max(axis=0).tolist()
+            rows, columns = _around(top, bottom, rows.stop), _around(left, right, columns.stop)
+        part = gray[rows, columns]
+        self._low = np.array([columns.start, rows.start], np.float64)  # first pixel of the part, u and v
+        self._high = self._low + part.shape[::-1] - 1.0
         # From uint8 straight to float: a fifth of the time of a conversion and cv2.GaussianBlur.
         self.smooth: Patches = np.asarray(
-            cv2.sepFilter2D(gray_part, cv2.CV_32F, _KERNEL, _KERNEL, borderType=cv2.BORDER_REFLECT_101),
-            np.float32,
+            cv2.sepFilter2D(part, cv2.CV_32F, _KERNEL, _KERNEL, borderType=cv2.BORDER_REFLECT_101), np.float32
         )
         self.noise_dn = pixel_noise(gray)
 
@@ -171,6 +166,12 @@ class SaddleImage:
             borderMode=cv2.BORDER_REPLICATE,
         )
         return np.asarray(flat).reshape(len(uv), 2 * radius + 3, 2 * radius + 3), centre
+
+
+def _around(low: float, high: float, size: int) -> slice:
+    """Pixels of one side of a picture that lie around places between two bounds, px; at least one."""
+    first, last = (int(min(max(x, 0.0), size - 1.0)) for x in (low - AROUND_PX, high + AROUND_PX))
+    return slice(first, last + 1)
 
 
 def pixel_noise(gray: Gray) -> float:

@@ -69,7 +69,7 @@ class Linear:
         valid: Points in front of the camera, shape (n,).
         shared: Square root of the noise that all corners share, in the same ways (a late stamp moves them
             all), shape (k, r).
-        by_shared: The ways by one unit of each of these errors, as of `shared_ways`, shape (k, 3); empty: they
+        by_shared: The ways by one unit of each of these errors (see `shared_ways`), shape (k, 3); empty: they
             are not measured.
     """
 
