@@ -46,7 +46,7 @@ class TrackOptions:
     cells: tuple[int, int] = (10, 8)
     window_px: int = 11
     back_window_px: int = 5
-    levels: int = 2
+    levels: int = 3
     back_px: float = 0.7
     align_px: float = 1.0
     unlike: float = 0.45
