@@ -17,7 +17,6 @@ import numpy as np
 from vical_daemon.vision.detection import FloatArray, Gray
 from vical_daemon.vision.layout import BoardLayout
 from vical_daemon.vision.saddle import SaddleImage
-from vical_daemon.vision.tag_code import sample
 from vical_daemon.vision.target import Checkerboard
 
 LEAST_WIDTH_PX = 320
@@ -108,7 +107,7 @@ def _colour_match(image: SaddleImage, target: Checkerboard, uv: FloatArray) -> f
     """Mean grey of the squares that should be white minus those that should be black."""
     grid = uv.reshape(target.rows, target.cols, 2)
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    level = sample(image.smooth, centres)
+    level = image.levels(centres)
     row, col = np.indices(level.shape)
     black = (row + col) % 2 == 0
     return float(level[~black].mean() - level[black].mean())

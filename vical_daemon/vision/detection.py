@@ -48,6 +48,17 @@ def as_gray(image: AnyImage) -> Gray:
     return np.ascontiguousarray(image, np.uint8)
 
 
+def sample(image: npt.NDArray[np.float32], uv_px: FloatArray) -> FloatArray:
+    """Bilinear grey levels at (finite) pixels, shape (...,); points outside repeat the edge."""
+    flat = uv_px.reshape(-1, 2).astype(np.float32)
+    rows = 16384
+    parts = [
+        cv2.remap(image, flat[i : i + rows, None, :], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for i in range(0, len(flat), rows)
+    ]
+    return np.concatenate(parts).reshape(uv_px.shape[:-1]).astype(np.float64)
+
+
 def median(values: FloatArray) -> float:
     """The middle one of some numbers (the upper of two), shape (n,), n > 0: a tenth of np.median's time."""
     return float(np.partition(values, len(values) // 2)[len(values) // 2])

@@ -56,7 +56,7 @@ class _LastFrame:
     reduced: Gray
     t_ns: int | None
     velocity_px: FloatArray
-    """Motion of each corner per second (per frame without stamps), nan where unknown."""
+    """Motion of each corner per second (per frame without stamps); 0 where unknown, shape (n, 2)."""
 
 
 class BoardDetector:
@@ -90,13 +90,12 @@ class BoardDetector:
             ValueError: The picture has a shape or type that no camera of ours gives.
         """
         gray = as_gray(image)
-        picture = SaddleImage(gray)
         reduced = _reduced(gray) if self._guided else gray
-        fix = self._follow(picture, reduced, t_ns) if self._guided else None
+        fix = self._follow(gray, reduced, t_ns) if self._guided else None
         if fix is not None:
             self.stats.guided += 1
         else:
-            fix = self._search(picture, gray)
+            fix = self._search(gray)
         if fix is None or fix.found.sum() < MIN_POINTS:
             self._last = None
             self._misses += 1
@@ -106,8 +105,9 @@ class BoardDetector:
         ids = np.flatnonzero(fix.found).astype(np.int64)
         return Detection(ids, fix.uv_px[ids], fix.sigma_px[ids])
 
-    def _search(self, picture: SaddleImage, gray: Gray) -> BoardFix | None:
+    def _search(self, gray: Gray) -> BoardFix | None:
         self.stats.searches += 1
+        picture = SaddleImage(gray)
         uv = np.full((len(self._layout.xy_m), 2), np.nan)
         if isinstance(self.target, AprilGrid):
             tags, corners = search_tags(picture, gray, self.target, self._misses)
@@ -123,12 +123,13 @@ class BoardDetector:
             uv = put_in_order(picture, self._layout, found, last)
         return complete_board(picture, self._layout, uv, np.isfinite(uv).all(axis=1), self._lens)
 
-    def _follow(self, picture: SaddleImage, reduced: Gray, t_ns: int | None) -> BoardFix | None:
+    def _follow(self, gray: Gray, reduced: Gray, t_ns: int | None) -> BoardFix | None:
         """Guided detection; None when there is nothing to follow or the board is lost."""
         start = self._flow(reduced, t_ns)
-        if start is None or start[0].shape != picture.shape:
+        if start is None or start[0].shape != gray.shape:
             return None
-        model, predicted = start
+        model, predicted, around = start
+        picture = SaddleImage(gray, around)
         fix = refine_predicted(picture, self._layout, model, predicted, search_px=5.0)
         if fix is not None:
             fix = check_identity(picture, self._layout, refine_missing(picture, self._layout, fix))
@@ -136,8 +137,13 @@ class BoardDetector:
             return None
         return fix
 
-    def _flow(self, reduced: Gray, t_ns: int | None) -> tuple[GridModel, FloatArray] | None:
-        """Start from the last frame, moved by the optical flow of a few well spread corners."""
+    def _flow(self, reduced: Gray, t_ns: int | None) -> tuple[GridModel, FloatArray, FloatArray] | None:
+        """Start from the last frame, moved by the optical flow of a few well spread corners.
+
+        Returns:
+            The last model; a place for each corner, shape (n, 2), nan where there is none; and the finite
+            places that the checks look at, shape (m, 2). None where there is nothing to follow.
+        """
         last = self._last
         if last is None or last.reduced.shape != reduced.shape:
             return None
@@ -145,17 +151,17 @@ class BoardDetector:
         if step is None:
             return None
         found = np.flatnonzero(last.fix.found)
-        chosen = found[np.linspace(0, len(found) - 1, min(len(found), FLOW_POINTS)).round().astype(int)]
+        count = min(len(found), FLOW_POINTS)
+        chosen = found[np.arange(count) * len(found) // count]
+        scale = round(last.fix.model.shape[1] / reduced.shape[1])
+        middle = 0.5 * (scale - 1)  # of the first pixel of the reduced picture
         before = last.fix.uv_px[chosen]
-        guess = before + np.nan_to_num(last.velocity_px[chosen] * step)
-        scale = round(
-            last.fix.model.shape[1] / reduced.shape[1]
-        )  # cv2.pyrDown keeps every other pixel's centre
+        guess = before + last.velocity_px[chosen] * step
         after, status, _ = cv2.calcOpticalFlowPyrLK(
             last.reduced,
             reduced,
-            np.ascontiguousarray((before / scale)[:, None], np.float32),
-            np.ascontiguousarray((guess / scale)[:, None], np.float32),
+            np.ascontiguousarray(((before - middle) / scale)[:, None], np.float32),
+            np.ascontiguousarray(((guess - middle) / scale)[:, None], np.float32),
             winSize=FLOW_WINDOW,
             maxLevel=FLOW_LEVELS,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.05),
@@ -164,11 +170,15 @@ class BoardDetector:
         good = status.ravel() > 0
         if good.sum() < 4:
             return None
-        where = after[good, 0].astype(np.float64) * scale
+        where = after[good, 0].astype(np.float64) * scale + middle
         H, _ = cv2.findHomography(before[good], where, cv2.USAC_FAST, FLOW_TOLERANCE_PX)
         if H is None:
             return None
-        return last.fix.model, cv2.perspectiveTransform(last.fix.places_px[:, None], H)[:, 0]
+        model, rim = last.fix.model, self._layout.rim
+        predicted = _moved(last.fix.places_px, H)
+        around = predicted if rim is None else _moved(model.predict(rim.xy_m), H)
+        around = around[np.isfinite(around).all(axis=1)]
+        return (model, predicted, around) if len(around) else None
 
     def _holds(self, fix: BoardFix, shape: tuple[int, int]) -> bool:
         """Whether guided detection still finds most of what should be in view."""
@@ -179,7 +189,7 @@ class BoardDetector:
         return found >= 8 and found >= KEEP_SHARE * int(inside.sum())
 
     def _remember(self, fix: BoardFix, reduced: Gray, t_ns: int | None) -> None:
-        velocity = np.full(fix.uv_px.shape, np.nan)
+        velocity = np.zeros(fix.uv_px.shape)
         if self._last is not None:
             step = _elapsed(self._last.t_ns, t_ns)
             if step is not None:
@@ -192,10 +202,17 @@ class BoardDetector:
         self._last = _LastFrame(fix, reduced, t_ns, velocity)
 
 
+def _moved(uv_px: FloatArray, H: FloatArray) -> FloatArray:
+    """Pixels moved by a homography, shape (n, 2)."""
+    return np.asarray(cv2.perspectiveTransform(uv_px[:, None], H)[:, 0])
+
+
 def _reduced(gray: Gray) -> Gray:
     """The picture, halved until the next half would be narrower than `FLOW_WIDTH_PX`."""
     while gray.shape[1] >= 2 * FLOW_WIDTH_PX:
-        gray = np.asarray(cv2.pyrDown(gray), np.uint8)
+        height, width = (size // 2 for size in gray.shape)  # means of four: a quarter of cv2.pyrDown's time
+        whole = gray[: 2 * height, : 2 * width]
+        gray = np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     return gray
 
 

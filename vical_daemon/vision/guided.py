@@ -15,7 +15,7 @@ from vical_daemon.vision.detection import FloatArray, median
 from vical_daemon.vision.grid_model import GridModel, fit_grid, outliers
 from vical_daemon.vision.layout import BoardLayout
 from vical_daemon.vision.saddle import SaddleImage
-from vical_daemon.vision.tag_code import agreement, bit_places, sample
+from vical_daemon.vision.tag_code import agreement, bit_places
 from vical_daemon.vision.target import AprilGrid
 
 BoolArray = npt.NDArray[np.bool_]
@@ -180,12 +180,8 @@ def _look(
 
 def _consistent(layout: BoardLayout, look: _Look, model: GridModel, tried_px: FloatArray) -> BoardFix | None:
     """Drop the corners that stand out from the model and their neighbours; None below four."""
-    predicted, found = model.predict(layout.xy_m), look.found
-    for _ in range(2):
-        wrong = outliers(look.uv_px - predicted, found, layout.neighbours)
-        if not wrong.any():
-            break
-        found = found & ~wrong
+    predicted = model.predict(layout.xy_m)
+    found = look.found & ~outliers(look.uv_px - predicted, look.found, layout.neighbours)
     if found.sum() < 4:
         return None
     places = predict_with_residuals(layout, model, predicted, look.uv_px, found)
@@ -220,15 +216,16 @@ def corner_contrast(
 ) -> FloatArray:
     """White minus black sectors around each corner, grey levels; negative where the colours are swapped."""
     arm = 0.6 * layout.reach_m * axes_px
-    diagonals = np.stack([arm[:, 0] + arm[:, 1], arm[:, 0] - arm[:, 1]], axis=1)
-    spots = uv_px[:, None, None, :] + diagonals[:, :, None, :] * np.array([1.0, -1.0])[:, None]
-    level = sample(image.smooth, spots)
-    same, other = level[:, 0], level[:, 1]
-    mean = (same.sum(axis=1) - other.sum(axis=1)) / 2
+    along, across = arm[:, 0] + arm[:, 1], arm[:, 0] - arm[:, 1]
+    spots = np.stack([uv_px + along, uv_px - along, uv_px + across, uv_px - across])
+    a, b, c, d = image.levels(spots)  # a and b are of one colour, c and d of the other
+    mean = (a + b - c - d) / 2
     # The weaker side counts: a half-hidden corner has one sector of the wrong colour.
     polarity = layout.polarity[index]
     weakest = np.where(
-        polarity > 0, same.min(axis=1) - other.max(axis=1), other.min(axis=1) - same.max(axis=1)
+        polarity > 0,
+        np.minimum(a, b) - np.maximum(c, d),
+        np.minimum(c, d) - np.maximum(a, b),
     )
     return np.asarray(np.minimum(mean * polarity, weakest + 0.5 * np.abs(mean)))
 
@@ -282,7 +279,7 @@ def check_codes(image: SaddleImage, layout: BoardLayout, fix: BoardFix) -> Board
     seen = np.flatnonzero(inside & found.any(axis=1))
     if not len(seen):
         return None
-    match = agreement(sample(image.smooth, bit_places(quads[seen])), seen)
+    match = agreement(image.levels(bit_places(quads[seen])), seen)
     if match.mean() < MIN_BOARD_AGREEMENT:
         return None
     hidden = match < MIN_AGREEMENT

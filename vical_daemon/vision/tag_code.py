@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.vision.detection import FloatArray, IntArray
+from vical_daemon.vision.detection import FloatArray, IntArray, sample
 from vical_daemon.vision.target import TAG_FAMILY_SIZE
 
 BITS = 6
@@ -63,17 +63,6 @@ def bit_places(quads_px: FloatArray) -> FloatArray:
     depth = g[:, None] * x + h[:, None] * y + 1.0
     uv = (right[..., None] * x + up[..., None] * y + p0[..., None]) / np.maximum(depth, 1e-6)
     return np.asarray(uv.transpose(1, 2, 0))
-
-
-def sample(image: npt.NDArray[np.float32], uv_px: FloatArray) -> FloatArray:
-    """Bilinear grey levels at (finite) pixels, shape (...,); points outside repeat the edge."""
-    flat = uv_px.reshape(-1, 2).astype(np.float32)
-    rows = 16384
-    parts = [
-        cv2.remap(image, flat[i : i + rows, None, :], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for i in range(0, len(flat), rows)
-    ]
-    return np.concatenate(parts).reshape(uv_px.shape[:-1]).astype(np.float64)
 
 
 def decode(image: npt.NDArray[np.float32], quads_px: FloatArray, tags: int) -> tuple[IntArray, FloatArray]:

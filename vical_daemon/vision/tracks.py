@@ -30,8 +30,9 @@ class TrackOptions:
     Attributes:
         max_features: Upper bound on features alive.
         cells: Columns and rows of the grid that spreads them.
-        window_px: Edge of the Lucas-Kanade window.
-        levels: Pyramid levels above the picture itself.
+        window_px: Edge of the Lucas-Kanade window, in the picture at half the size.
+        back_window_px: The same on the way back: with another window, a point on an edge slides elsewhere.
+        levels: Pyramid levels above the picture at half the size.
         back_px: Largest distance of the way back from where it began.
         align_px: Largest move of the alignment with a feature's first look before it is anchored anew.
         unlike: Largest unlikeness (0 equal, 1 unrelated) before it is anchored anew.
@@ -43,10 +44,11 @@ class TrackOptions:
 
     max_features: int = 80
     cells: tuple[int, int] = (10, 8)
-    window_px: int = 15
+    window_px: int = 11
+    back_window_px: int = 5
     levels: int = 3
     back_px: float = 0.7
-    align_px: float = 0.7
+    align_px: float = 1.0
     unlike: float = 0.45
     epipolar_px: float = 1.5
     fast_threshold: int = 18
@@ -56,9 +58,8 @@ class TrackOptions:
 
 @dataclass(frozen=True)
 class _Picture:
-    """A picture, the same at half the size, and its stamp, ns."""
+    """A picture at half the size (pixel u is at u / 2), and its stamp, ns."""
 
-    gray: Gray
     half: Gray
     t_ns: int | None
 
@@ -129,12 +130,12 @@ class FeatureTracker:
         """
         gray = as_gray(image)
         smooth: Float32 = np.asarray(cv2.sepFilter2D(gray, cv2.CV_32F, _KERNEL, _KERNEL), np.float32)
-        now = _Picture(gray, cv2.pyrDown(gray), t_ns)
-        if self._last is not None and self._last.gray.shape != gray.shape:
+        now = _Picture(np.asarray(cv2.pyrDown(gray), np.uint8), t_ns)
+        if self._last is not None and self._last.half.shape != now.half.shape:
             self._features, self._last = _Features(), None
         self._frame += 1
         if self._last is not None and len(self._features.ids):
-            self._follow(self._last, now)
+            self._follow(self._last, now, gray.shape)
             self._align(smooth)
             self._check_epipolar()
         self._refill(gray, smooth)
@@ -145,11 +146,12 @@ class FeatureTracker:
         sigma = np.sqrt(features.sigma**2 + features.drift**2 + self.options.sigma_floor_px**2)
         return Detection(features.ids.copy(), features.uv.copy(), sigma)
 
-    def _follow(self, before: _Picture, now: _Picture) -> None:
+    def _follow(self, before: _Picture, now: _Picture, shape: tuple[int, int]) -> None:
+        """Follow the features there and back; at half the size, as the alignment corrects a pixel or less."""
         features, options = self._features, self.options
-        height, width = now.gray.shape
+        height, width = shape
         guess = self.predictor.predict(features.uv, before.t_ns, now.t_ns)
-        uv, good = self._flow(before.gray, now.gray, features.uv, guess, options.levels, options.window_px)
+        uv, good = self._flow(before, now, features.uv, guess, options.levels, options.window_px)
         border = options.border_px
         good &= ((uv > border) & (uv < np.array([width, height]) - 1 - border)).all(axis=1)
         good &= self._comes_back(before, now, features.uv, uv)
@@ -160,36 +162,36 @@ class FeatureTracker:
     def _comes_back(
         self, before: _Picture, now: _Picture, uv_before: FloatArray, uv_now: FloatArray
     ) -> BoolArray:
-        """Whether the way back ends where the feature came from; at half the size, at a third of the cost."""
-        back, good = self._flow(
-            now.half,
-            before.half,
-            0.5 * uv_now,
-            0.5 * uv_before,
-            0,
-            self.options.window_px // 2 + 2,
-        )
-        near = np.linalg.norm(2.0 * back - uv_before, axis=1) < self.options.back_px
+        """Whether the way back ends where the feature came from."""
+        back, good = self._flow(now, before, uv_now, uv_before, 0, self.options.back_window_px)
+        near = np.linalg.norm(back - uv_before, axis=1) < self.options.back_px
         return np.asarray(good & near)
 
     def _flow(
-        self, source: Gray, goal: Gray, points: FloatArray, guess: FloatArray, levels: int, window_px: int
+        self,
+        source: _Picture,
+        goal: _Picture,
+        points: FloatArray,
+        guess: FloatArray,
+        levels: int,
+        window_px: int,
     ) -> tuple[FloatArray, BoolArray]:
+        """Where points of one picture are in another, px, and which were found."""
         if not len(points):
             return points.copy(), np.zeros(0, bool)
         window = (window_px, window_px)
         found, status, _ = cv2.calcOpticalFlowPyrLK(
-            source,
-            goal,
-            np.ascontiguousarray(points[:, None, :], np.float32),
-            np.ascontiguousarray(guess[:, None, :], np.float32),
+            source.half,
+            goal.half,
+            np.ascontiguousarray(0.5 * points[:, None, :], np.float32),
+            np.ascontiguousarray(0.5 * guess[:, None, :], np.float32),
             winSize=window,
             maxLevel=levels,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.02),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=1e-3,
         )
-        uv = found.reshape(-1, 2).astype(np.float64)
+        uv = 2.0 * found.reshape(-1, 2).astype(np.float64)
         good = (status.ravel() > 0) & np.isfinite(uv).all(axis=1)
         return np.where(good[:, None], uv, points), np.asarray(good)
 

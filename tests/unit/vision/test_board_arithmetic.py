@@ -48,15 +48,20 @@ def test_axes_are_the_pixels_of_a_metre(board):
     np.testing.assert_allclose(layout.steps.axes_px(uv), np.broadcast_to(axes, (len(uv), 2, 2)))
 
 
-def test_corners_with_windows_of_several_sizes_are_refined_together():
-    """One batch gives what each corner gives alone."""
-    u, v = np.meshgrid(np.arange(200.0), np.arange(160.0))
-    places = np.array([[50.3, 40.7], [120.6, 40.2], [50.8, 110.1], [120.1, 110.9]])
+def picture_of(places, shape):
+    """A corner with its four sectors at each place, shape (n, 2), px."""
+    v, u = np.indices(shape).astype(float)
     picture = 120 + sum(
         90 * np.tanh((u - a) / 0.9) * np.tanh((v - b) / 0.9) * (np.hypot(u - a, v - b) < 25)
         for a, b in places
     )
-    image = SaddleImage(np.round(picture).astype(np.uint8))
+    return np.round(picture).astype(np.uint8)
+
+
+def test_corners_with_windows_of_several_sizes_are_refined_together():
+    """One batch gives what each corner gives alone."""
+    places = np.array([[50.3, 40.7], [120.6, 40.2], [50.8, 110.1], [120.1, 110.9]])
+    image = SaddleImage(picture_of(places, (160, 200)))
     radius = np.array([2.0, 3.4, 5.0, 9.0])
     together = image.refine(places + 0.6, radius)
     assert together.ok.all()
@@ -65,6 +70,25 @@ def test_corners_with_windows_of_several_sizes_are_refined_together():
         alone = image.refine(places[k : k + 1] + 0.6, radius[k : k + 1])
         np.testing.assert_allclose(together.uv_px[k], alone.uv_px[0], atol=2e-3)
         assert together.sigma_px[k] == pytest.approx(alone.sigma_px[0], rel=0.02)
+
+
+def test_a_part_of_a_picture_gives_the_same_corners_as_the_whole():
+    places = np.array([[150.3, 140.7], [220.6, 140.2], [150.8, 210.1], [40.0, 40.0]])
+    picture = picture_of(places, (260, 300))
+    whole, part = SaddleImage(picture), SaddleImage(picture, places[:3])
+    assert part.smooth.size < 0.5 * whole.smooth.size
+    a, b = (image.refine(places + 0.6, np.full(4, 5.0)) for image in (whole, part))
+    np.testing.assert_allclose(a.uv_px[:3], b.uv_px[:3], atol=1e-5)
+    np.testing.assert_allclose(a.sigma_px[:3], b.sigma_px[:3], rtol=1e-5)
+    assert a.ok.all()
+    assert b.ok.tolist() == [True, True, True, False]  # the last one is not in the part
+    np.testing.assert_allclose(whole.levels(places[:3]), part.levels(places[:3]), atol=1e-3)
+
+
+@pytest.mark.parametrize("place", [(-500.0, 20.0), (40.0, 1e6)])
+def test_a_board_expected_beyond_the_picture_has_no_corners(place):
+    image = SaddleImage(picture_of([(50.0, 40.0)], (80, 100)), np.array([place]))
+    assert not image.refine(np.array([place, (50.0, 40.0)]), np.full(2, 4.0)).ok.any()
 
 
 def test_every_pass_has_its_turn_while_there_is_no_board():

@@ -127,7 +127,8 @@ def led_to(detector, uv):
     """Let the optical flow lead there, shape (points, 2), nan where unseen."""
     valid = np.isfinite(uv).all(axis=1)
     model = fit_grid(detector._layout.xy_m[valid], uv[valid], (480, 640), -0.1)
-    detector._flow = lambda gray, t_ns: (model, uv)
+    around = model.predict((detector._layout.rim or detector._layout).xy_m)
+    detector._flow = lambda gray, t_ns: (model, uv, around)
     return detector
 
 

@@ -240,8 +240,10 @@ class CalibrationFilter:
     def _with_shared(self, image: Image, lin: Linear) -> Linear:
         """The linearised image with the noise that its corners share."""
         shared = self.shared.get(image.camera)
-        if shared is not None and (shared.jitter_s or shared.shift_px):
-            lin.shared = lin.by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas)
+        if shared is not None:
+            lin.by_shared = lin.by_error @ shared_ways(self.state, self.layout, image.camera)
+            if shared.jitter_s or shared.shift_px:
+                lin.shared = lin.by_shared * shared.sigmas
         return lin
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
@@ -301,13 +303,14 @@ class CalibrationFilter:
         if self.arm_score is None:
             covariance = self.S[:MOTION_ERRORS] @ self.S[:MOTION_ERRORS].T
             self.arm_score = LeverArmScore.of(covariance, len(self.layout.cameras))
-        ways, by_error = fit.ways, lin.by_error
+        ways, by_error, by_shared = fit.ways, lin.by_error, lin.by_shared
         if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
             ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
             ways = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
+            by_shared = by_error @ shared_ways(self.state, self.layout, image.camera)
         information, shared = ways[:, :6].T @ ways[:, :6], self.shared.get(image.camera)
         if shared is not None:  # what corners share is noise, too
-            alike = ways @ (by_error @ (shared_ways(self.state, self.layout, image.camera) * shared.sigmas))
+            alike = ways @ (by_shared * shared.sigmas)
             across = ways[:, :6].T @ alike
             information -= across @ np.linalg.solve(unscented.unit(WAYS) + alike.T @ alike, across.T)
         at = list(self.layout.cameras).index(image.camera)

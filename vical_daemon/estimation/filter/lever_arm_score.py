@@ -20,12 +20,15 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ACCEL_BIAS, ATTITUDE, MOTION
+from vical_daemon.estimation.model.unscented import unit
 
 MOTION_ERRORS = ACCEL_BIAS.stop
 """Number of errors of attitude, position, velocity and biases."""
 UNCERTAIN = 0.5
 """Share of the bias: it goes with the square of the gyro's noise, which a data sheet gives to a quarter."""
 _STEP_M = 1e-3  # of a lever arm, for differences: log det S is straight over a hundred times that
+_STEPS = _STEP_M * so3.hat(so3.IDENTITY)
+_BIASES = np.arange(MOTION.stop, MOTION_ERRORS)
 
 
 @dataclass(slots=True)
@@ -52,12 +55,11 @@ class LeverArmScore:
             Q: Covariance of the noise that the motion gathers, shape (9, 9).
             walk: Variances that the biases gain, shape (6,).
         """
-        F = np.eye(MOTION_ERRORS)
+        F, gained = np.eye(MOTION_ERRORS), np.zeros((MOTION_ERRORS, MOTION_ERRORS))
         F[MOTION] = slopes
-        self.P = F @ self.P @ F.T
-        self.P[:, MOTION, MOTION] += Q
-        biases = np.arange(MOTION.stop, MOTION_ERRORS)
-        self.P[:, biases, biases] += walk
+        gained[MOTION, MOTION] = Q
+        gained[_BIASES, _BIASES] = walk
+        self.P = F @ self.P @ F.T + gained
 
     def update(
         self, information: FloatArray, by_motion: FloatArray, to_cam: FloatArray, at: int
@@ -74,10 +76,10 @@ class LeverArmScore:
             1/2 d log det S / dp of all lever arms, 1/m, shape (3 cameras,).
         """
         T = np.repeat(by_motion[None], len(self.P), axis=0)
-        T[1 + 3 * at : 4 + 3 * at, 3:6, ATTITUDE] -= _STEP_M * to_cam @ so3.hat(so3.IDENTITY)
+        T[1 + 3 * at : 4 + 3 * at, 3:6, ATTITUDE] -= to_cam @ _STEPS
         PT = self.P @ np.swapaxes(T, 1, 2)
-        A = np.eye(6) + information @ (T @ PT)
-        self.P = self.P - PT @ np.linalg.solve(A, information @ np.swapaxes(PT, 1, 2))
-        self.P = 0.5 * (self.P + np.swapaxes(self.P, 1, 2))
+        A = unit(6) + information @ (T @ PT)
+        P = self.P - PT @ np.linalg.solve(A, information @ np.swapaxes(PT, 1, 2))
+        self.P = 0.5 * (P + np.swapaxes(P, 1, 2))
         log_det = np.linalg.slogdet(A)[1]
         return np.asarray((log_det[1:] - log_det[0]) / (2.0 * _STEP_M))

@@ -69,6 +69,8 @@ class Linear:
         valid: Points in front of the camera, shape (n,).
         shared: Square root of the noise that all corners share, in the same ways (a late stamp moves them
             all), shape (k, r).
+        by_shared: The ways by one unit of each of these errors (see `shared_ways`), shape (k, 3); empty: they
+            are not measured.
     """
 
     z: FloatArray
@@ -78,6 +80,7 @@ class Linear:
     curved: FloatArray
     valid: BoolArray
     shared: FloatArray
+    by_shared: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def moves(self) -> FloatArray:

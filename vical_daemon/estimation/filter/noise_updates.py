@@ -10,7 +10,6 @@ from vical_daemon.estimation.filter.image_update import ImageFit, whitened
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
-from vical_daemon.estimation.noise.shared_errors import shared_ways
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
@@ -32,7 +31,7 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
     if shared is not None:
         ways, innovation = rows if lin.curved.size else (fit.ways, fit.r)
         level = f.consistency[image.camera].level
-        by_shared = ways @ (lin.by_error @ shared_ways(f.state, f.layout, image.camera))
+        by_shared = ways @ lin.by_shared
         shared.learn(image.t_cam_s, innovation, by_shared, (by_shared.T @ ways) @ lin.spread, level)
     if where.intrinsics is not None and where.distortion is not None and agreement is not None:
         by_lens = lin.by_error[:, where.intrinsics.start : where.distortion.stop]

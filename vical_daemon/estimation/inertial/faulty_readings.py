@@ -262,7 +262,16 @@ class SpikeFilter(Generic[T]):
 
 def _line(last: Six, before: Six, steps: int = 1) -> Six:
     """Where a straight line through two readings is some steps later."""
-    return [a + steps * (a - b) for a, b in zip(last, before, strict=True)]
+    a, b, c, d, e, f = last
+    u, v, w, x, y, z = before
+    return (
+        a + steps * (a - u),
+        b + steps * (b - v),
+        c + steps * (c - w),
+        d + steps * (d - x),
+        e + steps * (e - y),
+        f + steps * (f - z),
+    )
 
 
 def _apart(a: Six, b: Six) -> tuple[float, float]:

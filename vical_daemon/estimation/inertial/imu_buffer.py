@@ -79,7 +79,11 @@ class ImuBuffer:
         return float(self._rows[self._start, 0]) if len(self) else np.inf
 
     def append(
-        self, t_s: float, gyro: FloatArray, accel: FloatArray, clipping_sigma: Sequence[float] | None = None
+        self,
+        t_s: float,
+        gyro: Sequence[float] | FloatArray,
+        accel: Sequence[float] | FloatArray,
+        clipping_sigma: Sequence[float] | None = None,
     ) -> bool:
         """Add a reading; False (and nothing done) when it is not newer than the last, or not finite.
 
@@ -93,12 +97,10 @@ class ImuBuffer:
             return False
         if self._stop == len(self._rows):
             self._make_room()
-        row = self._rows[self._stop]
-        row[0] = t_s
-        row[1:4] = gyro
-        row[4:7] = accel
-        if not math.isfinite(row.sum()):
+        row = (t_s, *gyro, *accel)
+        if not math.isfinite(sum(row)):
             return False
+        self._rows[self._stop] = row
         if clipping_sigma is not None and self._clipping_sigma is None:
             self._clipping_sigma = np.zeros((len(self._rows), 6))
         if self._clipping_sigma is not None:

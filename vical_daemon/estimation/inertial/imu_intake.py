@@ -12,7 +12,6 @@ from vical_daemon.estimation.inertial.clipped_readings import Bridged, ClippedRe
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, Six, SpikeFilter
 from vical_daemon.estimation.inertial.imu_buffer import GAP_S, ImuBuffer
 from vical_daemon.estimation.inertial.stamp_steps import LEARN, StampSteps
-from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.plausible import MOST_MPS2, MOST_RPS
 
 _CLIPPED_S = 5.0  # from the first clipped reading on, their share in each such stretch is looked at
@@ -27,8 +26,8 @@ class Reading(NamedTuple):
     """One inertial reading: stamp as it came, ns; rad/s; m/s^2; `Bridged.clipping_sigma`."""
 
     t_imu_ns: int
-    gyro_rps: FloatArray
-    specific_force_mps2: FloatArray
+    gyro_rps: Sequence[float]
+    specific_force_mps2: Sequence[float]
     clipping_sigma: Six | None = None
 
 
@@ -169,8 +168,7 @@ class ImuIntake:
         if self.between and t_s < self._newest_s + _APART_S:  # its stamps overlap, or seem to go on
             self.base_ns -= round((self._newest_s + _APART_S - t_s) * 1e9)
             t_s = self._newest_s + _APART_S
-        values = np.array(six)
-        return self._in_order(buffer, t_s, Reading(t_imu_ns, values[:3], values[3:], clipping_sigma))
+        return self._in_order(buffer, t_s, Reading(t_imu_ns, six[:3], six[3:], clipping_sigma))
 
     def _announce_clipping(self, t_s: float) -> None:
         if self._clipping_s is None and self._at_range:

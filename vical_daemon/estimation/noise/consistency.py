@@ -76,17 +76,17 @@ def normalised(
     """
     if len(uv) < MODES:
         return None
-    W = np.concatenate([modes(uv), ways, innovation.reshape(-1, 1)], axis=1)
-    W /= np.repeat(sigma, 2)[:, None]
-    along = W[:, :MODES].T @ W
+    M = modes(uv)
+    weighted = (M / np.repeat(sigma * sigma, 2)[:, None]).T
     try:
-        L = root(along[:, :MODES])  # of the modes, Q L'
+        L = root(weighted @ M)  # of the modes, Q L'
     except np.linalg.LinAlgError:
         return None
     diagonal = L.diagonal()
     if diagonal.min() < 1e-6 * diagonal.max():
         return None
-    along = solve_lower(L, along[:, MODES:])  # Q' of ways and innovation
+    along = np.concatenate([weighted @ ways, (weighted @ innovation.ravel())[:, None]], axis=1)
+    along = solve_lower(L, along)  # Q' of ways and innovation
     if hidden is not None:
         directions, size, _ = np.linalg.svd(along[:, :-1] @ hidden)
         along = directions[:, int(np.count_nonzero(size > 1.0)) :].T @ along

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -74,7 +75,7 @@ class Evaluator:
         self._trace: dict[str, Trace] = {}
         self._ever_converged = self.believed = False
 
-    def saw_reading(self, t_ns: int, gyro: FloatArray, accel: FloatArray) -> None:
+    def saw_reading(self, t_ns: int, gyro: Sequence[float], accel: Sequence[float]) -> None:
         """Count one inertial reading, and keep the size of some."""
         if not self.imu_samples:
             self._first_ns = t_ns
@@ -83,7 +84,7 @@ class Evaluator:
         self._events.now_s = self.elapsed_s
         self.motion.add(self.elapsed_s, gyro)
         if self.imu_samples % _EVERY_READINGS == 1:
-            self._size.append(float(np.sqrt(accel @ accel)))
+            self._size.append(math.hypot(*accel))
 
     def saw_points(self, t_s: float, count: int) -> None:
         """Count one image with `count` points or tracks in it."""
