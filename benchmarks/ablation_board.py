@@ -30,12 +30,15 @@ from vical_daemon.estimation.filter import image_intake, image_update
 from vical_daemon.estimation.filter import snapshot as board_snapshot
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import ImageIntake
+from vical_daemon.estimation.inertial import clipped_readings
+from vical_daemon.estimation.inertial.clipped_readings import ClippedReadings
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.inertial.stamp_steps import StampSteps
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.model import start_sigmas
 from vical_daemon.estimation.model.held_lens import FixedLens
+from vical_daemon.estimation.noise import variance_components
 from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
@@ -95,6 +98,10 @@ def _no_watch() -> list[tuple[Any, ...]]:
 def _always_free(f: CalibrationFilter) -> dict[tuple[str, ...], float]:
     held = tuple(name for name, block in model_selection.blocks(f).items() if block.held)
     return {held: 1.0}
+
+
+def _no_arm_score(self: CalibrationFilter, *_args: Any) -> Any:
+    return np.zeros(3 * len(self.layout.cameras))
 
 
 def _sift(_self: Any, _six: Any, item: Any) -> list[Any]:
@@ -247,6 +254,18 @@ BOARD: dict[str, Mechanism] = {
         lambda: [(RangeLimits, "at_range", gives(()))],
         disturbances=("gyro clips",),
     ),
+    "imu clipped: error of the cubic": Mechanism(
+        WRONG,
+        "how much the same cubic misses where the truth is known",
+        lambda: [(ClippedReadings, "_missed", gives(0.0))],
+        disturbances=("gyro clips",),
+    ),
+    "imu clipped: beyond the range": Mechanism(
+        WRONG,
+        "a bridged reading may be anything up to twice as far beyond the range",
+        lambda: [(clipped_readings, "_EVEN", 0.0)],
+        disturbances=("gyro clips",),
+    ),
     "imu spikes": Mechanism(
         WRONG,
         "single readings that are wrong",
@@ -361,5 +380,23 @@ BOARD: dict[str, Mechanism] = {
         "whole images that are off, likewise",
         lambda: [then(SharedErrors, "_look", put(shift_px=0.0))],
         faults=("whole images off by 0.3 px",),
+    ),
+    "jitter and shifts: may be absent": Mechanism(
+        SMALL,
+        "half of the prior is on no such error; without: all sizes on the grid are alike, none among them",
+        lambda: [(variance_components, "PRESENT", 1.0 - 1.0 / variance_components.SIZE)],
+        faults=("stamp jitter 1 ms", "whole images off by 0.3 px", "slow motion"),
+    ),
+    "lever arms: bias by the gyro": Mechanism(
+        SMALL,
+        "what noise of the gyro does to lever arms is subtracted",
+        lambda: [(CalibrationFilter, "_arm_score", _no_arm_score)],
+        faults=("slow motion",),
+    ),
+    "lever arms: uncertain bias": Mechanism(
+        SMALL,
+        "sigmas include half of what is subtracted",
+        lambda: [(CalibrationFilter, "allowing_for_arm_bias", lambda self: self)],
+        faults=("slow motion",),
     ),
 }

@@ -110,6 +110,22 @@ FREE: dict[str, Mechanism] = {
         faults=("free: skew 100 ppm",),
         disturbances=("nothing", DRIFTS, "5 ms", "20 ms"),
     ),
+    "free: changes ten times as often": Mechanism(
+        MOVED,
+        "one change of the clocks an hour; without: ten",
+        lambda: [(clock_changes, "CLOCK_CHANGES_HZ", 10.0 * clock_changes.CLOCK_CHANGES_HZ)],
+        free=True,
+        faults=("free: skew 100 ppm",),
+        disturbances=("nothing", DRIFTS, "5 ms", "20 ms"),
+    ),
+    "free: changes a tenth as often": Mechanism(
+        MOVED,
+        "one change of the clocks an hour; without: one in ten hours",
+        lambda: [(clock_changes, "CLOCK_CHANGES_HZ", 0.1 * clock_changes.CLOCK_CHANGES_HZ)],
+        free=True,
+        faults=("free: skew 100 ppm",),
+        disturbances=("nothing", DRIFTS, "5 ms", "20 ms"),
+    ),
     "free: windows show": Mechanism(
         MOVED,
         "a change is decided when two windows follow it",
