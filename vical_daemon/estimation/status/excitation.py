@@ -13,14 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.guidance import AXES, Axis, Block, Guidance, Lack, Verb, WeakDirection
-from vical_daemon.estimation.measurements import ConvergenceTargets
+from vical_daemon.estimation.measurements import ConvergenceTargets, FloatArray
 from vical_daemon.estimation.temporal.rotation_turns import MIN_RATE_RPS
 from vical_daemon.estimation.wording import ALONG
-
-FloatArray = npt.NDArray[np.float64]
 
 WIDE = ConvergenceTargets(
     0.005, math.radians(0.5), 0.5e-3

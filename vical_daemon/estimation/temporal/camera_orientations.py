@@ -6,15 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, planar_poses
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import undistort
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _MIN_POINTS = 6
 _MAX_RMS_PX = 8.0  # a pose that misses its corners by more is a wrong detection

@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA
 from vical_daemon.estimation.significance import JUMP_SIGMAS
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
-
-FloatArray = npt.NDArray[np.float64]
 
 _DRIFT_WALK = 1e-6  # how much the drift rate may change, 1/sqrt(s)
 _SEARCH_S = 0.2  # about the delay of the window before

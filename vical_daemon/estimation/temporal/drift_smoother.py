@@ -12,11 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
-FloatArray = npt.NDArray[np.float64]
+from vical_daemon.estimation.measurements import FloatArray
 
 BIAS = slice(3, 6)  # where the gyro bias stands in the state
 

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import MEDIAN_CHI2_3, ORIENTATION_REFUSED, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftSolution, solve
 from vical_daemon.estimation.temporal.orientation_noise import estimate_scales, scaled, scales_of
@@ -28,9 +28,6 @@ from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.stretch_agreement import widening
 
 __all__ = ["DriftNoise", "Fit", "OrientationSensor", "polish"]
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 _GATE = chi_square_limit(3, ORIENTATION_REFUSED)
 _ROUNDS = 12

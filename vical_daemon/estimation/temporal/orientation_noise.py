@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem
 from vical_daemon.estimation.temporal.drift_smoother import cost as drift_cost
 from vical_daemon.estimation.temporal.orientation_problem import DriftNoise, Linear, OrientationSensor
-
-FloatArray = npt.NDArray[np.float64]
 
 _SLOW_LIMITS = (-4.0, 4.0)
 _CLOSE = 0.1  # a minimum this close, in steps, is reached

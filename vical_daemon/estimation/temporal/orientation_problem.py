@@ -14,11 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 _MIN_INTERVAL_S = 2e-5  # two stamps may coincide; the drift between them must not become infinitely certain
 LEAST_NOISE_RAD = 1e-5  # two seconds of arc: below every stamp's rounding at a motion of 60 deg/s

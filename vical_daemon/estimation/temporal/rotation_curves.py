@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_model import cross
-
-FloatArray = npt.NDArray[np.float64]
+from vical_daemon.estimation.measurements import FloatArray
 
 _GAP = 2.5  # intervals longer than this many median intervals are holes in the data
 

@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import Start, angles_between, robust_cost
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

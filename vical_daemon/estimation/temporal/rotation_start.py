@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_turns import (
     BASELINES_S,
@@ -23,8 +23,6 @@ from vical_daemon.estimation.temporal.rotation_turns import (
     Turns,
     camera_turns,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 _GRID_S = 0.01
 _FINE_S = 0.0025

@@ -8,14 +8,12 @@ start is repeated with each mistake undone, and the one that makes the rotations
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import Start, coarse_start, debiased_start
 from vical_daemon.estimation.temporal.stamp_stretch import BETTER, estimate_clock_rate
-
-FloatArray = npt.NDArray[np.float64]
 
 _FITS = 0.3  # median misfit of the turns over their median size
 

@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
-BoolArray = npt.NDArray[np.bool_]
 
 MIN_RATE_RPS = np.deg2rad(3.0)  # slower than this is "not moving"
 MIN_PAIRS = 8

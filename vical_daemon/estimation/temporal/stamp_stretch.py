@@ -8,8 +8,8 @@ fit. Before the rotations are blamed, the start is tried again with stretched st
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import (
     Start,
@@ -18,8 +18,6 @@ from vical_daemon.estimation.temporal.rotation_start import (
     shift_costs,
 )
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, camera_turns
-
-FloatArray = npt.NDArray[np.float64]
 
 _MOST = 0.22
 _STEP, _FINE = 0.02, 0.0025

@@ -11,18 +11,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.significance import STRETCHES_DISAGREE, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem, solve
-
-FloatArray = npt.NDArray[np.float64]
 
 _STRETCHES = 6
 _LEAST_ROWS = 20  # orientations in a stretch
 
 
-def widening(problem: DriftProblem, used: npt.NDArray[np.bool_], sensors: int) -> FloatArray:
+def widening(problem: DriftProblem, used: BoolArray, sensors: int) -> FloatArray:
     """By how much the sigmas of mounting and shift are too small, per sensor; 1 where the stretches agree.
 
     Args:
@@ -68,7 +66,7 @@ def scatter_factor(values: Sequence[FloatArray], covariances: Sequence[FloatArra
     return float(np.sqrt(chi2 / freedom)) if chi2 > chi_square_limit(freedom, STRETCHES_DISAGREE) else 1.0
 
 
-def _stretches(problem: DriftProblem, used: npt.NDArray[np.bool_], sensors: int) -> list[slice]:
+def _stretches(problem: DriftProblem, used: BoolArray, sensors: int) -> list[slice]:
     """Cut the rows so that the information on the shifts is divided evenly: rest is no stretch of its own."""
     count = min(_STRETCHES, int(np.count_nonzero(used)) // _LEAST_ROWS)
     if count < 2:

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.rotation_registration import Registration, closest_point_registration
@@ -40,8 +41,6 @@ __all__ = [
     "td_icp",
     "world_cam_from_cam_target",
 ]
-
-FloatArray = npt.NDArray[np.float64]
 
 _ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
 # noise of one orientation: above which the usual mistakes are tried out, and of a board as it usually is

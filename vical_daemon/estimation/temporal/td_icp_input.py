@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from vical_daemon.estimation.measurements import FloatArray
 
 MIN_ORIENTATIONS = 12
 SLOWEST_GYRO_HZ = 10.0  # as for `calibrate`: between slower samples a hand turns to and fro unseen

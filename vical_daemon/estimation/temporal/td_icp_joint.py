@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.significance import RATE_SIGMAS
 from vical_daemon.estimation.temporal.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
@@ -36,8 +37,6 @@ __all__ = [
     "joint_of_orientations",
     "joint_with_gyro",
 ]
-
-FloatArray = npt.NDArray[np.float64]
 
 _MOST = 3000  # orientations in all; more would add minutes and little accuracy
 _NO_BIAS_RPS = 1e-7  # a curve without a gyro has no bias to estimate
@@ -161,7 +160,7 @@ def _world(
     curve: RotationCurve,
     t: FloatArray,
     R: FloatArray,
-    used: npt.NDArray[np.bool_],
+    used: BoolArray,
     shift: float,
     R_ref_sensor: FloatArray,
 ) -> FloatArray:

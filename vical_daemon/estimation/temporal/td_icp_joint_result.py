@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-
-FloatArray = npt.NDArray[np.float64]
+from vical_daemon.estimation.measurements import FloatArray
 
 
 @dataclass(frozen=True)

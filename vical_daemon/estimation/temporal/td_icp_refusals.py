@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import RATE_SIGMAS
 from vical_daemon.estimation.temporal.orientation_fit import Fit
 from vical_daemon.estimation.temporal.rotation_start import Start
@@ -14,8 +14,6 @@ from vical_daemon.estimation.temporal.rotation_suspects import stretched
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, MIN_RATE_RPS, camera_turns
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions
-
-FloatArray = npt.NDArray[np.float64]
 
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3

@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.temporal.orientation_problem import DriftNoise
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 OK = "ok"
 DEGENERATE = "degenerate"

@@ -15,12 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.significance import MEDIAN_ABSOLUTE
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
-
-FloatArray = npt.NDArray[np.float64]
 
 MIN_FEATURES = 12  # that two images share: below, they do not show how the camera turned
 _MAX_GAP_NS = 400_000_000

@@ -9,10 +9,9 @@ stretches of five seconds scatter (`stretch_agreement`).
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
 from vical_daemon.estimation.temporal.td_icp import td_icp
@@ -21,7 +20,6 @@ from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions, TdIcpResult
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 
-FloatArray = npt.NDArray[np.float64]
 Frames = list[tuple[float, PointsFrame]]
 Lens = tuple[FloatArray, FloatArray, str]
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.tools.observability_setup import UNITS, Motion, Setup, block_layout
 
@@ -37,7 +38,6 @@ __all__ = [
     "pose_sensitivities",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
 _LOST = 1e-7  # singular value (in the units above, relative to the largest) below which a direction is lost

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.tools.power_series import ComplexArray, div, exp, matmul, mul, shift, trajectory
-
-FloatArray = npt.NDArray[np.float64]
 
 _STEP = 1e-30
 _ORDER = 12

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.measurements import ROWS
-
-FloatArray = npt.NDArray[np.float64]
+from vical_daemon.estimation.measurements import ROWS, FloatArray
 
 # What counts as one step of each parameter: makes metres, radians and seconds comparable
 UNITS = {
