@@ -96,7 +96,7 @@ def strapdown(
     moved = (2.0 * before + after) * (h * h / 6.0)
     if force_slope is not None:
         # slope of R f: R (omega x f + f'); hardly depends on the bias: the first of the batch stands for all
-        slope = cross(omega[0], force[0]) + (
+        slope = so3.cross(omega[0], force[0]) + (
             force_slope if accel_matrix is None else force_slope @ accel_matrix[0].T
         )
         slope = np.matmul(dR[0], slope[..., None])[..., 0]
@@ -132,15 +132,6 @@ def products(steps: FloatArray) -> FloatArray:
     return dR
 
 
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross product over the last axis; a fifth of the time of numpy's for small batches."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return out
-
-
 def rotation_steps(omega: FloatArray, dt: FloatArray, slope: FloatArray | None = None) -> FloatArray:
     """Rotation over each interval for a rate linear (or cubic) in time, with the coning term.
 
@@ -157,7 +148,7 @@ def rotation_steps(omega: FloatArray, dt: FloatArray, slope: FloatArray | None =
     w0, w1 = omega[:, :-1], omega[:, 1:]
     half = 0.5 * dt[:, None]
     # The coning term hardly depends on the bias: the first of the batch stands for all.
-    coning = cross(w0[:1], w1[:1])
+    coning = so3.cross(w0[:1], w1[:1])
     if slope is not None:
         coning = coning + (slope[:-1] - slope[1:])
     coning = coning * (dt * dt / 12.0)[:, None]

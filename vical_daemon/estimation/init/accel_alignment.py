@@ -14,7 +14,6 @@ R_cam_imu and the shift d enter linearly and are eliminated; turns of gyro and c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 
@@ -194,15 +193,5 @@ def _tangent(R: FloatArray) -> FloatArray:
     return np.stack([(generators[m] @ R).reshape(*R.shape[:-2], 9) for m in range(3)], axis=-1)
 
 
-def _cube_rotations() -> FloatArray:
-    """The 24 rotations of a cube, shape (24, 3, 3): any rotation is within 63 degrees of one."""
-    found = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.eye(3)[list(order)] * np.array(signs)
-            if np.linalg.det(R) > 0.0:
-                found.append(R)
-    return np.array(found)
-
-
-_STARTS = _cube_rotations()
+_ALIGNED = so3.signed_permutations()
+_STARTS = _ALIGNED[np.linalg.det(_ALIGNED) > 0.0]

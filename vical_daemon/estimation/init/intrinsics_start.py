@@ -14,7 +14,6 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.geometry.planar_pose import inliers, planar_poses
-from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.init.target_poses import Lens, ideal_views
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 
@@ -252,7 +251,7 @@ def _normal(
     rows = np.empty((len(X), 2, 7 + n))
     rows[..., :3] = J_point
     turned = np.concatenate([J_point[at] @ R for at, (R, _) in zip(each, poses, strict=True)])
-    rows[..., 3:6] = cross(X[:, None], turned)  # j' R (d x X) = (X x R' j)' d
+    rows[..., 3:6] = so3.cross(X[:, None], turned)  # j' R (d x X) = (X x R' j)' d
     rows[..., 6 : 6 + n] = J_lens
     rows[..., 6 + n] = np.concatenate([v.uv_px for v in views]) - uv
     sums = np.array([(w := rows[at].reshape(-1, 7 + n)).T @ w for at in each])

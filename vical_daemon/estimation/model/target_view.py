@@ -11,7 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project
-from vical_daemon.estimation.inertial.imu_model import Motion, cross
+from vical_daemon.estimation.inertial.imu_model import Motion
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.rates import Rates
 from vical_daemon.estimation.model.retract import CameraPoints
@@ -69,7 +69,7 @@ def _rolling(
     v_imu = np.matmul(motion.v[:, None, :], R)
     a_imu = np.matmul(rates.accel, R)[:, None, :]
     w = rates.omega
-    x1 = -cross(w, x_imu) - v_imu
-    x2 = -cross(rates.alpha, x_imu) - cross(w, x1) + cross(w, v_imu) - a_imu
+    x1 = -so3.cross(w, x_imu) - v_imu
+    x2 = -so3.cross(rates.alpha, x_imu) - so3.cross(w, x1) + so3.cross(w, v_imu) - a_imu
     out: FloatArray = e * x1 + (0.5 * e * e) * x2
     return out

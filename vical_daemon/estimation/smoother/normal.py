@@ -10,7 +10,6 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
 from vical_daemon.estimation.geometry.so3 import tangents
-from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import patches_seen, read_share
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
@@ -154,8 +153,8 @@ class Problem:
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
         JW = JR @ Rt  # by the point in the world
         by_shift = self._by_shift(seen, JR, R, x_imu, rates)
-        Jf = np.concatenate([cross(JR, x_imu[:, None]), -rho * JW], axis=2)
-        Jc = self._by_camera(seen, -rho * JR, cross(Jy, y[:, None]), by_shift, Jlens)
+        Jf = np.concatenate([so3.cross(JR, x_imu[:, None]), -rho * JW], axis=2)
+        Jc = self._by_camera(seen, -rho * JR, so3.cross(Jy, y[:, None]), by_shift, Jlens)
         basis = tangents(marks.bearing)[seen.landmark]
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
         by_rho = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
@@ -186,7 +185,7 @@ class Problem:
         """How pixels move with the time of the exposure: the imu turns and moves on, shape (N, 2)."""
         rho = self.window.landmarks.inverse[seen.landmark]
         forward = np.einsum("nj,nji->ni", self.window.v[seen.frame], R)  # speed in the imu frame
-        moved = cross(x_imu, rates) - rho[:, None] * forward
+        moved = so3.cross(x_imu, rates) - rho[:, None] * forward
         return np.asarray(np.einsum("nij,nj->ni", JR, moved))
 
     def pixels_late(self, seen: Seen) -> tuple[FloatArray, FloatArray]:

@@ -11,10 +11,9 @@ side from which the board is seen distinguishes the two.
 
 from __future__ import annotations
 
-from itertools import permutations, product
-
 import numpy as np
 
+from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 
 _WINDOW = 7  # images of a local parabola; at 20 Hz 0.35 s: shorter is noise, longer cuts hand motion off
@@ -68,7 +67,7 @@ def explain_accelerometer(
         return float(np.sqrt(np.mean((target - system @ solution) ** 2)))
 
     as_is = residual(np.eye(3))
-    mappings = list(_signed_permutations())
+    mappings = so3.signed_permutations()
     scores = [residual(A) for A in mappings]
     best = int(np.argmin(scores))
     if not scores[best] < _BETTER * as_is:
@@ -107,15 +106,6 @@ def _at(t_imu_s: FloatArray, force: FloatArray, t_s: FloatArray) -> FloatArray:
     high = np.maximum(np.searchsorted(t_imu_s, t_s + half_s), low + 1)
     mean: FloatArray = (total[high] - total[low]) / (high - low)[:, None]
     return mean
-
-
-def _signed_permutations() -> list[FloatArray]:
-    rows = np.eye(3)
-    return [
-        np.array([s * rows[i] for s, i in zip(signs, order, strict=True)])
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
 
 
 def _negated(seen_from_front: bool | None) -> str:

@@ -16,7 +16,6 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
-from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS
@@ -263,11 +262,11 @@ class _Fit:
         R12 = R.T @ dR @ R
         usable = (inside[p.first] & inside[p.second])[p.of] & self.ok
         b = np.matmul(R12[p.of], self.b[..., None])[..., 0]
-        n = cross(self.a, b) * usable[:, None]
+        n = so3.cross(self.a, b) * usable[:, None]
         M = np.add.reduceat(n[:, :, None] * n[:, None, :], p.begin)
         vectors = np.linalg.eigh(M)[1]
         d, Bt = vectors[:, :, 0][p.of], vectors[:, :, 1:][p.of]
-        ta, tb = cross(d, self.a), cross(d, b)
+        ta, tb = so3.cross(d, self.a), so3.cross(d, b)
         length = np.sqrt((ta**2).sum(-1) + (tb**2).sum(-1)) + 1e-6
         e = np.where(usable, (d * n).sum(-1) / length, 0.0)
         if self.fit_lens:
@@ -275,7 +274,7 @@ class _Fit:
             self.shrinking = usable[:, None] * across / across.sum(-1, keepdims=True) / self.intrinsics[:2]
         # a turn delta local to the second image: d . (a x R (delta x b)) = delta . (b x R^T (d x a))
         back = np.matmul(np.swapaxes(R12, 1, 2)[p.of], ta[..., None])[..., 0]
-        local = cross(self.b, back)
+        local = so3.cross(self.b, back)
         by_turn = self._turns(R, R12, dR, rate, area, A2)
         J = np.einsum("ni,nik->nk", local, by_turn[p.of])
         if self.fit_lens:

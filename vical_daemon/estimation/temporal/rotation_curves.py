@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.inertial.imu_model import cross
 from vical_daemon.estimation.measurements import FloatArray
 
 _GAP = 2.5  # intervals longer than this many median intervals are holes in the data
@@ -66,7 +65,7 @@ def cumulative_product(steps: FloatArray) -> FloatArray:
 def _turn(rate: FloatArray, slope: FloatArray, s: FloatArray) -> FloatArray:
     """Rotation vector of a rate that changes linearly over s seconds, with the coning term (third order)."""
     s = s[..., None]
-    out: FloatArray = s * (rate + 0.5 * s * slope) + (s**3 / 12.0) * cross(rate, slope)
+    out: FloatArray = s * (rate + 0.5 * s * slope) + (s**3 / 12.0) * so3.cross(rate, slope)
     return out
 
 

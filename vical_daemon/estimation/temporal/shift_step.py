@@ -169,13 +169,6 @@ def _errors(
     """Whitened errors of all orientations, the two worlds aligned at each shift, shape (k, 3 n)."""
     by_gyro = so3.matrix_from_quat(curve.quaternion(seen.t_cam_s + shifts_s[:, None])) @ R_imu_cam
     weighed = by_gyro / np.square(seen.sigma_rad)[:, None, None]
-    align = _nearest_rotation(np.einsum("nij,knlj->kil", seen.R_world_cam, weighed))
+    align = so3.nearest_rotation(np.einsum("nij,knlj->kil", seen.R_world_cam, weighed))
     missed = np.swapaxes(align[:, None] @ by_gyro, -1, -2) @ seen.R_world_cam
     return np.asarray((so3.log(missed) / seen.sigma_rad[:, None]).reshape(len(shifts_s), -1))
-
-
-def _nearest_rotation(M: FloatArray) -> FloatArray:
-    """Rotations that maximise trace(R' M), shape (k, 3, 3)."""
-    U, _, Vt = np.linalg.svd(M)
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return np.asarray(U @ Vt)

@@ -114,10 +114,9 @@ def _adjusted(pairs: list[Pair]) -> list[tuple[FloatArray, FloatArray] | None]:
     rays_1, rays_2 = np.zeros((2, len(pairs), count.max(), 3))
     for k, (first, second) in enumerate(pairs):
         rays_1[k, : count[k]], rays_2[k, : count[k]] = first, second
-    U, _, Vt = np.linalg.svd(np.swapaxes(rays_1, 1, 2) @ rays_2)
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    turned = so3.nearest_rotation(np.swapaxes(rays_1, 1, 2) @ rays_2)
     # a turn explains most of what a small translation does: its direction is tried along every axis
-    R, t = np.repeat(U @ Vt, 3, axis=0), np.tile(np.eye(3), (len(pairs), 1))
+    R, t = np.repeat(turned, 3, axis=0), np.tile(np.eye(3), (len(pairs), 1))
     rays_1, rays_2, count = (np.repeat(x, 3, axis=0) for x in (rays_1, rays_2, count))
     there = np.arange(rays_1.shape[1]) < count[:, None]
     weight = there.astype(np.float64)
@@ -147,13 +146,6 @@ def _middle(values: FloatArray, count: npt.NDArray[np.int64]) -> FloatArray:
     return np.asarray(0.5 * (ordered[rows, (count - 1) // 2] + ordered[rows, count // 2]))
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross product over the last axis; numpy's own is slow on small arrays."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), axis=-1)
-
-
 def _linearise(
     R: FloatArray, t: FloatArray, rays_1: FloatArray, rays_2: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -164,12 +156,12 @@ def _linearise(
     turned = rays_2 @ np.swapaxes(R, 1, 2)
     across = t[:, None, :]
     # noise of either ray moves the error along t x ray: dividing by its length makes the noise one
-    a, b = _cross(turned, across), _cross(across, rays_1)
+    a, b = so3.cross(turned, across), so3.cross(across, rays_1)
     length = np.sqrt(np.sum(a * a, axis=-1) + np.sum(b * b, axis=-1)) + 1e-9
     e = np.sum(rays_1 * -a, axis=-1) / length
     basis = np.linalg.svd(t[:, None, :])[2][:, 1:]
     J = np.empty((*e.shape, 5))
     # d e / d (local rotation): ray_1 . (t x R (d x ray_2)) = d . (ray_2 x R' (ray_1 x t))
-    J[..., :3] = _cross(rays_2, -b @ R)
-    J[..., 3:] = _cross(turned, rays_1) @ np.swapaxes(basis, 1, 2)
+    J[..., :3] = so3.cross(rays_2, -b @ R)
+    J[..., 3:] = so3.cross(turned, rays_1) @ np.swapaxes(basis, 1, 2)
     return e, J / length[..., None], basis
