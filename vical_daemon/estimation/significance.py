@@ -44,14 +44,6 @@ OUTLIER_SIGMAS = 6.0
 EVERY_S = 1.0
 """Decisions that need not follow every image are made this often, s."""
 
-# Medians, for standard deviations that outliers do not move.
-MEDIAN_ABSOLUTE = 0.6745
-"""Of the size of a standard normal variable."""
-MEDIAN_RAYLEIGH = 1.1774
-"""Of the length of two."""
-MEDIAN_CHI2, MEDIAN_CHI2_3 = 0.455, 2.366
-"""Of a chi-square variable with one degree of freedom, and with three."""
-
 
 def chi_square_limit(dof: int, false_alarm: float) -> float:
     """Largest value of a chi-square variable that may be chance."""

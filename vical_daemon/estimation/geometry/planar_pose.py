@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH, SURE_SIGMAS
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
 

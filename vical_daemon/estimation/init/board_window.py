@@ -30,7 +30,8 @@ from vical_daemon.estimation.model.retract import difference, orthonormal, retra
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
 from vical_daemon.estimation.noise.shared_errors import shared_ways
-from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH, OUTLIER_SIGMAS
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3

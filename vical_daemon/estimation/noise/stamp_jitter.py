@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import MEDIAN_CHI2, OUTLIER_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.robust import MEDIAN_CHI2
+from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 _FLOOR_S = 2e-5
 _ROUNDS = 8

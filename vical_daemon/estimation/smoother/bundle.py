@@ -18,7 +18,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.significance import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
     MarginalPrior,

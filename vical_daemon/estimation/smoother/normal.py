@@ -15,6 +15,7 @@ from vical_daemon.estimation.model.camera_rays import patches_seen, read_share
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.noise.lens_limit import SYSTEMATIC_PX, patches
 from vical_daemon.estimation.noise.stamp_jitter import excess
+from vical_daemon.estimation.robust import huber_weight
 from vical_daemon.estimation.smoother.inertial import Order, add_links, link_errors
 from vical_daemon.estimation.smoother.jitter import first_guess
 from vical_daemon.estimation.smoother.marginal_prior import (
@@ -131,7 +132,7 @@ class Problem:
         ok: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
         e = np.where(ok[:, None], (np.where(ok[:, None], uv, 0.0) - seen.uv) / self.noise.sigma_px, 0.0)
         size = np.sqrt((e**2).sum(axis=1))
-        weight = np.where(ok, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)), 0.0)
+        weight = np.where(ok, huber_weight(size, HUBER), 0.0)
         return e, ok, weight
 
     def normal(self, seen: Seen, links: PreintegratedLinks) -> Normal:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.robust import huber_weight
 from vical_daemon.estimation.smoother.normal import HUBER
 from vical_daemon.estimation.smoother.window import Seen, Window
 
@@ -18,8 +19,7 @@ def correlation(e: FloatArray, seen: Seen) -> float:
     The sum ends where the correlation is lost in its own noise. [Geyer, "Practical Markov chain Monte
     Carlo", 1992, initial positive sequence]
     """
-    size = np.sqrt((e**2).sum(axis=1, keepdims=True))
-    e = e * np.minimum(1.0, HUBER / np.maximum(size, 1e-9))
+    e = e * huber_weight(np.sqrt((e**2).sum(axis=1, keepdims=True)), HUBER)
     variance = float((e**2).mean())
     total = 1.0
     for k in range(1, _MEMORY):

@@ -21,7 +21,7 @@ from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFra
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
-from vical_daemon.estimation.significance import MEDIAN_ABSOLUTE
+from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.smoother.marginal_prior import HELD_M
 from vical_daemon.estimation.smoother.window import FARTHEST_M, NEAREST_M, Landmarks, Window, rays_of
 
@@ -188,10 +188,10 @@ class TrackStart:
             ahead = (away * d).sum(axis=1)
             depth = np.clip(ahead, NEAREST_M, FARTHEST_M)
             off = np.linalg.norm(np.matmul(P, away[..., None])[..., 0], axis=1) / depth
-            spread = float(np.median(off)) / MEDIAN_ABSOLUTE + 1e-6
+            spread = sigma_by_median(off) + 1e-6
             # a mounting turned by half a circle sees everything behind itself
             misfit = spread if np.mean(ahead < 0.0) < _MOST_BEHIND else np.inf
-            weight = self._ok / (_RAY_SIGMA * depth) ** 2 / (1.0 + (off / (3.0 * spread)) ** 2) ** 2
+            weight = self._ok / (_RAY_SIGMA * depth) ** 2 * geman_mcclure_weight((off / (3.0 * spread)) ** 2)
             gravity = gravity + z[GRAVITY]
             gravity *= self._gravity_mps2 / float(np.linalg.norm(gravity))
         return _Linear(z, gravity, misfit)

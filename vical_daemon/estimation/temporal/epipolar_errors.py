@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.temporal.epipolar_pairs import Pairs
 
 _MEMORIES_S = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
@@ -84,20 +84,17 @@ def persistent_scores(
         effects: Of the sightings on the residuals.
         noise: Of the sightings.
     """
-    frame = np.concatenate([pairs.first[pairs.of], pairs.second[pairs.of]])
-    _, feature = np.unique(np.concatenate([pairs.ids, pairs.ids]), return_inverse=True)
-    sighting, place = np.unique(frame * (int(feature.max()) + 1) + feature, return_inverse=True)
+    place, image, track = _sightings(pairs)
     p = clear.shape[1]
-    S = np.zeros((len(sighting), p, 2))
+    S = np.zeros((len(image), p, 2))
     rows = np.concatenate([clear, clear])
     by = np.concatenate([effects.by_first, effects.by_second])
     for k in range(2):
         for i in range(p):
-            S[:, i, k] = np.bincount(place, rows[:, i] * by[:, k], minlength=len(sighting))
-    image, track = np.divmod(sighting, int(feature.max()) + 1)
+            S[:, i, k] = np.bincount(place, rows[:, i] * by[:, k], minlength=len(image))
     white = np.einsum("sik,sjk->ij", S, S)
     together = white.copy()
-    carried = np.zeros((int(feature.max()) + 1, p, 2))
+    carried = np.zeros((int(track.max()) + 1, p, 2))
     edges = np.searchsorted(image, np.arange(int(image.max()) + 2))
     before_s = float(t_cam_s[0])
     for i in range(int(image.max()) + 1):
@@ -126,12 +123,9 @@ def sighting_errors(
         focal_px: Focal length, px.
     """
     rng = np.random.default_rng(0)
-    frame = np.concatenate([pairs.first[pairs.of], pairs.second[pairs.of]])
-    _, feature = np.unique(np.concatenate([pairs.ids, pairs.ids]), return_inverse=True)
-    sighting, place = np.unique(frame * (int(feature.max()) + 1) + feature, return_inverse=True)
-    image, track = np.divmod(sighting, int(feature.max()) + 1)
-    errors = rng.normal(0.0, np.sqrt(noise.white), (len(sighting), 2))
-    lasting = rng.normal(0.0, 1.0, (int(feature.max()) + 1, 2))
+    place, image, track = _sightings(pairs)
+    errors = rng.normal(0.0, np.sqrt(noise.white), (len(image), 2))
+    lasting = rng.normal(0.0, 1.0, (int(track.max()) + 1, 2))
     edges = np.searchsorted(image, np.arange(int(image.max()) + 2))
     for i in range(int(image.max()) + 1):
         if i:
@@ -141,6 +135,18 @@ def sighting_errors(
         errors[part] += np.sqrt(noise.persistent) * lasting[track[part]]
     rows = focal_px * errors[place]
     return rows[: len(pairs.of)], rows[len(pairs.of) :]
+
+
+def _sightings(pairs: Pairs) -> tuple[IntArray, IntArray, IntArray]:
+    """Sighting of each row's feature in its first images, then in its second ones, shape (2 n,).
+
+    And the image and the feature of each sighting, in the order of the images.
+    """
+    frame = np.concatenate([pairs.first[pairs.of], pairs.second[pairs.of]])
+    _, feature = np.unique(np.concatenate([pairs.ids, pairs.ids]), return_inverse=True)
+    features = int(feature.max()) + 1
+    sighting, place = np.unique(frame * features + feature, return_inverse=True)
+    return place, *np.divmod(sighting, features)
 
 
 def gyro_scores(

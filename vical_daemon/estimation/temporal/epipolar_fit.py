@@ -19,6 +19,7 @@ from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS
+from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.temporal.epipolar_errors import (
     Effects,
     TrackNoise,
@@ -182,9 +183,9 @@ class _Fit:
             if lin is None:
                 return None
             e, J, Jt = lin
-            spread = 1.4826 * float(np.median(np.abs(e[self.ok]))) + 1e-9
+            spread = sigma_by_median(e[self.ok]) + 1e-9
             k = 4.0 if step < 5 else 2.5
-            weight = np.where(self.ok, 1.0 / (1.0 + (e / (k * spread)) ** 2) ** 2, 0.0)
+            weight = np.where(self.ok, geman_mcclure_weight((e / (k * spread)) ** 2), 0.0)
             size = 7 if step < _LENS_AFTER else J.shape[1]  # first with the lens as given
             H, g, each = self._normal(e, J[:, :size], Jt, weight / spread**2)
             if size > 7 and step == _LENS_AFTER:
@@ -459,7 +460,7 @@ class _Fit:
             lin = self._linearise(*at)
             if lin is not None:
                 lag = (self.t_cam[far.second] - self.t_cam[far.first])[far.of]
-                near = np.abs(lin[0]) < 2.5 * 1.4826 * np.median(np.abs(lin[0][self.ok])) + 1e-9
+                near = np.abs(lin[0]) < 2.5 * sigma_by_median(lin[0][self.ok]) + 1e-9
                 near &= self.ok
                 by = self.effects
                 parts.append((lin[0][near], lag[near], by.by_first[near], by.by_second[near]))

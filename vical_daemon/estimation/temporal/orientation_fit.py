@@ -15,7 +15,8 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import MEDIAN_CHI2_3, ORIENTATION_REFUSED, chi_square_limit
+from vical_daemon.estimation.robust import MEDIAN_CHI2_3
+from vical_daemon.estimation.significance import ORIENTATION_REFUSED, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftSolution, solve
 from vical_daemon.estimation.temporal.orientation_noise import estimate_scales, scaled, scales_of
 from vical_daemon.estimation.temporal.orientation_problem import (

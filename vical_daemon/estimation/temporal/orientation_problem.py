@@ -64,6 +64,11 @@ class OrientationSensor:
         return float(np.sqrt(np.trace(self.covariance.mean(axis=0)) / 3.0))
 
     @property
+    def noise_rad(self) -> float:
+        """Noise of one orientation as it was measured, rms per axis, rad."""
+        return float(np.exp(self.log_scale)) * self.stated_rad
+
+    @property
     def least_log_scale(self) -> float:
         """The least that `log_scale` may become.
 

@@ -13,8 +13,11 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.robust import geman_mcclure_weight
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
-from vical_daemon.estimation.temporal.rotation_start import Start, angles_between, robust_cost
+from vical_daemon.estimation.temporal.rotation_start import Start, angles_between
+
+_WORLD_RAD = 0.2  # orientations that miss the usual one by more count less and less
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,13 @@ class Registration:
     iterations: int
 
 
-def mean_rotation(q: FloatArray, scale_rad: float = 0.2) -> FloatArray:
+def mean_rotation(q: FloatArray) -> FloatArray:
     """Return the robust mean of quaternions (n, 4): largest eigenvector, reweighted; shape (4,)."""
     weight = np.ones(len(q))
     mean: FloatArray = q[0]
     for _ in range(10):
         mean = np.asarray(np.linalg.eigh((q * weight[:, None]).T @ q)[1][:, -1], dtype=np.float64)
-        weight = (1.0 - robust_cost(angles_between(q, mean), scale_rad)) ** 2
+        weight = geman_mcclure_weight((angles_between(q, mean) / _WORLD_RAD) ** 2)
     return mean
 
 
@@ -116,7 +119,7 @@ def _shift_step(offset: FloatArray, rate: FloatArray, weight: FloatArray, window
     step = 0.0
     for _ in range(4):
         spread = np.sqrt(np.sum(w * (offset - step) ** 2) / w.sum()) + 1e-9
-        wr = w * (1.0 - robust_cost(offset - step, 2.0 * spread)) ** 2
+        wr = w * geman_mcclure_weight(((offset - step) / (2.0 * spread)) ** 2)
         step = float(np.sum(wr * offset) / np.sum(wr))
     return step
 
@@ -146,7 +149,7 @@ def _register(
     for _ in range(4):
         r = np.linalg.norm(e - J @ x, axis=1)
         scale = max(3.0 * float(np.median(r)), 1e-6)
-        weight = (1.0 - robust_cost(r, scale)) ** 2
+        weight = geman_mcclure_weight((r / scale) ** 2)
         JtW = np.swapaxes(J * weight[:, None, None], 1, 2)
         A = np.einsum("kai,kib->ab", JtW, J)
         A[np.arange(9), np.arange(9)] += 1e-9 * np.trace(A) / 9 + 1e-12

@@ -15,6 +15,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.robust import geman_mcclure_weight
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_turns import (
     BASELINES_S,
@@ -39,9 +40,7 @@ class Start:
         R_imu_cam: Mounting, shape (3, 3).
         bias_rps: Rough residual gyro bias, rad/s, shape (3,).
         agreement: Share of turns that agree in size at this shift, 0 to 1.
-        contrast: Cost at this shift over the median cost of all shifts (1: no better than any other).
         misfit_rad: Median length of the residual turn vectors.
-        singular_values: Of the matched turns' scatter, largest first, shape (3,).
         typical_rad: Median size of the camera's turns, for comparison.
         baseline_s: Time over which the turns were taken, s.
         scale_rad: How far the sizes of two turns may differ and still agree.
@@ -52,9 +51,7 @@ class Start:
     R_imu_cam: FloatArray
     bias_rps: FloatArray
     agreement: float
-    contrast: float
     misfit_rad: float
-    singular_values: FloatArray
     mirrored: bool
     typical_rad: float
     baseline_s: float
@@ -193,17 +190,16 @@ def _start_from(
     if len(grid) < 2:
         grid = np.array([grid[0], grid[0] + _GRID_S])
     costs = shift_costs(curve, t_cam_s, turns, grid, scale)
-    level = float(np.median(costs))
     best: Start | None = None
     for i in _minima(costs, apart=5):
-        start = _start_at(curve, t_cam_s, turns, float(grid[i]), scale, level)
+        start = _start_at(curve, t_cam_s, turns, float(grid[i]), scale)
         if start is not None and (best is None or start.misfit_rad < best.misfit_rad):
             best = start
     return best
 
 
 def _start_at(
-    curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shift_s: float, scale: float, level: float
+    curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shift_s: float, scale: float
 ) -> Start | None:
     """Refine the shift around a grid point and solve for the mounting there."""
     fine = shift_s + np.arange(-6, 7) * _FINE_S
@@ -231,9 +227,7 @@ def _start_at(
         fit.R,
         fit.bias,
         agreement,
-        float(costs[best]) / max(level, 1e-12),
         fit.misfit / share**2,
-        fit.singular_values,
         fit.mirrored,
         float(np.median(turns.angle)),
         turns.baseline_s,
@@ -246,7 +240,6 @@ class _Mounting:
     R: FloatArray
     bias: FloatArray
     misfit: float
-    singular_values: FloatArray
     mirrored: bool
 
 
@@ -254,7 +247,7 @@ def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mo
     """Robust Wahba: R with turn_imu = R turn_cam + bias dt, by reweighting; watches for mirrored axes."""
     weight = np.ones(len(dt))
     bias = np.zeros(3)
-    R, s = np.eye(3), np.ones(3)
+    R = np.eye(3)
     residual = turn_imu
     mirrored = False
     for i in range(8):
@@ -270,6 +263,6 @@ def _mounting(turn_imu: FloatArray, turn_cam: FloatArray, dt: FloatArray) -> _Mo
         bias = np.sum(residual * (weight * dt)[:, None], axis=0) / np.sum(weight * dt * dt)
         residual = residual - bias * dt[:, None]
         length2 = np.einsum("ij,ij->i", residual, residual)
-        weight = 1.0 / (1.0 + length2 / max(2.0 * float(np.median(length2)), 1e-12)) ** 2
+        weight = geman_mcclure_weight(length2 / max(2.0 * float(np.median(length2)), 1e-12))
     misfit = float(np.sqrt(np.median(np.einsum("ij,ij->i", residual, residual))))
-    return _Mounting(R, bias, misfit, s / len(dt), mirrored)
+    return _Mounting(R, bias, misfit, mirrored)

@@ -169,8 +169,7 @@ def _result(
     pairs = int(np.count_nonzero(took_part))
     order = [0, 1, 2, 4, 5, 6, 3]
     covariance = fit.covariance[np.ix_(order, order)]
-    noise = float(np.exp(sensor.log_scale) * np.sqrt(np.trace(sensor.covariance.mean(axis=0)) / 3.0))
-    status, reason = judge(fit, covariance, pairs, len(tau), noise)
+    status, reason = judge(fit, covariance, pairs, len(tau))
     if status == REFUSED:
         return TdIcpResult(REFUSED, reason, rejected=n_given)
     return TdIcpResult(
@@ -185,7 +184,7 @@ def _result(
         pairs=pairs,
         rejected=n_given - pairs,
         iterations=rough.iterations + fit.rounds,
-        camera_noise_rad=noise,
+        camera_noise_rad=sensor.noise_rad,
         slow_noise_ratio=float(np.exp(sensor.log_slow)),
         used=used,
         stamp_rate=float(fit.stamp_rate[0]),

@@ -265,13 +265,12 @@ def _delay(fit: Fit, i: int, span_s: tuple[float, float]) -> SensorDelay:
     variance = np.diagonal(fit.covariance)[4 * i : 4 * i + 4]
     tau = sensor.t_s + sensor.timeshift_s
     pairs = int(np.count_nonzero(sensor.used & (tau >= span_s[0]) & (tau <= span_s[1])))
-    noise = float(np.exp(sensor.log_scale) * np.sqrt(np.trace(sensor.covariance.mean(axis=0)) / 3.0))
     return SensorDelay(
         sensor.timeshift_s,
         float(np.sqrt(variance[3])),
         sensor.R_imu_sensor,
         np.sqrt(variance[:3]),
-        noise,
+        sensor.noise_rad,
         pairs,
         len(sensor.t_s) - pairs,
         float(fit.widened[i].max()),

@@ -137,10 +137,11 @@ def refuse_start(start: Start | None, options: TdIcpOptions) -> str:
     return ""
 
 
-def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int, noise: float) -> tuple[str, str]:
+def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int) -> tuple[str, str]:
     """Status and reason from the final covariance and residuals."""
     if pairs < max(MIN_ORIENTATIONS, 0.25 * n):
         return REFUSED, f"only {pairs} of {n} orientations fit the gyro at the best delay"
+    noise = fit.sensors[0].noise_rad
     rate, rate_sigma = float(fit.stamp_rate[0]), float(fit.stamp_rate_sigma[0])
     if abs(rate) > max(_STRETCHED, RATE_SIGMAS * rate_sigma):
         return REFUSED, stretched(rate)

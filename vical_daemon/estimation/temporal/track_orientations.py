@@ -17,7 +17,7 @@ import numpy.typing as npt
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
-from vical_daemon.estimation.significance import MEDIAN_ABSOLUTE
+from vical_daemon.estimation.robust import MEDIAN_ABSOLUTE, geman_mcclure_weight
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 MIN_FEATURES = 12  # that two images share: below, they do not show how the camera turned
@@ -125,7 +125,7 @@ def _adjusted(pairs: list[Pair]) -> list[tuple[FloatArray, FloatArray] | None]:
         cost = _middle(np.where(there, np.abs(e), np.inf), count)
         if i >= _PLAIN_STEPS:
             scale = 3.0 * cost[:, None] / MEDIAN_ABSOLUTE + 1e-9
-            weight = there / (1.0 + (e / scale) ** 2) ** 2
+            weight = there * geman_mcclure_weight((e / scale) ** 2)
         Jt = np.swapaxes(J * weight[..., None], 1, 2)
         A = Jt @ J
         A = A + np.eye(5) * (1e-7 * np.einsum("cii->c", A) / 5.0 + 1e-12)[:, None, None]

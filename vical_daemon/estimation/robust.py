@@ -1,0 +1,34 @@
+"""Robust statistics: what a median says of a sigma, and weights of errors that may be outliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+MEDIAN_ABSOLUTE = 0.6745
+"""Of the size of a standard normal variable."""
+MEDIAN_RAYLEIGH = 1.1774
+"""Of the length of two."""
+MEDIAN_CHI2, MEDIAN_CHI2_3 = 0.455, 2.366
+"""Of a chi-square variable with one degree of freedom, and with three."""
+
+
+def sigma_by_median(errors: FloatArray) -> float:
+    """Standard deviation of normal errors about zero, by the median of their sizes."""
+    return float(np.median(np.abs(errors))) / MEDIAN_ABSOLUTE
+
+
+def geman_mcclure_weight(square: FloatArray) -> FloatArray:
+    """Weight of errors in a least-squares problem reweighted for the cost x^2 / (1 + x^2).
+
+    Args:
+        square: Of the errors, over the square of the size from which on they count less and less.
+    """
+    return np.asarray((1.0 + square) ** -2.0)
+
+
+def huber_weight(size: FloatArray, limit: float) -> FloatArray:
+    """The same for Huber's cost: errors beyond a limit count by their size, not its square."""
+    return np.asarray(np.minimum(1.0, limit / np.maximum(size, 1e-9)))
