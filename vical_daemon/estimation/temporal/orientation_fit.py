@@ -20,15 +20,15 @@ from vical_daemon.estimation.significance import ORIENTATION_REFUSED, chi_square
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftSolution, solve
 from vical_daemon.estimation.temporal.orientation_noise import estimate_scales, scaled, scales_of
 from vical_daemon.estimation.temporal.orientation_problem import (
-    DriftNoise,
     Linear,
     OrientationSensor,
     linearise,
 )
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.stretch_agreement import widening
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
-__all__ = ["DriftNoise", "Fit", "OrientationSensor", "polish"]
+__all__ = ["Fit", "OrientationSensor", "polish"]
 
 _GATE = chi_square_limit(3, ORIENTATION_REFUSED)
 _ROUNDS = 12
@@ -67,7 +67,7 @@ def polish(
     make_curve: Callable[[FloatArray], RotationCurve],
     sensors: tuple[OrientationSensor, ...],
     bias_rps: FloatArray,
-    noise: DriftNoise,
+    options: TdIcpOptions,
 ) -> Fit:
     """Solve for all registrations together.
 
@@ -75,7 +75,7 @@ def polish(
         make_curve: Builds the curve for a gyro bias (a curve without bias ignores it).
         sensors: Streams with start values: shift within some 50 ms, mounting within some 10 degrees.
         bias_rps: Start of the bias, shape (3,).
-        noise: Of the curve.
+        options: Noise of the gyro.
 
     Raises:
         numpy.linalg.LinAlgError: nothing left to fit.
@@ -87,12 +87,12 @@ def polish(
     rounds, done = 0, False
     while rounds < _ROUNDS and not done:
         rounds += 1
-        linear = linearise(curve, sensors, bias, noise)
+        linear = linearise(curve, sensors, bias, options)
         sweeps = _SWEEPS[min(len(sensors) - 1, 1)].get(rounds, ())
-        if noise.estimate and sweeps:
-            sensors, log_gyro = estimate_scales(linear, sensors, log_gyro, noise, sweeps)
+        if sweeps:
+            sensors, log_gyro = estimate_scales(linear, sensors, log_gyro, options.gyro_log_sigma, sweeps)
         solution = solve(scaled(linear, scales_of(sensors, log_gyro)))
-        new_sensors, step = _update(linear, sensors, solution, noise.estimate and rounds <= 2, noise.estimate)
+        new_sensors, step = _update(linear, sensors, solution, rescale=rounds <= 2)
         same_gate = all(np.array_equal(a.used, b.used) for a, b in zip(sensors, new_sensors, strict=True))
         sensors = new_sensors
         bias = bias + solution.states[len(solution.states) // 2, BIAS]
@@ -124,8 +124,8 @@ def _update(
     linear: Linear,
     sensors: tuple[OrientationSensor, ...],
     solution: DriftSolution,
+    *,
     rescale: bool,
-    estimated: bool,
 ) -> tuple[tuple[OrientationSensor, ...], float]:
     """Apply a step, and judge every orientation anew by what the solution leaves to its noise."""
     noise = np.empty_like(solution.noise)
@@ -145,7 +145,7 @@ def _update(
         log_scale = by_median if rescale else s.log_scale
         largest = max(largest, abs(float(x[3])))
         # the gate may not close in on itself: it stays as wide as the median of all demands
-        width = max(log_scale, by_median + np.log(0.8)) if estimated else log_scale
+        width = max(log_scale, by_median + np.log(0.8))
         updated.append(
             replace(
                 s,

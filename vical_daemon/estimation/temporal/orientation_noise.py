@@ -9,9 +9,9 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem
 from vical_daemon.estimation.temporal.drift_smoother import cost as drift_cost
-from vical_daemon.estimation.temporal.orientation_problem import DriftNoise, Linear, OrientationSensor
+from vical_daemon.estimation.temporal.orientation_problem import Linear, OrientationSensor
 
-_SLOW_LIMITS = (-4.0, 4.0)
+_MOST_SLOW = 4.0  # logarithm of a slow error over the noise; as far below
 _CLOSE = 0.1  # a minimum this close, in steps, is reached
 
 
@@ -48,13 +48,13 @@ def estimate_scales(
     linear: Linear,
     sensors: tuple[OrientationSensor, ...],
     log_gyro: float,
-    noise: DriftNoise,
+    log_sigma: float,
     steps: tuple[float, ...],
 ) -> tuple[tuple[OrientationSensor, ...], float]:
     """Restricted maximum likelihood of the noises' scales, one after the other by parabolas, in sweeps.
 
     -2 log L = (weighted squares) + log det(information of all unknowns) - log det(weights and steps), plus
-    the prior that says how well the gyro's density is known.
+    the prior of the gyro's density, known to `log_sigma` of its logarithm.
     """
     S = len(sensors)
     counts = np.array([np.count_nonzero(linear.used & (linear.sensor == i)) for i in range(S)])
@@ -63,9 +63,9 @@ def estimate_scales(
 
     def cost(values: FloatArray) -> float:
         likelihood = drift_cost(scaled(linear, values)) + 6.0 * float(counts @ values[:S])
-        outside = np.maximum(np.abs(values[S : 2 * S]) - _SLOW_LIMITS[1], 0.0)
+        outside = np.maximum(np.abs(values[S : 2 * S]) - _MOST_SLOW, 0.0)
         outside = np.concatenate((outside, np.maximum(least - values[:S], 0.0)))
-        return likelihood + float(values[-1] / noise.log_sigma) ** 2 + 1e3 * float(outside @ outside)
+        return likelihood + float(values[-1] / log_sigma) ** 2 + 1e3 * float(outside @ outside)
 
     scales = scales_of(sensors, log_gyro)
     here = cost(scales)

@@ -15,8 +15,10 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.model.priors import ENTRY_SIGMA, GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
 _MIN_INTERVAL_S = 2e-5  # two stamps may coincide; the drift between them must not become infinitely certain
 LEAST_NOISE_RAD = 1e-5  # two seconds of arc: below every stamp's rounding at a motion of 60 deg/s
@@ -44,7 +46,6 @@ class OrientationSensor:
         log_scale: Log of the factor by which the noise is larger than `covariance` says (in sigma).
         log_slow: Log of the slow error that a second brings over the noise of one orientation. Slow errors
             come from lens and board models which are not exact, and change with the view.
-        jitter_s: Standard deviation of the stamps, s; independent from orientation to orientation.
     """
 
     t_s: FloatArray
@@ -56,7 +57,6 @@ class OrientationSensor:
     used: BoolArray
     log_scale: float = 0.0
     log_slow: float = _SLOW_START
-    jitter_s: float = 0.0
 
     @property
     def stated_rad(self) -> float:
@@ -76,27 +76,6 @@ class OrientationSensor:
         residuals costs all digits.
         """
         return float(np.log(LEAST_NOISE_RAD / self.stated_rad))
-
-
-@dataclass(frozen=True)
-class DriftNoise:
-    """Noise of the curve.
-
-    Attributes:
-        density: Gyro noise density, rad/s/sqrt(Hz).
-        walk: Bias walk, rad/s^2/sqrt(Hz).
-        bias_sigma_rps: Prior of the bias around zero, rad/s.
-        log_sigma: How well `density` is known, as the sigma of its logarithm.
-        estimate: Estimate the noises' scales from the data; else take them as given.
-        matrix_sigma: Prior sigma of each entry of the gyro's scale and misalignment errors; 0: none.
-    """
-
-    density: float
-    walk: float
-    bias_sigma_rps: float
-    log_sigma: float
-    estimate: bool
-    matrix_sigma: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -129,11 +108,11 @@ class Linear:
 
 
 def linearise(
-    curve: RotationCurve, sensors: tuple[OrientationSensor, ...], bias: FloatArray, noise: DriftNoise
+    curve: RotationCurve, sensors: tuple[OrientationSensor, ...], bias: FloatArray, options: TdIcpOptions
 ) -> Linear:
     """Residuals and derivatives in the curve's reference frame, sorted by time."""
     S = len(sensors)
-    p = 4 * S + (6 if noise.matrix_sigma > 0.0 else 0)
+    p = 4 * S + 6
     low, high = curve.span_s
     raw = np.concatenate([s.t_s + s.timeshift_s for s in sensors])
     order = np.argsort(np.clip(raw, low, high), kind="stable")
@@ -145,12 +124,12 @@ def linearise(
     R_ref_sensor = R @ np.stack([s.R_imu_sensor for s in sensors])[index]
     measured = np.concatenate([s.R_world_ref.T @ s.R_world_sensor for s in sensors])[order]
     J = _derivatives(R_ref_sensor, turn, index, p)
-    if p > 4 * S:
-        J[:, :, 4 * S :] = curve.matrix_effect(tau) @ _SYMMETRIC
+    J[:, :, 4 * S :] = curve.matrix_effect(tau) @ _SYMMETRIC
     used = np.concatenate([s.used for s in sensors])[order] & (raw >= low) & (raw <= high)
-    C = _noise(sensors, R_ref_sensor, turn, index, order)
+    own = np.concatenate([s.covariance for s in sensors])[order]
+    C = R_ref_sensor @ own @ np.swapaxes(R_ref_sensor, 1, 2)
     dt = np.maximum(np.diff(tau), _MIN_INTERVAL_S)
-    H, F, first_mean, first_information = _states(S, index, integral, bias, noise)
+    H, F, first_mean, first_information = _states(S, index, integral, bias)
     problem = DriftProblem(
         so3.log(measured @ np.swapaxes(R_ref_sensor, 1, 2)),
         J,
@@ -161,9 +140,11 @@ def linearise(
         0.0,
         first_mean,
         first_information,
-        _prior(S, p, noise.matrix_sigma),
+        _prior(S, p),
     )
-    drift = np.maximum(np.diff(curve.variance(tau, noise.density)), 1e-4 * noise.density**2 * _MIN_INTERVAL_S)
+    drift = np.maximum(
+        np.diff(curve.variance(tau, options.gyro_density)), 1e-4 * options.gyro_density**2 * _MIN_INTERVAL_S
+    )
     slow = np.empty((S, len(dt), 3, 3))
     for i, s in enumerate(sensors):
         A = R[:-1] @ s.R_imu_sensor
@@ -171,7 +152,7 @@ def linearise(
     middle = tau - 0.5 * (tau[0] + tau[-1])
     slow_inverse = np.asarray(np.linalg.inv(slow), dtype=np.float64)
     determinant = np.log(np.linalg.det(slow)).sum(axis=1)
-    walk = noise.walk**2 * dt
+    walk = options.gyro_walk**2 * dt
     return Linear(problem, index, order, used, drift, walk, middle, slow, slow_inverse, determinant)
 
 
@@ -187,22 +168,8 @@ def _derivatives(
     return J
 
 
-def _noise(
-    sensors: tuple[OrientationSensor, ...],
-    R_ref_sensor: FloatArray,
-    turn: FloatArray,
-    index: npt.NDArray[np.intp],
-    order: npt.NDArray[np.intp],
-) -> FloatArray:
-    """Covariance of each residual in the reference frame: the sensor's own and jitter of the stamps."""
-    own = np.concatenate([s.covariance for s in sensors])[order]
-    C: FloatArray = R_ref_sensor @ own @ np.swapaxes(R_ref_sensor, 1, 2)
-    jitter2 = np.array([s.jitter_s**2 * np.exp(-2.0 * s.log_scale) for s in sensors])[index]
-    return C + jitter2[:, None, None] * turn[:, :, None] * turn[:, None, :]
-
-
 def _states(
-    S: int, index: npt.NDArray[np.intp], integral: FloatArray, bias: FloatArray, noise: DriftNoise
+    S: int, index: npt.NDArray[np.intp], integral: FloatArray, bias: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """How the states enter the residuals, how they move, and what is known of the first one."""
     d = 6 if S == 1 else 6 + 3 * S
@@ -215,7 +182,7 @@ def _states(
     F = np.tile(np.eye(d), (n - 1, 1, 1))
     F[:, :3, 3:6] = -np.diff(integral, axis=0)
     information = np.zeros(d)
-    information[3:6] = 1.0 / noise.bias_sigma_rps**2
+    information[3:6] = 1.0 / GYRO_BIAS_SIGMA_RPS**2
     information[6:9] = 1e10  # of several sensors, the first one's slow error starts at zero
     information[9:] = _TURN_UNKNOWN
     mean = np.zeros(d)
@@ -223,10 +190,9 @@ def _states(
     return H, F, mean, information
 
 
-def _prior(S: int, p: int, matrix_sigma: float) -> FloatArray:
-    """Next to no information: 2 rad on rotations, 0.5 s on shifts; keeps a lost direction finite."""
+def _prior(S: int, p: int) -> FloatArray:
+    """Next to no information: 2 rad on rotations, 0.5 s on shifts; keeps lost ones finite. The gyro's matrix."""
     diagonal = np.full(p, 1.0 / 2.0**2)
     diagonal[3 : 4 * S : 4] = 1.0 / 0.5**2
-    if p > 4 * S:
-        diagonal[4 * S :] = 1.0 / matrix_sigma**2
+    diagonal[4 * S :] = ENTRY_SIGMA**-2
     return np.diag(diagonal)

@@ -25,12 +25,13 @@ from vical_daemon.estimation.temporal.rotation_start import Start, debiased_star
 from vical_daemon.estimation.temporal.rotation_suspects import explain
 from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 from vical_daemon.estimation.temporal.td_icp_input import (
+    TdIcpOptions,
     clean_gyro,
     clean_orientations,
     world_cam_from_cam_target,
 )
 from vical_daemon.estimation.temporal.td_icp_refusals import judge, refuse_motion, refuse_start
-from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions, TdIcpResult
+from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
 
 __all__ = [
     "DEGENERATE",
@@ -63,7 +64,7 @@ def td_icp(
         t_cam_s: Stamps of the orientations in the camera's clock (same kind of seconds), shape (n,).
         R_world_cam: Orientations of the camera in any fixed world, shape (n, 3, 3).
         rotation_sigma: Their noise, rad: one number, or (n,), or covariances of the local error (n, 3, 3).
-            With `estimate_noise` only the proportions between orientations matter.
+            Only the proportions between orientations matter: the noise is measured.
         options: Settings.
 
     Returns:
@@ -144,13 +145,12 @@ def _polish(data: _Data, bias: FloatArray, rough: Registration, options: TdIcpOp
         R_imu_sensor=rough.R_imu_cam,
         R_world_ref=rough.R_world_ref,
         used=rough.weight > 0.2,
-        jitter_s=options.stamp_jitter_s,
     )
     return polish(
         lambda b: GyroCurve.integrate(data.t_imu, data.gyro, b),
         (sensor,),
         bias + rough.bias_rps,
-        options.drift_noise(),
+        options,
     )
 
 
@@ -185,9 +185,9 @@ def _result(
         rejected=n_given - pairs,
         iterations=rough.iterations + fit.rounds,
         camera_noise_rad=sensor.noise_rad,
-        slow_noise_ratio=float(np.exp(sensor.log_slow)),
         used=used,
         stamp_rate=float(fit.stamp_rate[0]),
         stamp_rate_sigma=float(fit.stamp_rate_sigma[0]),
         widened=float(fit.widened[0].max()),
+        sensor=sensor,
     )

@@ -1,14 +1,36 @@
-"""Gyro samples and orientations brought into a form that can be registered, or the reason why not."""
+"""What temporal calibration is given: options, and gyro samples and orientations fit to be registered."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.measurements import FloatArray
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 
+_USUAL = ImuNoise()
 MIN_ORIENTATIONS = 12
 SLOWEST_GYRO_HZ = 10.0  # as for `calibrate`: between slower samples a hand turns to and fro unseen
+
+
+@dataclass(frozen=True, slots=True)
+class TdIcpOptions:
+    """Settings; the defaults suit a 3DM-GX3-25 or better.
+
+    Attributes:
+        search_s: The shift is looked for within +- this of the guess, s.
+        timeshift_guess_s: Middle of the search, s.
+        gyro_density: Gyro noise density, rad/s/sqrt(Hz).
+        gyro_walk: Gyro bias walk, rad/s^2/sqrt(Hz).
+        gyro_log_sigma: How well the density is known (sigma of its logarithm).
+    """
+
+    search_s: float = 5.0
+    timeshift_guess_s: float = 0.0
+    gyro_density: float = _USUAL.gyro_density
+    gyro_walk: float = _USUAL.gyro_walk
+    gyro_log_sigma: float = 0.2
 
 
 def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArray] | str:

@@ -15,19 +15,19 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.significance import RATE_SIGMAS
-from vical_daemon.estimation.temporal.orientation_fit import DriftNoise, Fit, OrientationSensor, polish
+from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
 from vical_daemon.estimation.temporal.rotation_start import coarse_start
 from vical_daemon.estimation.temporal.rotation_suspects import explain_stream, stretched
 from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 from vical_daemon.estimation.temporal.td_icp import td_icp
-from vical_daemon.estimation.temporal.td_icp_input import clean_gyro, clean_orientations
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions, clean_gyro, clean_orientations
 from vical_daemon.estimation.temporal.td_icp_joint_result import JointResult, PairDelay, SensorDelay
 from vical_daemon.estimation.temporal.td_icp_refusals import UNEVEN, refuse_start
-from vical_daemon.estimation.temporal.td_icp_result import OK, REFUSED, TdIcpOptions, TdIcpResult
+from vical_daemon.estimation.temporal.td_icp_result import OK, REFUSED
 
 __all__ = [
     "JointResult",
@@ -39,7 +39,6 @@ __all__ = [
 ]
 
 _MOST = 3000  # orientations in all; more would add minutes and little accuracy
-_NO_BIAS_RPS = 1e-7  # a curve without a gyro has no bias to estimate
 
 
 @dataclass(frozen=True)
@@ -121,53 +120,9 @@ def joint_with_gyro(
         if alone.status != OK:
             reasons.append(f"{stream.name}: {alone.reason}")
         bias = alone.gyro_bias_rps
-        sensors.append((stream.name, _from_alone(stream, alone, t_imu, gyro, base, options)))
-    return _together(
-        name, sensors, lambda b: GyroCurve.integrate(t_imu, gyro, b), bias, options.drift_noise(), reasons
-    )
-
-
-def _from_alone(
-    stream: OrientationStream,
-    alone: TdIcpResult,
-    t_imu: FloatArray,
-    gyro: FloatArray,
-    base: float,
-    options: TdIcpOptions,
-) -> OrientationSensor:
-    """A stream as a sensor of the joint fit, started from its own registration."""
-    cleaned = clean_orientations(stream.t_s - base, stream.R_world_sensor, stream.rotation_sigma)
-    assert not isinstance(cleaned, str)
-    t, R, covariance, index = cleaned
-    curve = GyroCurve.integrate(t_imu, gyro, alone.gyro_bias_rps)
-    R_world_ref = _world(curve, t, R, alone.used[index], alone.timeshift_cam_imu_s, alone.R_imu_cam)
-    stated = float(np.sqrt(np.trace(covariance.mean(axis=0)) / 3.0))
-    return OrientationSensor(
-        t,
-        R,
-        covariance,
-        alone.timeshift_cam_imu_s,
-        alone.R_imu_cam,
-        R_world_ref,
-        alone.used[index],
-        log_scale=float(np.log(alone.camera_noise_rad / stated)),
-        log_slow=float(np.log(alone.slow_noise_ratio)),
-        jitter_s=options.stamp_jitter_s,
-    )
-
-
-def _world(
-    curve: RotationCurve,
-    t: FloatArray,
-    R: FloatArray,
-    used: BoolArray,
-    shift: float,
-    R_ref_sensor: FloatArray,
-) -> FloatArray:
-    """The reference's frame in the sensor's world, from the used orientation in the middle."""
-    k = int(np.flatnonzero(used)[np.count_nonzero(used) // 2])
-    R_k = curve.at(np.array([t[k] + shift]))[0][0]
-    return np.asarray(R[k] @ (R_k @ R_ref_sensor).T, dtype=np.float64)
+        if alone.sensor is not None:
+            sensors.append((stream.name, alone.sensor))
+    return _together(name, sensors, lambda b: GyroCurve.integrate(t_imu, gyro, b), bias, options, reasons)
 
 
 def joint_of_orientations(
@@ -212,12 +167,11 @@ def joint_of_orientations(
                 stream.name,
                 OrientationSensor(
                     t, R, covariance, rough.timeshift_s, rough.R_imu_cam, rough.R_world_ref,
-                    rough.weight > 0.2, jitter_s=options.stamp_jitter_s,
+                    rough.weight > 0.2,
                 ),
             )
         )  # fmt: skip
-    noise = DriftNoise(options.gyro_density, _NO_BIAS_RPS, _NO_BIAS_RPS, 0.2, options.estimate_noise)
-    return _together(reference.name, sensors, lambda _: curve, np.zeros(3), noise, reasons)
+    return _together(reference.name, sensors, lambda _: curve, np.zeros(3), options, reasons)
 
 
 def _together(
@@ -225,14 +179,14 @@ def _together(
     sensors: list[tuple[str, OrientationSensor]],
     make_curve: Callable[[FloatArray], RotationCurve],
     bias: FloatArray,
-    noise: DriftNoise,
+    options: TdIcpOptions,
     reasons: list[str],
 ) -> JointResult:
     if not sensors:
         return JointResult(REFUSED, "; ".join(reasons) or "no sensor to register", reference)
     names = [name for name, _ in sensors]
     try:
-        fit = polish(make_curve, tuple(sensor for _, sensor in sensors), bias, noise)
+        fit = polish(make_curve, tuple(sensor for _, sensor in sensors), bias, options)
     except np.linalg.LinAlgError:
         return JointResult(REFUSED, "the orientations do not fit the reference together", reference)
     reasons += _uneven(names, fit, known="".join(reasons))

@@ -12,8 +12,8 @@ from vical_daemon.estimation.temporal.orientation_fit import Fit
 from vical_daemon.estimation.temporal.rotation_start import Start
 from vical_daemon.estimation.temporal.rotation_suspects import stretched
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, MIN_RATE_RPS, camera_turns
-from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
-from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS, TdIcpOptions
+from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED
 
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3

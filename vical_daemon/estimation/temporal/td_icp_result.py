@@ -1,4 +1,4 @@
-"""What temporal calibration is asked and what it answers: options and result of `td_icp`."""
+"""What temporal calibration answers: the result of `td_icp`."""
 
 from __future__ import annotations
 
@@ -8,50 +8,11 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.temporal.orientation_problem import DriftNoise
+from vical_daemon.estimation.temporal.orientation_problem import OrientationSensor
 
 OK = "ok"
 DEGENERATE = "degenerate"
 REFUSED = "refused"
-
-
-@dataclass(frozen=True, slots=True)
-class TdIcpOptions:
-    """Settings; the defaults suit a 3DM-GX3-25 or better.
-
-    Attributes:
-        search_s: The shift is looked for within +- this of the guess, s.
-        timeshift_guess_s: Middle of the search, s.
-        gyro_density: Gyro noise density, rad/s/sqrt(Hz).
-        gyro_walk: Gyro bias walk, rad/s^2/sqrt(Hz).
-        gyro_log_sigma: How well the density is known (sigma of its logarithm).
-        bias_sigma_rps: The bias is expected to lie around zero with this sigma, rad/s.
-        stamp_jitter_s: Standard deviation of camera stamps, independent from frame to frame, s.
-        estimate_noise: Measure the noises' scales; False: take rotation_sigma and gyro_density as they are.
-        gyro_matrix_sigma: Expected size of each scale and misalignment error of the gyro (0.003: 0.3 %); they
-            are estimated along with the rest. 0: a perfect gyro.
-    """
-
-    search_s: float = 5.0
-    timeshift_guess_s: float = 0.0
-    gyro_density: float = 5.2e-4
-    gyro_walk: float = 2.0e-5
-    gyro_log_sigma: float = 0.2
-    bias_sigma_rps: float = 0.1
-    stamp_jitter_s: float = 0.0
-    estimate_noise: bool = True
-    gyro_matrix_sigma: float = 0.003
-
-    def drift_noise(self) -> DriftNoise:
-        """Noise of the curve that the gyro gives."""
-        return DriftNoise(
-            self.gyro_density,
-            self.gyro_walk,
-            self.bias_sigma_rps,
-            self.gyro_log_sigma,
-            self.estimate_noise,
-            self.gyro_matrix_sigma,
-        )
 
 
 @dataclass(frozen=True)
@@ -73,7 +34,6 @@ class TdIcpResult:
         at_rest: Of the rejected, those left out because the rig rested for most of the recording.
         iterations: Rounds of both iterative phases.
         camera_noise_rad: Measured noise of one orientation, rms per axis, rad (from tracks: of one feature).
-        slow_noise_ratio: Measured slow error that a second brings over the noise of one orientation.
         used: Which of the given orientations took part, shape (n,).
         stamp_rate: By how much the delay grows with time in these data, s/s (1e-6: one microsecond a second);
             near zero where both clocks are sound. The shift above is that in the middle of the data.
@@ -81,6 +41,7 @@ class TdIcpResult:
         still: Refused because the rig stands still.
         widened: By how much stretches of the data disagree beyond what their noise explains (1: they agree);
             the sigmas are widened by it.
+        sensor: The orientations as registered, with stamps from the first gyro sample on; None: from tracks.
     """
 
     status: str
@@ -96,12 +57,12 @@ class TdIcpResult:
     at_rest: int = 0
     iterations: int = 0
     camera_noise_rad: float = float("nan")
-    slow_noise_ratio: float = float("nan")
     used: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     stamp_rate: float = float("nan")
     stamp_rate_sigma: float = float("nan")
     still: bool = False
     widened: float = 1.0
+    sensor: OrientationSensor | None = None
 
     def to_json(self) -> dict[str, object]:
         """Return what `vical td-icp --json` prints."""

@@ -15,9 +15,9 @@ from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
 from vical_daemon.estimation.temporal.td_icp import td_icp
-from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
+from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions, clean_gyro
 from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
-from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpOptions, TdIcpResult
+from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 
 Frames = list[tuple[float, PointsFrame]]
