@@ -59,7 +59,7 @@ def lens_line(used: LensUsed) -> str:
     """One line of numbers: px, then the distortion of the model."""
     fx, fy, cx, cy = used.lens.intrinsics
     distortion = " ".join(f"{k:+.4f}" for k in used.lens.distortion)
-    return f"fx {fx:.2f} fy {fy:.2f} cx {cx:.2f} cy {cy:.2f} px, {used.lens.model} {distortion}"
+    return f"fx {fx:.2f} fy {fy:.2f} cx {cx:.2f} cy {cy:.2f} px, {used.lens.distortion_model} {distortion}"
 
 
 def print_joint(result: JointResult, lenses: dict[str, LensUsed]) -> None:

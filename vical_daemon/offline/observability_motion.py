@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from vical_daemon.config.priors import Initial
-from vical_daemon.estimation.init.target_poses import Lens
+from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
@@ -151,7 +151,7 @@ def _longest(t: FloatArray) -> slice:
 
 
 def _setup(
-    lens: Lens,
+    lens: CameraState,
     corner_sigma_px: float,
     result: TdIcpResult,
     p_imu_cam: FloatArray,
@@ -168,7 +168,7 @@ def _setup(
         lens.intrinsics,
         lens.distortion,
         load_target(Path(target)).points_m,
-        model=lens.model,
+        model=lens.distortion_model,
         resolution=lens.resolution,
         estimate=blocks,
         corner_sigma_px=max(corner_sigma_px, 0.05),

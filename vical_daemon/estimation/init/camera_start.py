@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,10 +28,10 @@ def starting_camera(prior: CameraPrior) -> CameraState:
 
 
 def camera_by_rotations(
-    prior: CameraPrior, fix: Collection[str], R_imu_cam: FloatArray, timeshift_s: float
+    camera: CameraState, prior: CameraPrior, fix: Collection[str], R_imu_cam: FloatArray, timeshift_s: float
 ) -> CameraState:
-    """Camera with mounting (3, 3) and time shift (s) as found, but for what is given and held fixed."""
-    camera = starting_camera(prior)
+    """A camera with mounting (3, 3) and time shift (s) as found, but for what is given and held fixed."""
+    camera = replace(camera)
     if prior.T_imu_cam is None or "extrinsics" not in fix:
         camera.R_imu_cam = R_imu_cam
     if prior.timeshift_cam_imu_s is None or "timeshift" not in fix:

@@ -14,11 +14,11 @@ import numpy as np
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD, Alignment, align, align_at
 from vical_daemon.estimation.init.accel_evidence import CameraPath
-from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet
+from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
-from vical_daemon.estimation.init.target_poses import Lens, TargetPose, recent_poses
+from vical_daemon.estimation.init.target_poses import TargetPose, recent_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState, Layout
@@ -61,7 +61,7 @@ class StartData:
 class Seen(NamedTuple):
     """What one camera has seen: its lens, as known or estimated, images without the readout, and poses."""
 
-    lens: Lens
+    lens: CameraState
     frames: Frames
     poses: list[TargetPose]
 
@@ -102,7 +102,9 @@ def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
         )
         if why:
             return StartResult(None, f"{name}: {why}", motion_missing=True)
-        camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_cam_imu_s)
+        camera = camera_by_rotations(
+            lens, data.priors[name], data.options.fix, found.R_imu_cam, found.timeshift_cam_imu_s
+        )
         rough[name] = RotationsKnown(camera, poses, found.gyro_bias_rps)
     return motion_start(data.buffer, rough, data.options, may_resize=data.may_resize)
 
@@ -138,7 +140,9 @@ def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult
             found, turn_axis_cam = _steady(data, name, path)
         if found is None or not found.trusted:
             return refused
-        camera = _camera(data, name, lens, found.R_imu_cam, found.timeshift_s)
+        camera = camera_by_rotations(
+            lens, data.priors[name], data.options.fix, found.R_imu_cam, found.timeshift_s
+        )
         rough[name] = RotationsKnown(camera, poses, found.gyro_bias_rps)
     result = motion_start(data.buffer, rough, data.options, True, turn_axis_cam)
     return refused if result.state is None else replace(result, reason=reason)
@@ -161,7 +165,7 @@ def _steady(data: StartData, name: str, path: CameraPath) -> tuple[Alignment | N
 def _seen(data: StartData, name: str) -> tuple[Seen, str]:
     """What a camera has seen, and which way a shutter rolls of which nothing was said; empty: it does not."""
     prior, given, target = data.priors[name], data.frames[name], data.target
-    lens, readout_s = Lens.from_prior(prior), prior.readout_s
+    lens, readout_s = starting_camera(prior), prior.readout_s
     estimated = data.layout.cameras[name].readout is not None
     if estimated:
         if not (lens.readout_axis or readout_s):
@@ -178,20 +182,12 @@ def _seen(data: StartData, name: str) -> tuple[Seen, str]:
     return Seen(lens, frames, [] if axis else recent_poses(frames, lens, target)), axis
 
 
-def _camera(data: StartData, name: str, lens: Lens, R_imu_cam: FloatArray, shift_s: float) -> CameraState:
-    """A camera whose lever arm is still to be found; what is held fixed is as it was given."""
-    camera = camera_by_rotations(data.priors[name], data.options.fix, R_imu_cam, shift_s)
-    camera.intrinsics, camera.distortion = lens.intrinsics, lens.distortion
-    camera.readout_s, camera.readout_axis = lens.readout_s, lens.readout_axis
-    return camera
-
-
-def _attitude_sigmas(poses: list[TargetPose], lens: Lens) -> FloatArray:
+def _attitude_sigmas(poses: list[TargetPose], lens: CameraState) -> FloatArray:
     """Of the poses as reported, but at least a fifth of a pixel, rad, shape (n,)."""
     return np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0]))
 
 
-def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: Lens) -> TdIcpResult:
+def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> TdIcpResult:
     rows = buffer.rows
     return td_icp(
         rows[:, 0],

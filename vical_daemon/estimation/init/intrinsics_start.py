@@ -14,8 +14,9 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.geometry.planar_pose import inliers, planar_poses
-from vical_daemon.estimation.init.target_poses import Lens, ideal_views
+from vical_daemon.estimation.init.target_poses import ideal_views
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.model.state import CameraState
 
 MOST_VIEWS = 24
 _FEWEST, _LEAST_POINTS = 6, 12
@@ -26,7 +27,7 @@ _PRIOR = np.array([0.3, 0.3, 0.1, 0.1, 0.5, 0.5, 0.05, 0.05, 0.2])
 
 
 def estimate_intrinsics(
-    lens: Lens, frames: list[PointsFrame], target: FloatArray, most: int = MOST_VIEWS
+    lens: CameraState, frames: list[PointsFrame], target: FloatArray, most: int = MOST_VIEWS
 ) -> LensFit | None:
     """Improve a lens in place by a bundle adjustment over spread-out views (Gauss-Newton, Levenberg damping).
 
@@ -62,7 +63,7 @@ class LensFit(NamedTuple):
     views: list[PointsFrame]
     which: list[int]
 
-    def take_into(self, lens: Lens) -> None:
+    def take_into(self, lens: CameraState) -> None:
         """Overwrite a lens, unless the fit has gone astray."""
         if np.isfinite(self.rms_px) and 0.3 * lens.intrinsics[0] < self.theta[0] < 3.0 * lens.intrinsics[0]:
             lens.intrinsics, lens.distortion = self.theta[:4], self.theta[4:]
@@ -84,7 +85,7 @@ class LensFit(NamedTuple):
         return float(self.rms_px * np.sqrt(self.numbers / free))
 
 
-def fit_lens(views: list[PointsFrame], lens: Lens, target: FloatArray) -> LensFit | None:
+def fit_lens(views: list[PointsFrame], lens: CameraState, target: FloatArray) -> LensFit | None:
     """Adjust lens and poses to chosen views, then to their corners that belong; None: too few show a pose."""
     which, poses = _poses(views, lens, target)
     if len(which) < _FEWEST:
@@ -92,7 +93,8 @@ def fit_lens(views: list[PointsFrame], lens: Lens, target: FloatArray) -> LensFi
     views = [views[k] for k in which]
     theta, poses, rms_px = adjusted(views, poses, lens, target)
     cleaned = [
-        _without_outliers(v, *pose, target, theta, lens.model) for v, pose in zip(views, poses, strict=True)
+        _without_outliers(v, *pose, target, theta, lens.distortion_model)
+        for v, pose in zip(views, poses, strict=True)
     ]
     if any(len(new.ids) < len(old.ids) for new, old in zip(cleaned, views, strict=True)):
         theta, poses, rms_px = adjusted(cleaned, poses, lens, target)
@@ -100,7 +102,7 @@ def fit_lens(views: list[PointsFrame], lens: Lens, target: FloatArray) -> LensFi
 
 
 def adjusted(
-    views: list[PointsFrame], poses: _Poses, lens: Lens, target: FloatArray
+    views: list[PointsFrame], poses: _Poses, lens: CameraState, target: FloatArray
 ) -> tuple[FloatArray, _Poses, float]:
     """Lens (4 + d,), poses and RMS residual in px after the adjustment, from a lens and poses."""
     theta = np.concatenate([lens.intrinsics, lens.distortion])
@@ -108,7 +110,7 @@ def adjusted(
     prior, cost, damping = theta.copy(), np.inf, 1e-3
     best = (theta, poses)
     for _ in range(_STEPS):
-        normal = _normal(views, poses, target, theta, lens.model)
+        normal = _normal(views, poses, target, theta, lens.distortion_model)
         if normal is None:
             break
         new_cost = normal.cost + float((((theta - prior) / scale) ** 2).sum())
@@ -128,14 +130,16 @@ def adjusted(
     return best[0], best[1], float(np.sqrt(cost / max(count, 1)))
 
 
-def _scale(lens: Lens) -> FloatArray:
+def _scale(lens: CameraState) -> FloatArray:
     """How far the numbers of a lens may be off, shape (4 + d,)."""
     n = 4 + len(lens.distortion)
     scale: FloatArray = np.concatenate([np.full(4, lens.intrinsics[0]), np.ones(n - 4)]) * _PRIOR[:n]
     return scale
 
 
-def along(fit: LensFit, lens: Lens, target: FloatArray, moves: list[FloatArray]) -> tuple[float, float]:
+def along(
+    fit: LensFit, lens: CameraState, target: FloatArray, moves: list[FloatArray]
+) -> tuple[float, float]:
     """How the squared residuals change if all corners move, and lens and poses follow them.
 
     Args:
@@ -149,7 +153,7 @@ def along(fit: LensFit, lens: Lens, target: FloatArray, moves: list[FloatArray])
         a corner lies behind its camera.
     """
     here, up, down = (
-        _normal(_moved(fit.views, moves, share), fit.poses, target, fit.theta, lens.model)
+        _normal(_moved(fit.views, moves, share), fit.poses, target, fit.theta, lens.distortion_model)
         for share in (0.0, 1.0, -1.0)
     )
     if here is None or up is None or down is None:
@@ -176,7 +180,7 @@ def _without_outliers(
     return PointsFrame(view.camera, view.t_cam_ns, view.ids[good], view.uv_px[good])
 
 
-def spread(frames: list[PointsFrame], lens: Lens, most: int = MOST_VIEWS) -> list[int]:
+def spread(frames: list[PointsFrame], lens: CameraState, most: int = MOST_VIEWS) -> list[int]:
     """Choose views with many points that differ most in where the board lies in the image."""
     usable = [k for k, f in enumerate(frames) if len(f.ids) >= _LEAST_POINTS]
     if len(usable) <= most:
@@ -194,7 +198,7 @@ def spread(frames: list[PointsFrame], lens: Lens, most: int = MOST_VIEWS) -> lis
     return sorted(usable[i] for i in chosen)
 
 
-def _poses(views: list[PointsFrame], lens: Lens, target: FloatArray) -> tuple[list[int], _Poses]:
+def _poses(views: list[PointsFrame], lens: CameraState, target: FloatArray) -> tuple[list[int], _Poses]:
     """Which views show a pose, and these."""
     seen = ideal_views(views, lens, target)
     found = planar_poses([points for points, _ in seen], [xy for _, xy in seen])

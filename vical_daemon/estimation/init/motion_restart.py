@@ -13,7 +13,7 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import BIAS, GRAVITY, LinearMotion
-from vical_daemon.estimation.init.target_poses import Lens, TargetPose, pose_of
+from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.model.state import (
@@ -82,7 +82,7 @@ class MotionRestart:
             self.frames, self._seen = [], []
         if t_s < buffer.oldest_s or buffer.gap_within(t_s, t_s):
             return
-        seen = pose_of(frame, t_cam_s, _lens(_camera(state, frame)), self._target)
+        seen = pose_of(frame, t_cam_s, _camera(state, frame), self._target)
         if seen is None and not self.frames:
             return
         self.frames.append((t_cam_s, frame))
@@ -177,7 +177,3 @@ def _distance_m(p_target_cam: FloatArray) -> float:
 
 def _camera(state: State, frame: PointsFrame) -> CameraState:
     return state.cameras[frame.camera]
-
-
-def _lens(camera: CameraState) -> Lens:
-    return Lens(camera.intrinsics, camera.distortion, camera.distortion_model, camera.resolution)

@@ -14,9 +14,9 @@ import numpy as np
 
 from vical_daemon.estimation.init.intrinsics_start import LensFit, along, fit_lens, spread
 from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row, corner_speeds
-from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray
 from vical_daemon.estimation.model.camera_rays import read_share
+from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _ROUNDS = 3
@@ -24,7 +24,7 @@ _SHORT_S = 0.004
 _BEYOND_DOUBT = 100.0  # a global shutter on a real lens reaches 76 (EuRoC, 4 s from 55 s on)
 
 
-def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> float:
+def readout(frames: Frames, lens: CameraState, target: FloatArray, given_s: float) -> float:
     """The readout to start with, s: as given unless the board is significantly flatter with another one.
 
     Args:
@@ -46,7 +46,7 @@ def readout(frames: Frames, lens: Lens, target: FloatArray, given_s: float) -> f
     return found_s
 
 
-def likely_axis(frames: Frames, lens: Lens, target: FloatArray) -> str:
+def likely_axis(frames: Frames, lens: CameraState, target: FloatArray) -> str:
     """`ROWS` or `COLUMNS`: which of them, read one after the other, make the board flatter.
 
     Arguments as for `readout`.
@@ -58,7 +58,7 @@ def likely_axis(frames: Frames, lens: Lens, target: FloatArray) -> str:
     return max((by_rows, ROWS), (by_columns, COLUMNS), key=lambda x: x[0][0] ** 2 / x[0][1])[1]
 
 
-def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) -> str:
+def looks_rolling(frames: Frames, lens: CameraState, target: FloatArray, fit: LensFit) -> str:
     """Whether the board is flatter beyond doubt if rows, or columns, are read over 4 ms, not all at once.
 
     Returns `ROWS`, `COLUMNS`, or empty: no rolling shutter shows. It does where the readout is longer than
@@ -71,7 +71,7 @@ def looks_rolling(frames: Frames, lens: Lens, target: FloatArray, fit: LensFit) 
     return axis if surely else ""
 
 
-def lens_fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
+def lens_fit(frames: Frames, lens: CameraState, target: FloatArray, readout_s: float = 0.0) -> LensFit | None:
     """A lens and poses adjusted to spread-out images whose rows are read like that; None: too few."""
     views = [frame for _, frame in at_middle_row(frames, readout_s, lens.resolution, lens.readout_axis)]
     left_out = 1 if readout_s else 0  # at either end
@@ -83,7 +83,7 @@ def lens_fit(frames: Frames, lens: Lens, target: FloatArray, readout_s: float = 
 
 
 def _parabolas(
-    frames: Frames, lens: Lens, target: FloatArray, fit: LensFit, axes: Sequence[str]
+    frames: Frames, lens: CameraState, target: FloatArray, fit: LensFit, axes: Sequence[str]
 ) -> list[tuple[float, float]]:
     """Half the first and second derivative of the squared residuals by the readout, px^2/s and px^2/s^2."""
     own = [

@@ -8,36 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, inliers, planar_poses
-from vical_daemon.estimation.measurements import CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
+from vical_daemon.estimation.model.state import CameraState
 
 _MIN_POINTS = 8
 _MOST_POSES = 160
 _CLEANINGS = 3  # a gross outlier may hide lesser ones
-
-
-@dataclass(slots=True)
-class Lens:
-    """Intrinsics in use while starting: given, guessed, or estimated from the first frames."""
-
-    intrinsics: FloatArray
-    distortion: FloatArray
-    model: str
-    resolution: tuple[int, int]
-    readout_s: float = 0.0
-    readout_axis: str = ""
-
-    @classmethod
-    def from_prior(cls, prior: CameraPrior) -> Lens:
-        """Take what is given; a lens of 60 degrees across where nothing is."""
-        return cls(
-            prior.start_intrinsics(),
-            prior.coefficients(),
-            prior.distortion_model,
-            prior.resolution,
-            prior.readout_s,
-            prior.readout_axis,
-        )
 
 
 @dataclass(slots=True)
@@ -69,13 +46,13 @@ class TargetPose:
         return float(np.sqrt(np.trace(self.pose.covariance[3:, 3:]) / 3.0))
 
 
-def pose_of(frame: PointsFrame, t_cam_s: float, lens: Lens, target: FloatArray) -> TargetPose | None:
+def pose_of(frame: PointsFrame, t_cam_s: float, lens: CameraState, target: FloatArray) -> TargetPose | None:
     """Planar pose of one frame; None where too few points are seen or the two-fold ambiguity is open."""
     return poses_of([(t_cam_s, frame)], lens, target)[0]
 
 
 def poses_of(
-    frames: Sequence[tuple[float, PointsFrame]], lens: Lens, target: FloatArray
+    frames: Sequence[tuple[float, PointsFrame]], lens: CameraState, target: FloatArray
 ) -> list[TargetPose | None]:
     """Planar poses of frames with their stamps in s, see `pose_of`."""
     left = [k for k, (_, f) in enumerate(frames) if len(f.ids) >= _MIN_POINTS]
@@ -93,13 +70,13 @@ def poses_of(
 
 
 def ideal_views(
-    frames: Sequence[PointsFrame], lens: Lens, target: FloatArray
+    frames: Sequence[PointsFrame], lens: CameraState, target: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
     """What the lens has not bent: points of the target, m (n, 3), and where they are, X/Z and Y/Z (n, 2)."""
     if not frames:
         return []
     uv, ids = np.concatenate([f.uv_px for f in frames]), np.concatenate([f.ids for f in frames])
-    rays, ok = unproject(uv, lens.intrinsics, lens.distortion, lens.model)
+    rays, ok = unproject(uv, lens.intrinsics, lens.distortion, lens.distortion_model)
     ends = np.cumsum([len(f.ids) for f in frames])[:-1]
     each = zip(np.split(target[ids], ends), np.split(rays, ends), np.split(ok, ends), strict=True)
     return [(points[good], ray[good, :2] / ray[good, 2:]) for points, ray, good in each]
@@ -123,7 +100,7 @@ def _cleaned(views: dict[int, tuple[FloatArray, FloatArray]], k: int, pose: Plan
 
 
 def recent_poses(
-    frames: Sequence[tuple[float, PointsFrame]], lens: Lens, target: FloatArray
+    frames: Sequence[tuple[float, PointsFrame]], lens: CameraState, target: FloatArray
 ) -> list[TargetPose]:
     """Poses of at most 160 of the frames (stamp in s, points), evenly thinned, in order of time."""
     step = max(1, -(-len(frames) // _MOST_POSES))

@@ -221,8 +221,8 @@ class TargetFreeInitializer:
             about = _only_unsure_about(best, still_axis(t[inside], gyro[inside], best.gyro_bias))
         if why and about is None:
             return reason or why
-        camera = camera_by_rotations(prior, self.options.fix, best.R_imu_cam, best.timeshift_s)
         camera.intrinsics, camera.distortion = best.intrinsics, best.distortion
+        camera = camera_by_rotations(camera, prior, self.options.fix, best.R_imu_cam, best.timeshift_s)
         sigma = WINDOW_START.lever_arm_m if given is None else 1e-4
         return _Found(camera, np.concatenate([best.gyro_bias, np.zeros(3 + NUMBERS)]), sigma, about)
 

@@ -11,7 +11,7 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.target_poses import Lens, poses_of
+from vical_daemon.estimation.init.target_poses import poses_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.significance import EVERY_S
@@ -138,8 +138,7 @@ def _orientations(
     if not frames:
         return None
     known = f.state.cameras[frames[0][1].camera]
-    lens = Lens(known.intrinsics, known.distortion, known.distortion_model, known.resolution)
-    poses = [p for p in poses_of(frames, lens, target) if p is not None]
+    poses = [p for p in poses_of(frames, known, target) if p is not None]
     if not poses:
         return None
     return Orientations(

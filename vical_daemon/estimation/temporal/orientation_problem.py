@@ -191,7 +191,7 @@ def _states(
 
 
 def _prior(S: int, p: int) -> FloatArray:
-    """Next to no information: 2 rad on rotations, 0.5 s on shifts; keeps lost ones finite. The gyro's matrix."""
+    """Next to no information: 2 rad on rotations, 0.5 s on shifts; keeps lost ones finite. The matrix."""
     diagonal = np.full(p, 1.0 / 2.0**2)
     diagonal[3 : 4 * S : 4] = 1.0 / 0.5**2
     diagonal[4 * S :] = ENTRY_SIGMA**-2

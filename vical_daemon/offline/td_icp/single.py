@@ -54,7 +54,7 @@ def register_camera(request: TdIcpRequest, watch_s: float | None = None) -> Sing
     t_imu, prior, options = seconds(t_ns, base), prior_of(request.initial, camera), request.options
     if stream.kind == "tracks":
         frames, used = track_frames(recording, stream, prior, base)
-        lens = (used.lens.intrinsics, used.lens.distortion, used.lens.model)
+        lens = (used.lens.intrinsics, used.lens.distortion, used.lens.distortion_model)
         result = track_registration(t_imu, gyro, frames, lens, options)
         if watch_s is not None:
             raise OptionError("--watch needs a board: tracks of unknown points are fitted as a whole")

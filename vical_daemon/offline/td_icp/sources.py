@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.intrinsics_start import LensFit, estimate_intrinsics
-from vical_daemon.estimation.init.target_poses import Lens
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
+from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.temporal.camera_orientations import Orientations, target_orientations
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
@@ -28,14 +29,14 @@ _LENS_VIEWS = 60  # where the board stands in the image is then seen in many pla
 class LensUsed:
     """The lens with which orientations were taken from images, and where it is from."""
 
-    lens: Lens
+    lens: CameraState
     origin: str
 
     def to_json(self) -> dict[str, Any]:
         """Return it as `vical td-icp --json` prints it, with the names of `vical calibrate`."""
         return {
             "intrinsics": self.lens.intrinsics.tolist(),
-            "distortion_model": self.lens.model,
+            "distortion_model": self.lens.distortion_model,
             "distortion": self.lens.distortion.tolist(),
             "origin": self.origin,
         }
@@ -72,7 +73,7 @@ def camera_stream(
         if prior is None or prior.intrinsics is None:
             raise OptionError(f"{stream.name}: tracks need the lens: give --initial with its intrinsics")
         chains = track_orientations(
-            recording.points_frames(stream.name), lens.intrinsics, lens.distortion, lens.model
+            recording.points_frames(stream.name), lens.intrinsics, lens.distortion, lens.distortion_model
         )
         if not chains:
             raise InputError(f"{stream.name}: too few features carry over from frame to frame")
@@ -100,7 +101,7 @@ def track_frames(
 
 
 def board_poses(
-    recording: Recording, stream: Stream, lens: Lens, target: str | None, warn: Warn = ignore
+    recording: Recording, stream: Stream, lens: CameraState, target: str | None, warn: Warn = ignore
 ) -> tuple[Orientations, LensFit | None]:
     """Find the board in a camera's frames, improve the lens by them, and return the camera's poses.
 
@@ -127,10 +128,10 @@ def board_poses(
             f"{stream.name}: point ids go beyond the target's {len(points_m)} points; wrong target file?"
         )
     fit = estimate_intrinsics(lens, frames, points_m, _LENS_VIEWS)
-    return target_orientations(frames, points_m, lens.intrinsics, lens.distortion, lens.model), fit
+    return target_orientations(frames, points_m, lens.intrinsics, lens.distortion, lens.distortion_model), fit
 
 
-def lens_of(stream: Stream, prior: CameraPrior | None) -> Lens:
+def lens_of(stream: Stream, prior: CameraPrior | None) -> CameraState:
     """Return what is known about a camera's lens, or a guess from the image size.
 
     Raises:
@@ -147,7 +148,7 @@ def lens_of(stream: Stream, prior: CameraPrior | None) -> Lens:
         if stream.resolution is None:
             raise OptionError(f"{stream.name}: --initial gives neither resolution nor intrinsics")
         prior = CameraPrior(resolution=stream.resolution, distortion_model=prior.distortion_model)
-    return Lens.from_prior(prior)
+    return starting_camera(prior)
 
 
 def _stream(name: str, found: Orientations, base_ns: int) -> OrientationStream:

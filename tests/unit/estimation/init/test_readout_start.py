@@ -7,9 +7,9 @@ import pytest
 from vical_mocks.points import board_points, crooked_board, simulate
 from vical_mocks.rig import reference_rig
 
+from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
-from vical_daemon.estimation.init.target_poses import Lens
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 
 BOARD = board_points()
 
@@ -18,7 +18,7 @@ def seen(seed, readout_s, seconds=4.0, axis="rows", **options):
     rig = replace(reference_rig(seed, timeshift_cam_imu_s=0.01), readout_s=readout_s, readout_axis=axis)
     run = simulate(seed, seconds, rig=rig, **options)
     frames = [(f.t_s, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px)) for f in run.frames]
-    return frames, Lens(np.array([530.0, 530.0, 322.0, 236.0]), np.zeros(4), "radtan", (640, 480))
+    return frames, starting_camera(CameraPrior((640, 480), (530.0, 530.0, 322.0, 236.0)))
 
 
 def rolls(frames, lens):
@@ -57,7 +57,7 @@ def test_a_rig_that_stands_still_shows_nothing():
     still = reference_rig(1, mean_rate_dps=0.05)
     run = simulate(1, 4.0, rig=replace(still, readout_s=0.02))
     frames = [(f.t_s, PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px)) for f in run.frames]
-    lens = Lens(np.array([530.0, 530.0, 322.0, 236.0]), np.zeros(4), "radtan", (640, 480))
+    lens = starting_camera(CameraPrior((640, 480), (530.0, 530.0, 322.0, 236.0)))
     assert not rolls(frames, lens)
     assert readout(frames, lens, BOARD, 0.011) == 0.011
 

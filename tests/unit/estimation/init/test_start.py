@@ -15,8 +15,9 @@ from vical_mocks.points import board_points, simulate
 from vical_mocks.rig import nominal_gravity, reference_rig
 from vical_mocks.trajectory import hand_motion
 
+from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.init.target_poses import Lens, pose_of
+from vical_daemon.estimation.init.target_poses import pose_of
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior
 
 
@@ -71,7 +72,7 @@ def test_outliers_do_not_delay_the_start(dirty):
 
 def test_the_pose_of_one_image_leaves_outliers_out(dirty):
     run = dirty
-    lens = Lens.from_prior(
+    lens = starting_camera(
         CameraPrior((640, 480), tuple(run.rig.lens.intrinsics), "radtan", tuple(run.rig.lens.distortion))
     )
     shown = [f for f in run.frames if f.outlier.any() and len(f.ids) == 48][:10]
@@ -88,7 +89,7 @@ def test_the_first_lens_is_not_bent_by_outliers(dirty):
     clean = simulate(1, 7.0, timeshift_cam_imu_s=0.03)
     focal = []
     for run in (clean, dirty):
-        lens = Lens.from_prior(CameraPrior((640, 480), (540.0, 540.0, 320.0, 240.0)))
+        lens = starting_camera(CameraPrior((640, 480), (540.0, 540.0, 320.0, 240.0)))
         fit = estimate_intrinsics(lens, [points_frame(f) for f in run.frames], run.points_m)
         assert fit.rms_px == pytest.approx(0.5, rel=0.3)
         focal.append(lens.intrinsics[0])

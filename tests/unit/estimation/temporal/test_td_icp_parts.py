@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 from vical_mocks.points import board_points, simulate
 
 from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.init.target_poses import Lens
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.delay_windows import delay_windows
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, cumulative_product
 from vical_daemon.estimation.temporal.td_icp import TdIcpOptions
@@ -70,14 +70,15 @@ def test_a_wrong_lens_is_put_right_by_the_views():
     lens = run.rig.lens
     truth = np.array([*lens.intrinsics, *lens.distortion])
     wrong = truth * np.array([1.01, 1.01, 1.0, 1.0, 0.9, 0.9, 1.0, 1.0]) + np.array([0, 0, 5, -4, 0, 0, 0, 0])
-    found = Lens(wrong[:4], wrong[4:], lens.model, lens.resolution)
+    prior = CameraPrior(lens.resolution, tuple(wrong[:4]), lens.model, tuple(wrong[4:]))
+    found = starting_camera(prior)
     fit = estimate_intrinsics(found, frames, board_points(), 60)
     assert len(fit.views) >= 15
     error = np.concatenate((found.intrinsics, found.distortion)) - truth
     sigma = np.array([1.8, 1.8, 0.75, 0.64, 2.2e-3, 5.0e-3, 3.0e-4, 3.6e-4])  # of these views at 0.2 px
     assert np.all(np.abs(error) < 3 * sigma)
     assert fit.corner_sigma_px == pytest.approx(0.2, rel=0.15)
-    few = Lens(wrong[:4], wrong[4:], lens.model, lens.resolution)
+    few = starting_camera(prior)
     assert estimate_intrinsics(few, frames[:3], board_points()) is None
     assert np.array_equal(few.intrinsics, wrong[:4])
 
