@@ -13,6 +13,7 @@ Mourikis, "Estimator initialization in vision-aided inertial navigation with unk
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -94,18 +95,20 @@ class LinearStart:
     """Result of `linear_start` (world = target frame).
 
     Attributes:
+        p_world_cam: Position at the first pose, m, shape (3,); of the imu where the lever arm was zero.
+        v_world_imu: Velocity of the imu there, m/s.
+        gravity: Acceleration of free fall, m/s^2; as found, it does not have the right length yet.
         p_imu_cam: Lever arm, m, shape (3,).
-        v_world_imu: Velocity of the imu at the first pose, m/s.
-        gravity: Acceleration of free fall, m/s^2, as found (not yet of the right length).
         accel_bias: m/s^2.
-        sigma_p_imu_cam: Standard deviations, m, shape (3,).
+        sigma_p_imu_cam: Standard deviations, m, shape (3,); 0 where it was known.
         size: True size of the target over the stated one; 1 where that was not asked for.
         sigma_size: Its standard deviation; 0 likewise.
     """
 
-    p_imu_cam: FloatArray
+    p_world_cam: FloatArray
     v_world_imu: FloatArray
     gravity: FloatArray
+    p_imu_cam: FloatArray
     accel_bias: FloatArray
     sigma_p_imu_cam: FloatArray
     size: float = 1.0
@@ -116,39 +119,48 @@ def linear_start(
     motion: LinearMotion,
     p_world_cam: FloatArray,
     position_sigma: FloatArray,
-    held_axes: FloatArray | None = None,
     *,
+    unknown: Sequence[slice] = (SPEED, GRAVITY, ARM, BIAS),
+    known: FloatArray | None = None,
+    held_axes: FloatArray | None = None,
     free_size: bool = False,
 ) -> LinearStart:
-    """Solve velocity, gravity, accelerometer bias and lever arm from positions of the camera.
+    """Solve velocity, gravity, lever arm and accelerometer bias, or some of them, from positions.
 
     Args:
         motion: At the instants of the positions, with attitudes by vision (mounting from TD-ICP).
-        p_world_cam: Camera positions, m, shape (n, 3).
+        p_world_cam: Camera positions, m, shape (n, 3); of the imu, where its lever arm is taken as zero.
         position_sigma: Standard deviation of each, m, shape (n,).
+        unknown: Parts of z that are unknown, in their order.
+        known: z, where it is known; the accelerometer bias is known to its prior in any case; None: zeros.
         held_axes: Of the imu, along which the lever arm is held at zero, shape (k, 3): where an axis hardly
             turns (`still_axes`), errors of the attitudes would be taken for a lever arm along it.
         free_size: Find the size of the target, too, by which positions scale.
     """
-    n = len(p_world_cam)
-    columns = [motion.A, np.broadcast_to(np.eye(3), (n, 3, 3))]  # z and p_0
+    n, z = len(p_world_cam), np.zeros(12) if known is None else known.copy()
+    free = np.concatenate([np.arange(12)[part] for part in unknown])
+    fixed = np.setdiff1d(np.arange(12), free)
+    columns = [motion.A[:, :, free], np.broadcast_to(np.eye(3), (n, 3, 3))]  # z and p_0
     columns += [-p_world_cam[:, :, None]] if free_size else []
     A = np.concatenate(columns, axis=2)
     w = 1.0 / position_sigma
     rows = (A * w[:, None, None]).reshape(-1, A.shape[2])
-    y = (((0.0 if free_size else p_world_cam) - motion.D) * w[:, None]).ravel()
-    prior = np.zeros((6, A.shape[2]))
+    left = (0.0 if free_size else p_world_cam) - motion.D - motion.A[:, :, fixed] @ z[fixed]
+    y = (left * w[:, None]).ravel()
+    prior = np.zeros((6, 12))
     prior[:3, BIAS] = np.eye(3) / ACCEL_BIAS_SIGMA_MPS2
     if held_axes is not None:
         prior[3:, ARM] = held_axes.T @ held_axes / HELD_M
-    A_all, y_all = np.vstack([rows, prior]), np.concatenate([y, np.zeros(6)])
-    x, *_ = np.linalg.lstsq(A_all, y_all, rcond=None)
-    residual = (y - rows @ x).reshape(-1, 3)
-    variance = float(np.mean(residual**2))
-    cov = np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)
-    sigma = np.sqrt(np.diag(cov))
-    size, sigma_size = (float(x[15]), float(sigma[15])) if free_size else (1.0, 0.0)
-    return LinearStart(x[ARM], x[SPEED], x[GRAVITY], x[BIAS], sigma[ARM], size, sigma_size)
+    A_all = np.vstack([rows, np.zeros((6, A.shape[2]))])
+    A_all[-6:, : len(free)] = prior[:, free]
+    x, *_ = np.linalg.lstsq(A_all, np.concatenate([y, prior[:, free] @ z[free]]), rcond=None)
+    variance = float(np.mean((y - rows @ x) ** 2))
+    sigma = np.sqrt(np.diag(np.linalg.pinv(A_all.T @ A_all) * max(variance, 1.0)))
+    z[free], k = x[: len(free)], len(free)
+    sigmas = np.zeros(12)
+    sigmas[free] = sigma[:k]
+    size = (float(x[k + 3]), float(sigma[k + 3])) if free_size else (1.0, 0.0)
+    return LinearStart(x[k : k + 3], z[SPEED], z[GRAVITY], z[ARM], z[BIAS], sigmas[ARM], *size)
 
 
 def still_axes(mean_R_world_imu: FloatArray) -> FloatArray:

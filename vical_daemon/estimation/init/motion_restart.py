@@ -12,7 +12,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.linear_start import BIAS, GRAVITY, LinearMotion
+from vical_daemon.estimation.init.linear_start import SPEED, LinearMotion, linear_start
 from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
@@ -113,12 +113,11 @@ class MotionRestart:
         found = LinearMotion.between(buffer, t_s, R, state.gyro_bias)
         if found is None:
             return None
-        T, known = found.T, np.concatenate([state.gravity, state.accel_bias])
-        y = poses.p - found.D - np.concatenate([found.A[..., GRAVITY], found.A[..., BIAS]], axis=2) @ known
-        start, velocity = np.linalg.lstsq(np.stack([np.ones_like(T), T], axis=1), y, rcond=None)[0]
-        wide = self._sigmas(poses.first, layout, sigmas, float(T[-1]))
+        known = np.concatenate([np.zeros(3), state.gravity, np.zeros(3), state.accel_bias])
+        start = linear_start(found, poses.p, np.ones(len(t_s)), unknown=[SPEED], known=known)
+        wide = self._sigmas(poses.first, layout, sigmas, float(found.T[-1]))
         elapsed_s = self._elapsed_s(poses.first.frame, float(t_s[0]) - state.t_s)
-        return MotionStart(float(t_s[0]), R[0], start, velocity, wide, elapsed_s)
+        return MotionStart(float(t_s[0]), R[0], start.p_world_cam, start.v_world_imu, wide, elapsed_s)
 
     def _poses(self, state: State) -> Poses | None:
         """Poses of the imu by the images collected and the calibration as it is known."""

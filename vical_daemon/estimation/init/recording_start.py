@@ -11,8 +11,14 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.inertial.imu_model import strapdown
-from vical_daemon.estimation.init.linear_start import BIAS, GRAVITY, SPEED, LinearMotion
+from vical_daemon.estimation.init.linear_start import (
+    BIAS,
+    GRAVITY,
+    SPEED,
+    LinearMotion,
+    LinearStart,
+    linear_start,
+)
 from vical_daemon.estimation.init.motion_restart import MotionRestart
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.priors import (
@@ -21,6 +27,7 @@ from vical_daemon.estimation.model.priors import (
     GYRO_BIAS_SIGMA_RPS,
 )
 from vical_daemon.estimation.model.state import BiasStart, Layout, MotionStart, State
+from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _LEAST_IMAGES = 8
 _LEAST_S = 1.5
@@ -50,13 +57,20 @@ class RecordingStart(MotionRestart):
         found = LinearMotion.between(buffer, poses.t_s, poses.R, gyro_bias)
         if found is None:
             return None
-        position, velocity, gravity, accel_bias = _linear(found, poses.p, state)
+        start = _linear(found, poses.p, state)
         span_s = float(poses.t_s[-1] - poses.t_s[0])
         wide = self._sigmas(poses.first, layout, sigmas, span_s)
         biases = BiasStart(
-            gyro_bias, accel_bias, gravity, GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD
+            gyro_bias,
+            start.accel_bias,
+            start.gravity,
+            GYRO_BIAS_SIGMA_RPS,
+            ACCEL_BIAS_SIGMA_MPS2,
+            GRAVITY_SIGMA_RAD,
         )
-        return MotionStart(float(poses.t_s[0]), poses.R[0], position, velocity, wide, 0.0, biases)
+        return MotionStart(
+            float(poses.t_s[0]), poses.R[0], start.p_world_cam, start.v_world_imu, wide, 0.0, biases
+        )
 
     def gyro_bias(self, state: State, buffer: ImuBuffer) -> FloatArray:
         """Bias of the gyro by the images so far, rad/s, shape (3,); the state's where they say nothing."""
@@ -70,40 +84,21 @@ def _gyro_bias(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray) -> F
 
     log(dR_gyro' dR_seen) = -integral of dR(t)' b dt, with dR from t to the end of each interval.
     """
-    found = buffer.intervals(t_s)
-    if found is None:
+    if t_s[0] < buffer.oldest_s or t_s[-1] > buffer.newest_s:
         return None
-    segment, begin = found
-    dR = strapdown(segment, np.zeros((1, 3)), np.zeros((1, 3))).dR[0]
-    steps = np.diff(segment.t_s)[:, None, None] * 0.5 * (dR[1:] + dR[:-1])
-    end = np.append(begin[1:], len(dR)) - 1
-    turned = np.cumsum(steps, axis=0)[
-        end - 1
-    ]  # integral of dR: of a constant vector, seen from the first attitude
-    back = np.swapaxes(dR[end], 1, 2)
+    curve = GyroCurve.integrate(buffer.rows[:, 0], buffer.rows[:, 1:4], np.zeros(3))
+    R, _, integral = curve.at(t_s)
+    back, turned = np.swapaxes(R[1:], 1, 2) @ R[0], R[0].T @ (integral[1:] - integral[0])
     misses = so3.log(back @ R_world_imu[0].T @ R_world_imu[1:])
     rows = np.concatenate([back @ turned, back], axis=2)  # the error of the first attitude is unknown, too
     x, *_ = np.linalg.lstsq(rows.reshape(-1, 6), -misses.ravel(), rcond=None)
     return np.asarray(x[:3])
 
 
-def _linear(
-    motion: LinearMotion, p_world_imu: FloatArray, state: State
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Position and velocity at the first pose, gravity of its known length, and the accelerometer's bias."""
-    n, eye = len(motion.T), np.eye(3)
-    A = np.concatenate(
-        [np.broadcast_to(eye, (n, 3, 3)), motion.A[..., SPEED], motion.A[..., GRAVITY], motion.A[..., BIAS]],
-        axis=2,
-    )
-    noise_m = _POSITION_SIGMA_M
-    prior = np.zeros((3, 12))
-    prior[:, 9:12] = noise_m / ACCEL_BIAS_SIGMA_MPS2 * eye
-    rows = np.concatenate([A.reshape(-1, 12), prior])
-    y = np.concatenate([(p_world_imu - motion.D).ravel(), noise_m / ACCEL_BIAS_SIGMA_MPS2 * state.accel_bias])
-    x, *_ = np.linalg.lstsq(rows, y, rcond=None)
-    gravity = x[6:9] * (np.linalg.norm(state.gravity) / np.linalg.norm(x[6:9]))
-    rest = y - rows[:, 6:9] @ gravity
-    free = [*range(6), *range(9, 12)]
-    x, *_ = np.linalg.lstsq(rows[:, free], rest, rcond=None)
-    return x[:3], x[3:6], gravity, x[6:9]
+def _linear(motion: LinearMotion, p_world_imu: FloatArray, state: State) -> LinearStart:
+    """Motion at the first pose, gravity of its known length, and the accelerometer's bias."""
+    sigma, known = np.full(len(p_world_imu), _POSITION_SIGMA_M), np.zeros(12)
+    known[BIAS] = state.accel_bias
+    found = linear_start(motion, p_world_imu, sigma, unknown=[SPEED, GRAVITY, BIAS], known=known)
+    known[GRAVITY] = found.gravity * (np.linalg.norm(state.gravity) / np.linalg.norm(found.gravity))
+    return linear_start(motion, p_world_imu, sigma, unknown=[SPEED, BIAS], known=known)

@@ -108,7 +108,7 @@ def motion_start(
         motion = LinearMotion.between(buffer, t, R, gyro_bias)
         if motion is not None and may_resize and not partial:
             other = other or _other_size(motion, p, sigma, options.gravity_mps2)
-        linear = None if motion is None else linear_start(motion, p, sigma, axes)
+        linear = None if motion is None else linear_start(motion, p, sigma, held_axes=axes)
         if linear is None or (float(np.max(linear.sigma_p_imu_cam)) > 0.1 and not partial):
             why = f"{name}: lever arm not yet visible: turn the rig about two axes"
             return StartResult(None, why, motion_missing=True, size=other)
