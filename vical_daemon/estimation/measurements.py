@@ -16,6 +16,9 @@ BoolArray = npt.NDArray[np.bool_]
 ROWS, COLUMNS = "rows", "columns"
 """What a rolling shutter reads one after the other; columns: a phone's sensor, of images turned upright."""
 
+IMAGE_GAP_S = 0.5
+"""Images further apart, s, do not show how points and camera moved in between; a track may be another."""
+
 
 @dataclass(frozen=True, slots=True)
 class ImuNoise:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtri, ndtri
 
 FloatArray = npt.NDArray[np.float64]
 
-MEDIAN_ABSOLUTE = 0.6745
+MEDIAN_ABSOLUTE = float(ndtri(0.75))
 """Of the size of a standard normal variable."""
-MEDIAN_RAYLEIGH = 1.1774
+MEDIAN_RAYLEIGH = float(np.sqrt(chdtri(2, 0.5)))
 """Of the length of two."""
-MEDIAN_CHI2, MEDIAN_CHI2_3 = 0.455, 2.366
+MEDIAN_CHI2, MEDIAN_CHI2_3 = float(chdtri(1, 0.5)), float(chdtri(3, 0.5))
 """Of a chi-square variable with one degree of freedom, and with three."""
 
 

@@ -30,17 +30,16 @@ CALIBRATIONS_DISAGREE = 1e-3
 # Standard deviations, of a normal variable (two-sided).
 SURE_SIGMAS = 5.0
 """6e-7: a term of the noise, a rolling shutter, another size of the target is taken as real."""
-LENS_TERM_SIGMAS = 4.0
-"""6e-5: a lens model lacks the next power of the radius."""
-DRIFT_SIGMAS, DRIFT_DOUBT_SIGMAS = 6.0, 3.0
-"""2e-9 and 3e-3: a time shift has left where it was, surely or perhaps; asked once a second over 20 spans."""
-JUMP_SIGMAS = 6.0
-"""2e-9: a time shift that `td_icp` follows has jumped; asked at every window."""
-RATE_SIGMAS = 6.0
-"""2e-9: two clocks do not run at one rate, so that a recording is refused."""
+TERM_SIGMAS = 4.0
+"""6e-5: a model lacks a term: the next power of a lens's radius, flicker of a sensor."""
+CHANGED_SIGMAS, PERHAPS_SIGMAS = 6.0, 3.0
+"""2e-9 and 3e-3: a time shift has left where it was, or jumped, or two clocks run at different rates: surely
+or perhaps. Asked once a second over 20 spans, at every window of `td_icp`."""
 OUTLIER_SIGMAS = 6.0
 """2e-9: an error beyond is an outlier; it counts as if it were no larger, and says nothing of a noise."""
 
+STRETCH_S = 5.0
+"""What a model gets wrong lasts for seconds: stretches so long, s, are taken as independent."""
 EVERY_S = 1.0
 """Decisions that need not follow every image are made this often, s."""
 

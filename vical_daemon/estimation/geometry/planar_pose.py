@@ -20,10 +20,11 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
-from vical_daemon.estimation.significance import SURE_SIGMAS
+from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
 
+MIN_POINTS = 8  # of a view: two tags, or corners enough to see an outlier among them
 _STEPS = 15
 _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / n)
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
@@ -152,7 +153,7 @@ def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
         far: Distance of each point from its place, shape (n,).
     """
     sigma = np.median(far) / MEDIAN_RAYLEIGH
-    return np.asarray(far <= 6.0 * sigma)
+    return np.asarray(far <= OUTLIER_SIGMAS * sigma)
 
 
 def _homographies(v: _Views) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

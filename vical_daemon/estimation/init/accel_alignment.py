@@ -24,9 +24,8 @@ from vical_daemon.estimation.measurements import FloatArray
 _COARSE_S, _FINE_S = 0.02, 0.004
 _APART_S = 0.25  # another delay this far away must fit worse by the contrast
 _MIN_CONTRAST = 4.0
-ROTATION_SIGMA_RAD = np.deg2rad(1.0)
-"""So well a mounting must be known for a start."""
-_MAX_SHIFT_SIGMA_S = 2e-3
+ROTATION_SIGMA_RAD, SHIFT_SIGMA_S = np.deg2rad(1.0), 1e-3
+"""So well mounting and time shift must be known for a start; after a long time, half as well will do."""
 _DESCENTS = 12
 
 
@@ -56,7 +55,7 @@ class Alignment:
         return (
             self.contrast > _MIN_CONTRAST
             and self.rotation_sigma_rad < ROTATION_SIGMA_RAD
-            and self.timeshift_sigma_s < _MAX_SHIFT_SIGMA_S
+            and self.timeshift_sigma_s < 2.0 * SHIFT_SIGMA_S
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+LONG_S = 8.0  # of data: much for a start; more of them would not make it better
 _GROWTH, _MOST_S = 1.25, 4.0  # each pause over the one before; the longest
 
 

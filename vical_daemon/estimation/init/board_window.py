@@ -24,8 +24,13 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
 from vical_daemon.estimation.model.imu_scale import numbers_of
-from vical_daemon.estimation.model.inertial_links import PreintegratedLink, PreintegratedLinks, make_links
-from vical_daemon.estimation.model.rates import Rates
+from vical_daemon.estimation.model.inertial_links import (
+    RELINK_S,
+    PreintegratedLink,
+    PreintegratedLinks,
+    make_links,
+)
+from vical_daemon.estimation.model.rates import SLOPE_S, Rates
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
@@ -39,8 +44,6 @@ _MOST_STEPS = 20
 _DONE = 0.1  # a step that promises less than this of the sum of squares is the last
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
-_RELINK_S = 3e-4  # of change of the time shift: links are integrated between the new instants
-_RATE_S = 0.02  # of readings on both sides of an instant: they show its angular acceleration
 
 Frames = list[tuple[float, PointsFrame]]
 
@@ -242,7 +245,7 @@ class BoardWindow:
         assert found is not None  # links have been made over the same
         segment, begin = found
         at = np.append(begin, len(segment.t_s) - 1)
-        self._measured = segment.gyro[at], segment.accel[at], self._buffer.turning(t_s, _RATE_S)[1]
+        self._measured = segment.gyro[at], segment.accel[at], self._buffer.turning(t_s, SLOPE_S)[1]
 
     def _find_rates(self) -> None:
         s = self.state
@@ -254,7 +257,7 @@ class BoardWindow:
 
     def _stale(self) -> bool:
         """Whether time shifts have left the instants for which links hold."""
-        return any(abs(self._late_s(n)) > _RELINK_S for n in self.nodes)
+        return any(abs(self._late_s(n)) > RELINK_S for n in self.nodes)
 
     def _late_s(self, node: Node) -> float:
         t_cam_s, frame = node.frames[0]

@@ -12,23 +12,27 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.accel_alignment import ROTATION_SIGMA_RAD, Alignment, align, align_at
+from vical_daemon.estimation.init.accel_alignment import (
+    ROTATION_SIGMA_RAD,
+    SHIFT_SIGMA_S,
+    Alignment,
+    align,
+    align_at,
+)
 from vical_daemon.estimation.init.accel_evidence import CameraPath
+from vical_daemon.estimation.init.attempts import LONG_S
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
-from vical_daemon.estimation.init.target_poses import TargetPose, recent_poses
+from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, recent_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
 
-_SHIFT_SIGMA_S = 1.0e-3
-_PATIENCE_S = 8.0  # after so long a start twice as uncertain is welcome: the filter's own is five times wider
 _LEAST_POSES = 20  # of two seconds at 10 Hz
-_PARTIAL_STRETCH_S = 8.0
 PARTIAL_S = 6.0  # before, a second axis may come yet
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)
 
@@ -93,11 +97,11 @@ def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )
         found = _timing(data.buffer, poses, lens)
-        long = poses[-1].t_cam_s - poses[0].t_cam_s > _PATIENCE_S
+        long = poses[-1].t_cam_s - poses[0].t_cam_s > LONG_S
         why = found.reason or not_sure_yet(
             found.timeshift_sigma_s,
             float(np.max(found.rotation_sigma_rad)),
-            (2.0 if long else 1.0) * _SHIFT_SIGMA_S,
+            (2.0 if long else 1.0) * SHIFT_SIGMA_S,
             ROTATION_SIGMA_RAD,
         )
         if why:
@@ -124,7 +128,7 @@ def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult
     turn_axis_cam: FloatArray | None = None
     refused = StartResult(None, reason, motion_missing=True)
     for name, (lens, frames, _) in seen.items():
-        since_s = data.frames[name][-1][0] - _PARTIAL_STRETCH_S
+        since_s = data.frames[name][-1][0] - LONG_S
         poses = recent_poses([x for x in frames if x[0] > since_s], lens, data.target)
         if not poses or poses[-1].t_cam_s - poses[0].t_cam_s < PARTIAL_S:
             return refused
@@ -133,7 +137,7 @@ def _partial(data: StartData, seen: dict[str, Seen], reason: str) -> StartResult
             np.array([p.R_target_cam for p in poses]),
             np.array([p.p_target_cam for p in poses]),
             np.maximum([p.sigma_m for p in poses], 2e-4),
-            _attitude_sigmas(poses, lens),
+            attitude_sigmas(poses, lens),
         )
         found = align(path, data.buffer.rows, _PARTIAL_SHIFTS_S)
         if found is not None and not found.trusted and len(data.priors) == 1:
@@ -182,11 +186,6 @@ def _seen(data: StartData, name: str) -> tuple[Seen, str]:
     return Seen(lens, frames, [] if axis else recent_poses(frames, lens, target)), axis
 
 
-def _attitude_sigmas(poses: list[TargetPose], lens: CameraState) -> FloatArray:
-    """Of the poses as reported, but at least a fifth of a pixel, rad, shape (n,)."""
-    return np.maximum([p.sigma_rad for p in poses], 0.2 / float(lens.intrinsics[0]))
-
-
 def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> TdIcpResult:
     rows = buffer.rows
     return td_icp(
@@ -194,5 +193,5 @@ def _timing(buffer: ImuBuffer, poses: list[TargetPose], lens: CameraState) -> Td
         rows[:, 1:4],
         np.array([p.t_cam_s for p in poses]),
         np.array([p.R_target_cam for p in poses]),
-        _attitude_sigmas(poses, lens),
+        attitude_sigmas(poses, lens),
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import PointsFrame
 
-_MOVED_PX = 1.0  # at 500 px of focal length 0.1 deg, a tenth of the rotation that a start must know
+MOVED_PX = 1.0  # at 500 px of focal length 0.1 deg, a tenth of the rotation that a start must know
 _REST_S = 1.0  # so long without moving that far is rest: slower than any rotation that shows a time shift
 _LEAST_COMMON = 4  # corners; an affine motion has six unknowns
 
@@ -21,7 +21,7 @@ class RestDetector:
     def take(self, t_cam_s: float, frame: PointsFrame) -> None:
         """Compare an image (stamp in the camera's clock, s) with the one since which nothing moved."""
         self._newest_s = t_cam_s
-        if self._since is None or _moved_px(self._since[1], frame) > _MOVED_PX:
+        if self._since is None or _moved_px(self._since[1], frame) > MOVED_PX:
             self._since = (t_cam_s, frame)
 
     @property

@@ -7,13 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, inliers, planar_poses
+from vical_daemon.estimation.geometry.planar_pose import (
+    MIN_POINTS,
+    PlanarPose,
+    PlanarPoses,
+    inliers,
+    planar_poses,
+)
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.state import CameraState
 
-_MIN_POINTS = 8
 _MOST_POSES = 160
+_CORNER_PX = 0.2  # no orientation is better than a corner's position over the focal length
 _CLEANINGS = 3  # a gross outlier may hide lesser ones
 
 
@@ -55,7 +61,7 @@ def poses_of(
     frames: Sequence[tuple[float, PointsFrame]], lens: CameraState, target: FloatArray
 ) -> list[TargetPose | None]:
     """Planar poses of frames with their stamps in s, see `pose_of`."""
-    left = [k for k, (_, f) in enumerate(frames) if len(f.ids) >= _MIN_POINTS]
+    left = [k for k, (_, f) in enumerate(frames) if len(f.ids) >= MIN_POINTS]
     views = dict(zip(left, ideal_views([frames[k][1] for k in left], lens, target), strict=True))
     found: dict[int, PlanarPoses] = {}
     for _ in range(1 + _CLEANINGS):
@@ -67,6 +73,11 @@ def poses_of(
         else None
         for k, (t, f) in enumerate(frames)
     ]
+
+
+def attitude_sigmas(poses: Sequence[TargetPose], camera: CameraState) -> FloatArray:
+    """Of the poses as reported, but at least of corners that are a fifth of a pixel off, rad, shape (n,)."""
+    return np.maximum([p.sigma_rad for p in poses], _CORNER_PX / float(camera.intrinsics[0]))
 
 
 def ideal_views(
@@ -93,7 +104,7 @@ def _cleaned(views: dict[int, tuple[FloatArray, FloatArray]], k: int, pose: Plan
     with np.errstate(all="ignore"):
         far = np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy, axis=1)
     good = inliers(far)
-    if good.all() or good.sum() < _MIN_POINTS:
+    if good.all() or good.sum() < MIN_POINTS:
         return False
     views[k] = points[good], xy[good]
     return True

@@ -10,7 +10,7 @@ from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import State
 
-_SLOPE_S = 0.02
+SLOPE_S = 0.02
 
 
 class Rates(NamedTuple):
@@ -46,6 +46,6 @@ def rates_after(state: State, segment: ImuSegment, before: Rates) -> Rates:
 
 def _late_slope(t_s: FloatArray, values: FloatArray) -> FloatArray:
     """Derivative of readings (n, 3) over the last hundredths of a second, by least squares."""
-    recent = slice(max(int(np.searchsorted(t_s, t_s[-1] - _SLOPE_S)) - 1, 0), None)
+    recent = slice(max(int(np.searchsorted(t_s, t_s[-1] - SLOPE_S)) - 1, 0), None)
     t = t_s[recent] - t_s[recent].mean()
     return np.asarray(t @ values[recent] / (t @ t))

@@ -15,9 +15,8 @@ import numpy as np
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.block_jackknife import BlockJackknife
-from vical_daemon.estimation.significance import LENS_TERM_SIGMAS
+from vical_daemon.estimation.significance import STRETCH_S, TERM_SIGMAS
 
-_STRETCH_S = 5.0
 _WEAK = 0.1  # of the focal length: as good as nothing known
 _WEAK_DISTORTION = 0.5
 # the two highest powers of the radius among fx fy cx cy and the distortion
@@ -40,7 +39,7 @@ class LensAgreement:
     model: str
     factors: FloatArray = field(init=False)
     moved: FloatArray = field(init=False)
-    _stretches: BlockJackknife = field(default_factory=lambda: BlockJackknife(_STRETCH_S))
+    _stretches: BlockJackknife = field(default_factory=lambda: BlockJackknife(STRETCH_S))
 
     def __post_init__(self) -> None:
         n = 4 + len(COEFFICIENTS[self.model])
@@ -66,7 +65,7 @@ class LensAgreement:
         self.factors = self._stretches.compared(weak[:n]).factors
         free = self._stretches.compared(weak)
         power, variance = free.values[n], free.covariance[n, n]
-        doubt = LENS_TERM_SIGMAS**2 * free.factors[n] * variance
+        doubt = TERM_SIGMAS**2 * free.factors[n] * variance
         there = power if power**2 > doubt else 0.0
         self.moved = free.covariance[:n, n] * (there / variance)
 

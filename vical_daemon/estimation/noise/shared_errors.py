@@ -20,7 +20,7 @@ from vical_daemon.estimation.noise.consistency import TELLING
 from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
-_MEMORY = 400  # images
+MEMORY = 400  # images by which a noise is known
 _EVERY = 20  # images that are added together; nothing is said before, unless a start said it
 JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
@@ -48,9 +48,9 @@ class SharedErrors:
     images: int = 0
     until_s: float = -math.inf
     _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
-    _A: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
-    _C: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS, WAYS)))
-    _b: FloatArray = field(default_factory=lambda: np.zeros((_MEMORY, WAYS)))
+    _A: FloatArray = field(default_factory=lambda: np.zeros((MEMORY, WAYS, WAYS)))
+    _C: FloatArray = field(default_factory=lambda: np.zeros((MEMORY, WAYS, WAYS)))
+    _b: FloatArray = field(default_factory=lambda: np.zeros((MEMORY, WAYS)))
 
     def begin(self, likelihood: FloatArray, until_s: float) -> None:
         """Go on from what the images of a start say together.
@@ -87,7 +87,7 @@ class SharedErrors:
         A = ways.T @ ways
         if not A.any():
             return
-        place = self.images % _MEMORY
+        place = self.images % MEMORY
         self._A[place], self._b[place] = A, innovation @ ways
         self._C[place] = level * (A + state @ state.T)
         self.images += 1
@@ -96,8 +96,8 @@ class SharedErrors:
 
     def _add(self, new: slice) -> None:
         """Add images to the likelihood; those of long ago are forgotten."""
-        if self.images > _MEMORY:
-            self._likelihood *= 1.0 - _EVERY / _MEMORY
+        if self.images > MEMORY:
+            self._likelihood *= 1.0 - _EVERY / MEMORY
         observed = Observed(self._b[new], self._A[new], self._C[new])
         self._likelihood = self._likelihood + of_images(observed, JITTERS_S, SHIFTS_PX)
         self._look()
@@ -114,7 +114,7 @@ class SharedErrors:
         A lens, a board or an imu that is off makes images look late or early, too, but neighbours
         alike. False as well while too few images are known.
         """
-        n = min(self.images, _MEMORY)
+        n = min(self.images, MEMORY)
         size = self._A[:n, 0, 0]
         if n < TELLING or not (size > 0.0).all():
             return False
@@ -123,8 +123,8 @@ class SharedErrors:
         most = OUTLIER_SIGMAS / np.sqrt(weight)  # one outlier is no correlation
         late = np.clip(late, -most, most)
         pairs = weight[1:] * weight[:-1]
-        newest = self.images % _MEMORY  # where the oldest follows the newest
-        if self.images > _MEMORY and newest:
+        newest = self.images % MEMORY  # where the oldest follows the newest
+        if self.images > MEMORY and newest:
             pairs[newest - 1] = 0.0
         alike = float((pairs * late[1:] * late[:-1]).sum() / pairs.sum())
         return alike < _PERSISTENT * self.jitter_s**2

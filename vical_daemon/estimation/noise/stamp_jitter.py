@@ -11,7 +11,7 @@ from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.robust import MEDIAN_CHI2
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
-_FLOOR_S = 2e-5
+FLOOR_S = 2e-5  # of a jitter that is one
 _ROUNDS = 8
 ANNOUNCED_S = 3e-4
 """From here on a jitter is announced, s: what to do about it is often a setting of the camera's driver."""
@@ -35,4 +35,4 @@ def excess(square: FloatArray, usual: FloatArray) -> float:
         weight = expected**-2
         excess = np.minimum(square, OUTLIER_SIGMAS**2 * expected) - usual
         variance = max(float(weight @ excess / weight.sum()), 0.0)
-    return float(np.sqrt(variance)) if variance > _FLOOR_S**2 else 0.0
+    return float(np.sqrt(variance)) if variance > FLOOR_S**2 else 0.0

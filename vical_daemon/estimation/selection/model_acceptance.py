@@ -16,11 +16,11 @@ from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.noise.consistency import TELLING
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
+from vical_daemon.estimation.noise.shared_errors import MEMORY
 from vical_daemon.estimation.selection.model_mixture import Block, lens_block, not_zero
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, blocks, factor, weights
 from vical_daemon.estimation.significance import EVERY_S
 
-_MEASURED = 400  # images
 _KINDS = {
     IMU: EventKind.IMU_INTRINSICS,
     LAG: EventKind.ACCEL_LAG,
@@ -108,7 +108,7 @@ def _needed(name: str, every: dict[str, Block], shares: dict[tuple[str, ...], fl
     if name in held:
         return 0
     if name == LAG or any(not_zero(shares, other) > OFF for other in held):
-        return _MEASURED
+        return MEMORY
     return TELLING if held else 0
 
 

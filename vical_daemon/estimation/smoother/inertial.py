@@ -6,10 +6,9 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
+from vical_daemon.estimation.noise.stamp_jitter import FLOOR_S
 from vical_daemon.estimation.smoother.jitter import StampOffsets
 from vical_daemon.estimation.smoother.window import KNOT_S, IntArray, Window
-
-_LEAST_JITTER_S = 3e-5
 
 
 class Order:
@@ -144,4 +143,4 @@ def links_left(
     late = StampOffsets(window, e, J, jitter_s)
     shown_s = float(np.sqrt(late.mean_square(J, order.of_links(window.knots()), root)))
     left = (float((e**2).sum()) - late.explained()) / e.size
-    return left, shown_s if shown_s > _LEAST_JITTER_S else 0.0
+    return left, shown_s if shown_s > FLOOR_S else 0.0

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vical_daemon.estimation.filter.unobservable_directions import HELD_M
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import FloatArray
@@ -21,7 +22,6 @@ from vical_daemon.estimation.smoother.window import Window
 TILT, SPEED, BIASES = slice(0, 2), slice(2, 5), slice(5, 11)
 CORE = 11
 """Of the `Layout` of a window's errors. The time shift is that at the first image."""
-HELD_M = 1e-4
 
 
 @dataclass(slots=True)

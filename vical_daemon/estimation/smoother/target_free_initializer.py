@@ -13,10 +13,17 @@ from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.attempts import Attempts
+from vical_daemon.estimation.init.attempts import LONG_S, Attempts
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.init.rest import MOVED_PX
+from vical_daemon.estimation.measurements import (
+    IMAGE_GAP_S,
+    CalibrationOptions,
+    CameraPrior,
+    FloatArray,
+    PointsFrame,
+)
 from vical_daemon.estimation.model.imu_scale import NUMBERS
 from vical_daemon.estimation.model.priors import WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
@@ -44,7 +51,7 @@ class _Found(NamedTuple):
     about: FloatArray | None = None  # axis of the imu about which the mounting is not known, unit
 
 
-_SPAN_S, _LONG_SPAN_S = 5.0, 8.0
+_SPAN_S = 5.0
 _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
@@ -52,9 +59,6 @@ _MOST_IMAGES = 120  # of a start: its cost grows with the cube
 _FULL_FITS = 2
 _ROUGH_STEPS = 8
 _ROUGH_ROWS, _FULL_ROWS = 4000, 20000  # features in pairs of images: more of the same images add little
-_APART_RAD = float(np.deg2rad(2.0))
-_MAX_HOLE_S = 0.5
-_STILL_PX = 1.0  # median travel of a feature over half a second
 
 
 class TargetFreeInitializer:
@@ -95,7 +99,7 @@ class TargetFreeInitializer:
         if not (last or self.attempts.due(end_s)):
             return None
         shift = known.camera.timeshift_s if known else self.prior.timeshift_cam_imu_s or 0.0
-        span = _LONG_SPAN_S if self.attempts.count > 1 else _SPAN_S
+        span = LONG_S if self.attempts.count > 1 else _SPAN_S
         usable = _last_stretch(
             frames, end_s - max(shift, 0.0), buffer.oldest_s + 0.05 - min(shift, 0.0), span
         )
@@ -317,7 +321,7 @@ def _best_apart(fits: list[EpipolarFit]) -> list[tuple[FloatArray, float]]:
     out: list[tuple[FloatArray, float]] = []
     for fit in sorted(fits, key=_misfit):
         turns = [float(np.linalg.norm(so3.log(R.T @ fit.R_imu_cam))) for R, _ in out]
-        if len(out) < _FULL_FITS and min(turns, default=np.inf) > _APART_RAD:
+        if len(out) < _FULL_FITS and min(turns, default=np.inf) > _ROTATION_SIGMA_RAD:
             out.append((fit.R_imu_cam, fit.timeshift_s))
     return out
 
@@ -338,7 +342,7 @@ def _last_stretch(frames: Frames, end_s: float, begin_s: float, span_s: float) -
     for t, frame in reversed(frames):
         if t > end_s or len(frame.ids) < MIN_FEATURES:
             continue
-        if t < begin_s or (out and (out[-1][0] - t > _MAX_HOLE_S or out[0][0] - t > span_s)):
+        if t < begin_s or (out and (out[-1][0] - t > IMAGE_GAP_S or out[0][0] - t > span_s)):
             break
         out.append((t, frame))
     every = max(1, math.ceil(len(out) / _MOST_IMAGES))
@@ -357,4 +361,4 @@ def _still(frames: Frames) -> bool:
         _, ka, kb = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
         if len(ka):
             travels.append(float(np.median(np.linalg.norm(a.uv_px[ka] - b.uv_px[kb], axis=1))))
-    return bool(travels) and float(np.median(travels)) < _STILL_PX
+    return bool(travels) and float(np.median(travels)) < MOVED_PX

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vical_daemon.estimation.filter.unobservable_directions import HELD_M
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import products
 from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion
@@ -22,7 +23,6 @@ from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, mak
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
-from vical_daemon.estimation.smoother.marginal_prior import HELD_M
 from vical_daemon.estimation.smoother.window import FARTHEST_M, NEAREST_M, Landmarks, Window, rays_of
 
 ROUNDS = 8

@@ -19,6 +19,7 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise
 from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
 from vical_daemon.estimation.model.inertial_links import (
+    RELINK_S,
     PreintegratedLink,
     PreintegratedLinks,
     make_links,
@@ -219,7 +220,7 @@ class Window:
         """Whether the links hold for another time shift or other biases than are believed now."""
         off = np.abs(self.imu_by_link() - np.array([x.imu for x in self.links]))
         return (
-            abs(self.camera.timeshift_s - self.shift_s) > 3e-4
+            abs(self.camera.timeshift_s - self.shift_s) > RELINK_S
             or float(off[:, :3].max()) > 5e-3
             or float(off[:, 3:6].max()) > 0.5
             or float(off[:, 6:].max(initial=0.0)) > 5e-3

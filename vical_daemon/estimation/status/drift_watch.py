@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vical_daemon.estimation.significance import DRIFT_DOUBT_SIGMAS, DRIFT_SIGMAS, EVERY_S
+from vical_daemon.estimation.significance import CHANGED_SIGMAS, EVERY_S, PERHAPS_SIGMAS
 
 _SPAN = 20
 
@@ -53,5 +53,5 @@ class DriftWatch:
             default=0.0,
         )
         self._past.append((t_s, value, variance))
-        self.doubtful = bool(far > DRIFT_DOUBT_SIGMAS)
-        return bool(far > DRIFT_SIGMAS)
+        self.doubtful = bool(far > PERHAPS_SIGMAS)
+        return bool(far > CHANGED_SIGMAS)

@@ -11,7 +11,7 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.target_poses import poses_of
+from vical_daemon.estimation.init.target_poses import attitude_sigmas, poses_of
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.significance import EVERY_S
@@ -28,7 +28,6 @@ _BEFORE_S = 3.0  # a change is noticed within
 _STRETCHES = (10, 15, 30)  # images in which a step is looked for
 _LATE_IMAGES = 2  # of these the newest: the inertial readings that belong to them may not have come
 _BEFORE_IMAGES = 30  # that show how well orientations usually fit
-_CORNER_PX = 0.2  # orientations are never better than a corner's position over the focal length
 _MOST = 200  # images kept, a camera
 
 
@@ -144,5 +143,5 @@ def _orientations(
     return Orientations(
         np.array([p.t_cam_s for p in poses]),
         np.array([p.R_target_cam for p in poses]),
-        np.maximum([p.sigma_rad for p in poses], _CORNER_PX / float(known.intrinsics[0])),
+        attitude_sigmas(poses, known),
     )

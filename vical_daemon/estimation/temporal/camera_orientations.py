@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.planar_pose import PlanarPose, PlanarPoses, planar_poses
-from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.geometry.planar_pose import MIN_POINTS, PlanarPose, PlanarPoses, planar_poses
+from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import undistort
 
-_MIN_POINTS = 6
 _MAX_RMS_PX = 8.0  # a pose that misses its corners by more is a wrong detection
 
 
@@ -69,7 +68,7 @@ def target_orientations(
     for frame, found in zip(
         frames, _planar(frames, points_m, (intrinsics, distortion, model), sigma), strict=True
     ):
-        near = bool(stamps) and frame.t_cam_ns - stamps[-1] < 500_000_000
+        near = bool(stamps) and frame.t_cam_ns - stamps[-1] < 1e9 * IMAGE_GAP_S
         pose = _choose(found, poses[-1] if near else None)
         if pose is None or pose.rms * float(intrinsics[0]) > _MAX_RMS_PX:
             skipped += 1
@@ -95,7 +94,7 @@ def _planar(
     for frame in frames:
         known = (frame.ids >= 0) & (frame.ids < len(points_m))
         xy, ok = undistort(frame.uv_px[known], *lens)
-        enough = ok.sum() >= _MIN_POINTS
+        enough = ok.sum() >= MIN_POINTS
         points.append(points_m[frame.ids[known][ok]] if enough else np.zeros((0, 3)))
         rays.append(xy[ok] if enough else np.zeros((0, 2)))
     return planar_poses(points, rays, sigma)

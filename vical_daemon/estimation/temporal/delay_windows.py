@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA
-from vical_daemon.estimation.significance import JUMP_SIGMAS
+from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA, SKEW_WALK
+from vical_daemon.estimation.significance import CHANGED_SIGMAS
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 
-_DRIFT_WALK = 1e-6  # how much the drift rate may change, 1/sqrt(s)
 _SEARCH_S = 0.2  # about the delay of the window before
 
 
@@ -106,7 +105,7 @@ def _tracked(before: _Delay | None, t_s: float, result: TdIcpResult) -> tuple[_D
         return anew, False
     x, P = _predicted(before, t_s)
     S, innovation = float(P[0, 0] + variance), z - float(x[0])
-    if innovation**2 > JUMP_SIGMAS**2 * S:
+    if innovation**2 > CHANGED_SIGMAS**2 * S:
         return anew, True
     K = P[:, 0] / S
     P = P - np.outer(K, P[0])
@@ -117,6 +116,6 @@ def _predicted(before: _Delay, t_s: float) -> tuple[FloatArray, FloatArray]:
     """Delay and drift rate at a later time: the rate wanders slowly, the delay a little of its own."""
     dt = max(t_s - before.t_s, 0.0)
     F = np.array([[1.0, dt], [0.0, 1.0]])
-    Q = _DRIFT_WALK**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    Q = SKEW_WALK**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
     Q[0, 0] += SHIFT_WALK**2 * dt
     return F @ before.x, F @ before.P @ F.T + Q

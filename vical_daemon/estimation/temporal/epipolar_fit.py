@@ -20,6 +20,7 @@ from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFr
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
+from vical_daemon.estimation.significance import STRETCH_S
 from vical_daemon.estimation.temporal.epipolar_errors import (
     Effects,
     TrackNoise,
@@ -45,7 +46,6 @@ _GOOD = 0.25  # weight of a feature that fits
 _LEAST_SLOPE = 0.2
 _BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
 _FAR_S, _FAR_EVERY = (1.0, 2.0), 4  # pairs that show how long errors last
-_STRETCH_S = 5.0  # of the data, solved alone for comparison
 _BLOCK_S = 0.5  # errors of the fit are taken as independent beyond this
 
 
@@ -385,7 +385,7 @@ class _Fit:
         prior, off = np.zeros((size, size)), np.zeros(size)
         self._prior(prior, off, bias)
         t = self.t_cam[p.first]
-        count = max(1, int((t[-1] - t[0]) / _STRETCH_S))
+        count = max(1, int((t[-1] - t[0]) / STRETCH_S))
         stretch = np.minimum(((t - t[0]) / max(t[-1] - t[0], 1e-9) * count).astype(int), count - 1)
         assert self.gyro_density is not None
         out = []

@@ -28,7 +28,7 @@ from vical_daemon.estimation.temporal.rotation_turns import (
 _GRID_S = 0.01
 _FINE_S = 0.0025
 _CANDIDATES = 4
-_CLEAR = 0.25  # misfit of turns over their size below which longer turns would not help
+CLEAR = 0.25  # misfit of turns over their size below which longer turns would not help
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def coarse_start(
         start = _start_from(curve, t_cam_s, turns, shifts_s)
         if start is not None and (best is None or start.misfit_share < best.misfit_share):
             best = start
-        if best is not None and best.misfit_share < _CLEAR:
+        if best is not None and best.misfit_share < CLEAR:
             break
     return best
 

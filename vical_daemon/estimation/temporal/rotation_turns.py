@@ -11,9 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtri
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.robust import MEDIAN_CHI2_3
 
 IntArray = npt.NDArray[np.intp]
 
@@ -26,9 +28,8 @@ _DISTINCT = 10.0  # ratio of a usual turn to its noise
 _ABOVE_NOISE = 3.0  # a turn this many times its noise is motion
 LONGEST_TURN_RAD = 1.0  # half of this from pi, where the axis of a turn is lost
 _MAX_PAIRS = 300
-_THIRD_DIFFERENCE = np.sqrt(20.0)  # gain of white noise in third differences: 1 + 9 + 9 + 1
+_LOW = 0.05  # quantile of third differences that shows their noise: outliers are above
 _SLOWEST_S = 0.11  # at less than 9 Hz third differences of a hand's motion exceed any noise
-_CHI3_LOW, _CHI3_MIDDLE = 0.593, 1.538  # 5 % and 50 % quantile of the length of a vector of unit noise
 
 
 @dataclass(frozen=True)
@@ -147,12 +148,13 @@ def orientation_noise(t_s: FloatArray, q: FloatArray) -> float:
     third = np.linalg.norm(turn[2:] - 2.0 * turn[1:-1] + turn[:-2], axis=1)[even]
     if len(third) < MIN_PAIRS:
         return 0.0
-    return float(np.quantile(third, 0.05)) / (_CHI3_LOW * float(_THIRD_DIFFERENCE))
+    # a third difference of white noise has 1 + 9 + 9 + 1 times its variance
+    return float(np.quantile(third, _LOW) / np.sqrt(20.0 * chdtri(3, 1.0 - _LOW)))
 
 
 def _turn_noise(noise_rad: float) -> float:
     """Usual length of the error of a turn between two orientations of some noise per axis, rad."""
-    return _CHI3_MIDDLE * float(np.sqrt(2.0)) * noise_rad
+    return float(np.sqrt(2.0 * MEDIAN_CHI2_3)) * noise_rad
 
 
 def _moving(t_cam_s: FloatArray, turns: Turns, noise_rad: float) -> BoolArray:

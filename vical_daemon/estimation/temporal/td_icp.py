@@ -43,9 +43,9 @@ __all__ = [
     "world_cam_from_cam_target",
 ]
 
-_ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
+ENOUGH_S = 5.0  # in less than this any mistake can be made to fit
 # noise of one orientation: above which the usual mistakes are tried out, and of a board as it usually is
-_DOUBTFUL_RAD, _USUAL_RAD = float(np.deg2rad(0.5)), float(np.deg2rad(0.1))
+_DOUBTFUL_RAD, USUAL_RAD = float(np.deg2rad(0.5)), float(np.deg2rad(0.1))
 
 
 def td_icp(
@@ -53,7 +53,7 @@ def td_icp(
     gyro_rps: FloatArray,
     t_cam_s: FloatArray,
     R_world_cam: FloatArray,
-    rotation_sigma: float | FloatArray = _USUAL_RAD,
+    rotation_sigma: float | FloatArray = USUAL_RAD,
     options: TdIcpOptions | None = None,
 ) -> TdIcpResult:
     """Find delay, mounting and gyro bias from a gyro and camera orientations.
@@ -106,7 +106,7 @@ class _Data:
 
     def mistake(self, shifts: tuple[float, float], start: Start | None) -> str:
         """The usual mistake that explains why the rotations do not fit; empty if none, or too few data."""
-        if self.t_cam[-1] - self.t_cam[0] < _ENOUGH_S:
+        if self.t_cam[-1] - self.t_cam[0] < ENOUGH_S:
             return ""
         return explain(self.t_imu, self.gyro, self.t_cam, self.q, shifts, start)
 

@@ -16,14 +16,14 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import RATE_SIGMAS
+from vical_daemon.estimation.significance import CHANGED_SIGMAS
 from vical_daemon.estimation.temporal.orientation_fit import Fit, OrientationSensor, polish
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_registration import closest_point_registration
 from vical_daemon.estimation.temporal.rotation_start import coarse_start
 from vical_daemon.estimation.temporal.rotation_suspects import explain_stream, stretched
 from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
-from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp import USUAL_RAD, td_icp
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions, clean_gyro, clean_orientations
 from vical_daemon.estimation.temporal.td_icp_joint_result import JointResult, PairDelay, SensorDelay
 from vical_daemon.estimation.temporal.td_icp_refusals import UNEVEN, refuse_start
@@ -55,7 +55,7 @@ class OrientationStream:
     name: str
     t_s: FloatArray
     R_world_sensor: FloatArray
-    rotation_sigma: float | FloatArray = 1.7e-3
+    rotation_sigma: float | FloatArray = USUAL_RAD
 
 
 def _thinned(streams: Sequence[OrientationStream], most: int = _MOST) -> list[OrientationStream]:
@@ -208,7 +208,7 @@ def _together(
 
 def _uneven(names: list[str], fit: Fit, known: str) -> list[str]:
     """Sensors whose delay does not stay, unless that has been said."""
-    limit = np.maximum(UNEVEN, RATE_SIGMAS * fit.stamp_rate_sigma)
+    limit = np.maximum(UNEVEN, CHANGED_SIGMAS * fit.stamp_rate_sigma)
     bad = np.flatnonzero(np.abs(fit.stamp_rate) > limit)
     rates = {names[i]: float(fit.stamp_rate[i]) for i in bad if f"{names[i]}: " not in known}
     return [f"{name}: {stretched(rate, 'sensor', 'reference')}" for name, rate in rates.items()]

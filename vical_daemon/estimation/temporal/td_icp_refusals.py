@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import RATE_SIGMAS
+from vical_daemon.estimation.significance import CHANGED_SIGMAS
 from vical_daemon.estimation.temporal.orientation_fit import Fit
 from vical_daemon.estimation.temporal.rotation_start import Start
 from vical_daemon.estimation.temporal.rotation_suspects import stretched
@@ -143,12 +143,12 @@ def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int) -> tuple[str, st
         return REFUSED, f"only {pairs} of {n} orientations fit the gyro at the best delay"
     noise = fit.sensors[0].noise_rad
     rate, rate_sigma = float(fit.stamp_rate[0]), float(fit.stamp_rate_sigma[0])
-    if abs(rate) > max(_STRETCHED, RATE_SIGMAS * rate_sigma):
+    if abs(rate) > max(_STRETCHED, CHANGED_SIGMAS * rate_sigma):
         return REFUSED, stretched(rate)
-    if noise > np.deg2rad(3.0):
+    if noise > _ROTATION_LOST_RAD:
         return REFUSED, f"gyro and camera disagree by {np.rad2deg(noise):.1f} deg (rms) at the best delay"
     reasons = lost_in_words(covariance, fit.sensors[0].R_imu_sensor)
-    if abs(rate) > max(UNEVEN, RATE_SIGMAS * rate_sigma):
+    if abs(rate) > max(UNEVEN, CHANGED_SIGMAS * rate_sigma):
         reasons.append(stretched(rate))
     return (DEGENERATE if reasons else OK), "; ".join(reasons)
 

@@ -15,13 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.robust import MEDIAN_ABSOLUTE, geman_mcclure_weight
 from vical_daemon.estimation.temporal.camera_orientations import Orientations
 
 MIN_FEATURES = 12  # that two images share: below, they do not show how the camera turned
-_MAX_GAP_NS = 400_000_000
 _STEPS = 12
 _PLAIN_STEPS = 6  # before outliers are put aside
 _AT_ONCE = 32
@@ -85,7 +84,7 @@ def _orientations(chain: list[tuple[int, FloatArray, FloatArray]]) -> Orientatio
 
 def _matched(before: _Rays, now: _Rays) -> Pair | None:
     """Rays of what both frames see; None where the chain breaks."""
-    if not 0 < now.t_ns - before.t_ns < _MAX_GAP_NS:
+    if not 0 < now.t_ns - before.t_ns < 1e9 * IMAGE_GAP_S:
         return None
     _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
     return (before.rays[i], now.rays[j]) if len(i) >= MIN_FEATURES else None

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, PointsFrame
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
-from vical_daemon.estimation.temporal.td_icp import td_icp
+from vical_daemon.estimation.temporal.td_icp import ENOUGH_S, td_icp
 from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions, clean_gyro
 from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
@@ -23,8 +23,7 @@ from vical_daemon.estimation.temporal.track_orientations import track_orientatio
 Frames = list[tuple[float, PointsFrame]]
 Lens = tuple[FloatArray, FloatArray, str]
 
-_WINDOW_S, _LEAST_S = 20.0, 5.0
-_HOLE_S = 0.5  # without an image: the same point may have got another id
+_WINDOW_S = 20.0
 _MOST_WINDOWS = 6
 _MOST_STARTS = 3
 _WANTED = [0, 1, 2, 6]  # mounting and delay among the unknowns of a result
@@ -55,7 +54,7 @@ def track_registration(
         return TdIcpResult(REFUSED, imu, rejected=len(frames))
     windows = _windows(frames)
     if not windows:
-        reason = f"the tracks cover less than {_LEAST_S:g} s without a hole"
+        reason = f"the tracks cover less than {ENOUGH_S:g} s without a hole"
         return TdIcpResult(REFUSED, reason, rejected=len(frames))
     options = options or TdIcpOptions()
     start = _start(imu, windows, lens, options)
@@ -84,12 +83,12 @@ def _windows(frames: Frames) -> list[Frames]:
     for frame in frames:
         if (
             not stretches
-            or frame[0] - stretches[-1][-1][0] > _HOLE_S
+            or frame[0] - stretches[-1][-1][0] > IMAGE_GAP_S
             or frame[0] - stretches[-1][0][0] > _WINDOW_S
         ):
             stretches.append([])
         stretches[-1].append(frame)
-    long = [s for s in stretches if s[-1][0] - s[0][0] >= _LEAST_S]
+    long = [s for s in stretches if s[-1][0] - s[0][0] >= ENOUGH_S]
     if len(long) > _MOST_WINDOWS:
         long = [long[i] for i in np.linspace(0, len(long) - 1, _MOST_WINDOWS).round().astype(int)]
     return long

@@ -22,10 +22,10 @@ from scipy.optimize import least_squares
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import LOWER
+from vical_daemon.estimation.temporal.orientation_problem import LEAST_NOISE_RAD
 
 POSITIONS_MIN = 9  # unknowns of the accelerometer
 MOTIONS_MIN = 6  # twelve directions for nine unknowns of the gyro
-ANGLE_FLOOR_RAD = 1e-5
 REST_FACTOR = 3.0  # a window is at rest when it is at most this much livelier than the quietest ones
 
 
@@ -303,5 +303,5 @@ def _turn_noise(motions: list[tuple[Rest, Rest]], rate_hz: float, accel: SensorC
         direction = np.mean(a.accel_sigma**2 + b.accel_sigma**2) / np.sum(a.accel_mps2**2)
         # The accelerometer's own calibration error turns both directions.
         matrix = np.mean(accel.matrix_sigma[LOWER[:, 0], LOWER[:, 1]] ** 2)
-        noise.append(np.sqrt(integrated + drift + direction + matrix + ANGLE_FLOOR_RAD**2))
+        noise.append(np.sqrt(integrated + drift + direction + matrix + LEAST_NOISE_RAD**2))
     return np.array(noise)
