@@ -230,7 +230,7 @@ BOARD: dict[str, Mechanism] = {
         WRONG,
         "inconsistent while a third is refused, or innovations four times too large",
         lambda: [(StatusEvaluator, "_trouble", gives(""))],
-        disturbances=(*JUNK, "gyro clips"),
+        disturbances=JUNK,
     ),
     "steady status": Mechanism(
         WRONG,
@@ -252,19 +252,19 @@ BOARD: dict[str, Mechanism] = {
         WRONG,
         "readings at the end of the range",
         lambda: [(RangeLimits, "at_range", gives(()))],
-        disturbances=("gyro clips",),
+        faults=("gyro clips",),
     ),
     "imu clipped: error of the cubic": Mechanism(
         WRONG,
         "how much the same cubic misses where the truth is known",
         lambda: [(ClippedReadings, "_missed", gives(0.0))],
-        disturbances=("gyro clips",),
+        faults=("gyro clips",),
     ),
     "imu clipped: beyond the range": Mechanism(
         WRONG,
         "a bridged reading may be anything up to twice as far beyond the range",
         lambda: [(clipped_readings, "_EVEN", 0.0)],
-        disturbances=("gyro clips",),
+        faults=("gyro clips",),
     ),
     "imu spikes": Mechanism(
         WRONG,

@@ -184,6 +184,12 @@ def _drawn_aside(run: SimulatedRun) -> SimulatedRun:
     return replace(run, frames=[replace(f, uv_px=drawn(f.uv_px)) for f in run.frames])
 
 
+def _clipped(run: SimulatedRun) -> SimulatedRun:
+    """The gyro's range ends where one reading in ten of the largest lies."""
+    limit = float(np.quantile(np.abs(run.gyro_rps).max(axis=1), 0.9))
+    return replace(run, gyro_rps=np.clip(run.gyro_rps, -limit, limit))
+
+
 _CASES = montecarlo.CASES
 FAULTS: dict[str, Fault] = {
     **{
@@ -203,6 +209,7 @@ FAULTS: dict[str, Fault] = {
     "drift 20 ppm": Fault(montecarlo.Case(skew_ppm=20.0)),
     "lens model misses": Fault(montecarlo.Case(), _bent),
     "detector's own error": Fault(montecarlo.Case(simulation={"corner_sigma_px": 0.05}), _drawn_aside),
+    "gyro clips": Fault(montecarlo.Case(), _clipped),
     "slow motion": Fault(montecarlo.Case(rig={"mean_rate_dps": 10.0}, simulation={"camera_rate_hz": 10.0})),
     "imu noise stated 10 times too small": Fault(montecarlo.Case(), noise_stated=0.1),
     **{

@@ -74,13 +74,6 @@ def _drift(rate: float, t_s: float) -> float:
     return rate * max(t_s - AT_S, 0.0)
 
 
-def _clipped(run: SimulatedRun) -> SimulatedRun:
-    """The gyro's range ends where it reads one sample in ten of the largest."""
-    late = (run.t_imu_ns - run.options.epoch_ns) * 1e-9 >= AT_S
-    limit = float(np.quantile(np.abs(run.gyro_rps).max(axis=1), 0.9))
-    return replace(run, gyro_rps=np.where(late[:, None], np.clip(run.gyro_rps, -limit, limit), run.gyro_rps))
-
-
 def _spikes(run: SimulatedRun) -> SimulatedRun:
     """One gyro reading a second is 3 rad/s off."""
     t_s = (run.t_imu_ns - run.options.epoch_ns) * 1e-9
@@ -138,7 +131,6 @@ DISTURBANCES: dict[str, Disturbance] = {
     "bump in a gap of 5 s": Disturbance(
         frozenset(_MOUNTING), partial(gaps.cut, "both", 5.0), bump=(2.0, 10.0, 0.0), lasts_s=5.0
     ),
-    "gyro clips": Disturbance(frozenset({EventKind.IMU_CLIPPED}), _clipped),
     "spikes of the gyro": Disturbance(changed=_spikes),
     "30 % junk corners for 3 s": Disturbance(changed=partial(_junk, 0.3, 3.0), lasts_s=3.0),
     "all corners junk for 1 s": Disturbance(changed=partial(_junk, 1.0, 1.0), lasts_s=1.0),
