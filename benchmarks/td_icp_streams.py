@@ -12,9 +12,9 @@ from vical_mocks.rotations import exp_so3, log_so3
 from vical_mocks.trajectory import hand_motion
 
 from benchmarks.td_icp_trials import DEG, GYRO, IMU_HZ, WALK, simulate_gyro
+from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
-from vical_daemon.estimation.init.target_poses import Lens
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.camera_orientations import target_orientations
 from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream, joint_with_gyro
@@ -28,7 +28,9 @@ def _handheld(seed: int, seconds: float) -> tuple[TdIcpResult, float, FloatArray
     run = simulate(seed, seconds, rig=reference_rig(seed, timeshift_cam_imu_s=shift), camera_rate_hz=20.0)
     lens = run.rig.lens
     frames = [PointsFrame("cam0", f.t_cam_ns, f.ids, f.uv_px) for f in run.frames]
-    used = Lens(np.array(lens.intrinsics), np.array(lens.distortion), lens.model, lens.resolution)
+    used = starting_camera(
+        CameraPrior(lens.resolution, tuple(lens.intrinsics), lens.model, tuple(lens.distortion))
+    )
     estimate_intrinsics(used, frames, board_points(), _LENS_VIEWS)
     poses = target_orientations(frames, board_points(), used.intrinsics, used.distortion, lens.model)
     base = int(run.t_imu_ns[0])
@@ -106,9 +108,9 @@ def study_real(folder: Path) -> None:
     recording = open_recording(folder, check=False)
     points = load_target(folder / "target.yaml").points_m
     frames = [f for f in recording.points_frames("cam0") if len(f.ids)]
-    lens = Lens.from_prior(camera)
+    lens = starting_camera(camera)
     estimate_intrinsics(lens, frames, points, _LENS_VIEWS)
-    poses = target_orientations(frames, points, lens.intrinsics, lens.distortion, lens.model)
+    poses = target_orientations(frames, points, lens.intrinsics, lens.distortion, lens.distortion_model)
     imu = recording.imu_arrays("imu0")
     base = int(imu.t_ns[0])
     t_imu, t_cam = (imu.t_ns - base) * 1e-9, (poses.t_cam_ns - base) * 1e-9
