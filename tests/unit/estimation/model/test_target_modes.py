@@ -122,7 +122,7 @@ def test_with_the_lens_held_it_is_the_board_that_is_found_and_not_the_lens(crook
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_a_straight_board_stays_as_it_is_stated_and_pays_nothing(seed, monkeypatch):
-    run = simulate(seed, 20.0)
+    run = simulate(seed, 14.0)
     c, asked = calibrate(run), calibrate(run, frozenset({"target_shape"}))
     estimate = c.estimate()
     assert not {EventKind.TARGET_SHAPE, EventKind.TARGET_SIZE} & {e.kind for e in estimate.events}
