@@ -46,12 +46,11 @@ from vical_daemon.estimation.noise.shared_errors import SharedErrors
 from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
 from vical_daemon.estimation.status import change_watch
+from vical_daemon.estimation.status.change_watch import ChangeWatch
 from vical_daemon.estimation.status.drift_watch import DriftWatch
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
 from vical_daemon.estimation.status.steady_status import SteadyStatus
-
-_NEVER = 10**9
 
 
 def _no_state(block: str) -> Callable[[], list[tuple[Any, ...]]]:
@@ -193,7 +192,7 @@ BOARD: dict[str, Mechanism] = {
     "refused images counted": Mechanism(
         WRONG,
         "ten refused in a row: pose anew, then calibration anew",
-        lambda: [(change_watch, "_REFUSED_POSE", _NEVER), (change_watch, "_REFUSED_CHANGED", _NEVER)],
+        lambda: [(ChangeWatch, "_refused", held_at(0), True)],
         disturbances=(*STEPS, "bump in a gap of 5 s"),
     ),
     "CUSUM of innovations": Mechanism(

@@ -19,10 +19,10 @@ from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.selection.clock_drift import stamps_variance, surely_apart
 from vical_daemon.estimation.status.drift_watch import DriftWatch
 
-_REFUSED_POSE = 10  # images in a row before the pose is taken anew
-_REFUSED_CHANGED = 8  # images in a row, soon after that, before the calibration is
+_IMAGES = 10
+"""So many refused in a row: the pose is taken anew, and soon after that the calibration. So many images after
+an alarm show what has changed."""
 _SOON_S = 4.0
-_LOOK_CLOSER = 10  # images after an alarm: what has changed shows only in those after it
 _SETTLE_S = 3.0  # after a start the innovations still move
 _DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 _DRIFT_AFTER_S = 2.0
@@ -78,7 +78,7 @@ class ChangeWatch:
         t = f.state.t_s
         self._refused = 0 if report.used else self._refused + 1
         soon = t < self._pose_taken_s + _SOON_S
-        if self._refused >= (_REFUSED_CHANGED if soon else _REFUSED_POSE):
+        if self._refused >= _IMAGES:
             self._refused = 0
             self.why = Cause.IMAGES_REFUSED
             if soon:
@@ -89,7 +89,7 @@ class ChangeWatch:
         if consistency.alarmed:
             consistency.alarm = 0.0
             if t > self._started_s + _SETTLE_S and not self._closer:
-                self._closer = _LOOK_CLOSER
+                self._closer = _IMAGES
         if self._closer:
             self._closer -= 1
             if not self._closer:

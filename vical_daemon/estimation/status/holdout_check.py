@@ -15,7 +15,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 
-_EVERY_S = 1.5
+EVERY_S = 1.5
 _AHEAD_S = 0.3
 _ENOUGH = 20  # predictions before the imu's noise is judged by them
 _WORSE, _BETTER = 1.5, 0.55  # mean squared error over its prediction: 4 standard deviations of chance
@@ -47,7 +47,7 @@ class HoldoutCheck:
         t_s = t_cam_s + held.state.cameras[frame.camera].timeshift_s
         if t_s < held.state.t_s + _AHEAD_S or len(frame.ids) < 8:
             return None
-        self._copy, self._next_s = None, t_s + _EVERY_S
+        self._copy, self._next_s = None, t_s + EVERY_S
         segment = buffer.segment(held.state.t_s, t_s)
         if segment is None or segment.clipping_sigma is not None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
             return None

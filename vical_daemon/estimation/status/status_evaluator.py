@@ -21,15 +21,14 @@ from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, 
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
 from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
 from vical_daemon.estimation.status.excitation import ALL_WAYS
-from vical_daemon.estimation.status.holdout_check import imu_noise_error
+from vical_daemon.estimation.status.holdout_check import EVERY_S, imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
 from vical_daemon.estimation.status.steady_status import Verdict
 
-_ENOUGH_FRAMES = 60
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _NIS_BAD = 4.0
-_RECENT = 60
-_KEPT_CHECKS = 2400  # one every 1.5 s: an hour
+_RECENT = 60  # images by which the fit of late is known; before, no status is one
+_KEPT_CHECKS = round(3600.0 / EVERY_S)  # of an hour
 
 
 class StatusEvaluator(Evaluator):
@@ -173,7 +172,7 @@ class StatusEvaluator(Evaluator):
         if not lacking:
             if self._partial:
                 return Verdict(Status.DEGENERATE, self._partial, ALL_WAYS)
-            enough = self.frames >= _ENOUGH_FRAMES and span >= _ENOUGH_S
+            enough = self.frames >= _RECENT and span >= _ENOUGH_S
             return self._once_known(enough=enough, doubt=self.in_doubt)
         lens = self._lens_to_blame(f, missing)
         if lens:
