@@ -201,7 +201,7 @@ FREE: dict[str, Mechanism] = {
     ),
     "free: outliers refused": Mechanism(
         WRONG,
-        "observations beyond 4.5 sigma",
+        "observations beyond 4.7 sigma",
         lambda: [(Bundle, "_refuse", gives(0))],
         free=True,
         faults=("free: 3 % outliers",),
