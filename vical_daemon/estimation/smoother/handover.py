@@ -32,8 +32,6 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 from vical_daemon.estimation.smoother.target_free_initializer import prior_centre
 from vical_daemon.estimation.smoother.window import KNOT_S, Landmarks, Window
 
-_GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2 = 4e-4, 5e-3  # by which biases may have walked while nothing was seen
-
 
 def initial_prior(
     window: Window,
@@ -62,9 +60,10 @@ def initial_prior(
     )
     if known is None:
         return wide if held is None else held_along(wide, held)
+    unseen_s = max(wide.t_cam_s - known.t_cam_s, KNOT_S)
     known = known.at(wide.t_cam_s)
     covariance, before = np.diag(np.diag(wide.root) ** -2.0), known.covariance()
-    before[BIASES, BIASES] += np.diag(np.repeat([_GYRO_BIAS_RPS, _ACCEL_BIAS_MPS2], 3) ** 2)
+    before[BIASES, BIASES] += _walked(window.noise, unseen_s)
     kept = [k for k in range(BIASES.start, layout.size) if k not in reopened]
     covariance[np.ix_(kept, kept)] = before[np.ix_(kept, kept)]
     camera, found, where = known.camera, window.camera, layout.camera
@@ -101,11 +100,16 @@ def with_process_noise(
 ) -> MarginalPrior:
     """Let biases and delay walk a little before the next window."""
     P, where = carry.covariance(), carry.layout.camera
-    P[BIASES, BIASES] += np.diag(np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * KNOT_S)
+    P[BIASES, BIASES] += _walked(noise, KNOT_S)
     for place, walk in ((where.timeshift, SHIFT_WALK), (where.skew, SKEW_WALK if drifting else 0.0)):
         if place is not None:
             P[place, place] += walk**2 * span_s
     return replace(carry, root=root_of(P))
+
+
+def _walked(noise: ImuNoise, seconds: float) -> FloatArray:
+    """Covariance that biases gain in some seconds, shape (6, 6)."""
+    return np.diag(np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * seconds)
 
 
 def next_window(window: Window, carry: MarginalPrior) -> Window:
