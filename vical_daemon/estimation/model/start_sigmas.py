@@ -46,19 +46,17 @@ def start_sigmas(
             s[where.timeshift], s[where.skew] = start.timeshift_s, SKEW_SIGMA
         if where.intrinsics is not None and where.distortion is not None:
             held = layout.held.get(name)
-            focal_px, n = float(camera.intrinsics[0]), len(camera.distortion)
-            of_lens = lens_sigmas(focal_px, n, camera.distortion_model, start)
-            s[layout.lens(name)] = of_lens if held is None else held.off_sigma
+            s[layout.lens(name)] = _of_lens(camera, start) if held is None else held.off_sigma
         if where.readout is not None:
             s[where.readout] = start.readout_s
     return s
 
 
-def lens_sigmas(focal_px: float, distortion: int, model: str, start: StartSigmas) -> FloatArray:
-    """Standard deviations of fx fy cx cy, px, and the distortion's coefficients, shape (4 + distortion,)."""
-    s = np.full(4 + distortion, start.distortion)
-    s[:2], s[2:4] = np.array([start.focal, start.centre]) * focal_px
-    if model == EQUIDISTANT:
+def _of_lens(camera: CameraState, start: StartSigmas) -> FloatArray:
+    """Of fx fy cx cy and the distortion, shape (n,)."""
+    s = np.full(4 + len(camera.distortion), start.distortion)
+    s[:2], s[2:4] = np.array([start.focal, start.centre]) * float(camera.intrinsics[0])
+    if camera.distortion_model == EQUIDISTANT:
         s[4:] = start.equidistant
     else:
         s[6:8] = start.tangential
