@@ -17,7 +17,7 @@ ROWS, COLUMNS = "rows", "columns"
 """What a rolling shutter reads one after the other; columns: a phone's sensor, of images turned upright."""
 
 IMAGE_GAP_S = 0.5
-"""Images further apart, s, do not show how points and camera moved in between; a track may be another."""
+"""Between images further apart, s, no camera is followed: a track may be another point's, a pose another side's."""
 
 
 @dataclass(frozen=True, slots=True)

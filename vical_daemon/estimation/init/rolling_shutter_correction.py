@@ -13,10 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import IMAGE_GAP_S, ROWS, FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import ROWS, FloatArray, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import read_share
 
 Frames = list[tuple[float, PointsFrame]]
+_MAX_STEP_S = 0.25  # corners move straight for so long; over 0.3 s a hand looks like a rolling shutter
 
 
 def at_middle_row(frames: Frames, readout_s: float, resolution: tuple[int, int], axis: str = ROWS) -> Frames:
@@ -75,7 +76,7 @@ class _Step(NamedTuple):
 
 def _step(a: tuple[float, PointsFrame], b: tuple[float, PointsFrame]) -> _Step:
     dt_s = b[0] - a[0]
-    if not 0.0 < dt_s < IMAGE_GAP_S:
+    if not 0.0 < dt_s < _MAX_STEP_S:
         none = np.zeros(0, np.intp)
         return _Step(none, none, np.zeros((0, 2)))
     _, first, second = np.intersect1d(a[1].ids, b[1].ids, assume_unique=True, return_indices=True)
