@@ -17,7 +17,7 @@ ROWS, COLUMNS = "rows", "columns"
 """What a rolling shutter reads one after the other; columns: a phone's sensor, of images turned upright."""
 
 IMAGE_GAP_S = 0.5
-"""Between images further apart, s, no camera is followed: a track may be another point's, a pose another side's."""
+"""Images further apart, s, are not followed from one to the next: a track may belong to another point."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import unproject
-from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS
+from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.significance import STRETCH_S
 from vical_daemon.estimation.temporal.epipolar_errors import (
@@ -33,8 +33,8 @@ from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _ITERATIONS = 18
-# What a lens may be off by: focal length and its ratio (relative), centre (of the focal length), distortion.
-_FOCAL_SIGMA, _RATIO_SIGMA, _CENTRE_SIGMA = 0.1, 0.003, 0.03
+# What a lens may be off by: focal length and its ratio (relative), distortion.
+_FOCAL_SIGMA, _RATIO_SIGMA = 0.1, 0.003
 _DISTORTION_SIGMA = {
     "radtan": (0.1, 0.1, 0.005, 0.005),
     "plumb_bob": (0.1, 0.1, 0.005, 0.005, 0.1),
@@ -240,7 +240,7 @@ class _Fit:
         focal = np.eye(2) * _FOCAL_SIGMA**-2 + np.array([[1.0, -1.0], [-1.0, 1.0]]) * _RATIO_SIGMA**-2
         P = np.zeros((len(g) - 7,) * 2)
         P[:2, :2] = focal / f**2
-        P[2:4, 2:4] = np.eye(2) / (_CENTRE_SIGMA * f) ** 2
+        P[2:4, 2:4] = np.eye(2) / (WINDOW_START.centre * f) ** 2
         P[4:, 4:] = np.diag(np.array(_DISTORTION_SIGMA[self.model]) ** -2.0)
         P *= self.lasting
         off = np.concatenate([self.intrinsics - self.given[0], self.distortion - self.given[1]])
