@@ -17,7 +17,6 @@ from vical_daemon.estimation.filter.frame_queue import FrameQueue
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.board_window import Frames
 from vical_daemon.estimation.init.initializer import LATE_S, Attempt, Initializer
 from vical_daemon.estimation.init.motion_restart import MotionRestart, motion_is_lost
 from vical_daemon.estimation.init.recording_start import RecordingStart
@@ -26,6 +25,7 @@ from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
     FloatArray,
+    Frames,
     PointsFrame,
 )
 from vical_daemon.estimation.model.frame_report import FrameReport

@@ -94,6 +94,10 @@ class PointsFrame:
     sigma_px: FloatArray | None = None
 
 
+Frames = list[tuple[float, PointsFrame]]
+"""Stamps in the camera's clock, s, and points; in order of time."""
+
+
 @dataclass(frozen=True, slots=True)
 class ConvergenceTargets:
     """A calibration counts as converged when every sigma lies below these (m, rad, s)."""

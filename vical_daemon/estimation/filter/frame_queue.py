@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import Frames, PointsFrame
 
 _WAIT_S = 0.3  # for a camera that lags behind the others
 _MOST = 2000  # images per camera; the oldest go first
@@ -56,7 +56,7 @@ class FrameQueue:
             return None
         return self._queues[first].popleft()
 
-    def take_all(self) -> list[tuple[float, PointsFrame]]:
+    def take_all(self) -> Frames:
         """Empty the queues."""
         out = [item for q in self._queues.values() for item in q]
         for q in self._queues.values():

@@ -22,7 +22,14 @@ from vical_daemon.estimation.filter.linearised_filter import Derivatives, Instan
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import (
+    BoolArray,
+    FloatArray,
+    Frames,
+    ImuNoise,
+    IntArray,
+    PointsFrame,
+)
 from vical_daemon.estimation.model.imu_scale import numbers_of
 from vical_daemon.estimation.model.inertial_links import (
     RELINK_S,
@@ -44,8 +51,6 @@ _MOST_STEPS = 20
 _DONE = 0.1  # a step that promises less than this of the sum of squares is the last
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
-
-Frames = list[tuple[float, PointsFrame]]
 
 
 @dataclass(slots=True)

@@ -24,10 +24,15 @@ from vical_daemon.estimation.init.attempts import LONG_S
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.linear_start import still_axes
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
-from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row
+from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, recent_poses
 from vical_daemon.estimation.init.velocity_gravity_init import RotationsKnown, StartResult, motion_start
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import (
+    CalibrationOptions,
+    CameraPrior,
+    FloatArray,
+    Frames,
+)
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
@@ -53,7 +58,7 @@ class StartData:
     """
 
     buffer: ImuBuffer
-    frames: dict[str, list[tuple[float, PointsFrame]]]
+    frames: dict[str, Frames]
     priors: dict[str, CameraPrior]
     options: CalibrationOptions
     layout: Layout

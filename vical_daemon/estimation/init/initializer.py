@@ -12,11 +12,16 @@ from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.attempts import Attempts
-from vical_daemon.estimation.init.board_window import Frames
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rest import RestDetector
 from vical_daemon.estimation.init.window_start import Step, window_start
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import (
+    CalibrationOptions,
+    CameraPrior,
+    FloatArray,
+    Frames,
+    PointsFrame,
+)
 from vical_daemon.estimation.model.state import Layout, State
 
 _MIN_SPAN_S = 3.0
@@ -160,7 +165,7 @@ class Initializer:
             return Attempt(None, [], "", size=1.0 if found.size == stated else size * found.size)
         return Attempt(found.filter, frames, result.reason)
 
-    def _frames_from(self, state: State) -> list[tuple[float, PointsFrame]]:
+    def _frames_from(self, state: State) -> Frames:
         """Images from the time of the state on, with their stamps, s; in the order of IMU time."""
         shifts = {name: c.timeshift_s for name, c in state.cameras.items()}
         frames = [

@@ -14,7 +14,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import SPEED, LinearMotion, linear_start
 from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
-from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.model.state import (
     ATTITUDE,
@@ -63,7 +63,7 @@ class MotionRestart:
     def __init__(self, target: FloatArray, before_ns: Mapping[str, int]) -> None:
         self._target = target
         self._before_ns = dict(before_ns)
-        self.frames: list[tuple[float, PointsFrame]] = []
+        self.frames: Frames = []
         self._seen: list[TargetPose | None] = []
 
     def take(self, frame: PointsFrame, t_cam_s: float, state: State, buffer: ImuBuffer) -> None:

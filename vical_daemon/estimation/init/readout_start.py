@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from vical_daemon.estimation.init.intrinsics_start import LensFit, along, fit_lens, spread
-from vical_daemon.estimation.init.rolling_shutter_correction import Frames, at_middle_row, corner_speeds
-from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray
+from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row, corner_speeds
+from vical_daemon.estimation.measurements import COLUMNS, ROWS, FloatArray, Frames
 from vical_daemon.estimation.model.camera_rays import read_share
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.significance import SURE_SIGMAS

@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import ROWS, FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import ROWS, FloatArray, Frames, IntArray, PointsFrame
 from vical_daemon.estimation.model.camera_rays import read_share
 
-Frames = list[tuple[float, PointsFrame]]
 _MAX_STEP_S = 0.25  # corners move straight for so long; over 0.3 s a hand looks like a rolling shutter
 
 

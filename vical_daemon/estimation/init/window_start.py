@@ -16,9 +16,9 @@ from scipy.linalg import cho_solve, cholesky
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.init.board_window import BoardWindow, Frames, Present
+from vical_daemon.estimation.init.board_window import BoardWindow, Present
 from vical_daemon.estimation.init.target_poses import TargetPose
-from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.priors import KNOWN_SIZE_SIGMA
 from vical_daemon.estimation.model.state import State

@@ -22,7 +22,7 @@ from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
     FloatArray,
-    PointsFrame,
+    Frames,
 )
 from vical_daemon.estimation.model.imu_scale import NUMBERS
 from vical_daemon.estimation.model.priors import WINDOW_START
@@ -38,8 +38,6 @@ from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 from vical_daemon.estimation.temporal.shift_step import Orientations, nearest_shift
 from vical_daemon.estimation.temporal.td_icp import td_icp
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES, track_orientations
-
-Frames = list[tuple[float, PointsFrame]]
 
 
 class _Found(NamedTuple):

@@ -18,7 +18,7 @@ from vical_daemon.estimation.filter.unobservable_directions import HELD_M
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import products
 from vical_daemon.estimation.init.linear_start import ARM, BIAS, GRAVITY, SPEED, LinearMotion
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, Frames, ImuNoise
 from vical_daemon.estimation.model.inertial_links import PreintegratedLinks, make_links
 from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_START
 from vical_daemon.estimation.model.state import CameraState
@@ -83,7 +83,7 @@ class TrackStart:
     def __init__(
         self,
         buffer: ImuBuffer,
-        frames: list[tuple[float, PointsFrame]],
+        frames: Frames,
         camera: CameraState,
         imu: FloatArray,
         noise: ImuNoise,

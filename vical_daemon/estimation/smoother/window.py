@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames, ImuNoise
 from vical_daemon.estimation.model.camera_rays import read_share, unproject
 from vical_daemon.estimation.model.imu_scale import matrices
 from vical_daemon.estimation.model.inertial_links import (
@@ -101,7 +101,7 @@ class Window:
 
     camera: CameraState
     noise: ImuNoise
-    frames: list[tuple[float, PointsFrame]]
+    frames: Frames
     R: FloatArray
     p: FloatArray
     v: FloatArray
@@ -163,7 +163,7 @@ class Window:
         turning = self.turning[1] @ matrices(self.imu)[0].T if len(self.imu) else self.turning[1]
         return turning, np.gradient(self.v, t, axis=0)
 
-    def extend(self, buffer: ImuBuffer, frames: list[tuple[float, PointsFrame]]) -> int:
+    def extend(self, buffer: ImuBuffer, frames: Frames) -> int:
         """Add images, carrying the motion on by inertial data; return how many could be added."""
         imu = np.concatenate([self.bias[-1], self.imu])[None]
         t_s = np.array([self.frames[-1][0], *(t for t, _ in frames)]) + self.shift_s

@@ -12,7 +12,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import attitude_sigmas, poses_of
-from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.significance import EVERY_S
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
@@ -69,7 +69,7 @@ class RecentPast:
 
     def before_step(
         self, f: CalibrationFilter, fit: ShiftFit, camera: str, buffer: ImuBuffer, target: FloatArray
-    ) -> list[tuple[float, PointsFrame]]:
+    ) -> Frames:
         """Images that `f`, the filter from before, has not taken yet, and that are surely from before a step.
 
         Args:
@@ -105,7 +105,7 @@ class RecentPast:
 
     def shift_of(
         self,
-        frames: list[tuple[float, PointsFrame]],
+        frames: Frames,
         f: CalibrationFilter,
         buffer: ImuBuffer,
         target: FloatArray,
@@ -130,9 +130,7 @@ class RecentPast:
         return find_shift(curve, seen, known.R_imu_cam, known.timeshift_s, SEARCHED_S, level)
 
 
-def _orientations(
-    frames: list[tuple[float, PointsFrame]], f: CalibrationFilter, target: FloatArray
-) -> Orientations | None:
+def _orientations(frames: Frames, f: CalibrationFilter, target: FloatArray) -> Orientations | None:
     """What the camera's orientations are by the target alone; None where no image shows one."""
     if not frames:
         return None

@@ -16,7 +16,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project_jacobians
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, Frames
 from vical_daemon.estimation.model.camera_rays import unproject
 from vical_daemon.estimation.model.priors import GYRO_BIAS_SIGMA_RPS, WINDOW_START
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
@@ -84,7 +84,7 @@ class EpipolarFit:
 def epipolar_fit(
     t_imu_s: FloatArray,
     gyro_rps: FloatArray,
-    frames: list[tuple[float, PointsFrame]],
+    frames: Frames,
     lens: tuple[FloatArray, FloatArray, str],
     R_imu_cam: FloatArray,
     timeshift_s: float,
@@ -146,7 +146,7 @@ class _Fit:
         self.intrinsics, self.distortion, self.model = lens[0].copy(), lens[1].copy(), lens[2]
         self.given = (lens[0].copy(), lens[1].copy())
         self.gyro_density: float | None = None
-        self.frames: list[tuple[float, PointsFrame]] = []
+        self.frames: Frames = []
         self.dray: list[FloatArray] = []
         self.shrinking = np.zeros((len(pairs.of), 2))
         self.lasting = 1.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFrame
+from vical_daemon.estimation.measurements import FloatArray, Frames, IntArray
 from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
 LAGS_S = (0.1, 0.25, 0.5)
@@ -33,9 +33,7 @@ class Pairs:
     uv_2: FloatArray
 
 
-def make_pairs(
-    frames: list[tuple[float, PointsFrame]], lags_s: tuple[float, ...] = LAGS_S, every: int = 1
-) -> Pairs | None:
+def make_pairs(frames: Frames, lags_s: tuple[float, ...] = LAGS_S, every: int = 1) -> Pairs | None:
     """Pair images a tenth, a quarter and half a second apart; None where too few share features.
 
     Args:

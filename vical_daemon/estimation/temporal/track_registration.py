@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames
 from vical_daemon.estimation.temporal.epipolar_fit import EpipolarFit, epipolar_fit
 from vical_daemon.estimation.temporal.stretch_agreement import scatter_factor
 from vical_daemon.estimation.temporal.td_icp import ENOUGH_S, td_icp
@@ -20,7 +20,6 @@ from vical_daemon.estimation.temporal.td_icp_refusals import lost_in_words
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
 from vical_daemon.estimation.temporal.track_orientations import track_orientations
 
-Frames = list[tuple[float, PointsFrame]]
 Lens = tuple[FloatArray, FloatArray, str]
 
 _WINDOW_S = 20.0
