@@ -11,10 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA, SKEW_WALK
+from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA
 from vical_daemon.estimation.significance import CHANGED_SIGMAS
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 
+_DRIFT_WALK = 1e-6
+"""How much the drift rate may change, 1/sqrt(s): a drift of 20 ppm that begins is followed within sigma; with
+the wander of a crystal (`SKEW_WALK`) it is 7 sigma off."""
 _SEARCH_S = 0.2  # about the delay of the window before
 
 
@@ -116,6 +119,6 @@ def _predicted(before: _Delay, t_s: float) -> tuple[FloatArray, FloatArray]:
     """Delay and drift rate at a later time: the rate wanders slowly, the delay a little of its own."""
     dt = max(t_s - before.t_s, 0.0)
     F = np.array([[1.0, dt], [0.0, 1.0]])
-    Q = SKEW_WALK**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    Q = _DRIFT_WALK**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
     Q[0, 0] += SHIFT_WALK**2 * dt
     return F @ before.x, F @ before.P @ F.T + Q
