@@ -28,13 +28,14 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 )
 from vical_daemon.estimation.smoother.normal import ImageNoise, Normal, Problem
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
-from vical_daemon.estimation.smoother.window import FARTHEST_M, Landmarks, Seen, Window
+from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
 _OUT = np.sqrt(chi_square_limit(2, RESIDUAL_REFUSED))  # sigmas; an observation beyond is taken out
 _DONE = 1.0  # a step that promises less than this of the sum of squares is the last
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
+_FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _SMALL = 0.1  # of the sum of squares: where a step promises no more, outliers stand out
 _STUCK = 0.02  # of the sum of squares: where a step brought no more, outliers may be why
 
@@ -193,7 +194,7 @@ class Bundle:
         A step that counts on them never brings what it promises. [Bertsekas, "Projected Newton methods for
         optimization problems with simple constraints", 1982]
         """
-        held = (self.window.landmarks.inverse < 1.0 / FARTHEST_M) & (normal.gl[:, 2] > 0.0)
+        held = (self.window.landmarks.inverse < _FAR) & (normal.gl[:, 2] > 0.0)
         if not held.any():
             return normal
         V, W, gl = normal.V.copy(), normal.W.copy(), normal.gl.copy()
