@@ -114,6 +114,12 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
     for path in (args.report, args.output):
         if path and not Path(path).absolute().parent.is_dir():
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
+        if path and Path(path).is_dir():
+            raise CliError(f"{path}: is a folder, the name of a file is needed", EXIT_USAGE)
+    files = [Path(path).resolve() for path in args.inputs]
+    for i, file in enumerate(files):
+        if file in files[:i]:
+            raise CliError(f"{args.inputs[i]} is given twice; its data count only once", EXIT_USAGE)
     from vical_daemon.config.priors import Initial, read_initial
     from vical_daemon.logs import open_recording
     from vical_daemon.offline.calibration_job import add_recordings, make_job

@@ -215,6 +215,20 @@ def _spoil_report(folder: Path) -> list[str]:
     return _arguments(folder, "--report", str(folder / "nowhere" / "r.html"))
 
 
+def _spoil_output(folder: Path) -> list[str]:
+    return _arguments(folder, "-o", str(folder))
+
+
+def _spoil_twice(folder: Path) -> list[str]:
+    command, first, *options = _arguments(folder)
+    return [command, first, str(folder / ".." / folder.name), *options]
+
+
+def _spoil_other_cameras(folder: Path) -> list[str]:
+    (folder / "initial.yaml").write_text("cam1: {readout_s: 0.0}\ncam2: {readout_s: 0.0}\n")
+    return _arguments(folder)
+
+
 @pytest.mark.parametrize(
     ("spoil", "code", "words"),
     [
@@ -235,6 +249,9 @@ def _spoil_report(folder: Path) -> list[str]:
         (_spoil_camera_name, 1, "cam7"),
         (_spoil_size, 2, "image size"),
         (_spoil_report, 2, "folder does not exist"),
+        (_spoil_output, 2, "is a folder"),
+        (_spoil_twice, 2, "is given twice"),
+        (_spoil_other_cameras, 2, "--initial has cam1, cam2, the recording has cam0"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
