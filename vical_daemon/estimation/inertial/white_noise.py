@@ -1,0 +1,75 @@
+"""White noise of the inertial readings themselves, from the upper half of their spectrum.
+
+Hands and robots move at some hertz: above that a spectrum shows the noise. Where it is flat there, its level
+is the density, whatever a data sheet says. Where it is not, a vibration is seen, or a filter in the sensor,
+and nothing is known of the density.
+[Welch, "The use of fast Fourier transform for the estimation of power spectra", 1967]
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import detrend
+
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise
+
+_LENGTH = 64  # readings of a stretch
+_LEAST = 6  # stretches: with 16 frequencies and three channels the density is known to 5 %
+_MOTION_HZ = 12.0  # the tremor of hands ends there; slower IMUs do not tell noise from motion
+_EVEN = 1.5  # usual intervals: a stretch with a longer one has a gap
+_BANDS = 4  # parts of the upper half of the spectrum that are compared
+_FLAT = 2.0  # ratio of the largest to the smallest density of them
+
+
+def measured_noise(stated: ImuNoise, rows: FloatArray) -> ImuNoise:
+    """Return noise densities in which white noise is as the readings show it, where they do.
+
+    Args:
+        stated: Of the data sheet or the config.
+        rows: Readings: t_s, gyro xyz, rad/s, accelerometer xyz, m/s^2; shape (n, 7).
+    """
+    gyro, accel = white_noise(rows)
+    return replace(
+        stated,
+        gyro_density=gyro or stated.gyro_density,
+        accel_density=accel or stated.accel_density,
+    )
+
+
+def white_noise(rows: FloatArray) -> tuple[float | None, float | None]:
+    """Densities of gyro, rad/s/sqrt(Hz), and accelerometer, m/s^2/sqrt(Hz), root mean square over the axes.
+
+    Args:
+        rows: See `measured_noise`.
+
+    Returns:
+        None each for a spectrum that is not flat, both for too few readings without a gap.
+    """
+    if len(rows) < _LENGTH:
+        return None, None
+    t_s = sliding_window_view(rows[:, 0], _LENGTH)[:: _LENGTH // 2]
+    step_s = float(np.median(np.diff(rows[:, 0])))
+    even = np.diff(t_s, axis=1).max(axis=1) < _EVEN * step_s
+    first = max(_LENGTH // 4, math.ceil(_MOTION_HZ * step_s * _LENGTH)) + 1
+    if even.sum() < _LEAST or first > _LENGTH * 3 // 8:
+        return None, None
+    values = sliding_window_view(rows[:, 1:7], _LENGTH, axis=0)[:: _LENGTH // 2][even]
+    window = np.hanning(_LENGTH)
+    spectrum = np.abs(np.fft.rfft(detrend(values) * window)) ** 2 / float(window @ window)
+    # each is the variance of one sample times an exponential deviate, whose median is ln 2
+    bands = np.array_split(spectrum[:, :, first:-1], _BANDS, axis=2)
+    variances = np.array([np.median(band, axis=(0, 2)) for band in bands]) / math.log(2.0)
+    densities = np.sqrt(step_s * variances.reshape(_BANDS, 2, 3).mean(axis=2))
+    gyro, accel = (_level(x) for x in densities.T)
+    return gyro, accel
+
+
+def _level(densities: FloatArray) -> float | None:
+    """Root mean square of the densities of some bands; None where they differ by too much."""
+    if not 0.0 < densities.max() < _FLAT * densities.min():
+        return None
+    return float(np.sqrt((densities**2).mean()))
