@@ -22,11 +22,14 @@ _LEAST = 6  # stretches: with 16 frequencies and three channels the density is k
 _MOTION_HZ = 12.0  # the tremor of hands ends there; slower IMUs do not tell noise from motion
 _EVEN = 1.5  # usual intervals: a stretch with a longer one has a gap
 _BANDS = 4  # parts of the upper half of the spectrum that are compared
+_MORE = 1.5
+"""Times what a start shows: later motion may be rougher. EuRoC has up to 1.2 times the noise of its first 3 s
+as a whole."""
 _FLAT = 2.0  # ratio of the largest to the smallest density of them
 
 
 def measured_noise(stated: ImuNoise, rows: FloatArray) -> ImuNoise:
-    """Return noise densities in which white noise is as the readings show it, where they do.
+    """Return noise densities in which white noise is what the readings show, or a little more if stated.
 
     Args:
         stated: Of the data sheet or the config.
@@ -35,9 +38,13 @@ def measured_noise(stated: ImuNoise, rows: FloatArray) -> ImuNoise:
     gyro, accel = white_noise(rows)
     return replace(
         stated,
-        gyro_density=gyro or stated.gyro_density,
-        accel_density=accel or stated.accel_density,
+        gyro_density=_within(stated.gyro_density, gyro),
+        accel_density=_within(stated.accel_density, accel),
     )
+
+
+def _within(stated: float, measured: float | None) -> float:
+    return stated if measured is None else min(max(stated, measured), _MORE * measured)
 
 
 def at_least_measured(stated: ImuNoise, rows: FloatArray) -> ImuNoise:
@@ -47,11 +54,11 @@ def at_least_measured(stated: ImuNoise, rows: FloatArray) -> ImuNoise:
     density, a quarter of the default, halves of a tablet's recording differ by 3.6 instead of 0.9 joint
     sigma (`python -m benchmarks phone`).
     """
-    found = measured_noise(stated, rows)
+    gyro, accel = white_noise(rows)
     return replace(
         stated,
-        gyro_density=max(stated.gyro_density, found.gyro_density),
-        accel_density=max(stated.accel_density, found.accel_density),
+        gyro_density=max(stated.gyro_density, gyro or 0.0),
+        accel_density=max(stated.accel_density, accel or 0.0),
     )
 
 
@@ -62,25 +69,30 @@ def white_noise(rows: FloatArray) -> tuple[float | None, float | None]:
         rows: See `measured_noise`.
 
     Returns:
-        None each for a spectrum that is not flat, both for too few readings without a gap.
+        None for a spectrum that is not flat, and for too few readings without a gap.
     """
     if len(rows) < _LENGTH:
         return None, None
-    t_s = sliding_window_view(rows[:, 0], _LENGTH)[:: _LENGTH // 2]
     step_s = float(np.median(np.diff(rows[:, 0])))
-    even = np.diff(t_s, axis=1).max(axis=1) < _EVEN * step_s
-    first = max(_LENGTH // 4, math.ceil(_MOTION_HZ * step_s * _LENGTH)) + 1
-    if even.sum() < _LEAST or first > _LENGTH * 3 // 8:
-        return None, None
-    values = sliding_window_view(rows[:, 1:7], _LENGTH, axis=0)[:: _LENGTH // 2][even]
-    window = np.hanning(_LENGTH)
-    spectrum = np.abs(np.fft.rfft(detrend(values) * window)) ** 2 / float(window @ window)
-    # each is the variance of one sample times an exponential deviate, whose median is ln 2
-    bands = np.array_split(spectrum[:, :, first:-1], _BANDS, axis=2)
-    variances = np.array([np.median(band, axis=(0, 2)) for band in bands]) / math.log(2.0)
-    densities = np.sqrt(step_s * variances.reshape(_BANDS, 2, 3).mean(axis=2))
-    gyro, accel = (_level(x) for x in densities.T)
+    gyro, accel = (_of_sensor(rows[:, 0], rows[:, k : k + 3], step_s) for k in (1, 4))
     return gyro, accel
+
+
+def _of_sensor(t_s: FloatArray, values: FloatArray, step_s: float) -> float | None:
+    """Density of one sensor; arguments: times, s, shape (n,), readings, shape (n, 3), usual interval, s."""
+    first = max(_LENGTH // 4, math.ceil(_MOTION_HZ * step_s * _LENGTH)) + 1
+    # a gap, or a reading that was written twice: the sensor measures less often than it is read
+    broken = (np.diff(t_s) > _EVEN * step_s) | (np.diff(values, axis=0) == 0.0).all(axis=1)
+    whole = ~sliding_window_view(broken, _LENGTH - 1)[:: _LENGTH // 2].any(axis=1)
+    if whole.sum() < _LEAST or first > _LENGTH * 3 // 8:
+        return None
+    stretches = sliding_window_view(values, _LENGTH, axis=0)[:: _LENGTH // 2][whole]
+    window = np.hanning(_LENGTH)
+    spectrum = np.abs(np.fft.rfft(detrend(stretches) * window)) ** 2 / float(window @ window)
+    bands = np.array_split(spectrum[:, :, first:-1], _BANDS, axis=2)
+    # each is the variance of one reading times an exponential deviate, whose median is ln 2
+    variances = np.array([np.median(band, axis=(0, 2)) for band in bands]).mean(axis=1) / math.log(2.0)
+    return _level(np.sqrt(step_s * variances))
 
 
 def _level(densities: FloatArray) -> float | None:

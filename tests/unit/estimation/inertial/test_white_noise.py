@@ -30,11 +30,11 @@ def test_the_density_is_found_whatever_the_rate(rate_hz, seed) -> None:
 
 
 def test_what_is_stated_gives_way_to_what_is_measured() -> None:
-    for factor in (0.1, 1.0, 10.0):
+    for factor, expected in ((0.1, 1.0), (1.0, 1.0), (1.3, 1.3), (10.0, 1.5)):
         stated = ImuNoise(factor * GYRO, 1e-5, factor * ACCEL, 1e-4)
         found = measured_noise(stated, rows())
-        assert found.gyro_density == pytest.approx(GYRO, rel=0.1)
-        assert found.accel_density == pytest.approx(ACCEL, rel=0.1)
+        assert found.gyro_density == pytest.approx(expected * GYRO, rel=0.1)
+        assert found.accel_density == pytest.approx(expected * ACCEL, rel=0.1)
         assert (found.gyro_walk, found.accel_walk) == (1e-5, 1e-4)
     cautious = ImuNoise(10.0 * GYRO, 1e-5, 0.1 * ACCEL, 1e-4)
     kept = at_least_measured(cautious, rows())
@@ -54,6 +54,13 @@ def test_a_filter_in_the_sensor_hides_the_noise() -> None:
     smooth[:, 1:4] = lfilter(b, a, smooth[:, 1:4], axis=0)
     gyro, accel = white_noise(smooth)
     assert gyro is None and accel == pytest.approx(ACCEL, rel=0.1)
+
+
+def test_a_sensor_that_is_read_more_often_than_it_measures_says_nothing() -> None:
+    held = rows()
+    held[:, 4:] = held[np.arange(len(held)) // 3 * 3, 4:]
+    gyro, accel = white_noise(held)
+    assert gyro == pytest.approx(GYRO, rel=0.1) and accel is None
 
 
 def test_readings_that_are_too_few_slow_or_full_of_gaps_say_nothing() -> None:
