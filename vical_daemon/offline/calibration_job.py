@@ -78,6 +78,7 @@ def make_job(
     estimate: Sequence[str] = (),
     skip_s: float = 0.0,
     seconds: float | None = None,
+    gravity_mps2: float = 9.80665,
 ) -> Job:
     """Choose streams and put what is known into the form of a config.
 
@@ -91,6 +92,7 @@ def make_job(
         estimate: See `CalibrationOptions`.
         skip_s: See `Job`.
         seconds: See `Job`.
+        gravity_mps2: Magnitude of gravity at the site.
 
     Raises:
         InputError: No such stream, or something needed is not known.
@@ -113,6 +115,7 @@ def make_job(
             mode="target" if target else "target_free",
             fix=tuple(fix),  # type: ignore[arg-type]
             estimate=tuple(estimate),  # type: ignore[arg-type]
+            gravity_mps2=gravity_mps2,
         ),
     )
     return Job(recording, imu_stream, chosen, config, priors, skip_s, seconds)
