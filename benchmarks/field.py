@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import gzip
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -124,6 +125,26 @@ def _mirrored(data: Data) -> Data:
     return replace(data, points=points)
 
 
+def _held(data: Data) -> Data:
+    """An accelerometer of 62.5 Hz in rows of 200 Hz: each of its readings is written three or four times."""
+    since_s = (data.t_ns - data.t_ns[0]) * 1e-9
+    six = data.six.copy()
+    six[:, 3:] = six[np.searchsorted(since_s, np.floor(62.5 * since_s) / 62.5 - 1e-6), 3:]
+    return replace(data, six=six)
+
+
+def _paired(data: Data) -> Data:
+    """For two seconds a driver pairs each image with the stamp of the next one."""
+    stamps, image = np.unique(data.points["t"], return_inverse=True)
+    since_s = (stamps - data.t_ns[0]) * 1e-9
+    wrong = (since_s > 30.0) & (since_s < 32.0)
+    moved = np.where(wrong, np.append(stamps[1:], stamps[-1]), stamps)
+    points = data.points.copy()
+    points["t"] = moved[image]
+    lost = np.append(False, np.diff(moved) == 0)  # the image whose stamp is taken
+    return replace(data, points=points[~lost[image]])
+
+
 FAULTS: dict[str, tuple[str, Callable[[Data, np.random.Generator], Data]]] = {
     "none": ("unchanged", lambda d, _: d),
     "delayed": ("IMU stamped on arrival, delays of 2 ms (exponential)", _delayed),
@@ -140,16 +161,37 @@ FAULTS: dict[str, tuple[str, Callable[[Data, np.random.Generator], Data]]] = {
     "negated": ("accelerometer negated", lambda d, _: replace(d, six=d.six * [1, 1, 1, -1, -1, -1])),
     "axes": ("accelerometer's axes permuted", lambda d, _: replace(d, six=d.six[:, [0, 1, 2, 4, 5, 3]])),
     "mirrored": ("images mirrored", lambda d, _: _mirrored(d)),
+    "held": ("accelerometer of 62.5 Hz in rows of 200 Hz", lambda d, _: _held(d)),
+    "paired": ("images of 2 s stamped as the next ones", lambda d, _: _paired(d)),
+    "loud": ("white noise stated three times too large", lambda d, _: d),
+    "quiet": ("white noise stated three times too small", lambda d, _: d),
 }
+STATED = {"loud": 3.0, "quiet": 1.0 / 3.0}
+"""By how much the densities in the file with the prior are too large."""
 
 
-def calibrate(data: Data) -> dict[str, Any]:
-    """Run `vical calibrate` on the data; its JSON, with what it printed last where it found nothing."""
+def _initial(stated: float) -> str:
+    """The prior, with other densities of white noise."""
+
+    def other(found: re.Match[str]) -> str:
+        return f"{found[1]}{stated * float(found[2]):.4e}"
+
+    return re.sub(r"(_noise_density: )(\S+)", other, (FOLDER / "initial.yaml").read_text())
+
+
+def calibrate(data: Data, stated: float = 1.0) -> dict[str, Any]:
+    """Run `vical calibrate` on the data; its JSON, with what it printed last where it found nothing.
+
+    Args:
+        data: The recording.
+        stated: By how much the stated white noise is too large.
+    """
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "recording"
+        folder, initial = Path(name) / "recording", Path(name) / "initial.yaml"
         write(data, folder)
+        initial.write_text(_initial(stated))
         command = [sys.executable, "-m", "vical_daemon", "calibrate", str(folder), "--json", "--quiet"]
-        command += ["--target", str(FOLDER / "target.yaml"), "--initial", str(FOLDER / "initial.yaml")]
+        command += ["--target", str(FOLDER / "target.yaml"), "--initial", str(initial)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     result: dict[str, Any] = json.loads(done.stdout) if done.stdout else {"cameras": {}, "status": "none"}
     result["said"] = (done.stderr.strip().splitlines() or [""])[-1].replace(
@@ -195,7 +237,8 @@ def main(argv: list[str]) -> int:
     for number, (name, (text, change)) in enumerate(FAULTS.items()):
         if args.fault and name not in args.fault:
             continue
-        result = calibrate(change(original, np.random.default_rng([number, 26])))
+        changed = change(original, np.random.default_rng([number, 26]))
+        result = calibrate(changed, STATED.get(name, 1.0))
         if "cam0" not in result["cameras"]:
             print(f"| {text} | {result['status']} | - | - | {result['said']} |")
             continue

@@ -67,6 +67,13 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         help=f"comma-separated, estimated from the start instead of on evidence: {', '.join(ESTIMATE)}",
     )
     add_stretch(parser)
+    parser.add_argument(
+        "--gravity",
+        type=float,
+        metavar="G",
+        default=9.80665,
+        help="local gravity, m/s^2: 9.78 at the equator, 9.83 at the poles (default 9.80665)",
+    )
     parser.add_argument("--report", metavar="F.html", help="write a report, one HTML file")
     parser.add_argument(
         "-o",
@@ -114,10 +121,20 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
     for path in (args.report, args.output):
         if path and not Path(path).absolute().parent.is_dir():
             raise CliError(f"{path}: its folder does not exist", EXIT_USAGE)
+        if path and Path(path).is_dir():
+            raise CliError(f"{path}: is a folder, the name of a file is needed", EXIT_USAGE)
+    files = [Path(path).resolve() for path in args.inputs]
+    for i, file in enumerate(files):
+        if file in files[:i]:
+            raise CliError(f"{args.inputs[i]} is given twice; its data count only once", EXIT_USAGE)
+    from vical_daemon.config.model import GRAVITY_BOUNDS
     from vical_daemon.config.priors import Initial, read_initial
     from vical_daemon.logs import open_recording
     from vical_daemon.offline.calibration_job import add_recordings, make_job
 
+    low, high = GRAVITY_BOUNDS
+    if not low <= args.gravity <= high:
+        raise CliError(f"--gravity {args.gravity:g}: {low} to {high} m/s^2 on Earth", EXIT_USAGE)
     initial = read_initial(args.initial) if args.initial else Initial()
     if args.target:
         from vical_daemon.vision.target import load_target
@@ -136,6 +153,7 @@ def job_of(args: argparse.Namespace, accept: tuple[str, ...] = ACCEPT) -> tuple[
         estimate=estimate,
         skip_s=args.skip,
         seconds=args.seconds,
+        gravity_mps2=args.gravity,
     )
     add_recordings(job, recordings[1:], args.imu)
     job.common_clock = args.clock == CLOCKS[0]

@@ -23,6 +23,7 @@ NAMESPACE = r"/|/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
 NAMESPACE_HINT = (
     "a ROS name like robot7 or /site/robot7: letters, digits and _ between slashes, no digit first"
 )
+GRAVITY_BOUNDS = (9.7, 9.9)  # m/s^2, on Earth
 LOG_SCHEME = "log:"
 """Of a `port` or `uri` that is a recording, played as if its device were there."""
 EMULATED = "emulated"
@@ -162,7 +163,7 @@ class CalibrationConfig:
     fix: tuple[Literal["intrinsics", "timeshift", "extrinsics"], ...] = ()
     estimate: tuple[Literal["imu_intrinsics", "readout", "target_scale", "target_shape"], ...] = ()
     corner_sigma_px: Annotated[float, Bound(above=0, high=20)] = CalibrationOptions().corner_sigma_px
-    gravity_mps2: Annotated[float, Bound(low=9.7, high=9.9, hint="magnitude on Earth, m/s^2")] = 9.80665
+    gravity_mps2: Annotated[float, Bound(*GRAVITY_BOUNDS, hint="magnitude on Earth, m/s^2")] = 9.80665
     lag_s: Annotated[float, Bound(low=0, high=5)] = 0.2
     detect_rate_hz: Annotated[float, Bound(above=0, high=1000)] = 30.0
     convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)

@@ -40,6 +40,8 @@ def open_recording(
     Raises:
         RecordingError: It cannot be used; the message is one line with a remedy.
     """
+    if not str(path):
+        raise RecordingError("the name of the recording is empty; is the shell's variable set?")
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path} does not exist; check the path")

@@ -42,6 +42,20 @@ _POINT_ROW = np.dtype([("t", "<i8"), ("id", "<i8"), ("uv", "<f8", (2,))])
 _IMAGE_LIMIT = 2**28  # bytes; larger than any camera's uncompressed frame
 
 
+def _refuse_lost_digits(path: Path, texts: npt.NDArray[Any], t_ns: IntArray) -> None:
+    """Refuse stamps like 1.404733e+18, which do not tell one reading from the next.
+
+    Raises:
+        RecordingError: Most stamps are equal to others, and they are written with an exponent.
+    """
+    different = len(np.unique(t_ns))
+    if different < len(t_ns) / 2 and "e" in texts[0].lower():
+        raise RecordingError(
+            f"{path}: only {different} different stamps in {len(t_ns)} rows, written like {texts[0]}: digits "
+            "are lost; write them as integers, nanoseconds"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class _Source:
     """A stream, its sorted stamps, and how to build its i-th message."""
@@ -224,6 +238,8 @@ class AslRecording(Recording):
             ) from None
         if report:
             self.warnings.append(f"{path.parent.name}: {report}")
+        if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":
+            _refuse_lost_digits(path, rows["t"], t_ns)
         out = np.empty(len(rows), dtype)
         out["t"] = t_ns
         for name in (dtype.names or ())[1:]:

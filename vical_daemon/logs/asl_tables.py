@@ -8,6 +8,7 @@ import os
 import re
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hosti
 from vical_daemon.logs.model import RecordingError
 
 _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
+_NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
+_SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
 IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _SMALL = 2**25  # bytes; a packed table may always unpack to this size
@@ -35,10 +38,16 @@ def without_cut_line(text: bytes, columns: int) -> bytes:
 
 
 def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
-    """Parse a table of numbers; stamps keep all digits: integers, or text where the first is a fraction."""
+    """Parse a table of numbers.
+
+    Stamps keep all digits: integers, or text where the first is a fraction. Other integers may be written
+    like 12.0.
+    """
     begin = _first_data_row(text)
-    if _fractional(text, begin):
-        dtype = np.dtype([("t", "U40"), *((name, dtype[name]) for name in (dtype.names or ())[1:])])
+    wanted = dtype
+    dtype = np.dtype([(name, _type_read(dtype, name, text, begin)) for name in dtype.names or ()])
+    if next(_data_lines(text, begin), None) is None:
+        raise RecordingError(f"{path}: no data below its title")
     try:
         rows: npt.NDArray[Any] = np.loadtxt(
             io.BytesIO(text[begin:]),
@@ -48,30 +57,59 @@ def load_table(text: bytes, path: Path, dtype: np.dtype[Any], columns: str) -> n
             ndmin=1,
             usecols=range(columns_of(dtype)),
         )
-    except (ValueError, OverflowError, UnicodeDecodeError) as error:
-        reason = str(error).split(";")[0].rstrip(".")
-        raise RecordingError(f"{path}: {reason}; expected {columns}") from None
+    except (ValueError, OverflowError, UnicodeDecodeError):
+        raise RecordingError(f"{path}: {_first_mistake(text, begin, wanted)}; expected {columns}") from None
+    for name in (wanted.names or ())[1:]:
+        if wanted[name].kind == "i" and (rows[name] % 1 != 0).any():
+            raise RecordingError(f"{path}: a fraction where integers are needed; expected {columns}")
     return rows
 
 
-def _fractional(text: bytes, begin: int) -> bool:
-    """Whether the first stamp is written with a point or an exponent."""
-    first = next(
-        (
-            line
-            for line in io.BytesIO(text[begin : begin + 2**20])
-            if line.strip() and line.lstrip()[:1] != b"#"
-        ),
-        b"",
-    )
-    return any(mark in first.split(b",")[0].lower() for mark in (b".", b"e"))
+def _type_read(dtype: np.dtype[Any], name: str, text: bytes, begin: int) -> np.dtype[Any]:
+    """Type as which a column is read: that wanted, unless its first number is a fraction."""
+    column = (dtype.names or ()).index(name)
+    if dtype[name].kind != "i" or not _fractional(text, begin, column):
+        return dtype[name]
+    return np.dtype("f8" if column else "U40")
+
+
+def _first_mistake(text: bytes, begin: int, dtype: np.dtype[Any]) -> str:
+    """Say which line of a table is not as many numbers as are needed, and what may be wrong with it."""
+    if b"\0" in text:
+        return "this is not plain text (UTF-16 from a spreadsheet? save it as CSV UTF-8)"
+    count = columns_of(dtype)
+    for number, line in _data_lines(text, begin):
+        cells = [cell.strip() for cell in line.split(b",")]
+        if len(cells) >= count and all(_NUMBER_BYTES.fullmatch(cell) for cell in cells[:count]):
+            continue
+        found = line.strip()[:60].decode("utf-8", "replace")
+        found = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in found)
+        other = next((name for mark, name in _SEPARATORS.items() if line.count(mark) >= count - 1), "")
+        hint = f", separated by {other}; separate them by commas, with points in the numbers" if other else ""
+        return f"line {number} is not {count} numbers{hint}: {found!r}"
+    return "a stamp or an id is no integer, or too large"
+
+
+def _data_lines(text: bytes, begin: int) -> Iterator[tuple[int, bytes]]:
+    """Yield number in the file, from 1, and text of each line that is neither empty nor a comment."""
+    for number, line in enumerate(io.BytesIO(text), 1):
+        begin -= len(line)
+        if begin < 0 and line.strip() and line.lstrip()[:1] != b"#":
+            yield number, line
+
+
+def _fractional(text: bytes, begin: int, column: int) -> bool:
+    """Whether the first number of a column is written with a point or an exponent."""
+    _, first = next(_data_lines(text, begin), (0, b""))
+    cell = (first.split(b",") + [b""] * column)[column].lower()
+    return b"." in cell or b"e" in cell
 
 
 def accelerometer_first(title: str) -> bool:
     """Whether the title of a table names the accelerometer before the gyro."""
     names = [name.strip().lower() for name in title.lstrip("# ").split(",")]
     accel = [i for i, name in enumerate(names) if re.match(r"a(?![a-z]*(ng|tt))|lin|spec|force|f_", name)]
-    gyro = [i for i, name in enumerate(names) if re.match(r"w(_|x|y|z)|gyr|ang|omega|rot", name)]
+    gyro = [i for i, name in enumerate(names) if re.match(r"[wg](_|x|y|z)|gyr|ang|omega|rot", name)]
     return len(accel) >= 3 and len(gyro) >= 3 and accel[0] < gyro[0]
 
 

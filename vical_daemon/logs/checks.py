@@ -14,6 +14,11 @@ GRAVITY_MPS2 = 9.80665
 _SLOWEST_IMU_HZ, _FASTEST_IMU_HZ = 10.0, 20_000.0
 _SLOWEST_CAMERA_HZ, _FASTEST_CAMERA_HZ = 1.0, 2_000.0
 _SMOOTHING_S = 0.5
+_LIKE_GRAVITY = (6.0, 16.0)  # m/s^2: where the median of a moving accelerometer may be
+_GRAVITY_REMOVED = 0.4
+"""Of the median, which 5 % of the readings are below where gravity is removed: motion passes through zero.
+Hand-held motion of 2 m/s^2 on top of gravity leaves 0.8 of it."""
+_CHANNELS = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
 _BURST = 19  # intervals over which a rate is taken: drivers hand over up to some ten readings at once
 
 
@@ -26,9 +31,10 @@ def check_imu(name: str, samples: ImuArrays) -> list[str]:
     if len(samples.t_ns) < 20:
         raise RecordingError(f"{name}: only {len(samples.t_ns)} samples; nothing can be calibrated from that")
     rate_hz = _check_imu_rate(name, samples.t_ns)
-    _check_accelerometer(name, samples.specific_force_mps2)
+    constant = _constant_channels(samples)
+    _check_accelerometer(name, samples, constant)
     _check_gyro(name, rate_hz, samples)
-    return _gaps(name, samples.t_ns, rate_hz)
+    return [f"{name}: {constant}"] * bool(constant) + _gaps(name, samples.t_ns, rate_hz)
 
 
 def _check_imu_rate(name: str, t_ns: IntArray) -> float:
@@ -50,22 +56,44 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
     return rate_hz
 
 
-def _check_accelerometer(name: str, specific_force: FloatArray) -> None:
-    median = float(np.median(np.linalg.norm(specific_force, axis=1)))
-    if 6.0 < median < 16.0:
+def _check_accelerometer(name: str, samples: ImuArrays, constant: str) -> None:
+    force = np.linalg.norm(samples.specific_force_mps2, axis=1)
+    low, median = np.percentile(force, [5, 50]).tolist()
+    if _LIKE_GRAVITY[0] < median < _LIKE_GRAVITY[1]:
         return
-    if 0.6 < median < 1.6:
+    gyro = float(np.median(np.linalg.norm(samples.gyro_rps, axis=1)))
+    if _LIKE_GRAVITY[0] < gyro < _LIKE_GRAVITY[1] and median < gyro:
+        text = f"the gyro reads {gyro:.3g}: their columns seem to be swapped"
+    elif constant:
+        text = constant
+    elif low < _GRAVITY_REMOVED * median or median < 0.6:
+        text = "gravity seems to be removed: record the accelerometer as it is"
+    elif 0.6 < median < 1.6:
         text = f"it looks like g: multiply by {GRAVITY_MPS2}"
     elif 600 < median < 1600:
         text = f"it looks like mg: multiply by {GRAVITY_MPS2 / 1000}"
-    elif median < 0.6:
-        text = "gravity seems to be removed: record the accelerometer as it is"
     else:
         text = "check its unit"
     raise RecordingError(
         f"{name}: the accelerometer reads {median:.3g} in the middle, m/s^2 (about {GRAVITY_MPS2:.1f}) are "
         f"expected; {text}"
     )
+
+
+def _constant_channels(samples: ImuArrays) -> str:
+    """Name the channels that never change, which noise does not allow; empty where there is none."""
+    six = np.hstack([samples.gyro_rps, samples.specific_force_mps2])
+    still = np.flatnonzero(np.ptp(six, axis=0) == 0.0).tolist()
+    for sensor, channels in (("gyro", [0, 1, 2]), ("accelerometer", [3, 4, 5])):
+        if still == channels:
+            return (
+                f"the {sensor} never changes; is it in another topic or file? Record both in one (RealSense: "
+                "unite_imu_method)"
+            )
+    if not still:
+        return ""
+    words = ", ".join(f"{_CHANNELS[i]} (always {six[0, i]:.3g})" for i in still)
+    return f"not even noise changes {words}; does the driver read this axis?"
 
 
 def _check_gyro(name: str, rate_hz: float, samples: ImuArrays) -> None:

@@ -311,6 +311,8 @@ class McapRecording(LogRecording):
                         yield RawMessage(
                             channel.topic, channel.type_name, message.log_time_ns, message.payload
                         )
+                    else:
+                        self._others[channel.topic] = f"{channel.type_name} in {channel.encoding}, not CDR"
             except LogError as error:
                 raise RecordingError(str(error)) from None
             if not self._scanned:

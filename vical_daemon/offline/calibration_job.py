@@ -78,6 +78,7 @@ def make_job(
     estimate: Sequence[str] = (),
     skip_s: float = 0.0,
     seconds: float | None = None,
+    gravity_mps2: float = 9.80665,
 ) -> Job:
     """Choose streams and put what is known into the form of a config.
 
@@ -91,6 +92,7 @@ def make_job(
         estimate: See `CalibrationOptions`.
         skip_s: See `Job`.
         seconds: See `Job`.
+        gravity_mps2: Magnitude of gravity at the site.
 
     Raises:
         InputError: No such stream, or something needed is not known.
@@ -103,7 +105,8 @@ def make_job(
         raise InputError(
             f"{recording.path} holds no camera, neither images nor points; `vical info` shows what is in it"
         )
-    priors = {name: _prior(name, stream, initial, fix) for name, stream in chosen.items()}
+    cameras = _cameras_meant(initial, chosen)
+    priors = {name: _prior(name, stream, cameras.get(name), fix) for name, stream in chosen.items()}
     config = _config(recording.rig, imu_stream, priors, initial.imu_noise or ImuNoise())
     config = replace(
         config,
@@ -112,6 +115,7 @@ def make_job(
             mode="target" if target else "target_free",
             fix=tuple(fix),  # type: ignore[arg-type]
             estimate=tuple(estimate),  # type: ignore[arg-type]
+            gravity_mps2=gravity_mps2,
         ),
     )
     return Job(recording, imu_stream, chosen, config, priors, skip_s, seconds)
@@ -168,12 +172,23 @@ def _choose(what: str, streams: dict[str, Stream], name: str | None) -> Stream:
     return streams[name]
 
 
-def _prior(name: str, stream: Stream, initial: Initial, fix: Sequence[str]) -> CameraPrior:
-    """Return the prior of one camera; a single camera of another name in the file is meant for it."""
-    cameras = initial.cameras
-    prior = cameras.get(name)
-    if prior is None and len(cameras) == 1:
-        prior = next(iter(cameras.values()))
+def _cameras_meant(initial: Initial, chosen: dict[str, Stream]) -> dict[str, CameraPrior]:
+    """Return priors by the recording's names; the only camera of the file may have another name there.
+
+    Raises:
+        OptionError: The file is of other cameras.
+    """
+    given = initial.cameras
+    if not given or any(name in given for name in chosen):
+        return given
+    if len(given) == 1:
+        return dict.fromkeys(chosen, next(iter(given.values())))
+    here, there = ", ".join(chosen), ", ".join(given)
+    raise OptionError(f"--initial has {there}, the recording has {here}: rename the camera in the file")
+
+
+def _prior(name: str, stream: Stream, prior: CameraPrior | None, fix: Sequence[str]) -> CameraPrior:
+    """Return the prior of one camera, with the size of its images."""
     prior = prior or CameraPrior(resolution=(0, 0))
     if prior.resolution == (0, 0):
         if stream.resolution is None:

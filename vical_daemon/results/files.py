@@ -30,14 +30,16 @@ def read_rig(path: Path) -> Rig:
         text = _read_yaml(path)
         return read_ros_yaml(text, path) if looks_like_ros(text) else read_camchain(path)
     document = _read_json(path)
-    note = f"vical, from {path.name}"
     if isinstance(document.get("estimate"), dict):  # a file of the store
         devices = {
             "imu": document.get("imu_serial"),
             f"camera/{document.get('camera')}": document.get("camera_serial"),
         }
-        return rig_from_json(document["estimate"] | {"devices": devices}, note=note)
-    return rig_from_json(document, note=note)
+        document = document["estimate"] | {"devices": devices}
+    try:
+        return rig_from_json(document, note=f"vical, from {path.name}")
+    except ExportError as error:
+        raise ExportError(f"{path}: {error}") from None
 
 
 def read_known_file(path: Path) -> tuple[dict[str, KnownCamera], Rig | None]:

@@ -215,6 +215,24 @@ def _spoil_report(folder: Path) -> list[str]:
     return _arguments(folder, "--report", str(folder / "nowhere" / "r.html"))
 
 
+def _spoil_output(folder: Path) -> list[str]:
+    return _arguments(folder, "-o", str(folder))
+
+
+def _spoil_gravity(folder: Path) -> list[str]:
+    return _arguments(folder, "--gravity", "981")
+
+
+def _spoil_twice(folder: Path) -> list[str]:
+    command, first, *options = _arguments(folder)
+    return [command, first, str(folder / ".." / folder.name), *options]
+
+
+def _spoil_other_cameras(folder: Path) -> list[str]:
+    (folder / "initial.yaml").write_text("cam1: {readout_s: 0.0}\ncam2: {readout_s: 0.0}\n")
+    return _arguments(folder)
+
+
 @pytest.mark.parametrize(
     ("spoil", "code", "words"),
     [
@@ -235,6 +253,10 @@ def _spoil_report(folder: Path) -> list[str]:
         (_spoil_camera_name, 1, "cam7"),
         (_spoil_size, 2, "image size"),
         (_spoil_report, 2, "folder does not exist"),
+        (_spoil_output, 2, "is a folder"),
+        (_spoil_gravity, 2, "--gravity 981: 9.7 to 9.9 m/s^2"),
+        (_spoil_twice, 2, "is given twice"),
+        (_spoil_other_cameras, 2, "--initial has cam1, cam2, the recording has cam0"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )
@@ -258,6 +280,12 @@ def test_a_failure_is_one_line_and_keeps_an_earlier_result(
     assert out == "" and "Traceback" not in err and last.startswith("vical: error: ")
     assert "check the sizes in " in last and f"{earlier} was not written" in last
     assert earlier.read_text(encoding="utf-8") == "of yesterday"
+
+
+def test_the_gravity_of_the_place_is_used(copy: Path, capsys) -> None:
+    assert main(_arguments(copy, "--gravity", "9.78", "--json", "--accept", "converging")) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert np.linalg.norm(result["gravity_world_mps2"]) == pytest.approx(9.78)
 
 
 def test_a_slipped_decimal_point_is_reported_and_the_answer_is_right(copy: Path, capsys) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -68,6 +69,7 @@ def test_a_last_line_that_was_cut_off_is_left_out_and_counted(tmp_path, write_as
         ("#timestamp [ns],a_RS_S_x [m s^-2],a_y,a_z,w_RS_S_x [rad s^-1],w_y,w_z", True),
         ("timestamp,accel_x,accel_y,accel_z,gyro_x,gyro_y,gyro_z", True),
         ("t,ax,ay,az,wx,wy,wz", True),
+        ("timestamp,ax,ay,az,gx,gy,gz", True),
         ("t,linear_acceleration.x,linear_acceleration.y,linear_acceleration.z,angular_velocity.x,"
          "angular_velocity.y,angular_velocity.z", True),
         ("#timestamp [ns],w_RS_S_x [rad s^-1],w_y,w_z,a_RS_S_x [m s^-2],a_y,a_z", False),
@@ -159,3 +161,101 @@ def test_a_stamp_that_is_no_number_is_named(tmp_path, write_asl):
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(RecordingError, match="its stamp is no number"):
         open_recording(folder)
+
+
+def _rewritten(folder, change, table="mav0/imu0/data.csv"):
+    """Change the lines of a table; returns the folder."""
+    path = folder / table
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda lines: lines[:1], "no data below its title"),
+        (lambda lines: [line.replace(",", ";") for line in lines], "separated by semicolons"),
+        (lambda lines: [line.replace(",", "\t") for line in lines], "separated by tabs"),
+        (lambda lines: [*lines[:40], "hello,world", *lines[40:]], "line 41 is not 7 numbers: 'hello,world'"),
+        (lambda lines: [line.rsplit(",", 3)[0] for line in lines], "line 2 is not 7 numbers"),
+    ],
+)  # fmt: skip
+def test_the_line_that_is_wrong_is_named(tmp_path, write_asl, change, message, recwarn):
+    folder = _rewritten(write_asl(tmp_path / "a"), change)
+    with pytest.raises(RecordingError, match=message):
+        open_recording(folder)
+    assert not recwarn.list
+
+
+def test_a_table_that_is_no_plain_text_is_named_as_that(tmp_path, write_asl):
+    folder = write_asl(tmp_path / "a")
+    path = folder / "mav0/imu0/data.csv"
+    path.write_text(path.read_text(), encoding="utf-16")
+    with pytest.raises(RecordingError, match="not plain text"):
+        open_recording(folder)
+
+
+def test_stamps_that_have_lost_their_digits_are_refused(tmp_path, write_asl):
+    def rounded(lines):
+        cells = [line.partition(",") for line in lines[1:]]
+        return [lines[0], *(f"{float(stamp):.6e},{rest}" for stamp, _, rest in cells)]
+
+    with pytest.raises(RecordingError, match=r"written like 1\.6\d+e\+18: digits are lost"):
+        open_recording(_rewritten(write_asl(tmp_path / "a"), rounded))
+
+
+def test_ids_may_be_written_as_fractions(tmp_path, write_asl):
+    def as_floats(lines):
+        cells = [line.split(",") for line in lines[1:]]
+        return [lines[0], *(f"{t},{float(i)},{u},{v}" for t, i, u, v in cells)]
+
+    table = "mav0/cam0/corners.csv"
+    before = list(open_recording(write_asl(tmp_path / "a")).points_frames("cam0"))
+    folder = _rewritten(write_asl(tmp_path / "b"), as_floats, table)
+    after = list(open_recording(folder).points_frames("cam0"))
+    assert [f.ids.tolist() for f in after] == [f.ids.tolist() for f in before]
+    _rewritten(folder, lambda lines: [*lines[:-1], lines[-1].replace(".0,", ".5,", 1)], table)
+    with pytest.raises(RecordingError, match="a fraction where integers are needed"):
+        open_recording(folder)
+
+
+def test_swapped_columns_without_a_title_are_recognised(tmp_path, write_asl, a_motion):
+    t_ns, gyro, force = a_motion()
+    folder = write_asl(tmp_path / "a", imu=(t_ns, force, gyro))
+    with pytest.raises(RecordingError, match="columns seem to be swapped"):
+        open_recording(folder)
+
+
+def test_gravity_removed_is_not_taken_for_g(tmp_path, write_asl, a_motion):
+    t_ns, gyro, force = a_motion()
+    rng = np.random.default_rng(11)
+    folder = write_asl(tmp_path / "a", imu=(t_ns, gyro, rng.normal(0.0, 0.8, force.shape)))
+    with pytest.raises(RecordingError, match="gravity seems to be removed"):
+        open_recording(folder)
+
+
+def test_an_axis_that_is_not_read_is_named(tmp_path, write_asl, a_motion):
+    t_ns, gyro, force = a_motion()
+    recording = open_recording(write_asl(tmp_path / "a", imu=(t_ns, gyro * [1.0, 1.0, 0.0], force)))
+    assert any("not even noise changes gyro z (always 0)" in warning for warning in recording.warnings)
+    with pytest.raises(RecordingError, match=r"the accelerometer never changes.*unite_imu_method"):
+        open_recording(write_asl(tmp_path / "b", imu=(t_ns, gyro, 0.0 * force)))
+
+
+def test_messages_in_another_encoding_are_named(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema("foo.Imu", "jsonschema", b"{}")
+        channel = writer.register_channel("/imu", "json", schema)
+        writer.add_message(channel, 10**18, b"{}", 10**18)
+        writer.finish()
+    with pytest.raises(RecordingError, match=r"found /imu \(foo\.Imu in json, not CDR\)"):
+        open_recording(path)
+
+
+def test_an_empty_name_is_not_the_present_folder(write_asl, tmp_path, monkeypatch):
+    monkeypatch.chdir(write_asl(tmp_path / "a"))
+    with pytest.raises(RecordingError, match="the name of the recording is empty"):
+        open_recording("")

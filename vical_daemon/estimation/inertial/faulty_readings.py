@@ -28,6 +28,8 @@ _OFTEN = 4.0
 """Times as often as a value close to it must the extreme occur: without clipping it is the rarest of them."""
 _NEAR = 0.9
 """Of the extreme: where values are close to it."""
+_SAME_RANGE = 0.99
+"""Of the largest channel: as large are the others where all three are at the range of their sensor."""
 _VALUES = 64
 """Different values close to the extreme that are counted."""
 _SPIKE = 10.0
@@ -47,8 +49,10 @@ class RangeLimits(Generic[T]):
     The six channels are followed upwards and downwards. A value that comes back again and again as the
     extreme of one of them is the end of the range, for all three channels of that sensor. So is one at which
     a channel stops in full motion: it comes there over many of its steps at once, and stays. Readings that
-    repeat such a value are held until it is decided. A stream whose first readings repeat one channel, while
-    the others of that sensor change, begins at the end. A larger value later shows that it was not the end.
+    repeat such a value are held until it is decided. Where a driver reads a sensor more often than it
+    measures, its three channels repeat at once, which shows nothing about the range. A stream whose first
+    readings repeat one channel, while the others of that sensor change, begins at the end. A larger value
+    later shows that it was not the end.
 
     Attributes:
         found: How often an end was found.
@@ -75,11 +79,14 @@ class RangeLimits(Generic[T]):
         """
         a, b, c, d, e, f = six
         both = (a, b, c, d, e, f, -a, -b, -c, -d, -e, -f)
+        fresh = _measured_anew(six[:3], self._previous[:3]), _measured_anew(six[3:], self._previous[3:])
         for i, (value, before) in enumerate(zip(six, self._previous, strict=True)):
             if 0.0 < abs(value - before) < self._step[i // 3]:
                 self._step[i // 3] = abs(value - before)
         waiting = 0  # readings, the newest ones
         for i, (value, near) in enumerate(zip(both, self._near, strict=True)):
+            if not fresh[i % 6 // 3]:
+                continue
             if value > near:
                 self._follow(i, value, abs(six[i % 6] - self._previous[i % 6]))
                 self._near[i] = _NEAR * self._extreme[i]
@@ -151,6 +158,14 @@ class RangeLimits(Generic[T]):
         values = self._values[i]
         usual = sum(values.values()) / max(len(values), 1)
         return self._at[i] >= _AT_RANGE and len(values) >= _AT_RANGE and self._at[i] > _OFTEN * usual
+
+
+def _measured_anew(three: Six, previous: Six) -> bool:
+    """Whether a reading is new: a channel of the sensor changes, or all three are at its range."""
+    if three != previous:
+        return True
+    sizes = [abs(x) for x in three]
+    return min(sizes) > _SAME_RANGE * max(sizes)
 
 
 class SpikeFilter(Generic[T]):

@@ -10,6 +10,7 @@ import numpy as np
 
 from vical_daemon.estimation.filter.linearised_filter import LinearisedFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.white_noise import measured_noise
 from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.attempts import Attempts
 from vical_daemon.estimation.init.initial_filter import initial_filter
@@ -135,8 +136,10 @@ class Initializer:
         look = self._newest_s >= self._next_look_s
         if look:
             self._next_look_s = self._newest_s + _LOOK_S
+        noise = measured_noise(self._options.imu_noise, buffer.rows)
+        options = replace(self._options, imu_noise=noise)
         data = start.StartData(
-            buffer, self._frames, priors, self._options, self._layout, self._target, may_resize, look
+            buffer, self._frames, priors, options, self._layout, self._target, may_resize, look
         )
         result = start.attempt(data, may_be_partial=may_be_partial)
         if result.rolling is not None:
@@ -148,7 +151,7 @@ class Initializer:
         make = partial(
             initial_filter,
             layout=self._layout,
-            options=self._options,
+            options=options,
             still_axes=result.still_axes,
             turn_axis_cam=result.turn_axis_cam,
         )

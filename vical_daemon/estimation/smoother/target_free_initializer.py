@@ -13,6 +13,7 @@ from vical_daemon.estimation.filter.image_intake import SEARCHED_S
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import PLUMB_BOB, RADTAN
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.white_noise import at_least_measured
 from vical_daemon.estimation.init.attempts import LONG_S, Attempts
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.closed_form import PARTIAL_S
@@ -167,7 +168,7 @@ class TargetFreeInitializer:
         frames = [x for x in frames if buffer.oldest_s < x[0] + camera.timeshift_s < buffer.newest_s - 5e-3]
         if len(frames) < 20:
             return "inertial data do not cover the images: are both stamped by the same clock?"
-        noise, gravity = self.options.imu_noise, self.options.gravity_mps2
+        noise, gravity = at_least_measured(self.options.imu_noise, buffer.rows), self.options.gravity_mps2
         held = self.held if found.about is None else found.about
         arm = ArmPrior(camera.p_imu_cam, found.arm_sigma_m, held)
         try:

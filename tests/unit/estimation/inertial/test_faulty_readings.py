@@ -51,6 +51,15 @@ def test_readings_within_the_range_are_not(step) -> None:
     assert at_range(motion(step=step)).mean() < 1e-3
 
 
+@pytest.mark.parametrize("sensor", [slice(0, 3), slice(3, 6)])
+def test_a_sensor_that_is_read_more_often_than_it_measures_is_not_at_its_range(sensor) -> None:
+    six = motion()
+    six[:, sensor] = six[np.arange(len(six)) // 5 * 5, sensor]
+    assert not at_range(six).any()
+    six[:, sensor] = np.clip(six[:, sensor], -9.5, 9.5)  # of the accelerometer only
+    assert at_range(six).any() == (sensor.start == 3)
+
+
 @pytest.mark.parametrize("step", [0.0, 1e-3, 1e-2, 0.1])
 def test_a_coarse_sensor_at_rest_is_not_at_its_range(step) -> None:
     six = np.random.default_rng(2).normal(GRAVITY, 5e-3, (6000, 6))
@@ -181,7 +190,7 @@ def test_readings_that_wait_are_dropped_when_another_recording_follows() -> None
     limits: RangeLimits[int] = RangeLimits()
     rates = [0.0, 0.001, *(0.1 * k for k in range(1, 12)), 1.1]  # at last twice the same: it may be the end
     for k, rate in enumerate(rates):
-        decided = limits.sift((rate, 0.0, 0.0, 0.0, 0.0, 9.8), k)
+        decided = limits.sift((rate, 1e-3 * k, 0.0, 0.0, 0.0, 9.8), k)
     assert decided == []
     limits.restart()
     assert [k for _, k, _ in limits.sift((0.0, 0.0, 0.0, 0.0, 0.0, 9.8), 99)] == [99]

@@ -31,9 +31,18 @@ def events_with(density_factor):
 
 
 @pytest.mark.parametrize(("factor", "said"), [(0.2, "worse"), (1.0, ""), (6.0, "better")])
-def test_wrong_noise_densities_are_told_once(factor, said):
+def test_wrong_noise_densities_are_told_once(monkeypatch, factor, said):
+    """Where the readings do not show their white noise, as behind a filter or in a vibration."""
+    monkeypatch.setattr("vical_daemon.estimation.init.initializer.measured_noise", lambda stated, _: stated)
     events, estimate = events_with(factor)
     assert estimate.nis_per_dof > 0.5
     announced = [event_text(e) for e in events if e.kind is EventKind.IMU_NOISE]
     assert len(announced) == (1 if said else 0)
     assert all(said in e and "vical allan" in e for e in announced)
+
+
+@pytest.mark.parametrize("factor", [0.2, 6.0])
+def test_densities_that_the_readings_show_need_not_be_told(factor):
+    events, estimate = events_with(factor)
+    assert not [e for e in events if e.kind in (EventKind.IMU_NOISE, EventKind.IMU_INTRINSICS)]
+    assert estimate.nis_per_dof > 0.5
