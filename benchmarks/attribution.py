@@ -132,7 +132,7 @@ CASES: dict[str, Case] = {
     "clocks 15 ppm apart": _is(Kind.CLOCK_DRIFT, rig=partial(_apart, 15.0, 0.0)),
     "clocks 100 ppm apart from 20 s on": _is(*_DRIFT, rig=partial(_apart, 100.0, AT_S), sudden=True),
     "clocks 15 ppm apart from 20 s on": _is(*_DRIFT, rig=partial(_apart, 15.0, AT_S), sudden=True),
-    "time shift steps by 2 ms": _is(Kind.TIMESHIFT_STEPPED, rig=_stepped, sudden=True),
+    "time shift steps by 2 ms": _is(Kind.TIMESHIFT_STEPPED, Kind.CLOCK_WANDER, rig=_stepped, sudden=True),
     "imu gap of 0.5 s": _is(Kind.IMU_GAP, after=partial(gaps.cut, "imu", 0.5)),
     "bump": _is(Kind.BUMPED, Kind.STARTED_OVER, also=_OF_A_BUMP, rig=_bumped, sudden=True),
 }

@@ -228,7 +228,8 @@ REFERENCE: dict[EventKind, About] = {
         "Once per camera, at a probability above 99 %.",
     ),
     EventKind.CLOCK_WANDER: About(
-        "The rate between the clocks of camera and IMU changes. Value: present drift.",
+        "The time shift is not constant: it stepped by a few milliseconds at most, or the rate between "
+        "the clocks of camera and IMU changed. Which of both is not known. Value: present drift.",
         "s/s",
         "Once per camera, when the drift leaves where earlier estimates put it, by 6 sigma.",
     ),

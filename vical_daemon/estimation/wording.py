@@ -343,7 +343,10 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     ),
     EventKind.CLOCK_WANDER: (
         "",
-        _drift("the time shift moves: the clocks of camera and imu run at changing rates"),
+        lambda e: (
+            "the time shift is not constant: it stepped, or the clocks of camera and imu changed their "
+            f"rates, which now differ by {_of(e, 1e6, 'us a second', '+.1f')}; the drift is now estimated too"
+        ),
     ),
     EventKind.STAMP_JITTER: (
         "",
