@@ -37,6 +37,7 @@ _DAMPING = 1e-12
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _SMALL = 0.1  # of the sum of squares: where a step promises no more, outliers stand out
+_MORE = 1.2  # times the jitter that is allowed for: so much does not end a window
 _STUCK = 0.02  # of the sum of squares: where a step brought no more, outliers may be why
 
 
@@ -107,7 +108,7 @@ class Bundle:
         if len(seen.begin) < 8:
             return None
         lam, steps, gain = _DAMPING, 0, np.inf
-        cleaned = settled = False
+        cleaned = False
         links = w.stacked()
         normal = self.problem.normal(seen, links)
         while steps < most:
@@ -120,9 +121,10 @@ class Bundle:
                 continue
             if cleaned and step.predicted_reduction < _DONE:
                 self._apply(step)
-                settled = not self._suspects_jitter(seen, links)
-                if settled:
-                    break
+                if not self._suspects_jitter(seen, links):
+                    fit = self._result(seen, links, normal, steps, settled=True)
+                    if fit is None or 2 * steps > most or not self._jitters_more(fit):
+                        return fit
                 w.bad.clear()  # late images had looked like outliers
                 seen, cleaned, gain = w.observe(), False, np.inf
             elif not cleaned and (
@@ -155,7 +157,7 @@ class Bundle:
                     return None
                 links = w.stacked()
             normal = self.problem.normal(seen, links)
-        return self._result(seen, links, normal, steps, settled)
+        return self._result(seen, links, normal, steps, settled=False)
 
     def _save(self) -> _Saved:
         w = self.window
@@ -249,6 +251,14 @@ class Bundle:
         problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(seen, links))
         return problem.noise.jitter_s > 0.0
 
+    def _jitters_more(self, fit: Fit) -> bool:
+        """Whether stamps jitter by much more than was allowed for; from then on they may (EM, one step)."""
+        allowed_s, shown_s = self.problem.noise.jitter_s, fit.noise.jitter_s
+        more = shown_s > _MORE * allowed_s > 0.0
+        if more:
+            self.problem.noise = self.problem.noise._replace(jitter_s=shown_s)
+        return more
+
     def _learn_noise(self, seen: Seen) -> None:
         """Pixel noise such that the kept errors have the size that they should have."""
         e, ok, _ = self.problem.pixel_errors(seen)
@@ -278,7 +288,7 @@ class Bundle:
         return int(out.sum())
 
     def _result(
-        self, seen: Seen, links: PreintegratedLinks, normal: Normal, steps: int, settled: bool
+        self, seen: Seen, links: PreintegratedLinks, normal: Normal, steps: int, *, settled: bool
     ) -> Fit | None:
         w, order = self.window, self.problem.order()
         try:
