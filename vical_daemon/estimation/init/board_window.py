@@ -42,7 +42,7 @@ from vical_daemon.estimation.model.retract import difference, orthonormal, retra
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
 from vical_daemon.estimation.noise.shared_errors import shared_ways
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, geman_mcclure_weight
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
@@ -292,7 +292,7 @@ class BoardWindow:
             t_s, R, p, v = node.at
             turned, camera = orthonormal(R @ so3.exp_one(d[:3])), node.frames[0][1].camera
             arm, now = before[camera].p_imu_cam, self.state.cameras[camera].p_imu_cam
-            # the camera goes where the step has it; arm and turn multiplied would move it
+            # The camera goes where the linear step has it: the product of both changes would displace it.
             seen = p + d[3:6] + R @ (now + np.cross(d[:3], arm))
             node.at = Instant(t_s, turned, seen - turned @ now, v + d[6:])
         self._find_rates()
@@ -398,7 +398,7 @@ class BoardWindow:
         left = view.residual
         for _ in range(2 if view.alike.size else 1):
             far = (left**2).sum(axis=1) / sigma**2
-            weight = np.where(view.seen, 1.0 / (1.0 + far / OUTLIER_SIGMAS**2), 0.0) / sigma
+            weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / OUTLIER_SIGMAS**2)), 0.0) / sigma
             twice = np.repeat(weight, 2)
             A, r = view.alike * twice[:, None], view.residual.ravel() * twice
             shared = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ r)
