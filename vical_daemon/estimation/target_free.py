@@ -365,8 +365,8 @@ class TargetFreeCalibrator:
         self._learn_lens(window, bundle, fit)
         if self.window_closed is not None:
             self.window_closed(window, fit)
-        if bundle.seen is not None:
-            self._reports += window_reports(bundle.problem, bundle.seen)
+        if bundle.view is not None:
+            self._reports += window_reports(bundle.problem, bundle.view)
         self.carry = opened(self._walked(self.evaluator.window_done(fit.carry), window.span_s))
         self.window = next_window(window, self.carry)
 

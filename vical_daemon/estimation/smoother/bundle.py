@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from vical_daemon.estimation.geometry import so3
@@ -26,7 +27,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
     calibration_difference,
     carried_out,
 )
-from vical_daemon.estimation.smoother.normal import ImageNoise, Normal, Problem
+from vical_daemon.estimation.smoother.normal import ImageNoise, Normal, Problem, View
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
@@ -79,6 +80,7 @@ class _Step(NamedTuple):
     states: FloatArray
     landmarks: FloatArray  # (L, 3)
     predicted_reduction: float  # by how much the sum of squares should fall
+    root: FloatArray | None  # see `_root`; None where the step was damped or bounded
 
 
 _Saved = tuple[
@@ -98,7 +100,7 @@ class Bundle:
     def __init__(self, window: Window, carry: MarginalPrior, noise: ImageNoise) -> None:
         self.window, self.carry = window, carry
         self.problem = Problem(window, carry, noise)
-        self.seen: Seen | None = None
+        self.view: View | None = None
 
     # ------------------------------------------------------------------ the loop
     def solve(self, buffer: ImuBuffer, most: int) -> Fit | None:
@@ -110,7 +112,8 @@ class Bundle:
         lam, steps, gain = _DAMPING, 0, np.inf
         cleaned = False
         links = w.stacked()
-        normal = self.problem.normal(seen, links)
+        view = self.problem.view(seen)
+        normal = self.problem.normal(view, links)
         while steps < most:
             steps += 1
             step = self._step(normal, lam)
@@ -120,28 +123,30 @@ class Bundle:
                 lam = max(0.01 * lam, _DAMPING)  # damped, a step promises little
                 continue
             if cleaned and step.predicted_reduction < _DONE:
-                self._apply(step)
-                if not self._suspects_jitter(seen, links):
-                    fit = self._result(seen, links, normal, steps, settled=True)
+                view = self._applied(step, seen)
+                if not self._suspects_jitter(view, links):
+                    fit = self._result(view, links, normal, step.root, steps, settled=True)
                     if fit is None or 2 * steps > most or not self._jitters_more(fit):
                         return fit
                 w.bad.clear()  # late images had looked like outliers
                 seen, cleaned, gain = w.observe(), False, np.inf
+                view = self.problem.view(seen)
             elif not cleaned and (
                 step.predicted_reduction < _SMALL * normal.cost or gain < _STUCK * normal.cost
             ):
                 # close enough to tell what does not belong; or stuck, because of it
-                self._apply(step)
+                view = self._applied(step, seen)
                 cleaned = True
-                self._learn_noise(seen)
-                if self._refuse(seen):
+                self._learn_noise(view)
+                if self._refuse(view):
                     seen = w.observe()
                     if len(seen.begin) < 8:
                         return None
+                    view = self.problem.view(seen)
             else:
                 saved = self._save()
-                self._apply(step)
-                trial = self.problem.normal(seen, links)
+                there = self._applied(step, seen)
+                trial = self.problem.normal(there, links)
                 if not np.isfinite(trial.cost) or trial.cost > normal.cost:
                     self._restore(saved)
                     lam *= 100.0
@@ -149,15 +154,15 @@ class Bundle:
                         break
                     continue
                 gain = normal.cost - trial.cost
-                normal, lam = trial, max(0.01 * lam, _DAMPING)
+                view, normal, lam = there, trial, max(0.01 * lam, _DAMPING)
                 if not w.stale():
                     continue
             if w.stale():
                 if not w.relink(buffer):
                     return None
-                links = w.stacked()
-            normal = self.problem.normal(seen, links)
-        return self._result(seen, links, normal, steps, settled=False)
+                links, view = w.stacked(), self.problem.view(seen)
+            normal = self.problem.normal(view, links)
+        return self._result(view, links, normal, None, steps, settled=False)
 
     def _save(self) -> _Saved:
         w = self.window
@@ -169,7 +174,7 @@ class Bundle:
 
     # ------------------------------------------------------------------ step
     def _reduced(self, normal: Normal, lam: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Normal matrix without landmarks, gradient, and what brings the landmarks back."""
+        """Normal matrix without landmarks (its upper triangle), gradient, what brings the landmarks back."""
         order = self.problem.order()
         F = len(self.window.frames)
         tiny = 1e-10 * np.trace(normal.V, axis1=1, axis2=2)
@@ -179,14 +184,14 @@ class Bundle:
         L = len(V)
         Y = np.matmul(inverse, normal.W).reshape(3 * L, -1)
         u = np.matmul(inverse, normal.gl[..., None]).reshape(-1)
-        S = Y.T @ Y
+        S = dsyrk(1.0, Y.T, lower=1).T  # Y'Y, its upper triangle
         s = Y.T @ u
         H, g = normal.H.copy(), normal.g.copy()
         at = np.concatenate([order.frames[:, :6].reshape(6 * F), order.camera])
         n, m = 9 * (F - 1), 6 * (F - 1)  # by a view where unknowns lie evenly: a fifth of the time
         H[:n, :n].reshape(F - 1, 9, F - 1, 9)[:, :6, :, :6] -= S[:m, :m].reshape(F - 1, 6, F - 1, 6)
-        H[np.ix_(at[m:], at)] -= S[m:]
-        H[np.ix_(at[:m], at[m:])] -= S[:m, m:]
+        S[m:, m:] += np.triu(S[m:, m:], 1).T  # the window's own lens comes before the last image in H
+        H[np.ix_(at, at[m:])] -= S[:, m:]
         g[at] -= s
         return H, g, inverse, at
 
@@ -203,9 +208,17 @@ class Bundle:
         V[held, 2, :2] = V[held, :2, 2] = gl[held, 2] = W[held, 2] = 0.0
         return normal._replace(V=V, W=W, gl=gl)
 
+    def _root(self, normal: Normal) -> FloatArray | None:
+        """Cholesky factor of the states' matrix without landmarks, see `_in_place`; None: not positive."""
+        try:
+            root, info = _in_place(self._reduced(normal, 0.0)[0])
+        except np.linalg.LinAlgError:
+            return None
+        return None if info else root
+
     def _step(self, normal: Normal, lam: float) -> _Step | None:
         """Step of states and landmarks; None where the matrix is not positive."""
-        normal = self._bounded(normal)
+        whole, normal = normal, self._bounded(normal)
         for _ in range(6):
             try:
                 H, g, inverse, at = self._reduced(normal, lam)
@@ -219,11 +232,13 @@ class Bundle:
                 right = normal.gl + np.matmul(normal.W, dx[at])
                 own = np.matmul(inverse, normal.gl[..., None])
                 dl = -np.matmul(np.swapaxes(inverse, 1, 2), np.matmul(inverse, right[..., None]))[..., 0]
-                return _Step(dx, dl, float((own**2).sum() - g @ dx))
+                exact = normal is whole and lam <= _DAMPING
+                return _Step(dx, dl, float((own**2).sum() - g @ dx), root if exact else None)
             lam = max(10.0 * lam, 1e-6)
         return None
 
-    def _apply(self, step: _Step) -> None:
+    def _applied(self, step: _Step, seen: Seen) -> View:
+        """Take a step; what the window then says of the observations."""
         dx, dl = step.states, step.landmarks
         w, order = self.window, self.problem.order()
         d = dx[order.frames]
@@ -241,14 +256,15 @@ class Bundle:
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
         inverse = np.clip(m.inverse + dl[:, 2], 0.2 * m.inverse, 5.0 * m.inverse + 0.01)
         w.landmarks = Landmarks(m.ids, m.anchor, bearing, inverse)
+        return self.problem.view(seen)
 
     # ------------------------------------------------------------------ noise, outliers, result
-    def _suspects_jitter(self, seen: Seen, links: PreintegratedLinks) -> bool:
+    def _suspects_jitter(self, view: View, links: PreintegratedLinks) -> bool:
         """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
         problem = self.problem
         if problem.noise.jitter_s:
             return False
-        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(seen, links))
+        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(view, links))
         return problem.noise.jitter_s > 0.0
 
     def _jitters_more(self, fit: Fit) -> bool:
@@ -259,9 +275,9 @@ class Bundle:
             self.problem.noise = self.problem.noise._replace(jitter_s=shown_s)
         return more
 
-    def _learn_noise(self, seen: Seen) -> None:
+    def _learn_noise(self, view: View) -> None:
         """Pixel noise such that the kept errors have the size that they should have."""
-        e, ok, _ = self.problem.pixel_errors(seen)
+        seen, ok, e = view.seen, view.valid, self.problem.pixel_errors(view)[0]
         size = np.sqrt((e[ok] ** 2).sum(axis=1))
         if not len(size):
             return
@@ -269,16 +285,16 @@ class Bundle:
         share = np.sqrt(max(self._dof(seen) / max(2 * int(ok.sum()), 1), 0.05))
         noise = self.problem.noise
         sigma_px = float(np.clip(noise.sigma_px * np.median(size) / MEDIAN_RAYLEIGH / share, 0.02, 20.0))
-        spread = float(np.sqrt(correlation(np.where(ok[:, None], e, 0.0), seen)))
+        spread = float(np.sqrt(correlation(e, seen)))
         self.problem.noise = noise._replace(sigma_px=sigma_px, spread=spread)
 
     def _dof(self, seen: Seen) -> int:
         return 2 * len(seen.frame) - 3 * len(seen.begin) - 2 * len(self.window.frames)
 
-    def _refuse(self, seen: Seen) -> int:
+    def _refuse(self, view: View) -> int:
         """Take observations out that do not fit, and whole landmarks of which a third does not."""
-        e, ok, _ = self.problem.pixel_errors(seen)
-        out = ~ok | ((e**2).sum(axis=1) > _OUT**2)
+        seen, e = view.seen, self.problem.pixel_errors(view)[0]
+        out = ~view.valid | ((e**2).sum(axis=1) > _OUT**2)
         count = np.add.reduceat(np.ones(len(out)), seen.begin)
         share = np.add.reduceat(out.astype(float), seen.begin) / count
         out |= (share > 0.34)[seen.landmark]
@@ -288,15 +304,19 @@ class Bundle:
         return int(out.sum())
 
     def _result(
-        self, seen: Seen, links: PreintegratedLinks, normal: Normal, steps: int, *, settled: bool
+        self,
+        view: View,
+        links: PreintegratedLinks,
+        normal: Normal,
+        root: FloatArray | None,
+        steps: int,
+        *,
+        settled: bool,
     ) -> Fit | None:
-        w, order = self.window, self.problem.order()
-        try:
-            H = self._reduced(normal, 0.0)[0]
-        except np.linalg.LinAlgError:
-            return None
-        root, info = _in_place(H)
-        if info:
+        """How the window came out, by its last normal equations and their root, if that is known."""
+        w, order, seen = self.window, self.problem.order(), view.seen
+        root = self._root(normal) if root is None else root
+        if root is None:
             return None
         own = len(order.own)
         L22 = np.tril(root[order.tail - own :, order.tail - own :])
@@ -304,8 +324,8 @@ class Bundle:
             covariance = np.asarray(np.linalg.inv(L22 @ L22.T), dtype=np.float64)
         except np.linalg.LinAlgError:
             return None
-        e, ok, _ = self.problem.pixel_errors(seen)
-        self.seen = seen
+        e, ok = self.problem.pixel_errors(view)[0], view.valid
+        self.view = view
         inertial, jitter_s = links_left(w, links, self.problem.noise.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
@@ -328,9 +348,10 @@ class Bundle:
 
 
 def _in_place(H: FloatArray) -> tuple[FloatArray, int]:
-    """Lower Cholesky factor of a symmetric matrix in its place, with rubbish above it; and LAPACK's info.
+    """Lower Cholesky factor of a symmetric matrix (upper triangle) in its place, and LAPACK's info.
 
-    Seen as its transpose it is in LAPACK's order: neither copying nor zeroing it saves a third of the time.
+    Above it is rubbish. Seen as its transpose it is in LAPACK's order: neither copying nor zeroing it saves a
+    third of the time.
     """
     root, info = dpotrf(H.T, lower=1, overwrite_a=1, clean=0)
     return root, int(info)

@@ -7,6 +7,7 @@ can arise from nothing. [docs/math/target_free.md, "From window to window"]
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,7 +25,7 @@ CORE = 11
 """Of the `Layout` of a window's errors. The time shift is that at the first image."""
 
 
-@dataclass(slots=True)
+@dataclass
 class MarginalPrior:
     """What is known at the first image of a window before its own data.
 
@@ -55,9 +56,9 @@ class MarginalPrior:
     jumps: FloatArray = field(default_factory=lambda: np.zeros(0))
     jump_t_s: tuple[float, ...] = ()
 
-    @property
+    @cached_property
     def S(self) -> FloatArray:
-        """Square root of the covariance, shape (d, d)."""
+        """Square root of the covariance, shape (d, d); `root` never changes."""
         return np.asarray(np.linalg.inv(self.root), dtype=np.float64)
 
     def covariance(self) -> FloatArray:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.geometry import so3
-from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
+from vical_daemon.estimation.geometry.camera_model import project_jacobians
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.measurements import COLUMNS, BoolArray, FloatArray
 from vical_daemon.estimation.model.camera_rays import patches_seen, read_share
@@ -28,6 +28,7 @@ from vical_daemon.estimation.smoother.marginal_prior import (
 from vical_daemon.estimation.smoother.window import IntArray, Seen, Window
 
 HUBER = 2.5  # sigmas (of the two axes together)
+_CONSTANTS = 9  # the first column of them, see `_derivatives`
 _GAUGE = 1e10
 _INVERSE_SIGMA = 5.0  # 1/m: next to nothing is known about the depth of a new landmark
 
@@ -50,6 +51,31 @@ class Normal(NamedTuple):
     W: FloatArray
     gl: FloatArray
     cost: float
+
+
+class View(NamedTuple):
+    """The landmarks as the camera sees them by the present values, at their N observations.
+
+    Attributes:
+        seen: The observations.
+        uv: Where they should be, px, shape (N, 2); where measured, if behind the camera.
+        valid: Those in front of the camera, shape (N,).
+        y, x_imu: In the frames of camera and imu, times rho, shape (N, 3).
+        R: R_world_imu at their exposure, shape (N, 3, 3).
+        rates: Angular rate there, rad/s, shape (N, 3).
+        by_point: Derivatives of uv by y, shape (N, 2, 3); 0 behind the camera.
+        by_lens: By fx fy cx cy and the distortion, shape (N, 2, 4 + d); 0 behind the camera.
+    """
+
+    seen: Seen
+    uv: FloatArray
+    valid: BoolArray
+    y: FloatArray
+    x_imu: FloatArray
+    R: FloatArray
+    rates: FloatArray
+    by_point: FloatArray
+    by_lens: FloatArray
 
 
 class ImageNoise(NamedTuple):
@@ -93,8 +119,18 @@ class Problem:
         return Order(len(w.frames), len(w.bias), layout.size - layout.core, of_imu, self.own, len(w.jumps))
 
     # ------------------------------------------------------------------ pixels
+    def view(self, seen: Seen) -> View:
+        """What the present values say of the observations."""
+        y, x_imu, R, rates = self._rays(seen)
+        with np.errstate(all="ignore"):
+            uv, by_point, by_lens = project_jacobians(y, *self.window.lens)
+        valid: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
+        if not valid.all():
+            uv[~valid], by_point[~valid], by_lens[~valid] = seen.uv[~valid], 0.0, 0.0
+        return View(seen, uv, valid, y, x_imu, R, rates, by_point, by_lens)
+
     def _rays(self, seen: Seen) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Landmarks in the camera frame at their observations, scaled by rho; and parts for derivatives."""
+        """See `View`: y, x_imu, R and rates."""
         w, cam = self.window, self.window.camera
         rates = w.rates()
         late = cam.timeshift_s - w.shift_s + cam.skew * self._since()
@@ -121,104 +157,95 @@ class Problem:
         stamps = np.array([t for t, _ in self.window.frames])
         return np.asarray(stamps - stamps[0])
 
-    def pixel_errors(self, seen: Seen) -> tuple[FloatArray, BoolArray, FloatArray]:
-        """Whitened errors (N, 2), which are valid, and Huber weights."""
-        y = self._rays(seen)[0]
-        with np.errstate(all="ignore"):
-            uv = project(y, *self.window.lens)
-        return self._weigh(seen, uv)
-
-    def _weigh(self, seen: Seen, uv: FloatArray) -> tuple[FloatArray, BoolArray, FloatArray]:
-        ok: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
-        e = np.where(ok[:, None], (np.where(ok[:, None], uv, 0.0) - seen.uv) / self.noise.sigma_px, 0.0)
+    def pixel_errors(self, view: View) -> tuple[FloatArray, FloatArray]:
+        """Whitened errors, shape (N, 2), 0 behind the camera; and Huber weights."""
+        e = (view.uv - view.seen.uv) / self.noise.sigma_px
         size = np.sqrt((e**2).sum(axis=1))
-        weight = np.where(ok, huber_weight(size, HUBER), 0.0)
-        return e, ok, weight
+        return e, np.where(view.valid, huber_weight(size, HUBER), 0.0)
 
-    def normal(self, seen: Seen, links: PreintegratedLinks) -> Normal:
+    def normal(self, view: View, links: PreintegratedLinks) -> Normal:
         """Normal equations with landmarks kept apart."""
-        w, cam = self.window, self.window.camera
-        y, x_imu, R, rates = self._rays(seen)
-        with np.errstate(all="ignore"):
-            uv, Jy, Jlens = project_jacobians(y, *w.lens)
-        e, ok, weight = self._weigh(seen, uv)
-        root = np.sqrt(weight) / (self.noise.sigma_px * self.noise.spread)
-        Jy = np.where(ok[:, None, None], Jy, 0.0) * root[:, None, None]
-        Jlens = np.where(ok[:, None, None], Jlens, 0.0) * root[:, None, None]
-        e = e * np.sqrt(weight)[:, None]
-        cost = self._robust_cost(e, weight) / self.noise.spread**2
-        e = e / self.noise.spread
+        e, weight = self.pixel_errors(view)
+        e *= np.sqrt(weight)[:, None]
+        spread = self.noise.spread
+        cost = self._robust_cost(e, weight) / spread**2
+        J = self._derivatives(view, np.sqrt(weight) / (self.noise.sigma_px * spread))
+        J[:, :, -1] = e / spread
+        return self._assemble(view.seen, links, J, cost)
+
+    def _derivatives(self, view: View, whitening: FloatArray) -> FloatArray:
+        """How pixels move, times a factor each (N,), and a last column for errors, (N, 2, 9 + c + 1).
+
+        The columns are the landmark (3), turn and place of the image (6), the c constants that move pixels.
+        """
+        w, cam, seen = self.window, self.window.camera, view.seen
+        layout, where = self.carry.layout, self.carry.layout.camera
         marks = w.landmarks
         rho = marks.inverse[seen.landmark][:, None, None]
-        Rt = np.ascontiguousarray(np.swapaxes(R, 1, 2))  # three times as fast below
+        J = np.empty((len(view.uv), 2, _CONSTANTS + layout.size - layout.dynamic + 1))
+        Jy = view.by_point * whitening[:, None, None]
         JR = (Jy.reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)  # by the point in the imu frame
-        JW = JR @ Rt  # by the point in the world
-        by_shift = self._by_shift(seen, JR, R, x_imu, rates)
-        Jf = np.concatenate([so3.cross(JR, x_imu[:, None]), -rho * JW], axis=2)
-        Jc = self._by_camera(seen, -rho * JR, so3.cross(Jy, y[:, None]), by_shift, Jlens)
-        basis = tangents(marks.bearing)[seen.landmark]
+        # by the point in the world; copied, as the product of views takes three times as long
+        JW = JR @ np.ascontiguousarray(np.swapaxes(view.R, 1, 2))
         away = marks.anchor[seen.landmark] - w.p[seen.frame]
-        by_rho = np.einsum("nij,nj->ni", JW, away) - JR @ cam.p_imu_cam
-        Jl = np.concatenate([JW @ basis, by_rho[..., None]], axis=2)
-        return self._assemble(seen, links, e, Jf, Jc, Jl, cost)
-
-    def _by_camera(
-        self, seen: Seen, by_arm: FloatArray, by_turn: FloatArray, by_shift: FloatArray, by_lens: FloatArray
-    ) -> FloatArray:
-        """How pixels move with those constants that move them, and with the window's own lens, (N, 2, c)."""
-        layout, where = self.carry.layout, self.carry.layout.camera
-        J = np.empty((len(by_shift), 2, layout.size + self.own))
+        J[:, :, :2] = JW @ tangents(marks.bearing)[seen.landmark]
+        J[:, :, 2] = np.matmul(JW, away[:, :, None])[..., 0] - JR @ cam.p_imu_cam
+        J[:, :, 3:6] = so3.cross(JR, view.x_imu[:, None])
+        J[:, :, 6:9] = -rho * JW
+        by_shift = self._by_shift(view, JR)
+        first = _CONSTANTS - layout.dynamic
         if where.position is not None and where.rotation is not None:
-            J[:, :, where.position], J[:, :, where.rotation] = by_arm, by_turn
+            J[:, :, _later(where.position, first)] = -rho * JR
+            J[:, :, _later(where.rotation, first)] = so3.cross(Jy, view.y[:, None])
         if where.timeshift is not None and where.skew is not None:
-            J[:, :, where.timeshift] = by_shift
-            J[:, :, where.skew] = by_shift * self._since()[seen.frame, None]
+            J[:, :, first + where.timeshift] = by_shift
+            J[:, :, first + where.skew] = by_shift * self._since()[seen.frame, None]
         if where.intrinsics is not None and where.distortion is not None:
-            J[:, :, where.intrinsics.start : where.distortion.stop] = by_lens
+            lens = slice(where.intrinsics.start, where.distortion.stop)
+            J[:, :, _later(lens, first)] = view.by_lens * whitening[:, None, None]
         if where.readout is not None:
-            J[:, :, where.readout] = by_shift * seen.row[:, None]
-        J[:, :, layout.size :] = by_lens[:, :, : self.own]
-        return J[:, :, layout.dynamic :]
+            J[:, :, first + where.readout] = by_shift * seen.row[:, None]
+        return J
 
-    def _by_shift(
-        self, seen: Seen, JR: FloatArray, R: FloatArray, x_imu: FloatArray, rates: FloatArray
-    ) -> FloatArray:
-        """How pixels move with the time of the exposure: the imu turns and moves on, shape (N, 2)."""
+    def _by_shift(self, view: View, JR: FloatArray) -> FloatArray:
+        """How pixels move with the time of the exposure: the imu turns and moves on, shape (N, 2).
+
+        Args:
+            view: Present values.
+            JR: Derivatives of the pixels by the point in the imu frame, shape (N, 2, 3).
+        """
+        seen = view.seen
         rho = self.window.landmarks.inverse[seen.landmark]
-        forward = np.einsum("nj,nji->ni", self.window.v[seen.frame], R)  # speed in the imu frame
-        moved = so3.cross(x_imu, rates) - rho[:, None] * forward
-        return np.asarray(np.einsum("nij,nj->ni", JR, moved))
+        forward = np.einsum("nj,nji->ni", self.window.v[seen.frame], view.R)  # speed in the imu frame
+        moved = so3.cross(view.x_imu, view.rates) - rho[:, None] * forward
+        return np.asarray(np.matmul(JR, moved[:, :, None])[..., 0])
 
-    def pixels_late(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
+    def pixels_late(self, view: View) -> tuple[FloatArray, FloatArray]:
         """By how much each image looks late by its pixels, s, and the variance by their noise, shape (F,)."""
-        by_shift, e = self._whitened_by_shift(seen)
-        F = len(self.window.frames)
+        by_shift, e = self._whitened_by_shift(view)
+        seen, F = view.seen, len(self.window.frames)
         size = np.bincount(seen.frame, (by_shift**2).sum(axis=1), F)
         late = np.bincount(seen.frame, (by_shift * e).sum(axis=1), F)
         shown = size > 0.0
         return late[shown] / size[shown], self.noise.spread**2 / size[shown]
 
-    def late_by_columns(self, seen: Seen) -> float:
+    def late_by_columns(self, view: View) -> float:
         """By how much at least the squared errors would fall if columns were read one after the other.
 
         At the optimum of all else this is the score test of one more parameter, with the information that
         it would have were all else known: a lower bound. [Rao 1948]
         """
-        by_shift, e = self._whitened_by_shift(seen)
-        by_column = by_shift * read_share(seen.uv, self.window.camera.resolution, COLUMNS)[:, None]
+        by_shift, e = self._whitened_by_shift(view)
+        by_column = by_shift * read_share(view.seen.uv, self.window.camera.resolution, COLUMNS)[:, None]
         size = float((by_column**2).sum())
         return float((by_column * e).sum()) ** 2 / max(size, 1e-300) / self.noise.spread**2
 
-    def _whitened_by_shift(self, seen: Seen) -> tuple[FloatArray, FloatArray]:
+    def _whitened_by_shift(self, view: View) -> tuple[FloatArray, FloatArray]:
         """How pixels move with the exposure's time, and their errors, both over their noise, (N, 2) each."""
-        cam = self.window.camera
-        y, x_imu, R, rates = self._rays(seen)
-        with np.errstate(all="ignore"):
-            uv, Jy, _ = project_jacobians(y, *self.window.lens)
-        e, ok, weight = self._weigh(seen, uv)
-        JR = (np.where(ok[:, None, None], Jy, 0.0).reshape(-1, 3) @ cam.R_imu_cam.T).reshape(Jy.shape)
+        e, weight = self.pixel_errors(view)
         root = np.sqrt(weight)[:, None]
-        return self._by_shift(seen, JR, R, x_imu, rates) * root / self.noise.sigma_px, e * root
+        JR = (view.by_point.reshape(-1, 3) @ self.window.camera.R_imu_cam.T).reshape(view.by_point.shape)
+        return self._by_shift(view, JR) * root / self.noise.sigma_px, e * root
 
     def _robust_cost(self, e: FloatArray, weight: FloatArray) -> float:
         """Sum of the Huber losses (e is weighted already: weight * size^2)."""
@@ -227,55 +254,55 @@ class Problem:
         outer = 2.0 * HUBER * np.sqrt(square / np.maximum(weight, 1e-12)) - HUBER**2
         return float(np.where(weight < 1.0, outer, inner).sum()) + 1e4 * float((weight == 0.0).sum())
 
-    def _assemble(
-        self,
-        seen: Seen,
-        links: PreintegratedLinks,
-        e: FloatArray,
-        Jf: FloatArray,
-        Jc: FloatArray,
-        Jl: FloatArray,
-        cost: float,
-    ) -> Normal:
-        w = self.window
-        F, k, L = len(w.frames), Jc.shape[2], len(seen.begin)
-        order = self.order()
-        camera = order.camera
+    def _assemble(self, seen: Seen, links: PreintegratedLinks, J: FloatArray, cost: float) -> Normal:
+        """The normal equations from derivatives and errors of the pixels (`_derivatives`) and their cost."""
+        w, order = self.window, self.order()
+        F, L = len(w.frames), len(seen.begin)
         H, g = np.zeros((order.size, order.size)), np.zeros(order.size)
-        begin, by, fb, fw = seen.begin, seen.by_frame, seen.frame_begin, seen.frames_with
-        Jall = np.concatenate([Jf, Jc, e[..., None]], axis=2)
-        sorted_J = Jall[by]
-        blocks = _products(sorted_J[:, :, :6], sorted_J, fb)
-        pose = order.frames[:, :6]
-        at = pose[fw]
-        H[at[:, :, None], at[:, None, :]] += blocks[:, :, :6]
-        H[at[:, :, None], camera] += blocks[:, :, 6:-1]
-        H[camera[:, None], at.reshape(1, -1)] += blocks[:, :, 6:-1].reshape(-1, k).T
-        g[at] += blocks[:, :, -1]
-        flat = Jc.reshape(-1, k)
-        H[camera[:, None], camera] += flat.T @ flat
-        g[camera] += flat.T @ e.reshape(-1)
-        own = _products(Jl, np.concatenate([Jl, Jall[:, :, 6:]], axis=2), begin)
-        V = own[:, :, :3].copy()
+        columns, camera = self._camera_columns(), order.camera
+        k = len(columns)
+        by_camera = np.zeros((F, 6, k))
+        for frame, rows in zip(seen.frames_with, np.split(seen.by_frame, seen.frame_begin[1:]), strict=True):
+            of_image = J[rows].reshape(2 * len(rows), -1)
+            block = of_image[:, 3:9].T @ of_image
+            pose = slice(order.frames[frame, 0], order.frames[frame, 5] + 1)
+            H[pose, pose], g[pose], by_camera[frame] = block[:, 3:9], block[:, -1], block[:, columns]
+        poses, sides = order.frames[:, :6].ravel(), by_camera.reshape(6 * F, k)
+        H[poses[:, None], camera], H[camera[:, None], poses] = sides, sides.T
+        flat = J.reshape(2 * len(J), -1)
+        block = flat.T @ flat
+        H[camera[:, None], camera], g[camera] = block[columns[:, None], columns], block[columns, -1]
+        own = np.empty((L, 3, flat.shape[1]))
+        for at, (low, high) in enumerate(pairwise([*(2 * seen.begin).tolist(), len(flat)])):
+            np.matmul(flat[low:high, :3].T, flat[low:high], out=own[at])
+        V, gl = own[:, :, :3].copy(), own[:, :, -1].copy()
         V[:, 2, 2] += _INVERSE_SIGMA**-2
-        gl = own[:, :, -1].copy()
         gl[:, 2] += w.landmarks.inverse * _INVERSE_SIGMA**-2
         cost += float((w.landmarks.inverse**2).sum()) * _INVERSE_SIGMA**-2
         W = np.zeros((L, 3, 6 * F + k))
-        W[:, :, 6 * F :] = own[:, :, 3:-1]
+        W[:, :, 6 * F :] = own[:, :, columns]
         by_frame = W[:, :, : 6 * F].reshape(L, 3, F, 6)  # the same memory
-        by_frame[seen.landmark, :, seen.frame] = np.swapaxes(Jl, 1, 2) @ Jf  # seen once in an image
+        by_frame[seen.landmark, :, seen.frame] = np.swapaxes(J[:, :, :3], 1, 2) @ J[:, :, 3:9]
         cost += add_links(w, links, self.noise.jitter_s, order, H, g)
         cost += self._add_prior(H, g, order) + self._add_own_lens(H, g, order)
         return Normal(H, g, V, W, gl, cost)
 
-    def suspected_jitter_s(self, seen: Seen, links: PreintegratedLinks) -> float:
+    def _camera_columns(self) -> IntArray:
+        """Columns of `_derivatives` for `Order.camera`: a window's own lens moves pixels as the lens does."""
+        layout = self.carry.layout
+        constants = _CONSTANTS + np.arange(layout.size - layout.dynamic)
+        if not self.own or layout.camera.intrinsics is None:
+            return constants
+        lens = _CONSTANTS + layout.camera.intrinsics.start - layout.dynamic + np.arange(self.own)
+        return np.concatenate([constants, lens])
+
+    def suspected_jitter_s(self, view: View, links: PreintegratedLinks) -> float:
         """Jitter of the stamps, s, that errors show while stamps are believed; 0 where it may be chance.
 
         A late image is torn between its links and its pixels: the stiffer of the two keeps most of the error.
         """
         by_links = first_guess(self.window, *link_errors(self.window, links))
-        late, variance = self.pixels_late(seen)
+        late, variance = self.pixels_late(view)
         return float(np.hypot(by_links, excess(late**2, variance)))
 
     # ------------------------------------------------------------------ prior
@@ -316,15 +343,6 @@ class Problem:
         return float(e @ e)
 
 
-def _products(A: FloatArray, B: FloatArray, begin: IntArray) -> FloatArray:
-    """Sums of A_n^T B_n over groups of rows, (N, 2, a) and (N, 2, b) to (groups, a, b).
-
-    One product of long matrices a group: numpy takes three times as long for many small ones.
-    """
-    a, b = A.shape[2], B.shape[2]
-    A, B = A.reshape(-1, a), B.reshape(-1, b)
-    out = np.empty((len(begin), a, b))
-    edges = [*(2 * begin).tolist(), len(A)]
-    for k, (low, high) in enumerate(pairwise(edges)):
-        np.matmul(A[low:high].T, B[low:high], out=out[k])
-    return out
+def _later(where: slice, columns: int) -> slice:
+    """A slice so many columns later."""
+    return slice(where.start + columns, where.stop + columns)

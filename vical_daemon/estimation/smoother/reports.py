@@ -5,22 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from vical_daemon.estimation.model.frame_report import FrameReport
-from vical_daemon.estimation.smoother.normal import Problem
-from vical_daemon.estimation.smoother.window import Seen
+from vical_daemon.estimation.smoother.normal import Problem, View
 
 
-def window_reports(problem: Problem, seen: Seen) -> list[FrameReport]:
+def window_reports(problem: Problem, view: View) -> list[FrameReport]:
     """Residuals of every image with landmarks in it, in order of time.
 
     Args:
         problem: Of the adjusted window.
-        seen: The observations it used.
+        view: Its values at the observations it used.
 
     Returns:
         One report an image, without predictions: a window is adjusted after its images.
     """
     window = problem.window
-    e, ok, _ = problem.pixel_errors(seen)
+    seen, ok, e = view.seen, view.valid, problem.pixel_errors(view)[0]
     residual = np.where(ok[:, None], -e * problem.noise.sigma_px, np.nan)
     out = []
     ends = np.append(seen.frame_begin[1:], len(seen.frame))

@@ -18,10 +18,10 @@ def shows_columns(bundle: Bundle, fit: Fit) -> bool:
     The gain is a lower bound: motion, lens and mounting have taken what they could of it. So anything beyond
     chance is worth it; which axis it is, the two adjustments decide.
     """
-    if bundle.seen is None:
+    if bundle.view is None:
         return False
     chance = chi_square_limit(1, COLUMNS_TRIED) * max(fit.squares / fit.dof, 1.0)
-    return bundle.problem.late_by_columns(bundle.seen) > chance
+    return bundle.problem.late_by_columns(bundle.view) > chance
 
 
 def readout_sigmas(carry: MarginalPrior) -> float:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from math import ceil
-
-import numpy as np
+from statistics import median
 
 _LATEST = 31  # intervals that tell the rate
 
@@ -41,4 +40,4 @@ class Thinning:
     def _every(self) -> int:
         if not self._intervals_s:
             return 1
-        return max(1, ceil(1.0 / (self._most_hz * float(np.median(self._intervals_s))) - 1e-6))
+        return max(1, ceil(1.0 / (self._most_hz * median(self._intervals_s)) - 1e-6))

@@ -257,13 +257,19 @@ class Window:
 
     def _place(self, ids: npt.NDArray[np.int64], seen: Seen) -> None:
         """Keep known landmarks, and place the new ones where their rays meet."""
-        anchor, bearing, inverse = place(seen, self.R, self.p, self.camera, len(ids))
-        known = {int(i): k for k, i in enumerate(self.landmarks.ids)}
         old = self.landmarks
-        for k, name in enumerate(ids.tolist()):
-            at = known.get(name)
-            if at is not None:
-                anchor[k], bearing[k], inverse[k] = old.anchor[at], old.bearing[at], old.inverse[at]
+        known = {int(name): row for row, name in enumerate(old.ids)}
+        row = np.array([known.get(name, -1) for name in ids.tolist()], np.intp)
+        new = row < 0
+        anchor, bearing, inverse = np.empty((len(ids), 3)), np.empty((len(ids), 3)), np.empty(len(ids))
+        for values, before in ((anchor, old.anchor), (bearing, old.bearing), (inverse, old.inverse)):
+            values[~new] = before[row[~new]]
+        own = new[seen.landmark]
+        fresh = _listed(seen.frame[own], (np.cumsum(new) - 1)[seen.landmark[own]], seen.uv[own], self.camera)
+        count = int(np.count_nonzero(new))
+        anchor[new], bearing[new], inverse[new] = place(
+            fresh, self.R, self.p, self.camera, count, inverse[~new]
+        )
         self.landmarks = Landmarks(ids, anchor, bearing, inverse)
 
 
@@ -291,9 +297,12 @@ def rays_of(uv: FloatArray, camera: CameraState) -> tuple[FloatArray, BoolArray]
 
 
 def place(
-    seen: Seen, R: FloatArray, p: FloatArray, camera: CameraState, count: int
+    seen: Seen, R: FloatArray, p: FloatArray, camera: CameraState, count: int, others: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Anchor, bearing, inverse distance where the rays of each landmark meet; a guess where they do not."""
+    """Anchor, bearing, inverse distance where the rays of each landmark meet.
+
+    Where they do not, the distance is the usual one, also of `others`, 1/m.
+    """
     if not count:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     rays, ok = rays_of(seen.uv, camera)
@@ -310,6 +319,7 @@ def place(
     distance = np.linalg.norm(X, axis=1)
     along = (X * d[first]).sum(axis=1) / np.maximum(distance, 1e-9)
     fine = (along > 0.9) & (distance > NEAREST_M) & (distance < FARTHEST_M)
-    usual = float(np.median(1.0 / distance[fine])) if fine.any() else 0.3
+    shown = np.concatenate([others, 1.0 / distance[fine]])
+    usual = float(np.median(shown)) if len(shown) else 0.3
     bearing = np.where(fine[:, None], X / np.maximum(distance, 1e-9)[:, None], d[first])
     return anchor, bearing, np.where(fine, 1.0 / np.maximum(distance, 1e-9), usual)

@@ -226,7 +226,7 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
     layout = window_layout(model)
     problem = bundle_of(window, layout, 50.0).problem
     seen, links = window.observe(), window.stacked()
-    normal, order = problem.normal(seen, links), problem.order()
+    normal, order = problem.normal(problem.view(seen), links), problem.order()
     rng = np.random.default_rng(2)
     of_lens = np.array([0.01] * 4 + [1e-5] * coefficients)
     scales = np.array([1e-6] * 15 + [1e-5] + [1e-4] * 6 + [1e-5] * 2 + [*of_lens, 1e-5])
@@ -236,7 +236,7 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
         camera, costs = window.camera, []
         for d in (step, -step):
             window.camera, window.imu = moved_camera(camera, layout.camera, d), d[layout.inertial]
-            costs.append(problem.normal(seen, links).cost)
+            costs.append(problem.normal(problem.view(seen), links).cost)
         window.camera, window.imu = camera, np.zeros(16)
         up, down = costs
         slope = (up - down) / 2.0 / size / 2.0
@@ -246,7 +246,7 @@ def test_bundle_gradient_agrees_with_differences_of_the_cost(scene, readout_s, m
         step, costs = size * np.eye(len(own))[k], []
         for d in (step, -step):
             window.own_lens = own + d
-            costs.append(problem.normal(seen, links).cost)
+            costs.append(problem.normal(problem.view(seen), links).cost)
         slope, at = (costs[0] - costs[1]) / 4.0 / size, order.own[k]
         assert slope == pytest.approx(normal.g[at], rel=0.02, abs=0.02 * np.sqrt(normal.H[at, at])), k
 
