@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from math import ceil
-from statistics import median
 
 _LATEST = 31  # intervals that tell the rate
 
@@ -40,4 +39,7 @@ class Thinning:
     def _every(self) -> int:
         if not self._intervals_s:
             return 1
-        return max(1, ceil(1.0 / (self._most_hz * median(self._intervals_s)) - 1e-6))
+        intervals_s = sorted(self._intervals_s)
+        last = len(intervals_s) - 1
+        median_s = 0.5 * (intervals_s[last // 2] + intervals_s[(last + 1) // 2])
+        return max(1, ceil(1.0 / (self._most_hz * median_s) - 1e-6))
