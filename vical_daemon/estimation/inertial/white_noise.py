@@ -95,7 +95,10 @@ def _of_sensor(t_s: FloatArray, values: FloatArray, step_s: float) -> float | No
 
 
 def _detrended(stretches: FloatArray) -> FloatArray:
-    """Stretches without their straight lines, least squares along the last axis (`scipy.signal` loads for 0.5 s)."""
+    """Stretches without their straight lines, by least squares along the last axis.
+
+    As `scipy.signal.detrend`, which takes 0.5 s to load.
+    """
     at = np.arange(stretches.shape[-1]) - 0.5 * (stretches.shape[-1] - 1)
     slopes = stretches @ (at / float(at @ at))
     return np.asarray(stretches - stretches.mean(axis=-1, keepdims=True) - slopes[..., None] * at)
