@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.significance import CALIBRATIONS_DISAGREE
@@ -110,4 +110,4 @@ def _test(difference: Difference, kept: IntArray) -> tuple[float, float]:
     scale = np.sqrt(np.diag(S))
     e = d / scale
     square = float(e @ np.linalg.solve(S / np.outer(scale, scale) + 1e-12 * np.eye(len(e)), e))
-    return square, float(chi2.sf(square, len(kept)))
+    return square, float(chdtrc(len(kept), square))

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import project, project_jacobians
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.camera_rays import rays_over_image, unproject
+from vical_daemon.estimation.significance import chi_square_limit
 from vical_daemon.results.compare import FALSE_ALARM
 from vical_daemon.results.difference import Difference
 from vical_daemon.results.known import KnownCamera
@@ -77,7 +77,7 @@ def _least(difference: Difference, p_imu: FloatArray) -> FloatArray:
     J = np.stack([_moved(base, p_imu, k, _STEP * scale[k]) for k in range(len(d))], axis=-1) / _STEP
     J = np.nan_to_num(J)
     inverse = np.linalg.inv(S / np.outer(scale, scale) + 1e-12 * np.eye(len(d)))
-    e, bound = d / scale, float(chi2.isf(FALSE_ALARM, len(d)))
+    e, bound = d / scale, chi_square_limit(len(d), FALSE_ALARM)
     if e @ inverse @ e <= bound:
         return np.zeros(len(J))
     H = J.T @ J

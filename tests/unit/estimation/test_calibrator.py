@@ -1,7 +1,5 @@
 """The estimator as the roles see it, on simulated corners: truth, changes, bad input, repeatability."""
 
-import subprocess
-import sys
 from copy import deepcopy
 
 import numpy as np
@@ -226,11 +224,3 @@ def test_two_cameras_on_one_imu_are_estimated_together(run):
     )
     gap = np.array(cameras["cam1"].T_imu_cam.p_m) - cameras["cam0"].T_imu_cam.p_m
     assert np.linalg.norm(gap) < 4e-3
-
-
-def test_starting_needs_no_part_of_scipy_that_loads_slowly():
-    """`scipy.signal` alone takes 0.5 s of CPU, a tenth of what EuRoC takes."""
-    slow = {f"scipy.{name}" for name in ("signal", "stats", "interpolate", "optimize", "spatial")}
-    code = f"import sys, vical_daemon.estimation.calibrator;print(*sorted({slow!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from vical_daemon.estimation.temporal.epipolar_errors import (
     Effects,
     TrackNoise,
+    _not_negative,
     gyro_scores,
     persistent_scores,
     sighting_errors,
@@ -50,6 +52,16 @@ def test_sizes_and_memory_of_errors_are_found_from_residuals():
     e = residuals(pairs, effects, *sighting_errors(pairs, T, white, 1.0))
     found = track_noise(e, lag, effects.by_first, effects.by_second)
     assert found.white + found.persistent == pytest.approx(0.09, rel=0.1)
+
+
+def test_least_squares_that_are_not_negative_agree_with_scipy():
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        A, b = rng.normal(size=(8, 2)), rng.normal(size=8)
+        A[:, 1] *= rng.integers(2)
+        (x, left), (expected, norm) = _not_negative(A, b), nnls(A, b)
+        assert left == pytest.approx(norm)
+        np.testing.assert_allclose(A @ x, A @ expected, atol=1e-9)
 
 
 def test_the_gradients_covariance_is_that_of_drawn_errors(monkeypatch):
