@@ -76,6 +76,7 @@ class AlternativeModels:
         self.rolling = self._rolling_known = rolling
         self.stamp_sigma_s = 0.0
         self._began_s = np.inf
+        self._asked: tuple[MarginalPrior, tuple[float, ...], list[Clock]] | None = None  # see `clocks`
         self._announced_s: tuple[float, ...] = ()  # jumps that may be the drift that was announced
 
     def watch(self, carry: MarginalPrior, factor: float, compared: bool) -> list[Event]:
@@ -140,10 +141,12 @@ class AlternativeModels:
         return ""
 
     def clocks(self, carry: MarginalPrior, factor: float) -> list[Clock]:
-        """Hypotheses about the clocks, with probabilities."""
+        """Hypotheses about the clocks, with probabilities; asked several times about the same carry."""
         self._began_s = min(self._began_s, carry.t_cam_s)
-        elapsed_s = carry.t_cam_s - self._began_s
-        return what_happened(carry, factor, self.stamp_sigma_s, elapsed_s, drifting=self.drifting)
+        given = factor, self.stamp_sigma_s, carry.t_cam_s - self._began_s, self.drifting
+        if self._asked is None or self._asked[0] is not carry or self._asked[1] != given:
+            self._asked = carry, given, what_happened(carry, *given[:3], drifting=self.drifting)
+        return self._asked[2]
 
     def window_done(self, carry: MarginalPrior, factor: float) -> tuple[MarginalPrior, list[Event]]:
         """Decide, at the end of a window, what happened to the clocks; make room for another change.
