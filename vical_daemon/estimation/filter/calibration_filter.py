@@ -318,11 +318,14 @@ class CalibrationFilter:
         return self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)
 
     def allowing_for_arm_bias(self) -> CalibrationFilter:
-        """The filter with sigmas that allow for what is not known of the bias that was subtracted."""
+        """The filter with sigmas that allow for what is not known of the bias that was subtracted.
+
+        Its `S` has one column more, the first: the last may be that of `model_mixture.joined`.
+        """
         if not np.any(self.arm_scores):
             return self
         left = UNCERTAIN * self._step_by(np.asarray(self.arm_scores), self.S)
-        return replace(self, S=unscented.lower_root(np.concatenate([self.S, left[:, None]], axis=1)))
+        return replace(self, S=np.concatenate([left[:, None], self.S], axis=1))
 
     def _step_by(self, score: FloatArray, S: FloatArray) -> FloatArray:
         """Step of the state by a score of all lever arms, shape (3 cameras,), with the covariance S S'."""

@@ -220,3 +220,15 @@ def test_a_copy_that_runs_ahead_leaves_the_filter_as_it_is(recording):
     ahead.predict(buffer.segment(f.state.t_s, f.state.t_s + 0.3))
     np.testing.assert_array_equal(f.arm_score.P, P)
     assert np.abs(ahead.arm_score.P - P).max() > 0.0
+
+
+def test_allowance_for_the_bias_of_lever_arms_keeps_the_last_column(recording):
+    """The last column may be how far the reported mean is from that over all models."""
+    f, _, _ = build(recording)
+    apart = np.linspace(0.0, 1e-3, len(f.S))
+    f.S, f.arm_scores = np.column_stack([f.S, apart]), np.array([2.0, -1.0, 0.5])
+    where = f.layout.cameras["cam0"].position
+    step = 0.5 * f.covariance(range(len(f.S)))[:, where] @ f.arm_scores
+    allowed = f.allowing_for_arm_bias()
+    np.testing.assert_array_equal(allowed.S[:, -1], apart)
+    np.testing.assert_allclose(allowed.S @ allowed.S.T, f.S @ f.S.T + np.outer(step, step), atol=1e-15)
