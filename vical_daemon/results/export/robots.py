@@ -6,7 +6,6 @@ import json
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
@@ -52,6 +51,8 @@ def write_urdf(rig: Rig) -> str:
     calls an optical frame (z forward, x right). The joint's origin is the child in the parent: our
     T_imu_cam. URDF's rpy is R = Rz(y) Ry(p) Rx(r). URDF has no place for a time shift.
     """
+    from scipy.spatial.transform import Rotation  # takes 0.3 s to load, also where nothing is exported
+
     lines = ['<?xml version="1.0"?>', '<robot name="vical_rig">']
     lines += [f"  <!-- {_xml_comment(line)} -->" for line in rig.header.splitlines()]
     lines.append(f'  <link name="{rig.imu_frame}"/>')
