@@ -34,6 +34,7 @@ from vical_daemon.estimation.plausible import usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
+from vical_daemon.estimation.selection.model_mixture import Weights
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
 from vical_daemon.estimation.status.recent_past import RecentPast
@@ -477,17 +478,18 @@ class Calibrator:
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
-        self.evaluator.in_doubt = "" if self.filter is None else self._in_doubt(self.filter)
+        f, shares = self.filter, None if self.filter is None else model_selection.weights(self.filter)
+        self.evaluator.in_doubt = "" if f is None else self._in_doubt(f, shares)
         self.evaluator.believed &= not self.evaluator.in_doubt
-        return self._intake.by_present_stamps(self.evaluator.estimate(self.filter, self._stale))
+        return self._intake.by_present_stamps(self.evaluator.estimate(f, self._stale, shares))
 
-    def _in_doubt(self, f: CalibrationFilter) -> str:
+    def _in_doubt(self, f: CalibrationFilter, shares: Weights | None) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""
         believed = self.evaluator.believed
         drifts = (clock_drift.in_doubt(f, name, believed=believed) for name in self.rig.priors)
         if self.watch.doubtful or any(drifts):
             return clock_drift.CLOCKS_IN_DOUBT
-        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, believed=believed), "")
+        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, shares, believed=believed), "")
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

@@ -83,22 +83,23 @@ def off(f: CalibrationFilter, name: str) -> float:
     return not_zero(weights(f), name)
 
 
-def in_doubt(f: CalibrationFilter, *, believed: bool = False) -> str:
+def in_doubt(f: CalibrationFilter, shares: Weights | None = None, *, believed: bool = False) -> str:
     """Name of a block for which the data speak, though not yet surely: they soon will. Empty: none.
 
     Images that do not fit may never decide it; the reported covariance then covers both. A result that was
     believed stays so until the block is more likely off than not: of many looks, one sees 5 % by chance.
+    `shares` are `weights`, if they are known.
     """
     if misfit(f) != 1.0:
         return ""
-    doubtful, shares = blocks(f).keys() - f.off, weights(f)
+    doubtful, shares = blocks(f).keys() - f.off, weights(f) if shares is None else shares
     enough = 0.5 if believed else OFF
     return next((n for n in IN_DOUBT if n in doubtful and not_zero(shares, n) > enough), "")
 
 
-def averaged(f: CalibrationFilter) -> CalibrationFilter:
-    """Return the filter to be reported: mean and covariance over all models."""
-    step, S = mixture(f.S, blocks(f), weights(f), factor(f))
+def averaged(f: CalibrationFilter, shares: Weights | None = None) -> CalibrationFilter:
+    """Return the filter to be reported: mean and covariance over all models; `shares`: see `in_doubt`."""
+    step, S = mixture(f.S, blocks(f), weights(f) if shares is None else shares, factor(f))
     if S is f.S and not step.any():
         return f
     return replace(f, state=retract(f.state, f.layout, step), S=S)

@@ -113,10 +113,20 @@ class StatusEvaluator(Evaluator):
 
     # ------------------------------------------------------------------ what is said
     def estimate(
-        self, f: CalibrationFilter | None, stale: CalibrationFilter | None = None
+        self,
+        f: CalibrationFilter | None,
+        stale: CalibrationFilter | None = None,
+        shares: model_mixture.Weights | None = None,
     ) -> CalibrationEstimate:
-        """Put everything together; `stale`: what was known before a change, shown while starting anew."""
-        f, stale = (None if x is None else self.weighed(x) for x in (f, stale))
+        """Put everything together.
+
+        Args:
+            f: The filter.
+            stale: What was known before a change, shown while starting anew.
+            shares: See `weighed`.
+        """
+        f = None if f is None else self.weighed(f, shares)
+        stale = None if stale is None else self.weighed(stale)
         shown = f or stale
         cameras = {} if shown is None else {name: self._camera(name, shown) for name in self.layout.cameras}
         missing = {} if f is None else {name: self._missing(e, name, f) for name, e in cameras.items()}
@@ -139,9 +149,14 @@ class StatusEvaluator(Evaluator):
             refused=self._points[0] / max(self._points[1], 1),
         )
 
-    def weighed(self, f: CalibrationFilter) -> CalibrationFilter:
-        """The filter to be reported: mean and covariance over all models of imu, target and clocks."""
-        f = model_selection.averaged(f).allowing_for_arm_bias()
+    def weighed(self, f: CalibrationFilter, shares: model_mixture.Weights | None = None) -> CalibrationFilter:
+        """The filter to be reported: mean and covariance over all models of imu, target and clocks.
+
+        Args:
+            f: The filter.
+            shares: `model_selection.weights` of it, if they are known.
+        """
+        f = model_selection.averaged(f, shares).allowing_for_arm_bias()
         if not self._imu_asked:
             cameras, S = in_gyro_frame(f.layout, f.state.gyro_matrix, f.state.cameras, f.S)
             f = replace(f, state=replace(f.state, cameras=cameras), S=S)
