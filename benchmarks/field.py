@@ -145,6 +145,18 @@ def _paired(data: Data) -> Data:
     return replace(data, points=points[~lost[image]])
 
 
+def late_images(data: Data, rng: np.random.Generator) -> Data:
+    """Images stamped when a driver has them, one after the other: 4 ms late, 1 % of them 60 ms."""
+    stamps, image = np.unique(data.points["t"], return_inverse=True)
+    late = rng.exponential(4e6, len(stamps)) + 60e6 * (rng.random(len(stamps)) < 0.01)
+    arrivals: list[int] = []
+    for arrival in (stamps + late.astype(np.int64)).tolist():
+        arrivals.append(max(arrival, arrivals[-1] + 100_000) if arrivals else arrival)
+    points = data.points.copy()
+    points["t"] = np.array(arrivals)[image]
+    return replace(data, points=points)
+
+
 FAULTS: dict[str, tuple[str, Callable[[Data, np.random.Generator], Data]]] = {
     "none": ("unchanged", lambda d, _: d),
     "delayed": ("IMU stamped on arrival, delays of 2 ms (exponential)", _delayed),
@@ -165,6 +177,7 @@ FAULTS: dict[str, tuple[str, Callable[[Data, np.random.Generator], Data]]] = {
     "paired": ("images of 2 s stamped as the next ones", lambda d, _: _paired(d)),
     "loud": ("white noise stated three times too large", lambda d, _: d),
     "quiet": ("white noise stated three times too small", lambda d, _: d),
+    "late_images": ("images stamped on arrival, 4 ms late, 1 % of them 60 ms", late_images),
 }
 STATED = {"loud": 3.0, "quiet": 1.0 / 3.0}
 """By how much the densities in the file with the prior are too large."""

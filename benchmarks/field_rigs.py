@@ -141,6 +141,7 @@ BOTH: dict[str, Fault] = {
     "10 % of the images delivered twice": Fault(FAULTS["twice"][1], counted="images_repeated"),
     "two points with one id": Fault(_recycled, text="id seen twice"),
     "60 s at rest before": Fault(rest=True),
+    "images stamped on arrival": Fault(FAULTS["late_images"][1], text="even grid"),
 }
 BOARD = BOTH | {
     "accelerometer negated": Fault(FAULTS["negated"][1], text="accelerometer", answers=False),

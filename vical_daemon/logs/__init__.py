@@ -33,8 +33,8 @@ def open_recording(
         topics: Topics, or names of imus and cameras, to take; None: all that can be used.
         cameras: Of the cameras only these, where there is one of them: files of an ASL folder that belong to
             others may be as broken as they like.
-        as_recorded: Leave the stamps alone. Otherwise readings of an imu that were stamped on arrival are
-            put on the even grid of their device (`even_stamps`), with a warning.
+        as_recorded: Leave the stamps alone. Otherwise readings and images that were stamped on arrival are
+            put on the even grid of their device (`even_stamps`, `even_images`), with a warning.
         check: Refuse wrong units, rates and clocks (`check_recording`).
 
     Raises:

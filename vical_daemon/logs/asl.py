@@ -24,6 +24,7 @@ from vical_daemon.logs.asl_tables import (
     read_table,
     without_cut_line,
 )
+from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.model import (
     ImuArrays,
@@ -82,7 +83,7 @@ class AslRecording(Recording):
             folder: With `mav0`, or that itself.
             names: Imus and cameras to read; None: all. Files of others are not read.
             cameras: Of the cameras only these, if the folder has one of them.
-            as_recorded: Leave the stamps of imus alone.
+            as_recorded: Leave the stamps alone.
 
         Raises:
             RecordingError: The imu or the camera is missing, or a table cannot be read.
@@ -172,15 +173,15 @@ class AslRecording(Recording):
         t_ns, begins = np.unique(rows["t"], return_index=True)
         ends = np.append(begins[1:], len(rows)).tolist()
         ids, uv = np.ascontiguousarray(rows["id"]), np.ascontiguousarray(rows["uv"])
-        first, stamps = begins.tolist(), t_ns.tolist()
-        stream = self._stream(kind, name, path, t_ns)
-        size = stream.resolution or (0, 0)
+        first = begins.tolist()
+        size = self._stream(kind, name, path, t_ns).resolution or (0, 0)
 
         def build(i: int) -> bytes:
             part = slice(first[i], ends[i])
-            return encode_points(stamps[i], name, ids[part], uv[part], image_size=size)
+            return encode_points(int(t_ns[i]), name, ids[part], uv[part], image_size=size)
 
-        return _Source(stream, t_ns, build)
+        t_ns = self._even_images(kind, name, t_ns, build)
+        return _Source(self._stream(kind, name, path, t_ns), t_ns, build)
 
     def _read_images(self, table: Path, folder: Path) -> _Source:
         stamps, files, lost = image_list(table, folder)
@@ -212,6 +213,8 @@ class AslRecording(Recording):
                 int(t_ns[i]), folder.name, IMAGE_SUFFIXES[path.suffix.lower()], data
             )
 
+        if len(t_ns):
+            t_ns = self._even_images("compressed", folder.name, t_ns, build)
         return _Source(self._stream("compressed", folder.name, table, t_ns), t_ns, build)
 
     def _load(self, path: Path, dtype: np.dtype[Any], columns: str) -> npt.NDArray[Any]:
@@ -257,6 +260,26 @@ class AslRecording(Recording):
         rows = rows[~again]
         rows["t"] = even.t_ns
         return rows
+
+    def _even_images(self, kind: Kind, name: str, t_ns: IntArray, build: Callable[[int], bytes]) -> IntArray:
+        """Return better stamps of images that were stamped on arrival; others as they are."""
+        if self._as_recorded or already_even(t_ns):
+            return t_ns
+        marks = np.arange(len(t_ns))  # whether files of images are equal would take long to find out
+        if kind != "compressed":
+            marks = np.array([mark_of(build(i)) for i in range(len(t_ns))], dtype=np.int64)
+        stamps = CameraStamps(t_ns, marks)
+        wanted, reader = stamps.wanted, PointReader(kind)
+        for i, stamp_ns in enumerate(t_ns.tolist()):
+            if stamp_ns in wanted:
+                stamps.take(stamp_ns, reader.read(build(i)))
+        even = stamps.even()
+        if even is None:
+            return t_ns
+        self.warnings.append(even.describe(name, "images"))
+        self.stamp_sigma_s[name] = even.sigma_s
+        better = dict(zip(stamps.t_ns.tolist(), even.t_ns.tolist(), strict=True))
+        return np.array([better[t] for t in t_ns.tolist()], dtype=np.int64)
 
     def _sorted(self, rows: npt.NDArray[Any], name: str, *, drop_equal: bool) -> npt.NDArray[Any]:
         """Return the rows in order of their stamps."""

@@ -20,12 +20,12 @@ _BLOCK_S = 1.0
 _WINDOW_S = 15.0
 """Half width of the local line through the earliest arrivals, s. A crystal's rate wanders by 2.4 ppm a minute
 (`vical_drivers.envelope`): within the window that bends a line by 4e-8 / 2 * 15**2 = 5 us."""
-_EVEN_S = 5e-5
+EVEN_S = 5e-5
 """Stamps that deviate less from an even grid come from a device's clock and stay as they are, s; as in
 `estimation.inertial.stamp_steps`."""
 _LEAST_BLOCKS = 5
 """Pieces without losses must hold so many blocks on average: fewer do not show whether the device is even."""
-_CERTAIN = 3.0
+CERTAIN = 3.0
 """Standard errors by which the motion must be smoother over the even stamps: one chance in 740."""
 
 
@@ -47,10 +47,10 @@ class EvenStamps(NamedTuple):
     sigma_s: float
     pieces: int
 
-    def describe(self, name: str) -> str:
-        """Return one line for the user about the imu of this name."""
+    def describe(self, name: str, what: str = "readings") -> str:
+        """Return one line for the user about the sensor of this name."""
         return (
-            f"{name}: its stamps jitter by {self.jitter_s * 1e3:.3g} ms but it samples evenly: readings were "
+            f"{name}: its stamps jitter by {self.jitter_s * 1e3:.3g} ms but it samples evenly: {what} were "
             f"put on an even grid along the earliest arrivals (moved by up to {self.largest_s * 1e3:.3g} ms)"
         )
 
@@ -84,10 +84,10 @@ def even_stamps(t_ns: IntArray, gyro_rps: FloatArray) -> EvenStamps | None:
     taken_s = t_s - even_s
     jitter_s = float(taken_s.std())
     new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
-    if jitter_s < _EVEN_S or _rounded(t_ns, taken_s, period_s) or (np.diff(new_ns) <= 0).any():
+    if jitter_s < EVEN_S or rounded(t_ns, taken_s, period_s) or (np.diff(new_ns) <= 0).any():
         return None
     gain = _surprise(gyro_rps[sort], t_s[sort]) - _surprise(gyro_rps, even_s)
-    if not gain.mean() > _CERTAIN * gain.std() / np.sqrt(len(gain)):
+    if not gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
         return None
     largest_s = float(taken_s.max() - np.median(taken_s))
     return EvenStamps(new_ns, jitter_s, largest_s, float(np.median(scatter_s)), len(starts))
@@ -146,20 +146,34 @@ def _earliest(late_s: FloatArray, block: int) -> IntArray:
 
 def _on_grid(t_s: FloatArray, period_s: float, block: int) -> tuple[FloatArray, float]:
     """Even stamps of one piece, s, shape (n,), and the scatter of its earliest arrivals about them, s."""
-    grid_s = period_s * np.arange(len(t_s))
-    late_s = t_s - grid_s
+    grid_s = np.asarray(period_s * np.arange(len(t_s)), np.float64)
+    line_s, scatter_s = envelope(grid_s, t_s - grid_s, block)
+    return grid_s + line_s, scatter_s
+
+
+def envelope(grid_s: FloatArray, late_s: FloatArray, block: int) -> tuple[FloatArray, float]:
+    """Lower envelope of arrivals.
+
+    Args:
+        grid_s: Even time axis, s, shape (n,).
+        late_s: How much later than on the grid each sample arrived, s, shape (n,).
+        block: Of so many samples the earliest one counts.
+
+    Returns:
+        The envelope at each sample, s, shape (n,), and the scatter of the earliest arrivals about it, s.
+    """
     earliest = _earliest(late_s, block)
     x = np.asarray(grid_s[earliest], np.float64)
     y = np.asarray(late_s[earliest], np.float64)
     if len(x) < 2:
-        return grid_s + y[0], 0.0
+        return np.full(len(grid_s), y[0]), 0.0
     line = np.array([_local_line(x, y, float(at)) for at in x])
     fitted = np.interp(grid_s, x, line)
     for end, inner in ((0, 1), (-1, -2)):  # beyond the first and the last one: straight on
         outside = grid_s < x[0] if end == 0 else grid_s > x[-1]
         slope = (line[inner] - line[end]) / (x[inner] - x[end])
         fitted[outside] = line[end] + slope * (grid_s[outside] - x[end])
-    return grid_s + fitted, float(np.std(y - line))
+    return fitted, float(np.std(y - line))
 
 
 def _local_line(x: FloatArray, y: FloatArray, at: float) -> float:
@@ -172,7 +186,7 @@ def _local_line(x: FloatArray, y: FloatArray, at: float) -> float:
     return float(weight @ y / weight.sum() + slope * (at - centre))
 
 
-def _rounded(t_ns: IntArray, taken_s: FloatArray, period_s: float) -> bool:
+def rounded(t_ns: IntArray, taken_s: FloatArray, period_s: float) -> bool:
     """Whether the deviations are those of stamps written in whole 10 us to 10 ms: rounding, not delays."""
     spread_ns = float(np.ptp(taken_s)) * 1e9
     return any(

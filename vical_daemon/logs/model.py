@@ -17,7 +17,7 @@ from vical_daemon.estimation.measurements import FloatArray, IntArray, PointsFra
 
 Kind = Literal["imu", "image", "compressed", "points", "tracks"]
 # Preferred stream of a camera that has several: points before images.
-_PREFERENCE: tuple[Kind, ...] = ("points", "tracks", "image", "compressed")
+PREFERENCE: tuple[Kind, ...] = ("points", "tracks", "image", "compressed")
 _WINDOW_NS = 2_000_000_000
 _WINDOW_BYTES = 512 * 2**20
 _MARK_NS = 50_000_000
@@ -78,7 +78,7 @@ class Recording(ABC):
         rig: Name of the rig in the keys.
         streams: Its sensors.
         warnings: Problems, one line each.
-        stamp_sigma_s: Of each imu whose stamps were put on an even grid, how well that is known, s.
+        stamp_sigma_s: Of each sensor whose stamps were put on an even grid, how well that is known, s.
     """
 
     path: Path
@@ -96,7 +96,7 @@ class Recording(ABC):
     def cameras(self) -> dict[str, Stream]:
         """Cameras by name, each with the stream it is best calibrated from."""
         best: dict[str, Stream] = {}
-        for kind in reversed(_PREFERENCE):
+        for kind in reversed(PREFERENCE):
             best.update({stream.name: stream for stream in self.streams if stream.kind == kind})
         return dict(sorted(best.items()))
 

@@ -26,9 +26,11 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.bus.topics import BY_KIND, PREDICTED, STATUS, parse_key
 from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.logs.even_images import CameraStamps, PointReader, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.mcap import LogError, LogReader
 from vical_daemon.logs.model import (
+    PREFERENCE,
     ImuArrays,
     Kind,
     OutOfReach,
@@ -91,6 +93,7 @@ class _Channel:
     kind: Kind
     name: str
     stamps: array[int] = field(default_factory=lambda: array("q"))
+    marks: array[int] = field(default_factory=lambda: array("q"))  # of images, see `mark_of`
     values: bytearray = field(default_factory=bytearray)
     resolution: tuple[int, int] | None = None
     unreadable: int = 0
@@ -108,7 +111,7 @@ class LogRecording(Recording):
         Args:
             path: File or folder.
             topics: Topics (or names of imus and cameras) to take; None: all that can be used.
-            as_recorded: Leave the stamps of imus alone.
+            as_recorded: Leave the stamps alone.
 
         Raises:
             RecordingError: It cannot be read, or holds no usable topic.
@@ -125,9 +128,11 @@ class LogRecording(Recording):
         self._order = OutOfReach()
         self._scan()
         self._scanned = True
-        for channel in self._channels.values():
-            if channel.kind == "imu" and not as_recorded:
-                self._even(channel)
+        if not as_recorded:
+            for channel in self._channels.values():
+                if channel.kind == "imu":
+                    self._even(channel)
+            self._even_cameras()
         self.streams = tuple(
             self._stream(topic, channel) for topic, channel in self._channels.items() if len(channel.stamps)
         )
@@ -152,6 +157,8 @@ class LogRecording(Recording):
             if channel.kind == "imu":
                 channel.values += raw.payload[_GYRO]
                 channel.values += raw.payload[_FORCE]
+            else:
+                channel.marks.append(mark_of(raw.payload))
             channel.stamps.append(stamp_ns)
             self._order.saw(stamp_ns, raw.log_time_ns)
         for channel in self._channels.values():
@@ -200,6 +207,26 @@ class LogRecording(Recording):
             self.stamp_sigma_s[channel.name] = even.sigma_s
             channel.even_ns = even.t_ns
 
+    def _even_cameras(self) -> None:
+        """Put images that were stamped on arrival on the even grid of their camera."""
+        images = [(t, c) for t, c in self._channels.items() if c.kind != "imu" and c.stamps]
+        for name in dict.fromkeys(channel.name for _, channel in images):
+            of_it = [(t, c) for t, c in images if c.name == name]
+            topic, channel = min(of_it, key=lambda item: PREFERENCE.index(item[1].kind))
+            stamps = CameraStamps(_stamps(channel), np.array(channel.marks, dtype=np.int64))
+            wanted, reader = stamps.wanted, PointReader(channel.kind)
+            for raw in self._raw() if wanted else ():
+                stamp_ns = stamp_of(raw.payload) if raw.topic == topic else None
+                if stamp_ns in wanted:
+                    stamps.take(stamp_ns, reader.read(raw.payload))
+            even = stamps.even()
+            if even is not None:
+                self.warnings.append(even.describe(name, "images"))
+                self.stamp_sigma_s[name] = even.sigma_s
+                better = dict(zip(stamps.t_ns.tolist(), even.t_ns.tolist(), strict=True))
+                for _, c in of_it:
+                    c.even_ns = np.array([better.get(t, t) for t in c.stamps], dtype=np.int64)
+
     def _stream(self, topic: str, channel: _Channel) -> Stream:
         stamps = np.sort(_stamps(channel))
         statistics = stream_statistics(stamps)
@@ -231,7 +258,7 @@ class LogRecording(Recording):
                 continue
             payload, channel = raw.payload, self._channels.get(raw.topic)
             if channel is not None and channel.even_ns is not None:
-                if not _has_imu_size(payload):
+                if channel.kind == "imu" and not _has_imu_size(payload):
                     continue
                 stamp_ns = int(channel.even_ns[rows[raw.topic]])
                 rows[raw.topic] += 1

@@ -5,6 +5,7 @@ Everything happens in one thread and in the order of the stamps, so two runs are
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -163,9 +164,10 @@ class _Player:
     def play(self, part: Job, later_ns: int) -> None:
         """Publish one recording, its stamps moved by `later_ns`."""
         keys = keys_of(self._job, part)
-        stamp_sigma_s = part.recording.stamp_sigma_s.get(part.imu.name)
-        if stamp_sigma_s is not None:
-            self.estimator.stamps_known_to(stamp_sigma_s)
+        sigma_s = part.recording.stamp_sigma_s
+        moved = [sigma_s[x.name] for x in (part.imu, *part.cameras.values()) if x.name in sigma_s]
+        if moved:
+            self.estimator.stamps_known_to(math.hypot(*moved))
         for key, payload in part.messages():
             if self._stop:
                 break

@@ -1,0 +1,265 @@
+"""Stamps of a camera that samples evenly, recovered from stamps that were taken on arrival.
+
+A naive driver stamps an image when it has it: late by the transfer, the buffers and the scheduler. As with
+an imu (`even_stamps`) a delay is never negative, so the true times follow the lower envelope of the stamps.
+Other than inertial readings, images are lost or doubled all the time, but their delays are mostly shorter
+than their period: which image of the even grid one is, follows from its stamp.
+
+Cameras need not sample evenly: a trigger in software, or an exposure that changes, moves the middle of the
+exposure. Whether the even grid is the better time axis is decided by how smoothly points move in the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vical_daemon.bus.messages import MessageError, decode_compressed_image, decode_image, decode_points
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
+from vical_daemon.logs.even_stamps import CERTAIN, EVEN_S, EvenStamps, envelope, rounded
+
+_BLOCK = 20
+"""Of so many images the earliest arrival counts: with exponential delays it is late by 1/20 of their mean."""
+_SLOT = 0.75
+"""An image is at most so much of a period later than the earliest arrivals about it; otherwise it is the next
+image of the grid, unless that one is taken."""
+_GAP = 40
+"""A gap of so many periods begins a new piece: the period is known to 1 % before the fit."""
+_LEAST = 60  # images: three blocks
+_NEAR = 0.35
+"""90 % of the images of an even camera lie within so much of a period of the middle; of any other, 0.45."""
+_CHUNKS, _CHUNK = 10, 60
+"""So many stretches of so many images decide, spread over the recording."""
+_MOST = 3.0  # of the logarithm of one ratio of errors: an image counts twenty times at most
+_TINY_PX = 1e-3
+
+
+class ImagePoints(NamedTuple):
+    """Points of one image: ids, shape (n,), increasing, and pixels, shape (n, 2)."""
+
+    ids: IntArray
+    uv_px: FloatArray
+
+
+def already_even(t_ns: IntArray) -> bool:
+    """Whether all intervals are multiples of one, within `EVEN_S`: nothing is to be done then."""
+    intervals_s = np.diff(t_ns) * 1e-9
+    if not len(intervals_s) or not (period_s := float(np.median(intervals_s))) > 0.0:
+        return True
+    return bool((np.abs(intervals_s - period_s * np.round(intervals_s / period_s)) < EVEN_S).all())
+
+
+class CameraStamps:
+    """Stamps of the images of one camera, and better ones where there are.
+
+    Args:
+        t_ns: Stamps in the order of the recording, ns, shape (n,).
+        marks: By which an image that was delivered twice is recognised (`mark_of`), shape (n,).
+    """
+
+    def __init__(self, t_ns: IntArray, marks: IntArray) -> None:
+        self.t_ns, first = np.unique(t_ns, return_index=True)
+        marks = marks[first]
+        self._again: BoolArray = np.append(False, marks[1:] == marks[:-1])[: len(self.t_ns)]
+        self._grid = even_grid(self.t_ns[~self._again])
+        self._images: dict[int, ImagePoints] = {}
+
+    @property
+    def wanted(self) -> set[int]:
+        """Stamps of the images that are needed for a decision; empty: the stamps stay as they are."""
+        if self._grid is None:
+            return set()
+        return {int(t) for chunk in self._chunks() for t in self.t_ns[~self._again][chunk]}
+
+    def _chunks(self) -> list[slice]:
+        count = int((~self._again).sum())
+        begins = np.linspace(0, max(count - _CHUNK, 0), _CHUNKS).astype(int)
+        if count <= _CHUNK * _CHUNKS:
+            return [slice(0, count)]
+        return [slice(begin, begin + _CHUNK) for begin in begins.tolist()]
+
+    def take(self, t_ns: int, image: ImagePoints | None) -> None:
+        """Take an image that is wanted."""
+        if image is not None:
+            self._images[t_ns] = image
+
+    def even(self) -> EvenStamps | None:
+        """Decide.
+
+        Returns:
+            Stamps for `t_ns`; None where these stay as they are.
+        """
+        if self._grid is None:
+            return None
+        old_ns, new_ns = self.t_ns[~self._again], self._grid.t_ns
+        found: list[float] = []
+        for chunk in self._chunks():
+            images = [self._images.get(t) for t in old_ns[chunk].tolist()]
+            found += gains(images, *((t[chunk] - old_ns[0]) * 1e-9 for t in (old_ns, new_ns)))
+        if len(found) < 3 or not np.mean(found) > CERTAIN * np.std(found) / np.sqrt(len(found)):
+            return None
+        stamps = np.empty_like(self.t_ns)
+        stamps[~self._again] = new_ns
+        for k in np.flatnonzero(self._again).tolist():
+            stamps[k] = stamps[k - 1] + 1000  # the same image once more: the estimator leaves it out
+        return self._grid._replace(t_ns=stamps)
+
+
+def mark_of(payload: bytes) -> int:
+    """Return a number that two messages share if they differ in nothing but the stamp."""
+    return hash(payload[12 :: max(len(payload) // 1000, 1)])
+
+
+class PointReader:
+    """Finds points in messages of one camera, to be read in their order.
+
+    Args:
+        kind: points, tracks, image or compressed, see `model.Kind`.
+    """
+
+    def __init__(self, kind: str) -> None:
+        self._kind = kind
+        self._tracker: Any = None
+
+    def read(self, payload: bytes) -> ImagePoints | None:
+        """Return the points of one message; None if there are none, or it cannot be read."""
+        try:
+            found = self._found(payload)
+        except (MessageError, ValueError):
+            return None
+        if found is None or not len(found.ids):
+            return None
+        ids, first = np.unique(found.ids, return_index=True)
+        return ImagePoints(ids, found.uv_px[first])
+
+    def _found(self, payload: bytes) -> Any:
+        if self._kind in ("points", "tracks"):
+            return decode_points(payload).to_frame()
+        if self._tracker is None:
+            from vical_daemon.vision.tracks import FeatureTracker
+
+            self._tracker = FeatureTracker()
+        if self._kind == "image":
+            return self._tracker.detect(decode_image(payload).pixels())
+        from vical_daemon.vision import image_codec
+
+        data = np.frombuffer(decode_compressed_image(payload).data, np.uint8)
+        return self._tracker.detect(image_codec.decode_image(data))
+
+
+def even_grid(t_ns: IntArray) -> EvenStamps | None:
+    """Put images on the even grid of their camera, whether or not it samples evenly.
+
+    Args:
+        t_ns: Sorted stamps of different images, ns, shape (n,).
+
+    Returns:
+        None where the stamps are even already, rounded, or far from any grid.
+    """
+    if len(t_ns) < _LEAST:
+        return None
+    t_s = (t_ns - t_ns[0]) * 1e-9
+    intervals_s = np.diff(t_s)
+    period_s = float(np.median(intervals_s))
+    if not period_s > 0.0:
+        return None
+    period_s = float(np.median(intervals_s[np.abs(intervals_s / period_s - 1.0) < 0.5]))  # nothing is lost
+    cuts = np.flatnonzero(np.diff(t_s) > _GAP * period_s) + 1
+    bounds = [0, *cuts.tolist(), len(t_s)]
+    for _ in range(2):  # the second time with the period of the first fit
+        slots = np.concatenate([_slots(t_s[a:b], period_s) for a, b in pairwise(bounds)])
+        period_s = _period_s(t_s, slots, bounds, period_s)
+    even_s, scatter_s = np.empty_like(t_s), []
+    for a, b in pairwise(bounds):
+        grid_s = period_s * slots[a:b]
+        line_s, scatter = envelope(grid_s, t_s[a:b] - grid_s, _BLOCK)
+        even_s[a:b] = grid_s + line_s
+        scatter_s.append(scatter)
+    taken_s = t_s - even_s
+    new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
+    middle_s = float(np.median(taken_s))
+    if np.quantile(np.abs(taken_s - middle_s), 0.9) > _NEAR * period_s or (np.diff(new_ns) <= 0).any():
+        return None
+    jitter_s = float(taken_s.std())
+    if jitter_s < EVEN_S or rounded(t_ns, taken_s, period_s):
+        return None
+    largest_s = float(taken_s.max()) - middle_s
+    return EvenStamps(new_ns, jitter_s, largest_s, float(np.median(scatter_s)), len(bounds) - 1)
+
+
+def _slots(t_s: FloatArray, period_s: float) -> IntArray:
+    """Number on the grid of each image of one piece, shape (n,), strictly increasing."""
+    slots = np.zeros(len(t_s), np.int64)
+    late_s = np.zeros(len(t_s))
+
+    def place(k: int, earliest_s: float, before: float) -> None:
+        slots[k] = min(np.floor((t_s[k] - earliest_s) / period_s + 1.0 - _SLOT), before)
+        late_s[k] = t_s[k] - slots[k] * period_s
+
+    for k in range(len(t_s)):
+        place(k, late_s[max(k - _BLOCK, 0) : k].min() if k else t_s[0], np.inf)
+    # The first ones may all have been late, and a late image takes the place before the next one.
+    for k in range(len(t_s) - 2, -1, -1):
+        behind = late_s[k + 1 : k + 1 + _BLOCK]
+        earliest_s = behind.min() if len(behind) == _BLOCK else late_s[max(k - _BLOCK, 0) : k + 1].min()
+        place(k, earliest_s, slots[k + 1] - 1)
+    return slots
+
+
+def _period_s(t_s: FloatArray, slots: IntArray, bounds: list[int], period_s: float) -> float:
+    """The period by which the earliest arrivals of the longest piece are even, s."""
+    a, b = max(pairwise(bounds), key=lambda piece: piece[1] - piece[0])
+    late_s = t_s[a:b] - period_s * slots[a:b]
+    blocks = [a + k + int(late_s[k : k + _BLOCK].argmin()) for k in range(0, b - a - _BLOCK + 1, _BLOCK)]
+    if len(blocks) < 2:
+        return period_s
+    return float(np.polyfit(slots[blocks], t_s[blocks], 1)[0])
+
+
+def gains(images: Sequence[ImagePoints | None], old_s: FloatArray, new_s: FloatArray) -> list[float]:
+    """How much more smoothly points move over new stamps than over old ones.
+
+    Each image is compared with the cubic through the two before and the two after it.
+
+    Args:
+        images: Consecutive images of one camera; None: nothing was found in it.
+        old_s: Their stamps, s, shape (n,).
+        new_s: Other stamps of them, s, shape (n,).
+
+    Returns:
+        Logarithms of the ratio of errors, of means of five images: they share points with each other.
+    """
+    out = []
+    for k in range(2, len(images) - 2):
+        five = [image for image in images[k - 2 : k + 3] if image is not None]
+        if len(five) < 5:
+            continue
+        ids = five[0].ids
+        for image in five[1:]:
+            ids = np.intersect1d(ids, image.ids)
+        if len(ids):
+            uv = np.stack([x.uv_px[np.searchsorted(x.ids, ids)] for x in five])
+            old, new = (_error_px(uv, t[k - 2 : k + 3]) for t in (old_s, new_s))
+            out.append(np.clip(np.log((old + _TINY_PX) / (new + _TINY_PX)), -_MOST, _MOST))
+    return [float(np.mean(out[k : k + 5])) for k in range(0, len(out) - 4, 5)]
+
+
+def _error_px(uv_px: FloatArray, t_s: FloatArray) -> float:
+    """Distance of the middle of five images from the cubic through the others, px: median over points.
+
+    It is divided by what noise of the points alone would give on this time axis.
+    """
+    x = t_s - t_s[2]
+    others = np.array([0, 1, 3, 4])
+    weights = np.empty(4)
+    for i, j in enumerate(others):
+        rest = x[others[others != j]]
+        spans = rest - x[j]
+        if (spans == 0.0).any():
+            return np.inf  # two images at once
+        weights[i] = np.prod(rest / spans)
+    error = uv_px[2] - np.tensordot(weights, uv_px[others], 1)
+    return float(np.median(np.linalg.norm(error, axis=1)) / np.sqrt(1.0 + weights @ weights))
