@@ -17,13 +17,15 @@ STOP_S = 45  # longer than the roles of any process may take together, see `proc
 _HURRIED_STOP_S = 2.0  # enough to close a log on a disk that is not busy
 _SETTLED_S = 10.0  # what fails sooner has a wrong config or a port that is taken: again would not help
 _PAUSE_S = 0.5  # RestartSec= of the units
+_AGAIN_S = 10.0  # between attempts of a process that ran before and does not start any more
 _POLL_S = 0.05
 
 
 @dataclass(slots=True)
 class _Child:
-    process: subprocess.Popen[bytes]
-    since_s: float  # CLOCK_MONOTONIC
+    process: subprocess.Popen[bytes] | None  # None: it failed to start again
+    since_s: float  # of the start, or of the failure, CLOCK_MONOTONIC
+    again: bool = False  # it ran before
 
 
 class Children:
@@ -31,11 +33,17 @@ class Children:
 
     Args:
         command: Gives the words that start a process, by its name.
-        settled_s: A child that ends sooner ends all.
+        settled_s: A child that ends sooner when it is started first ends all.
+        again_s: One that ends as soon when it is started again is tried after this time; the others go on.
     """
 
-    def __init__(self, command: Callable[[str], Sequence[str]], settled_s: float = _SETTLED_S) -> None:
-        self._command, self._settled_s = command, settled_s
+    def __init__(
+        self,
+        command: Callable[[str], Sequence[str]],
+        settled_s: float = _SETTLED_S,
+        again_s: float = _AGAIN_S,
+    ) -> None:
+        self._command, self._settled_s, self._again_s = command, settled_s, again_s
         self._children: dict[str, _Child] = {}
 
     def start(self, name: str) -> int:
@@ -45,7 +53,7 @@ class Children:
             Its process id.
         """
         process = subprocess.Popen(self._command(name), start_new_session=True)
-        self._children[name] = _Child(process, time.monotonic())
+        self._children[name] = _Child(process, time.monotonic(), again=name in self._children)
         return process.pid
 
     def tend(self, stop: threading.Event) -> None:
@@ -55,15 +63,25 @@ class Children:
             CliError: A child failed soon after its start.
         """
         for name, child in self._children.items():
-            code = child.process.poll()
+            code = child.process.poll() if child.process is not None else 0
             if code is None or stop.is_set():
                 continue
+            age_s = time.monotonic() - child.since_s
+            if child.process is None:
+                if age_s > self._again_s:
+                    self.start(name)
+                continue
             how = f"ended with code {code}" if code >= 0 else f"was killed by {signal.Signals(-code).name}"
-            if time.monotonic() - child.since_s < self._settled_s:
+            if age_s >= self._settled_s:
+                _log.warning("process %s %s: starting it again", name, how)
+                if not stop.wait(_PAUSE_S):
+                    self.start(name)
+            elif child.again:
+                later = "it is tried again every %g s, the others go on"
+                _log.error("process %s %s soon after its start: " + later, name, how, self._again_s)
+                child.process, child.since_s = None, time.monotonic()
+            else:
                 raise CliError(f"process {name} {how}; see its messages above")
-            _log.warning("process %s %s: starting it again", name, how)
-            if not stop.wait(_PAUSE_S):
-                self.start(name)
 
     def stop(self, hurry: threading.Event) -> None:
         """End all, consumers last to first started: acquire, which hosts the bus, goes last.
@@ -71,11 +89,12 @@ class Children:
         Args:
             hurry: When set, nobody waits for anybody: all are asked at once, and killed after 2 s.
         """
-        for child in reversed(self._children.values()):
+        processes = [child.process for child in self._children.values() if child.process is not None]
+        for process in reversed(processes):
             if not hurry.is_set():
-                child.process.terminate()
-                _wait(child.process, time.monotonic() + STOP_S, hurry)
-        left = [child.process for child in self._children.values() if child.process.poll() is None]
+                process.terminate()
+                _wait(process, time.monotonic() + STOP_S, hurry)
+        left = [process for process in processes if process.poll() is None]
         for process in left:
             process.terminate()
         end_s = time.monotonic() + _HURRIED_STOP_S

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     if not config.imus and not config.cameras:
         raise CliError(f"{args.config}: {NOTHING_TO_RUN}", EXIT_USAGE)
     if not args.roles:
-        return _run_children(args, process_sets.needed_processes(config))
+        return _run_children(args, config, process_sets.needed_processes(config))
     roles = process_sets.role_names(args.roles)
     threading.excepthook = report_thread
     with stop_signals(leave_at_once, STOP_S if args.parent else 0) as stop:
@@ -121,14 +121,31 @@ def _attend(config: Config, bus: Bus, roles: list[str], threads: RoleThreads, st
     notify.stopping()
 
 
-def _run_children(args: argparse.Namespace, names: list[str]) -> int:
+def _run_children(args: argparse.Namespace, config: Config, names: list[str]) -> int:
     """Start each process as a child and tend them until a signal comes."""
+    from vical_daemon.bus.socket_paths import Reach, reach
+    from vical_daemon.cli.bus_access import socket_path
+
+    # Asked before anything starts: record and calibrate would join the bus of the other one.
+    if "acquire" in names and reach(socket_path(config.bus)) is Reach.OPEN:
+        raise CliError(
+            f"vical runs already: another process hosts the bus at {socket_path(config.bus)}; stop it first "
+            "(systemctl status vical-acquire), or set bus.socket"
+        )
     more = [flag for flag in ("--verbose", "--quiet") if getattr(args, flag[2:])]
-    config, me = str(Path(args.config).absolute()), str(os.getpid())
+    file, me = Path(args.config).absolute(), str(os.getpid())
+    as_started = _contents(file)
 
     def command(name: str) -> list[str]:
+        if _contents(file) != as_started:
+            _log.warning(
+                "%s was edited: process %s starts with the new settings, others keep the old ones until "
+                "`vical run` is started again",
+                file,
+                name,
+            )
         program = [sys.executable, "-m", "vical_daemon", "run", name]
-        return [*program, "-c", config, "--parent", me, *more]
+        return [*program, "-c", str(file), "--parent", me, *more]
 
     hurry = threading.Event()
     children = Children(command)
@@ -141,3 +158,11 @@ def _run_children(args: argparse.Namespace, names: list[str]) -> int:
         finally:
             children.stop(hurry)
     return 0
+
+
+def _contents(file: Path) -> bytes | None:
+    """What is in a file; None: it cannot be read."""
+    try:
+        return file.read_bytes()
+    except OSError:
+        return None
