@@ -11,6 +11,7 @@ import signal
 import struct
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from types import SimpleNamespace, TracebackType
@@ -228,7 +229,7 @@ def _run_imu(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -> N
         serial_number=SERIAL_IMU,
     )
     emulator.plug()
-    with emulator:
+    with emulator, suppress(OSError):  # the parent may have ended already
         pipe.send((emulator.port_name, emulator._clock))
         _wait_for_close(pipe)
 
@@ -247,7 +248,10 @@ def _run_camera(settings: LiveRigSettings, t_start_s: float, pipe: Connection) -
     camera = SimulatedCamera(board, rig.lens, rig.camera_pose_target, optics, settings.seed)
     jitter = np.random.default_rng([settings.seed, 31])
     camera.render(0.0)  # the first picture builds its tables
-    pipe.send(None)
+    try:
+        pipe.send(None)
+    except OSError:  # the parent has ended
+        return
     sequence = 0
     while True:
         # Whoever cannot keep up skips pictures; the sequence number shows it.

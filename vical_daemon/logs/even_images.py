@@ -19,7 +19,7 @@ import numpy as np
 
 from vical_daemon.bus.messages import MessageError, decode_compressed_image, decode_image, decode_points
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
-from vical_daemon.logs.even_stamps import CERTAIN, EVEN_S, EvenStamps, envelope, rounded
+from vical_daemon.logs.even_stamps import CERTAIN, EvenStamps, envelope, rounded
 
 _BLOCK = 20
 """Of so many images the earliest arrival counts: with exponential delays it is late by 1/20 of their mean."""
@@ -28,6 +28,8 @@ _SLOT = 0.75
 image of the grid, unless that one is taken."""
 _GAP = 40
 """A gap of so many periods begins a new piece: the period is known to 1 % before the fit."""
+_EVEN_S = 2e-4
+"""Stamps that deviate less stay as they are, s: 0.1 px at 1 rad/s and f = 500 px, less than corners have."""
 _LEAST = 60  # images: three blocks
 _NEAR = 0.35
 """90 % of the images of an even camera lie within so much of a period of the middle; of any other, 0.45."""
@@ -45,11 +47,11 @@ class ImagePoints(NamedTuple):
 
 
 def already_even(t_ns: IntArray) -> bool:
-    """Whether all intervals are multiples of one, within `EVEN_S`: nothing is to be done then."""
+    """Whether all intervals are multiples of one, within `_EVEN_S`: nothing is to be done then."""
     intervals_s = np.diff(t_ns) * 1e-9
     if not len(intervals_s) or not (period_s := float(np.median(intervals_s))) > 0.0:
         return True
-    return bool((np.abs(intervals_s - period_s * np.round(intervals_s / period_s)) < EVEN_S).all())
+    return bool((np.abs(intervals_s - period_s * np.round(intervals_s / period_s)) < _EVEN_S).all())
 
 
 class CameraStamps:
@@ -159,7 +161,7 @@ def even_grid(t_ns: IntArray) -> EvenStamps | None:
     Returns:
         None where the stamps are even already, rounded, or far from any grid.
     """
-    if len(t_ns) < _LEAST:
+    if len(t_ns) < _LEAST or already_even(t_ns):
         return None
     t_s = (t_ns - t_ns[0]) * 1e-9
     intervals_s = np.diff(t_s)
@@ -184,7 +186,7 @@ def even_grid(t_ns: IntArray) -> EvenStamps | None:
     if np.quantile(np.abs(taken_s - middle_s), 0.9) > _NEAR * period_s or (np.diff(new_ns) <= 0).any():
         return None
     jitter_s = float(taken_s.std())
-    if jitter_s < EVEN_S or rounded(t_ns, taken_s, period_s):
+    if jitter_s < _EVEN_S or rounded(t_ns, taken_s, period_s):
         return None
     largest_s = float(taken_s.max()) - middle_s
     return EvenStamps(new_ns, jitter_s, largest_s, float(np.median(scatter_s)), len(bounds) - 1)

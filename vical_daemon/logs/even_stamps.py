@@ -20,7 +20,7 @@ _BLOCK_S = 1.0
 _WINDOW_S = 15.0
 """Half width of the local line through the earliest arrivals, s. A crystal's rate wanders by 2.4 ppm a minute
 (`vical_drivers.envelope`): within the window that bends a line by 4e-8 / 2 * 15**2 = 5 us."""
-EVEN_S = 5e-5
+_EVEN_S = 5e-5
 """Stamps that deviate less from an even grid come from a device's clock and stay as they are, s; as in
 `estimation.inertial.stamp_steps`."""
 _LEAST_BLOCKS = 5
@@ -84,7 +84,7 @@ def even_stamps(t_ns: IntArray, gyro_rps: FloatArray) -> EvenStamps | None:
     taken_s = t_s - even_s
     jitter_s = float(taken_s.std())
     new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
-    if jitter_s < EVEN_S or rounded(t_ns, taken_s, period_s) or (np.diff(new_ns) <= 0).any():
+    if jitter_s < _EVEN_S or rounded(t_ns, taken_s, period_s) or (np.diff(new_ns) <= 0).any():
         return None
     gain = _surprise(gyro_rps[sort], t_s[sort]) - _surprise(gyro_rps, even_s)
     if not gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
