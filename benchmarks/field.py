@@ -23,12 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks import runner
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "euroc_imu_april"
-WIDTH_PX = 752
+WIDTH_PX, IMU_HZ = 752, 200.0
 BIAS_RPS = np.radians([-0.148, 1.369, 4.364])  # of this gyro, by `vical td-icp`
 _USUAL = {"target_shape", "lens_term_missing", "image_gap"}  # announced for the unchanged recording, too
 
@@ -145,6 +146,14 @@ def _paired(data: Data) -> Data:
     return replace(data, points=points[~lost[image]])
 
 
+def _lowpass(data: Data) -> Data:
+    """A filter of second order (Butterworth): 22 ms late."""
+    six = data.six.copy()
+    still = six[0, 3:]
+    six[:, 3:] = still + lfilter(*butter(2, 10.0 / (0.5 * IMU_HZ)), six[:, 3:] - still, axis=0)
+    return replace(data, six=six)
+
+
 def late_images(data: Data, rng: np.random.Generator) -> Data:
     """Images stamped when a driver has them, one after the other: 4 ms late, 1 % of them 60 ms."""
     stamps, image = np.unique(data.points["t"], return_inverse=True)
@@ -178,6 +187,7 @@ FAULTS: dict[str, tuple[str, Callable[[Data, np.random.Generator], Data]]] = {
     "loud": ("white noise stated three times too large", lambda d, _: d),
     "quiet": ("white noise stated three times too small", lambda d, _: d),
     "late_images": ("images stamped on arrival, 4 ms late, 1 % of them 60 ms", late_images),
+    "lowpass": ("accelerometer behind a low-pass filter of 10 Hz", lambda d, _: _lowpass(d)),
 }
 STATED = {"loud": 3.0, "quiet": 1.0 / 3.0}
 """By how much the densities in the file with the prior are too large."""

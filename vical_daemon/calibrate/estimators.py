@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 from vical_daemon.bus import topics
@@ -86,7 +87,9 @@ def make_estimator(config: Config, priors: dict[str, CameraPrior] | None = None)
     from vical_daemon.vision.target import load_target
 
     assert config.target_path is not None  # checked by `config.load`
-    return Calibrator(options, priors, load_target(config.target_path).points_m)
+    target = load_target(config.target_path)
+    options = replace(options, target_alike=target.alike_upside_down)
+    return Calibrator(options, priors, target.points_m)
 
 
 def input_keys(config: Config) -> list[str]:

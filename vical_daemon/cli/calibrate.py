@@ -193,6 +193,8 @@ def conclude(
         why = mistake or f"{status}: {why or 'too little data'} ({suspects(job)})"
         unwritten = "" if result["cameras"] or not args.output else f"; {args.output} was not written"
         raise CliError(f"no calibration: {why}{unwritten}")
+    if job.accel_late:
+        warn(result["warnings"][-1])
     if status == "converged":
         return 0
     warn(f"{status}: {why}")

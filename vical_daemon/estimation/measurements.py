@@ -116,6 +116,7 @@ class CalibrationOptions:
         estimate: Of {"imu_intrinsics", "readout", "target_scale", "target_shape", "accel_lag"}: optional
             blocks that are switched on.
         target_free: Landmarks are estimated, no target is known.
+        target_alike: A half turn maps the target onto itself, and its ids do not tell which end is up.
         gravity_mps2: Magnitude of gravity, m/s^2.
         corner_sigma_px: First guess of the corner noise; measured from the data afterwards.
         imu_noise: Densities of the IMU.
@@ -125,6 +126,7 @@ class CalibrationOptions:
     fix: frozenset[str] = frozenset()
     estimate: frozenset[str] = frozenset()
     target_free: bool = False
+    target_alike: bool = False
     gravity_mps2: float = 9.80665
     corner_sigma_px: float = 0.5
     imu_noise: ImuNoise = field(default_factory=ImuNoise)

@@ -301,6 +301,16 @@ def with_stamp(payload: bytes, stamp_ns: int) -> bytes:
     return payload[:4] + _STAMP.pack(*divmod(stamp_ns, 1_000_000_000)) + payload[12:]
 
 
+def force_of(payload: bytes) -> bytes:
+    """Return the specific force of a sensor_msgs/Imu as it is written."""
+    return payload[_FORCE]
+
+
+def with_force(payload: bytes, force: bytes) -> bytes:
+    """Return a sensor_msgs/Imu with another specific force, see `force_of`."""
+    return payload[: _FORCE.start] + force + payload[_FORCE.stop :]
+
+
 def _has_imu_size(payload: bytes) -> bool:
     """Whether these bytes are as long as a sensor_msgs/Imu with this frame id is."""
     if len(payload) < 16 + _IMU_NUMBERS:

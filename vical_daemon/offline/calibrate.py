@@ -16,9 +16,10 @@ from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.bus.outgoing import publish
 from vical_daemon.calibrate.estimators import make_estimator
 from vical_daemon.calibrate.worker import EstimateRole
-from vical_daemon.estimation.events import Event
+from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate
 from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
+from vical_daemon.offline.accel_shift import STRAIGHT_S
 from vical_daemon.offline.calibration_job import Job, input_key, keys_of, noise_of, points_key
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 Progress = Callable[[float, CalibrationEstimate | None], None]
 PUBLISH_EVERY_S = 1.0  # of the data: often enough for a progress bar
+_PASSES = 3
+"""A long lag of the accelerometer is found too short at first; the second time it is within an interval."""
 _APART_NS = 10_000_000_000  # between one recording and the next: more than any gap that is bridged
 
 
@@ -99,17 +102,25 @@ def run_job(
         enough: Called with each estimate, once a second of data; True: the rest is not needed.
         closed: Called with each complete window, of one camera without a target.
     """
-    frames: list[FrameReport] = []
-    player = _Player(job, progress, frames.extend if keep_frames else None, enough)
-    parts = job.parts if only is None else [job.parts[k] for k in only]
-    player.expected = sum(_expected(part) for part in parts)
-    role, estimator = player.role, player.estimator
-    if closed is not None:
-        from vical_daemon.estimation.target_free import TargetFreeCalibrator
+    passes = _PASSES if enough is None and closed is None else 1  # those would see some data twice
+    while True:
+        frames: list[FrameReport] = []
+        player = _Player(job, progress, frames.extend if keep_frames else None, enough)
+        player.may_shift = passes > 1
+        parts = job.parts if only is None else [job.parts[k] for k in only]
+        player.expected = sum(_expected(part) for part in parts)
+        role, estimator = player.role, player.estimator
+        if closed is not None:
+            from vical_daemon.estimation.target_free import TargetFreeCalibrator
 
-        assert isinstance(estimator, TargetFreeCalibrator)
-        estimator.window_closed = closed
-    inputs = _play_all(parts, role, player.play, common_clock=job.common_clock)
+            assert isinstance(estimator, TargetFreeCalibrator)
+            estimator.window_closed = closed
+        inputs = _play_all(parts, role, player.play, common_clock=job.common_clock)
+        if not player.accel_late:
+            break
+        for part in job.parts:
+            part.accel_late += player.accel_late
+        passes -= 1
     assert role.latest is not None
     traces = {name: [asdict(point) for point in estimator.trace(name)] for name in job.cameras}
     checks = [asdict(check) for check in estimator.held_out()]
@@ -133,6 +144,8 @@ class _Player:
         estimator: Its estimator.
         events: What it announced so far.
         expected: About how many messages are played in all.
+        may_shift: A long lag of the accelerometer ends the pass, to be taken off before the next.
+        accel_late: By how many readings, then.
     """
 
     def __init__(
@@ -150,6 +163,7 @@ class _Player:
         )
         self.events: list[Event] = []
         self.expected = 0.0
+        self.may_shift, self.accel_late = False, 0
         self._stop, self._done, self._shown_s = False, 0, time.monotonic()
         status_key = topics.STATUS.key(job.config.rig, "imu")
         for key in (job.imu.key, status_key, *(points_key(job, name) for name in job.cameras)):
@@ -157,9 +171,19 @@ class _Player:
         _attach_detectors(self._bus, job)
 
     def _inspect(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
-        self.events.extend(estimate.events)
+        self.events.extend(self._in_all(event) for event in estimate.events)
         self._stop = self._stop or (self._enough is not None and self._enough(estimate))
         return estimate
+
+    def _in_all(self, event: Event) -> Event:
+        """Return an event; a lag of the accelerometer with what was taken off before."""
+        if event.kind is not EventKind.ACCEL_LAG or event.value is None:
+            return event
+        rate_hz = self._job.imu.rate_hz
+        readings = round(event.value * rate_hz)
+        if self.may_shift and readings and abs(event.value) > STRAIGHT_S:
+            self.accel_late, self._stop = readings, True
+        return replace(event, value=event.value + self._job.accel_late / rate_hz)
 
     def play(self, part: Job, later_ns: int) -> None:
         """Publish one recording, its stamps moved by `later_ns`."""
@@ -247,6 +271,8 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     if result["imu"] is not None:
         result["imu"] |= {"name": job.imu.name, "noise": asdict(noise_of(job))}
     result["warnings"] = [text for part in job.parts for text in part.recording.warnings]
+    if job.accel_late:
+        result["warnings"].append(accel_moved(job))
     first = next(iter(job.cameras))
     result["trace"] = outcome.traces[first]
     if len(job.cameras) > 1:
@@ -255,6 +281,16 @@ def document(job: Job, outcome: Outcome) -> dict[str, Any]:
     result["left_out"] = outcome.left_out
     result["cpu_s"] = time.process_time()
     return result
+
+
+def accel_moved(job: Job) -> str:
+    """One line on the accelerometer's readings that were moved."""
+    moved_ms = 1e3 * job.accel_late / job.imu.rate_hz
+    where = "behind" if moved_ms > 0.0 else "ahead of"
+    return (
+        f"{job.imu.name}: the accelerometer is {where} the gyro: its readings were moved by "
+        f"{abs(moved_ms):.3g} ms; set both sensors to the same filter"
+    )
 
 
 def images_at(job: Job, camera: str, stamps_ns: Sequence[int]) -> dict[int, bytes]:

@@ -11,6 +11,7 @@ from vical_daemon.config.priors import Initial
 from vical_daemon.estimation.measurements import CameraPrior, ImuNoise
 from vical_daemon.logs import Recording, Stream
 from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.offline.accel_shift import AccelShift
 from vical_daemon.offline.errors import InputError, OptionError
 
 
@@ -28,6 +29,7 @@ class Job:
         seconds: How many are used then; None: all.
         others: Further recordings of the same rig, in the order in which they are used.
         common_clock: The time shift is the same in all recordings.
+        accel_late: By how many readings the accelerometer is behind the gyro, see `AccelShift`.
     """
 
     recording: Recording
@@ -39,6 +41,7 @@ class Job:
     seconds: float | None = None
     others: list[Job] = field(default_factory=list)
     common_clock: bool = True
+    accel_late: int = 0
 
     @property
     def duration_s(self) -> float:
@@ -61,10 +64,14 @@ class Job:
         begin_ns = self.begin_ns
         end_ns = begin_ns + round(self.duration_s * 1e9)
         statuses = [topics.STATUS.key(self.recording.rig, "imu")]  # they say how well stamps are known
+        shift = AccelShift(self.accel_late)
         for key, payload in self.recording.messages([self.imu, *self.cameras.values()], statuses):
             stamp_ns = stamp_of(payload)
-            if stamp_ns is not None and begin_ns <= stamp_ns <= end_ns:
-                yield key, payload
+            if stamp_ns is None or not begin_ns <= stamp_ns <= end_ns:
+                continue
+            complete = shift.take(payload) if key == self.imu.key else payload
+            if complete is not None:
+                yield key, complete
 
 
 def make_job(

@@ -50,6 +50,7 @@ class AprilGrid:
     tag_size_m: float
     tag_spacing: float
     kind: ClassVar[str] = "aprilgrid"
+    alike_upside_down: ClassVar[bool] = False  # each tag says where it belongs
 
     @property
     def pitch_m(self) -> float:
@@ -102,6 +103,11 @@ class Checkerboard:
     row_spacing_m: float
     col_spacing_m: float
     kind: ClassVar[str] = "checkerboard"
+
+    @property
+    def alike_upside_down(self) -> bool:
+        """Whether a half turn maps the board onto itself."""
+        return (self.cols + self.rows) % 2 == 0
 
     @cached_property
     def points_m(self) -> FloatArray:

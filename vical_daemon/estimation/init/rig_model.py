@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from vical_daemon.estimation.init.half_turn import HalfTurns
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, FloatArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import Layout, State, make_layout
@@ -26,6 +27,7 @@ class RigModel:
         target: Points of the target as far as its size is known, m, shape (n, 3).
         size: Of the target over the stated one, where that is far off.
         layout: Where the errors live.
+        turns: Numbers the points of a target that looks the same upside down.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class RigModel:
         self.priors, self.target, self.size = dict(cameras), target_points_m, 1.0
         self._stated = target_points_m
         self._options = options
+        self.turns = HalfTurns(target_points_m, alike=options.target_alike)
         self._held = self._held_lenses()
         self._states = options.estimate | _ALWAYS
         if "intrinsics" not in options.fix or self._held:  # else a wrong lens would look like a bent target

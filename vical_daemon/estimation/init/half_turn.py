@@ -1,0 +1,93 @@
+"""Boards that look the same upside down: their points may be numbered from either end.
+
+A checkerboard with an even sum of columns and rows is such a board. One image cannot tell which end is up, so
+a detector may number it one way in one image and the other way in the next. The board does not turn by 180
+degrees between two images: the numbering that continues the one before is right. After a gap it is the one
+by which the board stands in the image as the gyro says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
+from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
+from vical_daemon.estimation.inertial.imu_model import products, rotation_steps
+from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+
+_NEXT_NS = 400_000_000  # a hand turns a camera by less than 90 degrees in 0.4 s, as the detector assumes
+_CLEARLY = 0.5
+"""The other numbering moves the points by less than half as much: they jump by half the board."""
+_FEWEST = 4
+_BEHIND_S = 0.1  # readings may end so much before an image: 30 degrees at 5 rad/s
+
+
+class HalfTurns:
+    """Numbers the points of each image as those before it.
+
+    Args:
+        target_m: Points of the target, m, shape (n, 3).
+        alike: A half turn maps the target onto itself; otherwise nothing is done.
+    """
+
+    def __init__(self, target_m: FloatArray, *, alike: bool) -> None:
+        self._target_m, self._alike = target_m, alike
+        self._last: dict[str, PointsFrame] = {}
+
+    def numbered(
+        self, frame: PointsFrame, t_cam_s: float, f: CalibrationFilter | None, buffer: ImuBuffer | None
+    ) -> PointsFrame:
+        """Return an image with the numbers that continue those before.
+
+        Args:
+            frame: As detected; ids within the target.
+            t_cam_s: Its stamp, s since the base of the buffer.
+            f: The filter, after the image before; None: there is none yet.
+            buffer: Readings.
+        """
+        if not self._alike or len(frame.ids) < _FEWEST:
+            return frame
+        last, other = self._last.get(frame.camera), self._turned(frame)
+        if last is not None and 0 < frame.t_cam_ns - last.t_cam_ns <= _NEXT_NS:
+            turned = _moved_px(last, other) < _CLEARLY * _moved_px(last, frame)
+        else:
+            turned = self._upside_down(frame, t_cam_s, f, buffer)
+        self._last[frame.camera] = other if turned else frame
+        return self._last[frame.camera]
+
+    def _turned(self, frame: PointsFrame) -> PointsFrame:
+        """The same image, numbered from the other end."""
+        ids = (len(self._target_m) - 1 - frame.ids)[::-1]
+        sigma = None if frame.sigma_px is None else frame.sigma_px[::-1]
+        return replace(frame, ids=ids, uv_px=frame.uv_px[::-1], sigma_px=sigma)
+
+    def _upside_down(
+        self, frame: PointsFrame, t_cam_s: float, f: CalibrationFilter | None, buffer: ImuBuffer | None
+    ) -> bool:
+        """Whether the board stands on its head, by the attitude that the gyro gives."""
+        if f is None or buffer is None or frame.camera not in f.state.cameras:
+            return False
+        camera = f.state.cameras[frame.camera]
+        t_s = t_cam_s + camera.timeshift_s
+        until_s = min(t_s, buffer.newest_s)
+        if t_s - until_s > _BEHIND_S or until_s < f.state.t_s or buffer.gap_within(f.state.t_s, until_s):
+            return False
+        segment = buffer.segment(f.state.t_s, until_s)
+        if segment is None:
+            return False
+        rates = (segment.gyro - f.state.gyro_bias) @ f.state.gyro_matrix.T
+        turn = products(rotation_steps(rates[None], np.diff(segment.t_s)))[0, -1]
+        R_cam_target = (f.state.R_world_imu @ turn @ camera.R_imu_cam).T
+        board = self._target_m[frame.ids, :2] - self._target_m[frame.ids, :2].mean(axis=0)
+        seen = (frame.uv_px - frame.uv_px.mean(axis=0)).T @ board  # how its axes stand in the image
+        return bool((seen * R_cam_target[:2, :2]).sum() < 0.0)
+
+
+def _moved_px(a: PointsFrame, b: PointsFrame) -> float:
+    """Median distance of the points from one image to the next, px; inf: they share too few."""
+    _, at_a, at_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    if len(at_a) < _FEWEST:
+        return np.inf
+    return float(np.median(np.linalg.norm(a.uv_px[at_a] - b.uv_px[at_b], axis=1)))
