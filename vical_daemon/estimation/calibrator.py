@@ -125,8 +125,7 @@ class Calibrator:
         if self._intake.clock_was_set(frame.camera):
             self._clock_was_set(frame.camera)
         self.evaluator.saw_points(t_cam_s, len(frame.ids))
-        numbered = self.rig.turns.numbered(frame, t_cam_s, self.filter, self._buffer)
-        self._pending.push(t_cam_s, numbered)
+        self._pending.push(t_cam_s, self.rig.turns.numbered(frame, t_cam_s, self.filter, self._buffer))
 
     def _clock_was_set(self, camera: str) -> None:
         """Stamps have moved by seconds: the time shift is known only roughly until images show it."""
