@@ -267,4 +267,6 @@ def suspects(job: Job) -> str:
     things = ["the lens in --initial", f"the stamps (imu {job.imu.duration_s:.1f} s, {spans})"]
     if job.config.target:
         things.insert(0, f"the sizes in {job.config.target}")
-    return f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}"
+    waits = "; all wait for a camera that hardly sees the target: --camera NAME takes one of them alone"
+    check = f"if the motion was rich, check {' and '.join((', '.join(things[:-1]), things[-1]))}"
+    return check + (waits if job.config.target and len(job.cameras) > 1 else "")

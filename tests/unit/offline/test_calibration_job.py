@@ -14,7 +14,7 @@ from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.offline import calibrate
-from vical_daemon.offline.calibration_job import make_job
+from vical_daemon.offline.calibration_job import make_job, suspects
 
 
 def test_all_that_was_announced_on_the_way_is_told_at_the_end(
@@ -110,3 +110,13 @@ def test_only_the_part_that_was_asked_for_is_used(short: Path) -> None:
     job.seconds = None
     assert job.duration_s == pytest.approx(recording.duration_s - 2.5)
     assert list(job.messages())[-1] == everything[-1]
+
+
+def test_a_second_camera_that_hardly_sees_the_target_is_suspected(shortest: Path) -> None:
+    recording, initial = open_recording(shortest), read_initial(shortest / "initial.yaml")
+    job = make_job(recording, initial, target=str(shortest / "target.yaml"))
+    assert "--camera" not in suspects(job)
+    job.cameras["cam1"] = job.cameras["cam0"]
+    assert suspects(job).endswith("hardly sees the target: --camera NAME takes one of them alone")
+    job.config = replace(job.config, target=None)  # without a target each camera is on its own
+    assert "--camera" not in suspects(job)
