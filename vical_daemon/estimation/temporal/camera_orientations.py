@@ -23,14 +23,12 @@ class Orientations:
         t_cam_ns: Stamps in the camera's clock, ns, shape (n,).
         R_world_cam: The world is the target (or the first camera frame), shape (n, 3, 3).
         covariance: Of the local (right) error, rad^2, shape (n, 3, 3).
-        skipped: Frames without a usable pose.
         p_world_cam: Position of the camera in the world, m, shape (n, 3); empty where it is not known.
     """
 
     t_cam_ns: IntArray
     R_world_cam: FloatArray
     covariance: FloatArray
-    skipped: int = 0
     p_world_cam: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
@@ -63,7 +61,6 @@ def target_orientations(
     sigma = corner_sigma_px / float(np.mean(intrinsics[:2]))
     stamps: list[int] = []
     poses: list[PlanarPose] = []
-    skipped = 0
     frames = list(frames)
     for frame, found in zip(
         frames, _planar(frames, points_m, (intrinsics, distortion, model), sigma), strict=True
@@ -71,19 +68,18 @@ def target_orientations(
         near = bool(stamps) and frame.t_cam_ns - stamps[-1] < 1e9 * IMAGE_GAP_S
         pose = _choose(found, poses[-1] if near else None)
         if pose is None or pose.rms * float(intrinsics[0]) > _MAX_RMS_PX:
-            skipped += 1
             continue
         stamps.append(frame.t_cam_ns)
         poses.append(pose)
     if not poses:
-        return Orientations(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), skipped)
+        return Orientations(np.zeros(0, np.int64), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
     R = np.stack([pose.R_cam_target for pose in poses])
     covariance = np.stack([pose.covariance[3:, 3:] for pose in poses])
     rms = np.array([pose.rms for pose in poses])
     covariance *= np.maximum(1.0, rms / np.median(rms))[:, None, None] ** 2
     R_world_cam = np.swapaxes(R, 1, 2)
     p = -(R_world_cam @ np.stack([pose.p_cam_target for pose in poses])[..., None])[..., 0]
-    return Orientations(np.array(stamps), R_world_cam, R @ covariance @ R_world_cam, skipped, p)
+    return Orientations(np.array(stamps), R_world_cam, R @ covariance @ R_world_cam, p)
 
 
 def _planar(

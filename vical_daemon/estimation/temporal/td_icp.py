@@ -28,7 +28,6 @@ from vical_daemon.estimation.temporal.td_icp_input import (
     TdIcpOptions,
     clean_gyro,
     clean_orientations,
-    world_cam_from_cam_target,
 )
 from vical_daemon.estimation.temporal.td_icp_refusals import judge, refuse_motion, refuse_start
 from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
@@ -40,7 +39,6 @@ __all__ = [
     "TdIcpOptions",
     "TdIcpResult",
     "td_icp",
-    "world_cam_from_cam_target",
 ]
 
 ENOUGH_S = 5.0  # in less than this any mistake can be made to fit

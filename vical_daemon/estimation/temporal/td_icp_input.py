@@ -75,21 +75,3 @@ def clean_orientations(
     if len(index) < MIN_ORIENTATIONS:
         return f"{len(index)} usable camera orientations: at least {MIN_ORIENTATIONS} are needed"
     return t_s[index], R[index], sigma[index] + 1e-14 * np.eye(3), index
-
-
-def world_cam_from_cam_target(
-    R_cam_target: FloatArray, covariance: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray | None]:
-    """Turn target poses as seen by the camera into camera orientations in the world (= target).
-
-    Args:
-        R_cam_target: Rotations, shape (n, 3, 3).
-        covariance: Of their local (right) errors, rad^2, shape (n, 3, 3), or None.
-
-    Returns:
-        R_world_cam (n, 3, 3), and the covariance of its local error (n, 3, 3) or None.
-    """
-    R_world_cam = np.swapaxes(R_cam_target, 1, 2)
-    if covariance is None:
-        return R_world_cam, None
-    return R_world_cam, R_cam_target @ covariance @ R_world_cam

@@ -34,7 +34,6 @@ __all__ = [
     "covariance_of",
     "gramian",
     "judge",
-    "lost_in_block",
     "pose_sensitivities",
 ]
 
@@ -274,17 +273,3 @@ def covariance_of(result: Observability, prior: float = 1e3) -> FloatArray:
     values, vectors = np.linalg.eigh(result.information * np.outer(u, u))
     half = vectors / np.sqrt(np.maximum(values, 0.0) + prior**-2)
     return np.asarray((half @ half.T) * np.outer(u, u), dtype=np.float64)
-
-
-def lost_in_block(result: Observability, block: str) -> FloatArray:
-    """Return an orthonormal basis of what is lost within one block, shape (k, size), strongest first.
-
-    The lost directions span a space; this is its shadow on the block: for the lever arm under rotation about
-    one axis, that axis.
-    """
-    columns = result.blocks[block]
-    if not result.lost:
-        return np.zeros((0, columns.stop - columns.start))
-    shadow = np.stack([d.vector[columns] for d in result.lost])
-    _, s, Vt = np.linalg.svd(shadow, full_matrices=False)
-    return np.asarray(Vt[s > 1e-3], dtype=np.float64)

@@ -17,7 +17,6 @@ from vical_daemon.estimation.tools.observability import (
     Motion,
     Setup,
     gramian,
-    lost_in_block,
     pose_sensitivities,
 )
 from vical_daemon.estimation.tools.observability_model import ModelBlocks, model_rank
@@ -168,6 +167,13 @@ def test_general_motion_determines_everything_and_bounds_are_sensible():
     assert result.rank == result.unknowns == 25
     assert np.all(result.sigma[result.blocks["lever_arm"]] < 2e-3)
     assert result.sigma[result.blocks["timeshift"]][0] < 2e-4
+
+
+def lost_in_block(result, block):
+    """Basis of what is lost within one block, shape (k, size): the shadow of the lost directions on it."""
+    shadow = np.stack([d.vector[result.blocks[block]] for d in result.lost])
+    _, s, Vt = np.linalg.svd(shadow, full_matrices=False)
+    return Vt[s > 1e-3]
 
 
 def test_one_axis_names_the_axis_along_a_motion_too():
