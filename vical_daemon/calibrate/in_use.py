@@ -96,7 +96,7 @@ def _from_store(config: Config, persistence: CalibrationPersistence, now_ns: int
     stored = persistence.before
     lacking = [name for name in config.calibration_cameras if name not in stored]
     if lacking and not persistence.devices:
-        raise DevicesUnknownError("waiting for the serial numbers of imu and cameras")
+        raise DevicesUnknownError("waiting for the serial numbers of IMU and cameras")
     if lacking:
         raise NothingInUseError(
             f"no calibration of {', '.join(lacking)} is stored for these devices: `vical command calibrate`"

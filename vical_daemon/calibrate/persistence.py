@@ -102,7 +102,7 @@ class CalibrationPersistence:
     def begin_again(self) -> dict[str, CameraPrior]:
         """Switch to the devices that are present now; return the prior of each camera."""
         for line in self._serials.adopt():
-            said = f"{line}: the calibration begins anew"
+            said = f"{line}: the calibration starts over"
             _log.warning("%s", said)
             self.announce(Event(EventKind.DEVICE_REPLACED, said=said))
         self._before.clear()
@@ -239,7 +239,7 @@ class CalibrationPersistence:
                     self._store.save(imu, camera, name, before.estimate, before.saved_ns)
                 elif imu and camera and not self._serials.in_doubt:
                     self._store.remove(imu, camera)
-            said = "discarded: calibrating anew, with what was stored before"
+            said = "discarded: starting over, with what was stored before"
         except StoreError as error:
             said = f"discarded, but the store was not put back: {error}"
         self.announce(Event(EventKind.OTHER, said=said))

@@ -96,7 +96,7 @@ def calibrate(
         if "accept" in words and persistence.accept(role.latest):
             publish(bus, persistence.stored_messages())
         if words & {"discard", "reset"}:
-            _log.info("calibrating anew by command")
+            _log.info("starting over by command")
             checkpoint.forget()
             priors = persistence.discard() if "discard" in words else priors
             role.reset(make_estimator(config, priors))

@@ -139,9 +139,9 @@ class _VerifyService:
             verification.end_stretch()
         except Exception as error:  # an estimator should never raise on data; the next check may be fine
             text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-            _log.exception("the check failed and begins anew: %s", text)
+            _log.exception("the check failed and starts over: %s", text)
             self._persistence.announce(
-                Event(EventKind.ESTIMATOR_RESTARTED, said=f"the check failed and begins anew: {text}")
+                Event(EventKind.ESTIMATOR_RESTARTED, said=f"the check failed and starts over: {text}")
             )
             verification.begin_check()
         finally:

@@ -64,7 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser, accept: tuple[str, ...] = ACC
         "--estimate",
         metavar="WHAT",
         default="",
-        help=f"comma-separated, estimated from the start instead of on evidence: {', '.join(ESTIMATE)}",
+        help="comma-separated, estimated from the start, not only if the data require it: "
+        + ", ".join(ESTIMATE),
     )
     add_stretch(parser)
     parser.add_argument(

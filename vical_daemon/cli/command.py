@@ -31,7 +31,7 @@ _ANSWER_S = 5.0  # estimates come five times a second, also from a busy machine
 _EPILOG = """\
   vical command accept            store the present result as the calibration of these devices
   vical command discard           forget it, and put back what was stored when it began
-  vical command reset             forget it and begin anew; the store stays as it is
+  vical command reset             forget it and start over; the store stays as it is
   vical command check             with `mode: verify`: check the stored calibration now, without a pause
   vical command calibrate         with `mode: verify`: calibrate, store the result, and verify it from then on
   vical command verify            ends such a calibration

@@ -120,7 +120,7 @@ def _rms(px: FloatArray) -> float:
 
 
 def _imu(d: FloatArray, sigma: FloatArray) -> list[str]:
-    lines = ["imu biases (they walk: not part of the verdict)"]
+    lines = ["IMU biases (they walk: not part of the verdict)"]
     for k, (name, axis) in enumerate((n, axis) for n in ("gyro bias", "accel. bias") for axis in "xyz"):
         unit = "rad/s" if k < 3 else "m/s^2"
         lines.append(

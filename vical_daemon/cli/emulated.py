@@ -64,7 +64,7 @@ def emulated_devices(config: Config, roles: Collection[str]) -> Iterator[RoleOpt
         raise CliError(f"there is one emulated imu and one emulated camera, not {imus + cameras}", EXIT_USAGE)
     if imus and cameras and len(running) == 1:
         raise CliError(
-            "the emulated imu and camera are moved together: run both in one process (`vical run acquire`)",
+            "the emulated IMU and camera are moved together: run both in one process (`vical run acquire`)",
             EXIT_USAGE,
         )
     with make_rig(_board(config), _frame_rate_hz(config, cameras), devices=running) as rig:

@@ -157,7 +157,7 @@ def _read_recording(path: Path, imu: str | None) -> tuple[IntArray, FloatArray, 
     recording = open_recording(path, check=False)
     names = list(recording.imus)
     if not names:
-        raise CliError(f"{path} holds no imu data")
+        raise CliError(f"{path} holds no IMU data")
     if imu is None and len(names) > 1:
         raise CliError(f"{path} holds the imus {', '.join(names)}; choose one with --imu", EXIT_USAGE)
     chosen = imu or names[0]

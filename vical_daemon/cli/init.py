@@ -21,7 +21,7 @@ examples:
   vical init --target aprilgrid     also makes board.pdf to print, and target.yaml
   vical init --emulated             no hardware: an emulated IMU and a rendered camera
 
-Nothing is asked. Each line of the config says what it is for; change what you know better.
+It asks no questions. Each line of the config says what it is for; correct what you know better.
 """
 _BOARD_FILE, _TARGET_FILE = "board.pdf", "target.yaml"
 
@@ -113,7 +113,7 @@ def _look(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[FoundCam
         if not port["found"] and port["port"] in args.port:
             raise CliError(str(port["problem"]))
     for imu in imus:
-        _say(args, f"found imu {imu['model']} serial {imu['serial_number']} on {imu['port']}")
+        _say(args, f"found IMU {imu['model']} serial {imu['serial_number']} on {imu['port']}")
     for camera in cameras:
         _say(args, f"found camera {camera.model} at {camera.uri}")
     if not imus and not cameras:

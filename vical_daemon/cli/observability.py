@@ -186,7 +186,7 @@ def _print(document: dict[str, Any], missing: list[WeakDirection]) -> None:
         "intrinsics": (1.0, "px"),
         "readout": (1e3, "ms"),
     }
-    print("bound on sigma for a perfect imu:")
+    print("bound on sigma for a perfect IMU:")
     for name, values in document["sigma"].items():
         factor, unit = units.get(name, (1.0, ""))
         words = "  ".join("lost" if v is None else f"{factor * v:.2g}" for v in values)

@@ -49,7 +49,7 @@ COMMANDS = (
     Command("completion", START, "print a completion script for bash or zsh"),
     Command("run", SERVICE, "run the daemon, or single roles of it"),
     Command(
-        "command", SERVICE, "accept or discard the live calibration, begin anew, start or stop recording"
+        "command", SERVICE, "accept or discard the live calibration, start over, start or stop recording"
     ),
     Command("watch", SERVICE, "show the calibration live in the terminal"),
     Command("web", SERVICE, "serve a page with the live calibration, on loopback"),

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="A,B,C",
         help="register these sensors jointly: names of IMUs and cameras, topics with orientations (Odometry, "
         "PoseStamped, PoseWithCovarianceStamped, TransformStamped, QuaternionStamped, Imu), trajectory files "
-        "(TUM, EuRoC). The imu's gyro is the reference, or without one the fastest stream",
+        "(TUM, EuRoC). The IMU's gyro is the reference, or without one the fastest stream",
     )
     parser.add_argument(
         "--search", metavar="S", type=float, default=5.0, help="search delays up to ± S seconds (default 5)"

@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
     known, rig = read_known(args.against)
     if rig is not None and rig.status == "inconsistent":
-        raise CliError(f"{args.against} is inconsistent: its data contradict each other; calibrate anew")
+        raise CliError(f"{args.against} is inconsistent: its data contradict each other; calibrate again")
     if args.target:
         from vical_daemon.vision.target import load_target
 

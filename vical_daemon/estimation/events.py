@@ -166,10 +166,10 @@ class About(NamedTuple):
 
 REFERENCE: dict[EventKind, About] = {
     EventKind.BUMPED: About(
-        "The rig is no longer what was calibrated; calibration starts anew.",
+        "The rig has changed since it was calibrated; calibration starts over.",
         "",
         "After the first convergence, when images stop fitting the motion although pose and time shift were "
-        "found anew. Target-free: when 2 s of images show another mounting.",
+        "estimated again. Target-free: when 2 s of images show another mounting.",
     ),
     EventKind.STARTED_OVER: About(
         "As `bumped`, but there was no converged calibration yet.", "", "Before the first convergence."
@@ -246,7 +246,7 @@ REFERENCE: dict[EventKind, About] = {
     ),
     EventKind.IMU_CLOCK_SET_BACK: About("The IMU's clock was set back. Value: by how much.", "s", "At once."),
     EventKind.IMU_CLOCK_REMAPPED: About(
-        "The driver mapped the IMU's clock anew; the time shift follows. Value: step.",
+        "The driver mapped the IMU's clock again; the time shift follows. Value: step.",
         "s",
         "When 4 even readings have followed the step.",
     ),
@@ -319,12 +319,12 @@ REFERENCE: dict[EventKind, About] = {
         "The lens needs one more distortion term than radtan has: use `plumb_bob`.", "", "Once per camera."
     ),
     EventKind.DEVICE_REPLACED: About(
-        "A device was replaced by another one; the calibration begins anew. The text has the serial numbers.",
+        "A device was replaced by another one; calibration starts over. The text has the serial numbers.",
         "",
         "When its status has named another serial number three times in a row.",
     ),
     EventKind.ESTIMATOR_RESTARTED: About(
-        "The estimator failed and was started afresh. The text says why.",
+        "The estimator failed and was restarted. The text says why.",
         "",
         "When it raises an error, or uses no images for 15 s.",
     ),

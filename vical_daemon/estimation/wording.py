@@ -94,7 +94,7 @@ def guidance_caption(guidance: Guidance) -> str:
 _HEADLINES = {
     "waiting": "Waiting for data.",
     "initialising": "Looking for a first solution.",
-    "converging": "Getting sharper.",
+    "converging": "Improving: keep moving.",
     "converged": "Converged.",
     "degenerate": "The motion does not reveal everything yet.",
     "inconsistent": "The data contradict the model: do not use these numbers.",
@@ -235,8 +235,8 @@ def cause_text(cause: Cause, value: float | None = None) -> str:
 _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.NONE: lambda _: "",
     Cause.STORED_DIFFERS: lambda _: "since the stored calibration",
-    Cause.IMAGES_REFUSED: lambda _: "images no longer fit the motion, even with the pose taken anew",
-    Cause.IMAGES_DISAGREE: lambda _: "images have come to disagree with the motion: the camera moved",
+    Cause.IMAGES_REFUSED: lambda _: "images no longer fit the motion, even after the pose was re-initialised",
+    Cause.IMAGES_DISAGREE: lambda _: "images and motion disagree by more than before: the camera moved",
     Cause.ESTIMATE_IMPLAUSIBLE: lambda _: "the estimate is not finite",
     Cause.CALIBRATION_CONTRADICTED: lambda _: (
         "the last seconds move the calibration by more than the sigmas allow"
@@ -247,17 +247,15 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.INERTIAL_GAP: lambda _: "inertial data have a gap",
     Cause.TOO_FEW_FEATURES: lambda _: "too few features can be followed",
     Cause.FEATURES_CONTRADICT: lambda _: "the features of the last seconds contradict each other",
-    Cause.FEATURES_MISS: lambda v: f"features miss their places by {v:.1f} px",
+    Cause.FEATURES_MISS: lambda v: f"features are {v:.1f} px from where they are expected",
     Cause.INERTIAL_MISFIT: lambda v: f"inertial data and images disagree ({v:.1f} times their noise)",
     Cause.SCENE_MOVES: lambda v: f"{v:.0%} of the features do not move with the scene",
     Cause.NO_PARALLAX: lambda _: "the camera stands still, or features are lost before they show depth",
     Cause.IMAGES_SHIFTED: lambda _: "whole images are shifted: not distinguished without a board",
     Cause.SECOND_AXIS: lambda _: (
-        "the rig turns about a second axis now: starting anew, with all of the lever arm"
+        "the rig now turns about a second axis: restarting, to estimate the whole lever arm"
     ),
-    Cause.COLUMNS_READ: lambda _: (
-        "the images show that columns are read one after the other: starting anew with that"
-    ),
+    Cause.COLUMNS_READ: lambda _: "the images show that the shutter reads columns: restarting with that",
 }
 
 
@@ -292,7 +290,7 @@ def _imu_noise(event: Event) -> str:
     than = "worse" if (event.value or 0.0) > 1.0 else "better"
     times = _of(event, 1.0, "times", ".1f")
     return (
-        f"the imu predicts images {than} than its noise densities say ({times}): "
+        f"the IMU predicts images {than} than its noise densities say ({times}): "
         "measure them with `vical allan`"
     )
 
@@ -318,8 +316,8 @@ def _difference(what: str, factor: float, unit: str, form: str) -> Callable[[Eve
 _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.BUMPED: ("bumped: ", lambda e: cause_text(e.cause, e.cause_value)),
     EventKind.STARTED_OVER: ("started over: ", lambda e: cause_text(e.cause, e.cause_value)),
-    EventKind.STARTED_ANEW: ("", lambda _: "started anew after the change"),
-    EventKind.WENT_ON: ("", lambda e: f"went on after: {cause_text(e.cause, e.cause_value)}"),
+    EventKind.STARTED_ANEW: ("", lambda _: "restarted after the change"),
+    EventKind.WENT_ON: ("", lambda e: f"continued after: {cause_text(e.cause, e.cause_value)}"),
     EventKind.RESUMED: (
         "",
         lambda e: f"resumed from the state of {_of(e, 1.0, 's', '.1f')} ago: the process was restarted",
@@ -336,15 +334,15 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
         "",
         lambda e: f"the time shift stepped by {_of(e, 1e3, 'ms', '+.1f')}; all else is kept",
     ),
-    EventKind.POSE_LOST: ("", lambda _: "pose lost and taken anew from the images"),
+    EventKind.POSE_LOST: ("", lambda _: "pose lost, and re-initialised from the images"),
     EventKind.CLOCK_DRIFT: (
         "",
-        _drift("the time shift drifts: the clocks of camera and imu run at different rates"),
+        _drift("the time shift drifts: the clocks of camera and IMU run at different rates"),
     ),
     EventKind.CLOCK_WANDER: (
         "",
         lambda e: (
-            "the time shift is not constant: it stepped, or the clocks of camera and imu changed their "
+            "the time shift is not constant: it stepped, or the clocks of camera and IMU changed their "
             f"rates, which now differ by {_of(e, 1e6, 'us a second', '+.1f')}; the drift is now estimated too"
         ),
     ),
@@ -367,7 +365,8 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.IMU_CLOCK_REMAPPED: (
         "",
         lambda e: (
-            f"stamps of the imu moved by {_of(e, 1e3, 'ms', '+.1f')} (its clock was mapped anew): followed"
+            f"the IMU's stamps moved by {_of(e, 1e3, 'ms', '+.1f')}: its driver mapped the clock again; "
+            "corrected for"
         ),
     ),
     EventKind.IMU_GAP: ("", lambda e: f"{_of(e, 1.0, 's', '.1f')} without inertial data"),
@@ -388,7 +387,7 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.IMU_INTRINSICS: (
         "",
         lambda e: (
-            f"scale or alignment of the imu is off, by {_of(e, 100.0, '%', '.2f')}: allowed for from now on"
+            f"scale or alignment of the IMU is off, by {_of(e, 100.0, '%', '.2f')}: allowed for from now on"
         ),
     ),
     EventKind.ACCEL_LAG: ("", _accel_lag),

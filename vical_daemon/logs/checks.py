@@ -50,8 +50,8 @@ def _check_imu_rate(name: str, t_ns: IntArray) -> float:
         )
     if rate_hz < _SLOWEST_IMU_HZ:
         raise RecordingError(
-            f"{name}: {rate_hz:.3g} samples a second by its stamps; an imu needs {_SLOWEST_IMU_HZ:g} Hz and "
-            "more: are the stamps nanoseconds, and is this the imu's file?"
+            f"{name}: {rate_hz:.3g} samples a second by its stamps; an IMU needs {_SLOWEST_IMU_HZ:g} Hz and "
+            "more: are the stamps nanoseconds, and is this the IMU's file?"
         )
     return rate_hz
 
@@ -169,13 +169,13 @@ def check_camera(stream: Stream, imus: list[Stream]) -> list[str]:
     if overlap_s <= 0:
         apart_s = (stream.begin_ns - begin) * 1e-9
         raise RecordingError(
-            f"{stream.name}: its stamps and the imu's do not overlap (they begin {apart_s:.6g} s apart); "
+            f"{stream.name}: its stamps and the IMU's do not overlap (they begin {apart_s:.6g} s apart); "
             "both must come from one clock"
         )
     if stream.duration_s > 1.1 * imu_s + 2.0:
         raise RecordingError(
             f"{stream.name}: its stamps span {stream.duration_s:.1f} s, the imu's {imu_s:.1f} s; the "
-            "camera's rate or clock is wrong, or the imu was recorded in part only"
+            "camera's rate or clock is wrong, or the IMU was recorded in part only"
         )
     outside_s = stream.duration_s - overlap_s
     if outside_s > 1.0:

@@ -136,7 +136,7 @@ def test_a_replaced_device_gets_neither_the_old_calibration_nor_its_name(config:
     events = persistence.watch(_estimate(_camera(p_m=(0.6, 0.0, 0.0)))).events
     assert (
         event_text(events[0])
-        == "camera/cam0 is another device now (serial C2, not C1): the calibration begins anew"
+        == "camera/cam0 is another device now (serial C2, not C1): the calibration starts over"
     )
     persistence.close(None)
     for serial, p_m in (("C1", [0.08, 0.02, -0.03]), ("C2", [0.6, 0.0, 0.0])):

@@ -104,7 +104,7 @@ def test_another_device_begins_anew_and_is_told(running):
     status("I2")
     running.until(lambda: running.counts[-1] < before)
     running.until(lambda: running.events)
-    text = "imu/imu0 is another device now (serial I2, not I1): the calibration begins anew"
+    text = "imu/imu0 is another device now (serial I2, not I1): the calibration starts over"
     assert running.events == [text]
 
 

@@ -78,7 +78,7 @@ def test_stretched_stamps_are_refused_and_the_stamps_are_blamed(tmp_path, capsys
     folder = _write(tmp_path, run, stretch=1.05)
     code, result, err = _vical(capsys, "td-icp", folder, "--initial", str(folder / "initial.yaml"))
     assert code == 1 and result["status"] == "refused"
-    assert "the stamps of camera and imu advance at different rates" in err
+    assert "the stamps of camera and IMU advance at different rates" in err
     assert "direction" not in err and len(err.strip().splitlines()) == 1
 
 

@@ -44,7 +44,7 @@ def test_every_cause_has_a_text(cause):
     [
         (
             Event(EventKind.BUMPED, "cam0", cause=Cause.IMAGES_DISAGREE),
-            "bumped: cam0: images have come to disagree with the motion: the camera moved",
+            "bumped: cam0: images and motion disagree by more than before: the camera moved",
         ),
         (
             Event(EventKind.TIMESHIFT_STEPPED, "cam0", 0.0201),
@@ -52,7 +52,7 @@ def test_every_cause_has_a_text(cause):
         ),
         (
             Event(EventKind.CLOCK_DRIFT, "cam0", -5e-5, 1e-6),
-            "cam0: the time shift drifts: the clocks of camera and imu run at different rates, "
+            "cam0: the time shift drifts: the clocks of camera and IMU run at different rates, "
             "by -50.0 ± 1.0 us a second; it is now estimated too",
         ),
         (
@@ -61,7 +61,7 @@ def test_every_cause_has_a_text(cause):
         ),
         (
             Event(EventKind.WENT_ON, "cam0", cause=Cause.NO_IMAGES, cause_value=2.04),
-            "cam0: went on after: no usable images for 2.0 s",
+            "cam0: continued after: no usable images for 2.0 s",
         ),
         (Event(EventKind.OTHER, said="whatever"), "whatever"),
     ],

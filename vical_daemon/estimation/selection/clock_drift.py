@@ -1,4 +1,4 @@
-"""Model selection: do the clocks of camera and imu drift apart?
+"""Model selection: do the clocks of camera and IMU drift apart?
 
 Most cameras are stamped by the imu's clock; estimating a drift doubles the sigma of their time shift. Others
 have their own crystal, 100 ppm off; without a drift they are ten sigmas wrong after ten seconds.

@@ -18,7 +18,7 @@ from vical_daemon.estimation.selection.model_mixture import Block, Weights, lens
 
 IMU, LAG, SIZE, TARGET = "imu_intrinsics", "accel_lag", "target_scale", "target_shape"
 IN_DOUBT = {
-    IMU: "sigmas are small; it is not clear yet whether the imu's scale and alignment are as specified",
+    IMU: "sigmas are small; it is not clear yet whether the IMU's scale and alignment are as specified",
     SIZE: "sigmas are small; it is not clear yet whether the target has the size in its file",
     TARGET: "sigmas are small; it is not clear yet whether the target has the shape in its file",
 }

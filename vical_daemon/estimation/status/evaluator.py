@@ -164,7 +164,8 @@ class Evaluator:
     def _before_start(self) -> Verdict:
         """What is said before there is a calibration."""
         if self.bumped:
-            return Verdict(Status.INCONSISTENT, f"{cause_text(self.bumped)}; calibrating anew: {self.reason}")
+            why = f"{cause_text(self.bumped)}; calibrating again: {self.reason}"
+            return Verdict(Status.INCONSISTENT, why)
         if not self.imu_samples:
             return Verdict(Status.WAITING, "no inertial data yet")
         trouble = self._unit_trouble()

@@ -50,7 +50,7 @@ def explain(
         )
     if mirrored < limit:
         return (
-            "the rotations are mirrored: one gyro axis has the wrong sign, or two axes are swapped; the imu "
+            "the rotations are mirrored: one gyro axis has the wrong sign, or two axes are swapped; the IMU "
             "frame must be right-handed"
         )
     curve = GyroCurve.integrate(t_imu_s, gyro_rps, np.zeros(3))
@@ -83,7 +83,7 @@ def _score(start: Start | None) -> float:
     return start.misfit_share
 
 
-def stretched(rate: float, sensor: str = "camera", reference: str = "imu") -> str:
+def stretched(rate: float, sensor: str = "camera", reference: str = "IMU") -> str:
     """Words for a delay that grows by `rate` seconds a second."""
     excess = 1.0 / (1.0 + rate) - 1.0
     size = f"{100 * abs(excess):.1f} %" if abs(excess) >= 2e-3 else f"{1e6 * abs(excess):.0f} ppm"

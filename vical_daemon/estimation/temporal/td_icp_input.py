@@ -47,7 +47,7 @@ def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArra
     if rate_hz < SLOWEST_GYRO_HZ:
         return (
             f"the gyro has {rate_hz:.3g} samples a second by its stamps; at least {SLOWEST_GYRO_HZ:g} are "
-            "needed (are its stamps in the right unit, is it the imu's file?)"
+            "needed (are its stamps in the right unit, is it the IMU's file?)"
         )
     return t_s[keep], gyro[keep]
 

@@ -46,8 +46,8 @@ def refuse_motion(
     near = (t_imu > t_cam[0] - reach) & (t_imu < t_cam[-1] + reach)
     if np.count_nonzero(near) < 2 * MIN_ORIENTATIONS:
         return Refusal(
-            f"camera and imu do not overlap in time: the camera covers {t_cam[0]:.1f} to {t_cam[-1]:.1f} s, "
-            f"the imu 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?); bring both to "
+            f"camera and IMU do not overlap in time: the camera covers {t_cam[0]:.1f} to {t_cam[-1]:.1f} s, "
+            f"the IMU 0.0 to {t_imu[-1]:.1f} s, more than {reach:.1f} s apart (two clocks?); bring both to "
             "one epoch, or shift one by the difference"
         )
     mean_rate = _mean_rates(t_imu, gyro[near])
@@ -65,7 +65,7 @@ def refuse_motion(
         )
     if rate_cam < MIN_RATE_RPS and swing > 5.0 * MIN_RATE_RPS:
         return Refusal(
-            "the imu turns but the camera does not: is the camera fixed to the imu, are its poses fresh?"
+            "the IMU turns but the camera does not: is the camera fixed to the IMU, are its poses fresh?"
         )
     if 0.5 < ratio < 2.0 and _is_steady(mean_rate):
         return Refusal(
@@ -132,7 +132,7 @@ def refuse_start(start: Start | None, options: TdIcpOptions) -> str:
     if start.mirrored or start.misfit_rad > max(0.5 * start.typical_rad, 0.01):
         return (
             "the rotations agree in size but not in direction: is this the same recording, is the camera "
-            "fixed to the imu, are its orientations those of the camera in the world?"
+            "fixed to the IMU, are its orientations those of the camera in the world?"
         )
     return ""
 
@@ -167,7 +167,7 @@ def lost_in_words(covariance: FloatArray, R_imu_cam: FloatArray) -> list[str]:
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         words = " ".join(f"{a:+.2f}" for a in axis)
         reasons.append(
-            f"the mounting about the axis ({words}) of the imu is not determined "
+            f"the mounting about the axis ({words}) of the IMU is not determined "
             f"(sigma {np.rad2deg(np.sqrt(values[2])):.0f} deg): the motion turned about this axis only; "
             "turn about another"
         )

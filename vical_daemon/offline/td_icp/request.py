@@ -74,7 +74,7 @@ def choose_gyro(
     """
     imus = recording.imus
     if not imus:
-        raise InputError(f"{recording.path} holds no imu data")
+        raise InputError(f"{recording.path} holds no IMU data")
     if name is None and len(imus) > 1:
         raise OptionError(f"{recording.path} holds the imus {', '.join(imus)}; choose one with --imu")
     chosen = name or next(iter(imus))

@@ -142,10 +142,10 @@ def _imu_frame(poses: Mapping[str, Any], given: Sequence[str], source: str) -> s
     named = sorted({frame.strip("/") for frame in given if frame.strip("/")})
     known = [frame for frame in named if frame in poses]
     if named and not known:
-        raise ExportError(f"{source}: no transform of the imu's frame {named[0]!r}; {_frames(poses)}")
+        raise ExportError(f"{source}: no transform of the IMU's frame {named[0]!r}; {_frames(poses)}")
     candidates = known or [frame for frame in poses if "imu" in frame.lower()]
     if len(candidates) != 1:
-        several = f"frames that may be the imu's: {', '.join(candidates)}" if candidates else _frames(poses)
+        several = f"frames that may be the IMU's: {', '.join(candidates)}" if candidates else _frames(poses)
         raise ExportError(
             f"{source}: which frame is the imu's? ({several}) Add a line `---`, then `imu_frame: NAME`"
         )

@@ -112,7 +112,7 @@ def _camera(name: str, camera: Mapping[str, Any], gallery: Gallery) -> list[str]
     ]
     if maps:
         text = page.note(
-            "First: how far apart A and B project a point that is fixed to the imu, over the image of A. "
+            "First: how far apart A and B project a point that is fixed to the IMU, over the image of A. "
             "Second: the least difference that the sigmas of both allow, 0 if the verdict is `same`."
         )
         sections.append(page.section(f"{name}: in the image", *maps, text))

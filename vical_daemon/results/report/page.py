@@ -136,7 +136,7 @@ def scene(document: dict[str, Any]) -> str:
     )
     return (
         f'<div class="scene"><script type="application/json">{data}</script>'
-        '<canvas role="img" aria-label="3-D view of imu, camera and board"></canvas>'
+        '<canvas role="img" aria-label="3-D view of IMU, camera and board"></canvas>'
         f"<p>{rooms}{gains}</p>"
         '<p class="note">Drag to turn, wheel or two fingers to come nearer. Red: where the camera may be; '
         "at its axes: where their tips may be.</p></div>"

@@ -31,7 +31,7 @@ def test_an_imu_announced_gives_the_answer_of_a_wide_prior():
     np.testing.assert_allclose(f.S @ f.S.T, P, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(imu_entries(f.state), x[entries], atol=1e-8)
     value, sigma = surest(x, P, entries)
-    assert f"scale or alignment of the imu is off, by {1e2 * value:.2f} ± {1e2 * sigma:.2f} %" in event_text(
+    assert f"scale or alignment of the IMU is off, by {1e2 * value:.2f} ± {1e2 * sigma:.2f} %" in event_text(
         events[IMU]
     )
 
