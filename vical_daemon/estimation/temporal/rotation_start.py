@@ -17,18 +17,11 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.robust import geman_mcclure_weight
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
-from vical_daemon.estimation.temporal.rotation_turns import (
-    BASELINES_S,
-    LONGEST_TURN_RAD,
-    MIN_PAIRS,
-    Turns,
-    camera_turns,
-)
+from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, Turns, camera_turns
 
 _GRID_S = 0.01
 _FINE_S = 0.0025
 _CANDIDATES = 4
-CLEAR = 0.25  # misfit of turns over their size below which longer turns would not help
 
 
 @dataclass(frozen=True)
@@ -152,8 +145,7 @@ def coarse_start(
     """Find shift and mounting without any prior knowledge.
 
     Several local minima of the angle cost are judged by how well the turns agree as vectors: motion that
-    swings to and fro repeats its angles after half a period, but not its directions. Where the turns fit
-    badly, longer ones are tried: errors of orientations stay as large, and the turns grow.
+    swings to and fro repeats its angles after half a period, but not its directions.
 
     Args:
         curve: The imu's (or any reference's) orientation.
@@ -164,25 +156,7 @@ def coarse_start(
     Returns:
         The best start, or None where fewer than 8 turns can be formed.
     """
-    best: Start | None = None
-    for least_s in BASELINES_S:
-        turns = camera_turns(t_cam_s, q_world_cam, least_s=least_s)
-        if best is not None and (turns.baseline_s < least_s or np.median(turns.angle) > LONGEST_TURN_RAD):
-            break
-        if turns.baseline_s > least_s:
-            continue  # noise made it longer already
-        start = _start_from(curve, t_cam_s, turns, shifts_s)
-        if start is not None and (best is None or start.misfit_share < best.misfit_share):
-            best = start
-        if best is not None and best.misfit_share < CLEAR:
-            break
-    return best
-
-
-def _start_from(
-    curve: RotationCurve, t_cam_s: FloatArray, turns: Turns, shifts_s: tuple[float, float]
-) -> Start | None:
-    """Find shift and mounting from turns over one time."""
+    turns = camera_turns(t_cam_s, q_world_cam)
     if len(turns.first) < MIN_PAIRS:
         return None
     scale = agreement_scale(turns)

@@ -12,8 +12,10 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
-from vical_daemon.estimation.temporal.rotation_start import CLEAR, Start, coarse_start, debiased_start
+from vical_daemon.estimation.temporal.rotation_start import Start, coarse_start, debiased_start
 from vical_daemon.estimation.temporal.stamp_stretch import BETTER, estimate_clock_rate
+
+_CLEAR = 0.25  # misfit of turns over their size below which they fit
 
 
 def explain(
@@ -42,7 +44,7 @@ def explain(
     inverted = _score(debiased_start(t_imu_s, gyro_rps, t_cam_s, q_cam_world, shifts_s)[0])
     flipped = gyro_rps * np.array([-1.0, 1.0, 1.0])  # every mirrored mounting is this and a rotation
     mirrored = _score(debiased_start(t_imu_s, flipped, t_cam_s, q_world_cam, shifts_s)[0])
-    limit = min(CLEAR, BETTER * as_is)
+    limit = min(_CLEAR, BETTER * as_is)
     if inverted < min(limit, mirrored):
         return (
             "the orientations of the camera are inverted: the world's in the camera, not the camera's in "
@@ -67,7 +69,7 @@ def explain_stream(
 ) -> str:
     """The same for two streams of orientations, without a gyro; arguments as in `explain`."""
     inverted = _score(coarse_start(curve, t_s, so3.quat_conjugate(q_world_sensor), shifts_s))
-    if inverted < min(CLEAR, BETTER * _score(found)):
+    if inverted < min(_CLEAR, BETTER * _score(found)):
         return (
             "its orientations or the reference's are inverted: the world's in the sensor, not the sensor's "
             "in the world (with the inverses the rotations fit)"

@@ -26,7 +26,7 @@ MIN_PAIRS = 8
 BASELINES_S = (0.2, 0.4, 0.8, 1.6)
 _DISTINCT = 10.0  # ratio of a usual turn to its noise
 _ABOVE_NOISE = 3.0  # a turn this many times its noise is motion
-LONGEST_TURN_RAD = 1.0  # half of this from pi, where the axis of a turn is lost
+_LONGEST_TURN_RAD = 1.0  # half of this from pi, where the axis of a turn is lost
 _MAX_PAIRS = 300
 _LOW = 0.05  # quantile of third differences that shows their noise: outliers are above
 _SLOWEST_S = 0.11  # at less than 9 Hz third differences of a hand's motion exceed any noise
@@ -92,26 +92,23 @@ def evenly(turns: Turns, most: int) -> Turns:
     return turns.at(np.linspace(0, len(turns.first) - 1, most).round().astype(np.intp))
 
 
-def camera_turns(
-    t_cam_s: FloatArray, q_world_cam: FloatArray, most: int = _MAX_PAIRS, least_s: float = BASELINES_S[0]
-) -> Turns:
+def camera_turns(t_cam_s: FloatArray, q_world_cam: FloatArray, most: int = _MAX_PAIRS) -> Turns:
     """Pair orientations over a time in which turns stand out of the noise, and leave rest out if it prevails.
 
     Args:
         t_cam_s: Stamps, increasing, s, shape (n,).
         q_world_cam: Orientations w x y z, shape (n, 4).
         most: So many pairs are kept, evenly.
-        least_s: Shortest time between the two orientations of a pair, s.
     """
     noise = orientation_noise(t_cam_s, q_world_cam)
     best: tuple[float, Turns, BoolArray] | None = None
-    for baseline in (b for b in BASELINES_S if b >= least_s):
+    for baseline in BASELINES_S:
         turns = turns_apart(t_cam_s, q_world_cam, baseline)
         moving = _moving(t_cam_s, turns, noise)
         if np.count_nonzero(moving) < MIN_PAIRS:
             continue
         usual = float(np.median(turns.angle[moving]))
-        if best is not None and usual > LONGEST_TURN_RAD:
+        if best is not None and usual > _LONGEST_TURN_RAD:
             break
         ratio = usual / max(_turn_noise(noise), 1e-12)
         if best is None or ratio > best[0]:
@@ -119,7 +116,7 @@ def camera_turns(
         if ratio > _DISTINCT:
             break
     if best is None:
-        return evenly(replace(turns_apart(t_cam_s, q_world_cam, least_s), moving_share=0.0), most)
+        return evenly(replace(turns_apart(t_cam_s, q_world_cam), moving_share=0.0), most)
     _, turns, moving = best
     share = float(np.mean(moving))
     return evenly(replace(turns if share >= 0.5 else turns.at(moving), moving_share=share), most)
