@@ -221,7 +221,7 @@ def test_topics_can_be_chosen(tmp_path, a_motion):
     assert [s.kind for s in open_recording(path, topics={"imu0", "left"}).streams] == ["imu", "image"]
     with pytest.raises(RecordingError, match="none of the topics"):
         open_recording(path, topics={"/nothing"})
-    with pytest.raises(RecordingError, match="no imu data"):
+    with pytest.raises(RecordingError, match="no IMU data"):
         open_recording(path, topics={"left"})
 
 

@@ -147,7 +147,7 @@ def _imu_frame(poses: Mapping[str, Any], given: Sequence[str], source: str) -> s
     if len(candidates) != 1:
         several = f"frames that may be the IMU's: {', '.join(candidates)}" if candidates else _frames(poses)
         raise ExportError(
-            f"{source}: which frame is the imu's? ({several}) Add a line `---`, then `imu_frame: NAME`"
+            f"{source}: which frame is the IMU's? ({several}) Add a line `---`, then `imu_frame: NAME`"
         )
     return candidates[0]
 

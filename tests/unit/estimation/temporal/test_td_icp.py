@@ -129,7 +129,7 @@ def test_one_axis_keeps_the_delay_and_names_the_axis_that_is_lost():
     t_imu, gyro, t_cam, R, *_ = record(13, 0.3, motion=motion)
     result = td_icp(t_imu, gyro, t_cam, R)
     assert result.status == "degenerate"
-    axis = np.array(re.search(r"\((.*?)\) of the imu", result.reason)[1].split(), dtype=float)
+    axis = np.array(re.search(r"\((.*?)\) of the IMU", result.reason)[1].split(), dtype=float)
     np.testing.assert_allclose(axis, [0, 0, 1], atol=0.05)
     assert abs(result.timeshift_cam_imu_s - 0.3) < 4 * result.timeshift_sigma_s
     assert result.rotation_sigma_rad.max() > 0.1
@@ -182,7 +182,7 @@ def test_stamp_jitter_widens_the_sigma():
 def test_stretched_stamps_are_blamed_and_not_the_rotations(factor):
     t_imu, gyro, t_cam, R, *_ = record(20, 0.3)
     result = td_icp(t_imu, gyro, t_cam[0] + factor * (t_cam - t_cam[0]), R)
-    assert result.status == "refused" and "the stamps of camera and imu" in result.reason
+    assert result.status == "refused" and "the stamps of camera and IMU" in result.reason
     said = float(re.search(r"are ([0-9.]+) % too", result.reason)[1])
     assert said == pytest.approx(100 * abs(factor - 1), abs=0.4)
     assert ("fast" if factor > 1 else "slow") in result.reason

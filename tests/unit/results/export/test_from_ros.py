@@ -137,7 +137,7 @@ def test_a_bag_of_ros_1(tmp_path):
         ([info_document()], "no transforms in it"),
         (
             [tf_document(CHAIN[1:]), info_document()],
-            r"which frame is the imu's\? \(there are base_link, mast",
+            r"which frame is the IMU's\? \(there are base_link, mast",
         ),
         ([tf_document(CHAIN[:2]), info_document()], "no transform of the camera's frame 'cam_optical'"),
         ([tf_document([CHAIN[0], CHAIN[2]]), info_document()], "no chain of static transforms from imu_link"),
@@ -145,7 +145,7 @@ def test_a_bag_of_ros_1(tmp_path):
         ([tf_document(), info_document(k=[1.0])], "camera matrix has 1 numbers"),
         ([tf_document(), info_document(distortion_model="cubic")], "distortion model 'cubic'"),
         ([tf_document(), {"k": K, "d": D}], "'width' is missing"),
-        ([tf_document(), info_document(), {"imu_frame": "nose"}], "no transform of the imu's frame 'nose'"),
+        ([tf_document(), info_document(), {"imu_frame": "nose"}], "no transform of the IMU's frame 'nose'"),
     ],
 )
 def test_what_is_missing_is_one_line(tmp_path, documents, line):
