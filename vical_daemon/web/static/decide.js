@@ -3,7 +3,7 @@
 
 const FORMATS = ["kalibr", "ros", "opencv", "openvins", "vins", "orbslam3", "basalt", "urdf", "json"];
 const QUESTIONS = {
-  reset: "Forget the calibration so far and begin anew?",
+  reset: "Forget the calibration so far and start over?",
   accept: "Store the present result as the calibration of these devices?",
   discard: "Forget the present result, and put back what was stored before?",
 };
