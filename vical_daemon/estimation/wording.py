@@ -94,7 +94,7 @@ def guidance_caption(guidance: Guidance) -> str:
 _HEADLINES = {
     "waiting": "Waiting for data.",
     "initialising": "Looking for a first solution.",
-    "converging": "Improving: keep moving.",
+    "converging": "The estimate is improving.",
     "converged": "Converged.",
     "degenerate": "The motion does not reveal everything yet.",
     "inconsistent": "The data contradict the model: do not use these numbers.",

@@ -363,7 +363,7 @@ def check_what_stands_there(scene, reason, texts):
         assert texts["guidance"].startswith("no data for 3.0 s") and texts["turned"] == ""
         assert texts["motiontext"] == ""
     elif scene == "guided":
-        assert (texts["headline"], texts["turned"]) == ("Improving: keep moving.", "xy")
+        assert (texts["headline"], texts["turned"]) == ("The estimate is improving.", "xy")
         assert texts["motiontext"] == "turn about x and y" and texts["reason"] == reason
         assert "optical axis only" in texts["guidance"]
     elif scene == "edges":
