@@ -17,7 +17,8 @@ ROWS, COLUMNS = "rows", "columns"
 """What a rolling shutter reads one after the other; columns: a phone's sensor, of images turned upright."""
 
 IMAGE_GAP_S = 0.5
-"""Images further apart, s, are not followed from one to the next: a track may belong to another point."""
+"""Between images further apart, s, is a gap: it is reported, and nothing is followed across it. A track may
+belong to another point, and the motion may be better known from the next image."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,13 +10,12 @@ import numpy as np
 
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.inertial.imu_buffer import GAP_PERIODS
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import IMAGE_GAP_S, PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
 
 SEARCHED_S = 1.5
 """Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
 images and inertial readings arrive shows the greater part."""
-_REPORTED_S = 0.5  # shorter gaps are lost images, which every camera has and the device's status counts
 _FOLLOW = 0.1  # by which usual interval and usual lead follow each new image
 _AGREE = 5  # images in a row that show the same step
 _SETTLED = 10  # images after which the usual lead is known; a role may hold back the first three
@@ -137,7 +136,7 @@ class ImageIntake:
         """
         gap_s = t_s - stream.newest_s
         set_forwards = stream.off_s > 0.5 * gap_s
-        if gap_s > max(_REPORTED_S, GAP_PERIODS * stream.usual_s):
+        if gap_s > max(IMAGE_GAP_S, GAP_PERIODS * stream.usual_s):  # the status counts single lost images
             kind = EventKind.IMAGE_REPEATED if stream.repeats else EventKind.IMAGE_GAP
             if not set_forwards:
                 self._news.append(Event(kind, frame.camera, gap_s))

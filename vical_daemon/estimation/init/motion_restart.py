@@ -14,7 +14,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import SPEED, LinearMotion, linear_start
 from vical_daemon.estimation.init.target_poses import TargetPose, pose_of
-from vical_daemon.estimation.measurements import FloatArray, Frames, PointsFrame
+from vical_daemon.estimation.measurements import IMAGE_GAP_S, FloatArray, Frames, PointsFrame
 from vical_daemon.estimation.model.priors import AGAIN_SIGMAS
 from vical_daemon.estimation.model.state import (
     ATTITUDE,
@@ -32,7 +32,6 @@ _WIDE_RAD = 0.03
 """Sigma of attitude up to which images are near to linear, rad."""
 _WIDE_SHARE = 0.03
 """Likewise of position, of the distance to the target."""
-_BLIND_S = 0.5  # without a usable image before sigmas are looked at
 _WIDE_MPS = 0.3  # of velocity: ten times what the images give
 
 
@@ -157,7 +156,7 @@ def motion_is_lost(f: CalibrationFilter, buffer: ImuBuffer, camera: str, t_cam_s
     t_s = t_cam_s + f.state.cameras[camera].timeshift_s
     if buffer.gap_within(f.state.t_s, t_s):
         return True
-    if t_s < f.state.t_s + _BLIND_S:
+    if t_s < f.state.t_s + IMAGE_GAP_S:
         return False
     segment = buffer.segment(f.state.t_s, t_s)
     if segment is None:
