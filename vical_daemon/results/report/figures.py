@@ -10,7 +10,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtri
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
@@ -151,11 +151,10 @@ def consistency(points: CameraResiduals | None, trace: Sequence[dict[str, Any]])
         t, nis, dof = points.frame_t_s[use], points.frame_nis[use], points.frame_dof[use]
         ratio = nis / dof
         left.plot(t, ratio, ".", color=Z, markersize=2.5, alpha=0.6, rasterized=True)
-        left.fill_between(
-            t, chi2.ppf(0.025, dof) / dof, chi2.ppf(0.975, dof) / dof, color=Y, alpha=0.2, linewidth=0
-        )
+        low, high = chdtri(dof, 0.975) / dof, chdtri(dof, 0.025) / dof
+        left.fill_between(t, low, high, color=Y, alpha=0.2, linewidth=0)
         left.set_ylim(0, max(2.0, float(np.percentile(ratio, 99)) * 1.2))
-        probability = chi2.cdf(nis, dof)
+        probability = chdtr(dof, nis)
         right.hist(probability, bins=20, range=(0, 1), color=Z, alpha=0.75)
         right.axhline(len(probability) / 20, color=INK, linewidth=1, linestyle="--")
         style(right, "Rank of NIS: flat is right", "probability", "frames")
