@@ -118,6 +118,7 @@ CASES: dict[str, Case] = {
     "none, lens fixed": Case(held=True),
     "image stamps jitter by 1 ms": _is(Kind.STAMP_JITTER, simulation={"stamp_jitter_s": 1e-3}),
     "whole images off by 0.3 px": Case(simulation={"frame_sigma_px": 0.3}),
+    "corner noise changes": Case(simulation={"noise_spread": 0.8}),
     "5 % outliers": Case(simulation={"outlier_fraction": 0.05}),
     "lens of one term more": _is(Kind.LENS_TERM_MISSING, rig=_one_term_more),
     "fixed lens wrong": _is(Kind.FIXED_LENS, held=True, lens_off=True),

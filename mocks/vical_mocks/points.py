@@ -79,6 +79,8 @@ class SimulationOptions:
         accel_lag_s: How late the accelerometer's readings are against the gyro's.
         camera_rate_hz: Frames a second.
         corner_sigma_px: White noise per axis.
+        noise_spread: Standard deviation of the logarithm of a frame's white noise, as motion blur varies it;
+            frames within a second are alike.
         frame_sigma_px: Noise common to all corners of a frame, per axis.
         outlier_fraction: Share of corners displaced by up to `outlier_px`.
         outlier_px: Largest displacement per axis of an outlier.
@@ -96,6 +98,7 @@ class SimulationOptions:
     accel_lag_s: float = 0.0
     camera_rate_hz: float = 20.0
     corner_sigma_px: float = 0.5
+    noise_spread: float = 0.0
     frame_sigma_px: float = 0.0
     outlier_fraction: float = 0.0
     outlier_px: float = 20.0
@@ -270,7 +273,13 @@ def add_pixel_noise(
     uv: FloatArray, options: SimulationOptions, rng: np.random.Generator
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Noisy pixels (frames, n, 2), and which points were displaced on purpose (frames, n)."""
-    noisy = uv + options.corner_sigma_px * rng.standard_normal(uv.shape)
+    white = rng.standard_normal(uv.shape)
+    if options.noise_spread > 0.0:
+        alike = max(round(options.camera_rate_hz), 1)
+        steps = rng.standard_normal(len(uv) + alike - 1)
+        level = np.convolve(steps, np.full(alike, alike**-0.5), "valid")
+        white *= np.exp(options.noise_spread * level)[:, None, None]
+    noisy = uv + options.corner_sigma_px * white
     noisy = noisy + options.frame_sigma_px * rng.standard_normal((len(uv), 1, 2))
     outlier = rng.random(uv.shape[:2]) < options.outlier_fraction
     wrong = rng.uniform(-options.outlier_px, options.outlier_px, uv.shape)

@@ -34,7 +34,6 @@ from vical_daemon.estimation.plausible import usable_points
 from vical_daemon.estimation.result import CalibrationEstimate, HeldOutCheck, TracePoint
 from vical_daemon.estimation.selection import clock_drift, model_selection
 from vical_daemon.estimation.selection.model_acceptance import ModelAcceptance
-from vical_daemon.estimation.selection.model_mixture import Weights
 from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
 from vical_daemon.estimation.status.recent_past import RecentPast
@@ -233,7 +232,7 @@ class Calibrator:
                 self._initializer.take([(t_cam_s, frame)])
                 f.unobservable.follow(f)
             now = f.plain()
-            self._ask_held_back(now, frame, t_cam_s)
+            self._ask_held_back(now, report, frame, t_cam_s)
             self._note(now, report, frame, t_cam_s)
             self._reports.append(report)
         return []
@@ -324,7 +323,7 @@ class Calibrator:
             f.unobservable.follow(f)
         needed_s = min(f.state.t_s, self._initializer.oldest_s)
         self._buffer.trim(needed_s - _KEEP_S)
-        self._ask_held_back(f, frame, t_cam_s)
+        self._ask_held_back(f, report, frame, t_cam_s)
         if not f.finite():
             self.watch.why = Cause.ESTIMATE_IMPLAUSIBLE
             self._restart(f)
@@ -344,10 +343,12 @@ class Calibrator:
         self._past.saw(f, report, frame, t_cam_s)
         self.evaluator.saw_frame(report, f)
 
-    def _ask_held_back(self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float) -> None:
+    def _ask_held_back(
+        self, f: CalibrationFilter, report: FrameReport, frame: PointsFrame, t_cam_s: float
+    ) -> None:
         """Judge how well an image was predicted that the held-back copy of the filter has not used."""
         assert self._buffer is not None
-        ratio = self._held_back.follow(f, frame, t_cam_s, self.rig.target, self._buffer)
+        ratio = self._held_back.follow(f, report, frame, t_cam_s, self.rig.target, self._buffer)
         if ratio is not None:
             self.evaluator.held_back(ratio, f.consistency[frame.camera].scale)
 
@@ -478,18 +479,8 @@ class Calibrator:
     # ------------------------------------------------------------------ output
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
-        f, shares = self.filter, None if self.filter is None else model_selection.weights(self.filter)
-        self.evaluator.in_doubt = "" if f is None else self._in_doubt(f, shares)
-        self.evaluator.believed &= not self.evaluator.in_doubt
-        return self._intake.by_present_stamps(self.evaluator.estimate(f, self._stale, shares))
-
-    def _in_doubt(self, f: CalibrationFilter, shares: Weights | None) -> str:
-        """What keeps small sigmas from being believed, in words; empty: nothing."""
-        believed = self.evaluator.believed
-        drifts = (clock_drift.in_doubt(f, name, believed=believed) for name in self.rig.priors)
-        if self.watch.doubtful or any(drifts):
-            return clock_drift.CLOCKS_IN_DOUBT
-        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, shares, believed=believed), "")
+        self.evaluator.clocks_doubtful = self.watch.doubtful
+        return self._intake.by_present_stamps(self.evaluator.estimate(self.filter, self._stale))
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

@@ -36,6 +36,7 @@ class EventKind(StrEnum):
     IMU_CLIPPED = "imu_clipped"
     IMAGE_GAP = "image_gap"
     IMAGE_REPEATED = "image_repeated"
+    IMAGES_WANDER = "images_wander"
     IMU_NOISE = "imu_noise"
     IMU_INTRINSICS = "imu_intrinsics"
     ACCEL_LAG = "accel_lag"
@@ -238,6 +239,12 @@ REFERENCE: dict[EventKind, About] = {
         "s",
         "Once per camera, from 0.3 ms; with a board, once neighbours are known to be late independently. "
         "Without one, images that are shifted as a whole are not distinguished: cause `images_shifted`.",
+    ),
+    EventKind.IMAGES_WANDER: About(
+        "Whole images move against the motion of the IMU, for seconds: image stabilisation, a loose lens or "
+        "camera, or a board that moves. Meanwhile the result is not `converged`. Value: standard deviation.",
+        "px",
+        "Once per camera, with a board, from 1 px.",
     ),
     EventKind.STAMPS_STEPPED: About(
         "A camera's clock was set. Value: step against the IMU's stamps.",

@@ -354,6 +354,13 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
             + "; allowed for"
         ),
     ),
+    EventKind.IMAGES_WANDER: (
+        "",
+        lambda e: (
+            f"whole images move by {_of(e, 1.0, 'px', '.1f')} against the motion of the IMU: switch off "
+            "image stabilisation; lens, camera and board must not move on their own"
+        ),
+    ),
     EventKind.STAMPS_STEPPED: (
         "",
         lambda e: f"its stamps stepped by about {_of(e, 1.0, 's', '+.1f')} against those of the IMU",

@@ -74,15 +74,16 @@ class Verifier:
             if estimate.status is Status.INCONSISTENT or name not in found:
                 check.why = estimate.reason or "no calibration from this recording"
                 continue
-            self._weigh(check, found[name])
+            self._weigh(check, found[name], fits=estimate.cameras[name].model_fits)
         return all(check.answer is not Answer.CANNOT_TELL for check in self.cameras.values())
 
-    def _weigh(self, check: CameraCheck, found: KnownCamera) -> None:
+    def _weigh(self, check: CameraCheck, found: KnownCamera, *, fits: bool) -> None:
+        seconds = math.inf if fits else check.seconds
         try:
-            weighed = self._odds(check, found if check.lens_asked else found.without_lens())
+            weighed = self._odds(check, found if check.lens_asked else found.without_lens(), seconds)
             if not check.lens_asked:
                 # `changed` must stand even if the lens is off; `holds` is said for the lens as given
-                taken = self._odds(check, found.given_lens())
+                taken = self._odds(check, found.given_lens(), seconds)
                 weighed = replace(weighed, log_holds=taken.log_holds, visible=taken.visible)
         except NotComparableError as error:
             check.why = str(error)
@@ -93,11 +94,11 @@ class Verifier:
         elif weighed.log_changed > math.log(len(self.cameras) / FALSE_ALARM):
             check.answer = Answer.CHANGED
 
-    def _odds(self, check: CameraCheck, found: KnownCamera) -> Odds:
+    def _odds(self, check: CameraCheck, found: KnownCamera, seconds: float) -> Odds:
         apart = difference(check.stored, found)
         focal_px = 1.0 if check.stored.lens is None else float(check.stored.lens[0])
         counts = self.counts.of_errors(focal_px, len(apart.d))
-        return odds(apart.d, apart.covariance, apart.covariance_a, counts)
+        return odds(apart.d, apart.covariance, apart.covariance_a, counts, seconds)
 
     @property
     def answer(self) -> Answer:

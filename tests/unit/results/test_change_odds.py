@@ -6,9 +6,18 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, multivariate_t
 
-from vical_daemon.results.change_odds import FALSE_ALARM, MISSED, VISIBLE, Counts, odds
+from vical_daemon.results.change_odds import (
+    DOF_PER_S,
+    FALSE_ALARM,
+    MISSED,
+    SAME,
+    VISIBLE,
+    Counts,
+    odds,
+    visible_sigmas,
+)
 
 COUNTS = Counts().of_errors(460.0, 15)
 SURE = math.log(1.0 / FALSE_ALARM)
@@ -134,3 +143,43 @@ def test_looking_every_time_raises_no_more_false_alarms_and_misses_than_promised
     assert wrong[0.0] <= 1  # FALSE_ALARM * 60 = 0.06
     assert wrong[1.0] <= 4  # MISSED * 60 = 0.6: the probability of 5 or more is below 0.001
     assert MISSED == 0.01
+
+
+def test_where_the_model_does_not_fit_odds_are_ratios_of_students_densities():
+    """With a small difference of its own, and one unknown factor of all sigmas; by scipy, one block."""
+    rng, seconds = np.random.default_rng(7), 6.0
+    mixed = rng.standard_normal((7, 7))
+    P, e = mixed @ mixed.T + np.eye(7), 3.0 * rng.standard_normal(7)  # in units of what counts
+    d, S = e * COUNTS[:7], P * np.outer(COUNTS[:7], COUNTS[:7])
+    found = odds(d, S, 0.1 * S, COUNTS[:7], seconds)
+    near, dof = P + SAME**2 * np.eye(7), DOF_PER_S * seconds
+    late = np.zeros(7)
+    late[6] = max(1.0, found.floor["time shift"])
+    logs = [multivariate_t.logpdf(e, at, near, df=dof) for at in (np.zeros(7), late, -late)]
+    assert found.log_holds["time shift"] == pytest.approx(logs[0] - max(logs[1:]), rel=1e-9)
+    ratios = []
+    for k in range(1, 8):
+        at = [i for b, block in enumerate([(0, 1, 2), (3, 4, 5), (6,)]) if k >> b & 1 for i in block]
+        W = np.diag(np.isin(np.arange(7), at).astype(float))
+        ratios += [
+            multivariate_t.logpdf(e, np.zeros(7), near + n**2 * W, df=dof) - logs[0] for n in (1, 3, 10)
+        ]
+    assert found.log_changed == pytest.approx(np.log(np.mean(np.exp(ratios))), rel=1e-9)
+
+
+def test_a_misfit_in_all_directions_is_no_change_where_the_model_does_not_fit():
+    """Chi-square of seven times its degrees of freedom, as at times on EuRoC; one block is a change."""
+    rng, sigma = np.random.default_rng(2), COUNTS / 10.0
+    S = np.diag(sigma**2)
+    d = math.sqrt(7.0) * sigma * rng.choice([-1.0, 1.0], 15)
+    assert odds(d, S, 0.1 * S, COUNTS).log_changed > SURE
+    assert odds(d, S, 0.1 * S, COUNTS, 4.0).log_changed < SURE
+    d[3:6] = 5.0 * COUNTS[3]
+    moved = odds(d, S, 0.1 * S, COUNTS, 4.0)
+    assert moved.log_changed > SURE and moved.blocks == ("rotation",)
+
+
+def test_what_is_visible_needs_more_where_sigmas_are_known_less_well():
+    assert pytest.approx(5.1, abs=0.01) == VISIBLE
+    assert visible_sigmas(15, 1e9) == pytest.approx(VISIBLE)
+    assert visible_sigmas(15, 20.0) > visible_sigmas(15, 40.0) > VISIBLE

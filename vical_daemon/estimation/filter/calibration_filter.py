@@ -15,6 +15,7 @@ import numpy as np
 from vical_daemon.estimation.filter import noise_updates
 from vical_daemon.estimation.filter.image_update import (
     ImageFit,
+    blurred,
     corner_gate,
     curved_share,
     frame_limit,
@@ -170,7 +171,11 @@ class CalibrationFilter:
         lin = self._linearise(image)
         innovation = image.uv - lin.z
         predicted = np.where(lin.valid[:, None], lin.z, np.nan)
-        keep = lin.valid & self._belonging(image, innovation, lin)
+        keep, blur = lin.valid & self._belonging(image, innovation, lin), 1.0
+        if 2 * keep.sum() < lin.valid.sum():
+            blur = blurred(image, innovation, lin)
+            image = replace(image, sigma_px=blur * image.sigma_px)
+            keep = lin.valid & self._belonging(image, innovation, lin)
         if keep.sum() < 4:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
         fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
@@ -188,15 +193,16 @@ class CalibrationFilter:
         score = self._arm_score(image, lin, fit)
         self.arm_scores = self.arm_scores + score
         self._accept(fit.S, fit.dx + self._step_by(score, fit.S))
-        noise.learn(fit.rest * self.consistency[image.camera].scale, fit.dof_rest)
+        noise.learn(fit.rest * image.scale * blur**2, fit.dof_rest)
         keep = fit.keep
         residual = fit.left * image.sigma_px[:, None] + self._by_held(lin)
         self.consistency[image.camera].learn(
+            image.t_cam_s,
             lin.z[keep],
             innovation[keep],
             lin.ways[rows_of(keep)],
             lin.moves,
-            image.sigma_px[keep],
+            image.sigma_px[keep] * fit.noise,
             None if self.by_clipping is None else lin.by_error[:, :9] @ self.by_clipping,
         )
         return FrameReport(
@@ -209,7 +215,7 @@ class CalibrationFilter:
             True,
             fit.nis,
             fit.dof,
-            noise.sigma_px,
+            float(np.median(image.sigma_px)) * fit.noise,
             predicted_px=predicted,
         )
 
@@ -248,9 +254,9 @@ class CalibrationFilter:
 
     def image(self, frame: PointsFrame, t_cam_s: float, points: FloatArray) -> Image:
         """Put a measurement together with the noise it has at present."""
-        sigma = self.corner_noise[frame.camera].sigmas(frame.sigma_px, len(frame.ids))
-        sigma = sigma * np.sqrt(self.consistency[frame.camera].scale)
-        return Image(frame.camera, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma)
+        name, scale = frame.camera, self.consistency[frame.camera].scale
+        sigma = self.corner_noise[name].sigmas(frame.sigma_px, len(frame.ids)) * np.sqrt(scale)
+        return Image(name, frame.t_cam_ns, t_cam_s, frame.ids, points, frame.uv_px, sigma, scale)
 
     @staticmethod
     def _refused(image: Image, residual: FloatArray, predicted: FloatArray, why: str) -> FrameReport:
@@ -306,7 +312,7 @@ class CalibrationFilter:
         ways, by_error, by_shared = fit.ways, lin.by_error, lin.by_shared
         if len(by_error) == self.layout.size:  # by sigma points: the ways are not those of the camera
             ways, by_error = view_derivatives(self.state, self.layout, self.rates, image)[1:]
-            ways = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep], 2)[:, None]
+            ways = ways[rows_of(fit.keep)] / np.repeat(image.sigma_px[fit.keep] * fit.noise, 2)[:, None]
             by_shared = by_error @ shared_ways(self.state, self.layout, image.camera)
         information, shared = ways[:, :6].T @ ways[:, :6], self.shared.get(image.camera)
         if shared is not None:  # what corners share is noise, too

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,6 +12,8 @@ import numpy as np
 from vical_daemon.estimation.filter.linearise import Image, Linear
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
 from vical_daemon.estimation.model import unscented
+from vical_daemon.estimation.noise.corner_noise import MOST_PX, noise_of_image
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
 from vical_daemon.estimation.significance import (
     CORNER_REFUSED,
     IMAGE_REFUSED,
@@ -50,6 +53,7 @@ class ImageFit:
         ways: The ways of the kept rows, whitened and compressed: sums over the rows stay, shape (m, k).
         r: Their innovation, shape (m,).
         rows: Ways and innovation of the kept rows, whitened, where the fit is linearised; (2n, k), (2n,).
+        noise: Of the kept corners over `Image.sigma_px`; by both all but `rest` and `left` is whitened.
     """
 
     S: FloatArray
@@ -63,6 +67,7 @@ class ImageFit:
     ways: FloatArray
     r: FloatArray
     rows: tuple[FloatArray, FloatArray]
+    noise: float
 
 
 def rows_of(keep: BoolArray) -> BoolArray | slice:
@@ -70,11 +75,11 @@ def rows_of(keep: BoolArray) -> BoolArray | slice:
     return slice(None) if keep.all() else np.repeat(keep, 2)
 
 
-def whitened(image: Image, lin: Linear, keep: BoolArray) -> tuple[FloatArray, FloatArray]:
+def whitened(image: Image, lin: Linear, fit: ImageFit) -> tuple[FloatArray, FloatArray]:
     """The ways of the kept corners and their innovation over the corner noise, shapes (2n, k), (2n,)."""
-    sigma = image.sigma_px[keep]
-    ways = lin.ways[rows_of(keep)] / np.repeat(sigma, 2)[:, None]
-    return ways, ((image.uv - lin.z)[keep] / sigma[:, None]).ravel()
+    sigma = image.sigma_px[fit.keep] * fit.noise
+    ways = lin.ways[rows_of(fit.keep)] / np.repeat(sigma, 2)[:, None]
+    return ways, ((image.uv - lin.z)[fit.keep] / sigma[:, None]).ravel()
 
 
 def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
@@ -86,6 +91,22 @@ def corner_gate(image: Image, innovation: FloatArray, lin: Linear) -> BoolArray:
     var = var.reshape(-1, 2) + (image.sigma_px**2)[:, None]
     passed: BoolArray = (innovation**2 / var).sum(axis=1) < _CORNER_GATE
     return passed
+
+
+def blurred(image: Image, innovation: FloatArray, lin: Linear) -> float:
+    """How much noisier than usual the corners of an image are, at least 1, by what no state error explains.
+
+    For an image in which most corners fail the gate. Where the rig has moved the states explain it, and the
+    result is 1. The median leaves out corners that are elsewhere.
+    """
+    sigma, shown = image.sigma_px[lin.valid, None], rows_of(lin.valid)
+    ways, r = lin.ways[shown] / np.repeat(sigma, 2, axis=0), innovation[lin.valid] / sigma
+    spare = r.size - ways.shape[1]
+    if spare < _LEAST:
+        return 1.0
+    left = r - (ways @ np.linalg.lstsq(ways, r.ravel())[0]).reshape(-1, 2)
+    noise = float(np.median(np.linalg.norm(left, axis=1))) / MEDIAN_RAYLEIGH * math.sqrt(r.size / spare)
+    return max(noise, 1.0) if noise * float(np.median(sigma)) < MOST_PX else 1.0
 
 
 def curved_share(image: Image, lin: Linear, keep: BoolArray) -> float:
@@ -111,7 +132,6 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
     """
     S, dx = prior, np.zeros(len(prior))
     spread, offset = lin.spread, np.zeros(2 * len(image.ids))
-    weight = 1.0 / np.repeat(image.sigma_px, 2)
     for step in range(_ITERATIONS):
         if step:
             lin = linearise(dx, S)
@@ -120,8 +140,7 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, lineari
             keep = keep & lin.valid
             # the innovation refers to the prior mean
             spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
-        r = ((image.uv - lin.z).ravel() + offset) * weight
-        fit = _correct(prior, spread, r, lin, weight, keep)
+        fit = _correct(prior, spread, image, (image.uv - lin.z).ravel() + offset, lin, keep)
         if curved_share(image, lin, fit.keep) < _CURVED:
             break
         step_size = unscented.solve_lower(fit.S, fit.dx - dx)
@@ -149,10 +168,11 @@ def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
 
 
 def _correct(
-    prior: FloatArray, spread: FloatArray, r: FloatArray, lin: Linear, weight: FloatArray, keep: BoolArray
+    prior: FloatArray, spread: FloatArray, image: Image, innovation: FloatArray, lin: Linear, keep: BoolArray
 ) -> ImageFit:
     """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
-    ways = lin.ways * weight[:, None]
+    weight = 1.0 / np.repeat(image.sigma_px, 2)
+    ways, r = lin.ways * weight[:, None], innovation * weight
     k = ways.shape[1]
     if lin.curved.size:
         curved = lin.curved * weight[:, None]
@@ -163,25 +183,28 @@ def _correct(
         kept, r_kept = ways[rows], r[rows]
         R, r_small, rest, dof_rest = unscented.compress(kept, r_kept)
         small = np.concatenate([R[:, :k] @ spread, R[:, :k] @ lin.shared, R[:, k:]], axis=1)
-        c = unscented.correct(prior, small, r_small)
+        # Rows that no state moves are residuals like the rest, and say nothing about whether innovations fit.
+        apart, count = _unmoved(small, r_small) if dof_rest else (0.0, 0)
+        rest, dof_rest = rest + apart, dof_rest + count
+        noise = noise_of_image(rest * image.scale, dof_rest)
+        c = unscented.correct(prior, small / noise, r_small / noise)
         moved = _moved(c.solution, spread, lin.shared)
         left = (r - ways @ moved).reshape(-1, 2)
         bad = keep & (np.einsum("ij,ij->i", left, left) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
         if not bad.any() or (keep & ~bad).sum() < _LEAST:
             break
         keep = keep & ~bad
-    # Rows that no state moves are residuals like the rest, and say nothing about whether the innovations fit.
-    apart, count = _unmoved(small, r_small) if dof_rest else (0.0, 0)
     return ImageFit(
         c.S,
         c.dx,
-        max(c.nis - apart, 0.0),
+        max(c.nis - apart / noise**2, 0.0),
         max(len(r_small) - count, 1),
         keep,
-        rest + apart,
-        dof_rest + count,
+        rest,
+        dof_rest,
         left,
-        R[:, :k],
-        r_small,
-        (kept[:, :k], r_kept),
+        R[:, :k] / noise,
+        r_small / noise,
+        (kept[:, :k] / noise, r_kept / noise),
+        noise,
     )

@@ -44,7 +44,8 @@ class Image:
         ids: Point ids, shape (n,).
         points: Their places in the world, m, shape (n, 3).
         uv: Measured pixels, shape (n, 2).
-        sigma_px: White noise of each corner per axis, px, shape (n,).
+        sigma_px: Usual white noise of each corner per axis, px, shape (n,).
+        scale: By which `Consistency` has multiplied its square.
     """
 
     camera: str
@@ -54,6 +55,7 @@ class Image:
     points: FloatArray
     uv: FloatArray
     sigma_px: FloatArray
+    scale: float = 1.0
 
 
 @dataclass(slots=True)

@@ -26,7 +26,7 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
     """
     where = f.layout.cameras[image.camera]
     # a fit far from straight is linearised elsewhere
-    rows = whitened(image, lin, fit.keep) if lin.curved.size else fit.rows
+    rows = whitened(image, lin, fit) if lin.curved.size else fit.rows
     shared, agreement = f.shared.get(image.camera), f.agreement.get(image.camera)
     if shared is not None:
         ways, innovation = rows if lin.curved.size else (fit.ways, fit.r)

@@ -33,6 +33,7 @@ def camera_estimate(f: CalibrationFilter, name: str, reprojection_rms_px: float)
         rms_px=reprojection_rms_px,
         sigma_px=f.corner_noise[name].sigma_px,
         jitter_s=f.shared[name].jitter_found_s if name in f.shared else 0.0,
+        model_fits=f.consistency[name].fits,
     )
 
 

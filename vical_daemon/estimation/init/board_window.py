@@ -8,6 +8,7 @@ nothing changes: where the closed form had put lever arm and mounting no longer 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -40,7 +41,7 @@ from vical_daemon.estimation.model.inertial_links import (
 from vical_daemon.estimation.model.rates import SLOPE_S, Rates
 from vical_daemon.estimation.model.retract import difference, orthonormal, retract
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
-from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, relative_noise
+from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, noise_of_image, relative_noise
 from vical_daemon.estimation.noise.shared_errors import shared_ways
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, geman_mcclure_weight
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
@@ -50,6 +51,7 @@ _LEAST_IMAGES = 3
 _MOST_STEPS = 20
 _DONE = 0.1  # a step that promises less than this of the sum of squares is the last
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
+_OF_POSE = 6  # degrees of freedom of an image that its pose takes up
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
 
 
@@ -128,7 +130,8 @@ class BoardWindow:
         nodes: Instants, in order.
         layout: Of the filter's errors; the constants are all but the motion.
         offset: Of the constants from the mean of the prior, shape (c,).
-        sigma_px: Corner noise by camera.
+        sigma_px: Usual corner noise by camera.
+        noise: Corner noise of each image over the usual one; empty: not known yet.
         shared: Standard deviations of what the corners of an image share, see `shared_errors`, shape (3,), of
             the cameras for which they are known.
     """
@@ -149,6 +152,7 @@ class BoardWindow:
         self._information = root.T @ root
         self.offset = difference(state, prior.state, prior.layout)[MOTION.stop :]
         self.sigma_px = {name: noise.sigma_px for name, noise in prior.corner_noise.items()}
+        self.noise: list[float] = []
         self.shared: dict[str, FloatArray] = {}
         self._derivatives = Derivatives()  # of the filters about the window, once it is solved
         self._measured = (np.zeros((0, 3)),) * 3  # rate, specific force, derivative of the rate
@@ -391,10 +395,11 @@ class BoardWindow:
 
     def whitened(self, now: Present) -> list[Whitened]:
         """All images over the noise; corners that do not belong hardly count (Geman and McClure)."""
-        return [self._whitened(view) for view in now.views]
+        noise = self.noise or [1.0] * len(now.views)
+        return [self._whitened(*pair) for pair in zip(now.views, noise, strict=True)]
 
-    def _whitened(self, view: View) -> Whitened:
-        sigma = self.sigma_px[view.camera] * view.relative
+    def _whitened(self, view: View, noise: float) -> Whitened:
+        sigma = self.sigma_px[view.camera] * noise * view.relative
         left = view.residual
         for _ in range(2 if view.alike.size else 1):
             far = (left**2).sum(axis=1) / sigma**2
@@ -415,15 +420,25 @@ class BoardWindow:
 
     def _learn_noise(self, views: list[View], images: list[Whitened]) -> None:
         """Corner noise from the median of the residuals, as far as poses have not taken them up."""
+        lengths = [
+            np.linalg.norm(w.left[v.seen], axis=1) / v.relative[v.seen]
+            for v, w in zip(views, images, strict=True)
+        ]
         for name in self.sigma_px:
-            own = [(v, w.left) for v, w in zip(views, images, strict=True) if v.camera == name]
-            if not own:
-                continue
-            lengths = [np.linalg.norm(left[v.seen], axis=1) / v.relative[v.seen] for v, left in own]
-            size = np.concatenate(lengths)
-            share = max(1.0 - 6.0 * len(own) / (2.0 * len(size)), 0.05)
-            sigma = float(np.median(size)) / MEDIAN_RAYLEIGH / np.sqrt(share)
-            self.sigma_px[name] = float(np.clip(sigma, LEAST_PX, MOST_PX))
+            own = [size for v, size in zip(views, lengths, strict=True) if v.camera == name]
+            if own:
+                sigma = _level(np.concatenate(own), len(own))
+                self.sigma_px[name] = float(np.clip(sigma, LEAST_PX, MOST_PX))
+        self.noise = []
+        for view, size in zip(views, lengths, strict=True):
+            dof, ratio = max(2 * len(size) - _OF_POSE, 0), _level(size) / self.sigma_px[view.camera]
+            self.noise.append(noise_of_image(dof * ratio * ratio, dof))
+
+
+def _level(size: FloatArray, images: int = 1) -> float:
+    """Corner noise per axis by the median length of residuals, as far as poses have not taken them up."""
+    share = max(1.0 - _OF_POSE * images / (2.0 * len(size)), 0.05)
+    return float(np.median(size)) / MEDIAN_RAYLEIGH / math.sqrt(share)
 
 
 def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: ImuBuffer) -> list[Node]:

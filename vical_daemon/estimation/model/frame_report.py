@@ -23,7 +23,7 @@ class FrameReport:
         used: Whether the frame entered at all.
         nis: Normalised innovation squared of what the state can explain.
         dof: Its degrees of freedom.
-        sigma_px: Corner noise used, px.
+        sigma_px: Corner noise of this image as used, px.
         reason: Why a frame was refused; empty otherwise.
         predicted_px: Where the points were expected before the update, shape (n, 2); not-a-number where
             they could not be.

@@ -41,6 +41,7 @@ def camera_snapshot(
     sigma_px: float,
     rolling: bool = True,
     jitter_s: float = 0.0,
+    model_fits: bool = False,
 ) -> CameraEstimate:
     """Put what is reported of one camera together.
 
@@ -54,6 +55,7 @@ def camera_snapshot(
         sigma_px: Corner or feature noise, px.
         rolling: Its shutter is known to roll, or taken to: its readout is reported.
         jitter_s: Of its stamps, s.
+        model_fits: See `CameraEstimate`.
     """
     q = so3.quat_from_matrix(camera.R_imu_cam)
     return CameraEstimate(
@@ -73,6 +75,7 @@ def camera_snapshot(
         readout_axis=camera.readout_axis if rolling else "",
         stamp_jitter_s=float(jitter_s),
         calibration_covariance=joint.tolist(),
+        model_fits=model_fits,
     )
 
 

@@ -27,12 +27,16 @@ from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 MODES = 8
 TELLING = 100  # images; the correlation of neighbours is then known to 0.1
-_LAGS = 20
-_TAPER = 1.0 - np.arange(1, _LAGS + 1) / (_LAGS + 1)
+_LASTS_S = 2.99  # no multiple of usual intervals, where rounding would decide
+"""Errors of lens, target and motion change within so long: a board crosses the image, a hand turns back. On
+EuRoC stretches of 2 to 4 s move the lever arm by 12 to 16 times the filter's variance; sums over
+3 s say 14, those over 1 s 8."""
+_SHARE = 0.2  # of all images, at most in one sum: the long-run variance is then known to 18 %
 _FLOOR = 0.5
 _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 16.0
 _DEAD_BAND = 1.3
+_USUAL_AFTER = 20  # images that show the usual size of innovations
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
 _CUSUM_DRIFT = 1.6
 _CUSUM_LIMIT = 9.0
@@ -115,13 +119,19 @@ class Consistency:
     _level: float = 1.0
     _skip: int = _SETTLE
     _weight: float = 0.0
-    _lagged: FloatArray = field(default_factory=lambda: np.zeros(_LAGS + 1))
-    _recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=_LAGS + 1))
+    _short: float = 0.0  # sum of the squared innovations of images
+    _long: float = 0.0  # of squared sums of the innovations over 3 s, over the number of images in them
+    _sum: FloatArray = field(default_factory=lambda: np.zeros(MODES))
+    _recent: deque[tuple[float, FloatArray]] = field(default_factory=deque)
 
     def settle(self) -> None:
         """A filter starts anew with what was learnt: let its first images pass."""
         self._skip, self.alarm = _SETTLE, 0.0
+        self._interrupt()
+
+    def _interrupt(self) -> None:
         self._recent.clear()
+        self._sum = np.zeros(MODES)
 
     @property
     def alarmed(self) -> bool:
@@ -129,15 +139,21 @@ class Consistency:
 
         Where lens or board do not fit, the view decides: half a board at the image's edge is no bump.
         """
-        return self.images > _LAGS and self.alarm > _CUSUM_LIMIT * self.factor * np.sqrt(self.scale)
+        return self.images > _USUAL_AFTER and self.alarm > _CUSUM_LIMIT * self.factor * np.sqrt(self.scale)
+
+    @property
+    def fits(self) -> bool:
+        """Enough images have been seen, and their errors neither last nor exceed their noise."""
+        return self._weight >= TELLING and self.factor == self.scale == 1.0
 
     @property
     def level(self) -> float:
         """Usual squared innovation in a mode over its prediction, >= 1."""
-        return max(1.0, self._lagged[0] / (MODES * self._weight)) if self._weight else 1.0
+        return max(1.0, self._short / (MODES * self._weight)) if self._weight else 1.0
 
     def learn(
         self,
+        t_s: float,
         uv: FloatArray,
         innovation: FloatArray,
         ways: FloatArray,
@@ -148,6 +164,7 @@ class Consistency:
         """Take in the innovation of one image.
 
         Args:
+            t_s: Its instant, s.
             uv: Predicted pixels of the accepted corners, shape (n, 2).
             innovation: Measured minus predicted, px, shape (n, 2).
             ways: How these corners move in each way in which the image can, px, shape (2n, k).
@@ -169,9 +186,9 @@ class Consistency:
         self.alarm = max(0.0, self.alarm + min(ratio / self.level, 5.0) - _CUSUM_DRIFT)
         self._move_scale(ratio)
         if len(normal) == MODES:
-            self._remember(normal)
+            self._remember(t_s, normal)
         else:
-            self._recent.clear()
+            self._interrupt()
 
     def _move_scale(self, ratio: float) -> None:
         """Follow the ratio; a level that is 1 within its own scatter stays exactly 1, at no cost."""
@@ -180,16 +197,26 @@ class Consistency:
         self._level = min(max(moved, 0.5), _MAX_SCALE)
         self.scale = self._level if self._level > _DEAD_BAND else 1.0
 
-    def _remember(self, normal: FloatArray) -> None:
+    def _remember(self, t_s: float, normal: FloatArray) -> None:
+        """Measure the long-run variance: the mean squared sum of the innovations of 3 s, over their number.
+
+        That is the sum of the autocorrelations in Bartlett's window.
+        [Newey and West, "A simple, positive semi-definite ... covariance matrix", 1987]
+        """
         if self._weight >= self.memory:
             keep = 1.0 - 1.0 / self.memory
-            self._weight *= keep
-            self._lagged *= keep
+            self._weight, self._short, self._long = keep * self._weight, keep * self._short, keep * self._long
         self._weight += 1.0
-        self._recent.append(normal)
-        self._lagged[: len(self._recent)] += (np.array(self._recent) @ normal)[::-1]
+        self._recent.append((t_s, normal))
+        self._sum += normal
+        most = max(1.0, _SHARE * self._weight)
+        while len(self._recent) > most or not t_s - _LASTS_S <= self._recent[0][0] <= t_s:
+            self._sum -= self._recent.popleft()[1]
+        images = len(self._recent)
+        self._short += float(normal @ normal)
+        self._long += float(self._sum @ self._sum) / images
         if self._weight < TELLING:
             return
-        total = 2.0 * float(_TAPER @ self._lagged[1:] / self._lagged[0])
-        noise = 2.0 * float(np.sqrt(_TAPER @ _TAPER / (MODES * self._weight)))
-        self.factor = 1.0 + total if total > max(SURE_SIGMAS * noise, _FLOOR) else 1.0
+        more = self._long / self._short - 1.0
+        noise = math.sqrt(4.0 * images / (3.0 * MODES * self._weight))  # of white innovations
+        self.factor = 1.0 + more if more > max(SURE_SIGMAS * noise, _FLOOR) else 1.0

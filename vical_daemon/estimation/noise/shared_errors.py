@@ -26,6 +26,7 @@ JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px
 _ABSENT = 1e-3  # a jitter is reported where the probability that there is none is less
 _PERSISTENT = 0.5  # of the variance: nearer to that of a model error (1) than to that of a jitter (0)
+_WANDERS_PX = 1.0  # five times what errors of the lens show on EuRoC; stabilisation moves images by some px
 WAYS = 3  # late, to the side, down
 
 
@@ -37,6 +38,8 @@ class SharedErrors:
         jitter_s: Standard deviation of a stamp, s: root of the mean variance.
         shift_px: Standard deviation by which a whole image is off, per axis, px; likewise.
         jitter_found_s: The jitter where there surely is one, s; else 0.
+        wander_px: The shift where it is large and that of neighbours alike (image stabilisation, a loose
+            lens, a board that moves); else 0.
         images: Images taken in.
         until_s: Stamp (s) up to which images are known from the start, and are not to count again; -inf once
             they have passed.
@@ -45,6 +48,7 @@ class SharedErrors:
     jitter_s: float = 0.0
     shift_px: float = 0.0
     jitter_found_s: float = 0.0
+    wander_px: float = 0.0
     images: int = 0
     until_s: float = -math.inf
     _likelihood: FloatArray = field(default_factory=lambda: np.zeros((SIZE, SIZE)))
@@ -105,29 +109,30 @@ class SharedErrors:
     def _look(self) -> None:
         known = posterior(self._likelihood, JITTERS_S, SHIFTS_PX)
         self.jitter_s, self.shift_px = np.sqrt(known.mean).tolist()
-        surely = known.absent[0] < _ABSENT and self._independent()
+        surely = known.absent[0] < _ABSENT and self._alike(0, self.jitter_s) < _PERSISTENT
         self.jitter_found_s = self.jitter_s if surely else 0.0
+        wanders = self.shift_px > _WANDERS_PX and _PERSISTENT < self._alike(1, self.shift_px) < math.inf
+        self.wander_px = self.shift_px if wanders else 0.0
 
-    def _independent(self) -> bool:
-        """Whether images are late independently of each other.
+    def _alike(self, way: int, sigma: float) -> float:
+        """Correlation of what neighbouring images are off by in a way; infinite while too few are known.
 
         A lens, a board or an imu that is off makes images look late or early, too, but neighbours
-        alike. False as well while too few images are known.
+        alike.
         """
         n = min(self.images, MEMORY)
-        size = self._A[:n, 0, 0]
-        if n < TELLING or not (size > 0.0).all():
-            return False
-        late, usual = self._b[:n, 0] / size, self._C[:n, 0, 0] / size**2
-        weight = 1.0 / (usual + self.jitter_s**2)
+        size = self._A[:n, way, way]
+        if n < TELLING or not (size > 0.0).all() or sigma == 0.0:
+            return math.inf
+        late, usual = self._b[:n, way] / size, self._C[:n, way, way] / size**2
+        weight = 1.0 / (usual + sigma**2)
         most = OUTLIER_SIGMAS / np.sqrt(weight)  # one outlier is no correlation
         late = np.clip(late, -most, most)
         pairs = weight[1:] * weight[:-1]
         newest = self.images % MEMORY  # where the oldest follows the newest
         if self.images > MEMORY and newest:
             pairs[newest - 1] = 0.0
-        alike = float((pairs * late[1:] * late[:-1]).sum() / pairs.sum())
-        return alike < _PERSISTENT * self.jitter_s**2
+        return float((pairs * late[1:] * late[:-1]).sum() / pairs.sum()) / sigma**2
 
 
 def shared_ways(state: State, layout: Layout, camera: str) -> FloatArray:

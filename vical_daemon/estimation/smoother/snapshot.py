@@ -81,6 +81,7 @@ def camera_estimate(
         rms_px=rms_px,
         sigma_px=sigma_px,
         rolling=models.rolling,
+        model_fits=models.factor == 1.0,
     )
 
 

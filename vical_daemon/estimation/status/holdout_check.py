@@ -7,13 +7,14 @@ calibration that only explains its own data fails here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
 
 EVERY_S = 1.5
 _AHEAD_S = 0.3
@@ -32,9 +33,23 @@ class HoldoutCheck:
     _next_s: float = float("-inf")
 
     def follow(
-        self, f: CalibrationFilter, frame: PointsFrame, t_cam_s: float, target: FloatArray, buffer: ImuBuffer
+        self,
+        f: CalibrationFilter,
+        report: FrameReport,
+        frame: PointsFrame,
+        t_cam_s: float,
+        target: FloatArray,
+        buffer: ImuBuffer,
     ) -> float | None:
         """Look at one image after the filter has used it.
+
+        Args:
+            f: The filter.
+            report: Its verdict on the image.
+            frame: The image.
+            t_cam_s: Its stamp, s.
+            target: Points of the target, m, shape (n, 3).
+            buffer: Inertial readings.
 
         Returns:
             Mean squared error of the prediction over its predicted variance, when one was due; else None.
@@ -52,7 +67,11 @@ class HoldoutCheck:
         if segment is None or segment.clipping_sigma is not None or t_s > held.state.t_s + 2.0 * _AHEAD_S:
             return None
         held.predict(segment)
-        return held.prediction_nis(held.image(frame, t_cam_s, target[frame.ids]))
+        image = held.image(frame, t_cam_s, target[frame.ids])
+        if report.used:  # then the noise of its corners is known
+            own = report.sigma_px / float(np.median(image.sigma_px))
+            image = replace(image, sigma_px=own * image.sigma_px)
+        return held.prediction_nis(image)
 
 
 def imu_noise_error(ratios: Sequence[float], scale: float) -> float | None:

@@ -25,6 +25,7 @@ from vical_daemon.estimation.status.holdout_check import EVERY_S, imu_noise_erro
 from vical_daemon.estimation.status.image_coverage import Cover
 from vical_daemon.estimation.status.steady_status import Verdict
 
+IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
 _ENOUGH_S = 10.0  # until then a drift of the clocks of 100 ppm could hide
 _NIS_BAD = 4.0
 _RECENT = 60  # images by which the fit of late is known; before, no status is one
@@ -45,6 +46,7 @@ class StatusEvaluator(Evaluator):
         self._imu_asked = "imu_intrinsics" in options.estimate
         self.frames = 0
         self.in_doubt = ""
+        self.clocks_doubtful = False  # a time shift may be drifting
         self._partial = ""
         self._reopened_s = -np.inf
         self._points = [0, 0]
@@ -99,7 +101,11 @@ class StatusEvaluator(Evaluator):
         square.append((float((good**2).sum()), 2 * len(good)))
         self._maybe_trace(report.camera, f)
         self._cover.saw(report, f)
-        self._announce_jitter(report.camera, f.shared[report.camera].jitter_found_s)
+        shared = f.shared[report.camera]
+        self._announce_jitter(report.camera, shared.jitter_found_s)
+        if shared.wander_px:
+            event = Event(EventKind.IMAGES_WANDER, report.camera, shared.wander_px)
+            self.announce(event, once=f"wander {report.camera}")
         lens = f.agreement[report.camera]
         if lens.model == RADTAN and lens.moved.any() and f.layout.lens_free(report.camera):
             self.announce(Event(EventKind.LENS_TERM_MISSING, report.camera), once=f"lens {report.camera}")
@@ -116,15 +122,11 @@ class StatusEvaluator(Evaluator):
         self,
         f: CalibrationFilter | None,
         stale: CalibrationFilter | None = None,
-        shares: model_mixture.Weights | None = None,
     ) -> CalibrationEstimate:
-        """Put everything together.
-
-        Args:
-            f: The filter.
-            stale: What was known before a change, shown while starting anew.
-            shares: See `weighed`.
-        """
+        """Put everything together; `stale`: what was known before a change, shown while starting anew."""
+        shares = None if f is None else model_selection.weights(f)
+        self.in_doubt = "" if f is None else self._doubt(f, shares)
+        self.believed &= not self.in_doubt
         f = None if f is None else self.weighed(f, shares)
         stale = None if stale is None else self.weighed(stale)
         shown = f or stale
@@ -148,6 +150,15 @@ class StatusEvaluator(Evaluator):
             gravity=[] if shown is None else shown.state.gravity.tolist(),
             refused=self._points[0] / max(self._points[1], 1),
         )
+
+    def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:
+        """What keeps small sigmas from being believed, in words; empty: nothing."""
+        drifts = (clock_drift.in_doubt(f, name, believed=self.believed) for name in self.layout.cameras)
+        if self.clocks_doubtful or any(drifts):
+            return clock_drift.CLOCKS_IN_DOUBT
+        if any(x.wander_px for x in f.shared.values()):
+            return IMAGES_WANDER
+        return model_selection.IN_DOUBT.get(model_selection.in_doubt(f, shares, believed=self.believed), "")
 
     def weighed(self, f: CalibrationFilter, shares: model_mixture.Weights | None = None) -> CalibrationFilter:
         """The filter to be reported: mean and covariance over all models of imu, target and clocks.

@@ -143,6 +143,7 @@ _ACTIONABLE = {
     EventKind.FIXED_LENS,
     EventKind.LENS_TERM_MISSING,
     EventKind.STAMP_JITTER,
+    EventKind.IMAGES_WANDER,
     EventKind.IMU_NOISE,
     EventKind.IMU_CLIPPED,
     EventKind.ACCEL_LAG,

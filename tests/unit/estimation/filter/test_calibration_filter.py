@@ -107,14 +107,15 @@ def test_update_equals_the_linear_kalman_update_with_numeric_jacobians(recording
             f.state, layout, f.rates, "cam0", image.t_cam_s, image.points, None, np.stack([h, -h])
         )
         H[:, k] = ((up - down) / 2e-6).ravel()
-    P = S @ S.T
-    Z = H @ P @ H.T + 0.25 * np.eye(len(H))
-    K = P @ H.T @ np.linalg.inv(Z)
-    dx = K @ (image.uv - z).ravel()
-    expected = retract(f.state, layout, dx)
+    kept = f.copy()
     report = f.update(image)
     assert report.used
     assert report.accepted.all()
+    P = S @ S.T
+    Z = H @ P @ H.T + report.sigma_px**2 * np.eye(len(H))
+    K = P @ H.T @ np.linalg.inv(Z)
+    dx = K @ (image.uv - z).ravel()
+    expected = retract(kept.state, layout, dx)
     np.testing.assert_allclose(f.state.p_world_imu, expected.p_world_imu, atol=2e-5)
     np.testing.assert_allclose(
         f.state.cameras["cam0"].p_imu_cam, expected.cameras["cam0"].p_imu_cam, atol=1e-5

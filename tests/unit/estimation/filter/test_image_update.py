@@ -1,8 +1,9 @@
 """The correction of one image where its model bends."""
 
 import numpy as np
+import pytest
 
-from vical_daemon.estimation.filter.image_update import solve
+from vical_daemon.estimation.filter.image_update import blurred, solve
 from vical_daemon.estimation.filter.linearise import Image, Linear
 
 POINTS, STATES = 6, 3
@@ -30,3 +31,20 @@ def test_a_step_that_puts_the_points_behind_the_camera_is_not_linearised_about()
     assert len(asked) == 1  # it was bent, so once more was tried
     assert fit.keep.all()
     np.testing.assert_allclose(fit.dx, e, atol=0.05)
+
+
+def test_a_blurred_image_is_known_from_a_moved_one():
+    """Noise of five times the usual is found; a turn of the camera, however large, is none."""
+    rng, n = np.random.default_rng(4), 60
+    ways = rng.standard_normal((2 * n, STATES))
+    image = Image("cam0", 0, 0.0, np.arange(n), np.zeros((n, 3)), np.zeros((n, 2)), np.full(n, 0.2))
+    none = np.zeros((2 * n, 0))
+    lin = Linear(
+        image.uv, ways, np.eye(STATES), np.eye(STATES), none, np.ones(n, bool), np.zeros((STATES, 0))
+    )
+    white = 0.2 * rng.standard_normal((n, 2))
+    moved = (ways @ [30.0, -20.0, 10.0]).reshape(-1, 2)
+    assert blurred(image, white + moved, lin) < 1.2
+    assert blurred(image, 5.0 * white + moved, lin) == pytest.approx(5.0, rel=0.2)
+    wrong = moved + 200.0 * rng.standard_normal((n, 2))  # corners of something else
+    assert blurred(image, wrong, lin) == 1.0

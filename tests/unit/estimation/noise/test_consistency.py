@@ -19,7 +19,7 @@ def feed(c, rng, frames, size=1.0, common=None):
         e = 0.5 * size * rng.normal(size=UV.shape)
         if common is not None:
             e = e + (modes(UV) @ common[k]).reshape(-1, 2)
-        c.learn(UV, e, LINEAR, np.eye(LINEAR.shape[1]), SIGMA * np.sqrt(c.scale))
+        c.learn(c.images / 20.0, UV, e, LINEAR, np.eye(LINEAR.shape[1]), SIGMA * np.sqrt(c.scale))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -28,6 +28,7 @@ def test_honest_innovations_change_nothing(seed):
     feed(c, np.random.default_rng(seed), 1200)
     assert c.scale == 1.0
     assert c.factor == 1.0
+    assert c.fits
     assert not c.alarmed
 
 
@@ -45,7 +46,8 @@ def test_what_clipped_readings_hide_does_not_count_as_a_good_fit(told, level):
     hidden = 20.0 * np.eye(3)
     for _ in range(1500):
         innovation = rng.normal(size=UV.shape)
-        c.learn(UV, innovation, ways, hidden, SIGMA * np.sqrt(c.scale), hidden if told else None)
+        sigma = SIGMA * np.sqrt(c.scale)
+        c.learn(c.images / 20.0, UV, innovation, ways, hidden, sigma, hidden if told else None)
     assert c.scale == pytest.approx(level, rel=0.15)
 
 
@@ -56,7 +58,28 @@ def test_errors_that_last_raise_the_factor_to_their_long_run_variance():
         a[k] = rho * a[k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=8)
     c = Consistency()
     feed(c, rng, n, common=a)
-    assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)  # 9, less what the taper cuts
+    assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)  # 9, less what the window cuts
+    assert not c.fits
+
+
+def test_whether_the_model_fits_is_not_known_from_a_few_images():
+    c = Consistency()
+    feed(c, np.random.default_rng(0), 50)
+    assert not c.fits
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 60.0])
+def test_the_factor_does_not_depend_on_the_rate_of_the_images(rate_hz):
+    """Errors that last for half a second count as many images as that is."""
+    rng, n = np.random.default_rng(4), int(400 * rate_hz)
+    rho = np.exp(-2.0 / rate_hz)
+    a = np.zeros((n, 8))
+    for k in range(1, n):
+        a[k] = rho * a[k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=8)
+    c = Consistency(memory=n)
+    for k in range(n):
+        c.learn(k / rate_hz, UV, 0.03 * (modes(UV) @ a[k]).reshape(-1, 2), LINEAR, np.eye(3), SIGMA)
+    assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)
 
 
 def test_a_jump_is_an_alarm_within_half_a_second():
