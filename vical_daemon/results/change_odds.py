@@ -229,7 +229,8 @@ def _log_odds(e: FloatArray, S: FloatArray, W: FloatArray, dof: float) -> float:
     logs = np.log(np.diag(root)).sum() - np.log(np.diag(wider)).sum()
     near, far = np.linalg.solve(wider, e), np.linalg.solve(root, e)
     size = len(e)
-    return float(logs) + _log_density(near @ near, size, dof) - _log_density(far @ far, size, dof)
+    gain = _log_density(float(near @ near), size, dof) - _log_density(float(far @ far), size, dof)
+    return float(logs) + gain
 
 
 def _moved(e: FloatArray, S: FloatArray, W: FloatArray) -> tuple[FloatArray, FloatArray]:
