@@ -248,7 +248,7 @@ BOARD: dict[str, Mechanism] = {
     "status: what may be off": Mechanism(
         WRONG,
         "not converged while data speak for a drift, an imu or a target that is off",
-        lambda: [(Calibrator, "_in_doubt", gives(""))],
+        lambda: [(StatusEvaluator, "_doubt", gives(""))],
         faults=("imu 0.3 % off", "crooked board", "drift 20 ppm"),
         disturbances=("nothing", DRIFTS),
     ),
