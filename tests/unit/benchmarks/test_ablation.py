@@ -43,7 +43,14 @@ def _learnt():
     for _ in range(400):
         common = 0.95 * common + rng.normal()
         innovation = 0.5 * rng.normal(size=uv.shape) + common
-        c.learn(0.05 * c.images, uv, innovation, np.zeros((2 * len(uv), 3)), np.zeros((3, 3)), np.full(len(uv), 0.5))
+        c.learn(
+            0.05 * c.images,
+            uv,
+            innovation,
+            np.zeros((2 * len(uv), 3)),
+            np.zeros((3, 3)),
+            np.full(len(uv), 0.5),
+        )
     return c
 
 

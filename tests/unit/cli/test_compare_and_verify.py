@@ -152,7 +152,7 @@ def test_euroc_published_calibration_is_found_wrong(capsys):
     assert code == 4
     assert document["verdict"] == "changed"
     assert document["seconds_used"] < 20.0
-    assert document["probability_changed"] > 0.98  # 1 / (1 + 0.95 / 0.05 / 1000): the least with that verdict
+    assert document["probability_changed"] > 0.98  # odds of 1000 and a prior of 5 %
 
 
 @needs_euroc
