@@ -26,7 +26,7 @@ from benchmarks.ablation_patches import (
 )
 from vical_daemon.estimation import calibrator
 from vical_daemon.estimation.calibrator import Calibrator
-from vical_daemon.estimation.filter import image_intake, image_update
+from vical_daemon.estimation.filter import calibration_filter, image_intake, image_update
 from vical_daemon.estimation.filter import snapshot as board_snapshot
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.filter.image_intake import ImageIntake
@@ -35,6 +35,7 @@ from vical_daemon.estimation.inertial.clipped_readings import ClippedReadings
 from vical_daemon.estimation.inertial.faulty_readings import RangeLimits, SpikeFilter
 from vical_daemon.estimation.inertial.imu_intake import ImuIntake
 from vical_daemon.estimation.inertial.stamp_steps import StampSteps
+from vical_daemon.estimation.init import board_window
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.model import start_sigmas
 from vical_daemon.estimation.model.held_lens import FixedLens
@@ -299,6 +300,22 @@ BOARD: dict[str, Mechanism] = {
         "corners weigh less while innovations are larger than they should be",
         lambda: [(Consistency, "_move_scale", gives(None))],
         faults=("lens model misses",),
+    ),
+    "noise of each image": Mechanism(
+        SMALL,
+        "images that motion blurs count less than sharp ones; without: the usual noise of the camera for all",
+        lambda: [
+            (image_update, "noise_of_image", gives(1.0)),
+            (board_window, "noise_of_image", gives(1.0)),
+            (calibration_filter, "blurred", gives(1.0)),
+        ],
+        faults=("corner noise changes",),
+    ),
+    "blurred images pass the gate": Mechanism(
+        SMALL,
+        "an image in which most corners fail the gate is asked whether it is blurred",
+        lambda: [(calibration_filter, "blurred", gives(1.0))],
+        faults=("corner noise changes",),
     ),
     "autocorrelation": Mechanism(
         SMALL,

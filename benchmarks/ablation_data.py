@@ -209,6 +209,7 @@ FAULTS: dict[str, Fault] = {
     "drift 20 ppm": Fault(montecarlo.Case(skew_ppm=20.0)),
     "lens model misses": Fault(montecarlo.Case(), _bent),
     "detector's own error": Fault(montecarlo.Case(simulation={"corner_sigma_px": 0.05}), _drawn_aside),
+    "corner noise changes": Fault(montecarlo.Case(simulation={"corner_sigma_px": 0.2, "noise_spread": 0.8})),
     "gyro clips": Fault(montecarlo.Case(), _clipped),
     "slow motion": Fault(montecarlo.Case(rig={"mean_rate_dps": 10.0}, simulation={"camera_rate_hz": 10.0})),
     "imu noise stated 10 times too small": Fault(montecarlo.Case(), noise_stated=0.1),

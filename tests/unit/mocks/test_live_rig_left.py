@@ -12,8 +12,11 @@ BOARD = {"kind": "checkerboard", "cols": 8, "rows": 5, "row_spacing_m": 0.05, "c
 
 
 @pytest.mark.parametrize("device", list(_DEVICES))
-def test_a_parent_that_has_ended(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_whose_parent_has_ended_ends_and_prints_nothing(
+    device: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("signal.signal", lambda *_: None)  # the devices run in this process here
     ours, theirs = multiprocessing.Pipe()
     ours.close()
     _DEVICES[device](LiveRigSettings(BOARD), time.monotonic(), theirs)  # ^C while they load their libraries
+    assert capfd.readouterr() == ("", "")
