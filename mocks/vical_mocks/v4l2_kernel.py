@@ -120,9 +120,9 @@ class FakeKernel(Requests):
         """CLOCK_MONOTONIC."""
         return self.clock.now_ns
 
-    def realtime_ns(self) -> int:
-        """CLOCK_REALTIME: another epoch."""
-        return self.clock.now_ns + 1_700_000_000_000_000_000
+    def clocks_ns(self) -> tuple[int, int]:
+        """CLOCK_MONOTONIC, and CLOCK_REALTIME: another epoch."""
+        return self.clock.now_ns, self.clock.now_ns + 1_700_000_000_000_000_000
 
     def open(self, path: str) -> int:
         """Open a node."""

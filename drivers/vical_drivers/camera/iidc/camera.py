@@ -32,6 +32,7 @@ from vical_drivers.camera.settings import CameraSettings
 from vical_drivers.camera.stamps import RawStamp
 from vical_drivers.closing import Closing
 from vical_drivers.errors import DeviceBusyError, DeviceLostError, DeviceRefusedError, DriverError
+from vical_drivers.host_clocks import read_host_clocks
 from vical_drivers.samples import DeviceInfo, Frame, SourceStats
 
 _log = logging.getLogger(__name__)
@@ -227,8 +228,7 @@ class IidcCamera(Closing):
         if held is None:
             self._check_silence(device)
             return None
-        t_arrival_ns = time.monotonic_ns()
-        t_real_ns = time.time_ns()
+        t_arrival_ns, t_real_ns = read_host_clocks()
         self._t_alive_ns = t_arrival_ns
         frame: abi.VideoFrame = held.contents
         data = frame_bytes(frame)

@@ -226,8 +226,8 @@ class V4l2Camera(Closing):
         self._frames.stamper.set_exposure(read_exposure_ns(session.controls), self._kernel.monotonic_ns())
 
     def _frame(self, session: V4l2Session, buffer: DequeuedBuffer) -> Frame | None:
-        # Both clocks at once, and before anything takes time: a stamp of the wall clock is moved by the pair.
-        t_arrival_ns, t_realtime_ns = self._kernel.monotonic_ns(), self._kernel.realtime_ns()
+        # before anything takes time: a stamp of the wall clock is moved by the pair
+        t_arrival_ns, t_realtime_ns = self._kernel.clocks_ns()
         t_stamp_ns = to_monotonic_ns(buffer.t_ns, t_arrival_ns, t_realtime_ns) or t_arrival_ns
         self._frames.numbered(t_stamp_ns, self._sequence.missing_before(buffer.sequence))
         image = self._image(session, buffer)

@@ -20,6 +20,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from vical_drivers.host_clocks import read_host_clocks
+
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.mmap.restype = ctypes.c_void_p
 _libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
@@ -74,8 +76,8 @@ class Kernel(Protocol):
         """CLOCK_MONOTONIC, ns."""
         ...
 
-    def realtime_ns(self) -> int:
-        """CLOCK_REALTIME, ns."""
+    def clocks_ns(self) -> tuple[int, int]:
+        """CLOCK_MONOTONIC and CLOCK_REALTIME of the same moment, ns."""
         ...
 
 
@@ -140,6 +142,6 @@ class LinuxKernel:
         """See `Kernel.monotonic_ns`."""
         return time.monotonic_ns()
 
-    def realtime_ns(self) -> int:
-        """See `Kernel.realtime_ns`."""
-        return time.time_ns()
+    def clocks_ns(self) -> tuple[int, int]:
+        """See `Kernel.clocks_ns`."""
+        return read_host_clocks()

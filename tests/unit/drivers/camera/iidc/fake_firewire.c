@@ -62,7 +62,7 @@ static pthread_t camera_thread;
 static int camera_running;
 static struct rig *rig;
 static struct client clients[64];
-static uint32_t generation = 1, seen_resets;
+static uint32_t generation = 1, seen_resets, switched;
 static int64_t jump_ns;
 static uint32_t rom[2][64], rom_length[2];
 static uint32_t regs[0x20000 / 4];
@@ -154,6 +154,7 @@ static void put_feature(unsigned index, unsigned absolute, float low, float high
 static void reset_registers(void)
 {
     memset(regs, 0, sizeof regs);
+    switched++;
     REG(0x100) = 0xA1000000;                     /* formats 0, 2 and 7 */
     REG(0x180) = 0x04000000;                     /* 640x480 mono8 */
     REG(0x188) = 0x20000000;                     /* 1280x960 mono8 */
@@ -202,6 +203,7 @@ static double frame_rate(void)
 
 static void derive(uint32_t offset)
 {
+    if (offset == 0x614) switched++;                                  /* transmission on or off */
     if (offset == 0x918 && REG(0x81C) & 0x40000000) {                 /* shutter in seconds: 10 us steps */
         uint32_t raw = (uint32_t)lround(bits_float(REG(0x918)) * 1e5);
         REG(0x81C) = (REG(0x81C) & 0xFFFFF000) | (raw & 0xFFF);
@@ -316,7 +318,7 @@ static void *run_camera(void *unused)
         uint32_t packets = packet ? (bytes + packet - 1) / packet : 1;
         int64_t period = (int64_t)(1e9 / frame_rate());
         int64_t apart = packets * CYCLE_NS < period ? CYCLE_NS : period / packets;
-        uint32_t raw = REG(0x81C) & 0xFFF, sent = 0;
+        uint32_t raw = REG(0x81C) & 0xFFF, sent = 0, begun = switched;
         uint32_t width = REG(0x608) >> 29 == 7 ? REG(0xA0C) >> 16 : REG(0x608) >> 29 == 2 ? 1280 : 640;
         pthread_mutex_unlock(&lock);
         int64_t late = now_ns(CLOCK_MONOTONIC) - t_close;
@@ -327,8 +329,8 @@ static void *run_camera(void *unused)
             sleep_until(t_first + end * apart);
             pthread_mutex_lock(&lock);
             look_around();
-            int heard = 0;
-            for (unsigned i = 0; i < 64; i++) heard |= listens(&clients[i]);
+            int heard = 0;                                            /* a frame of the settings before is not sent */
+            for (unsigned i = 0; i < 64 && begun == switched; i++) heard |= listens(&clients[i]);
             if (!sent) draw(image, width, packets * packet, counter, t_close, raw);
             if (!sent && heard)
                 rig->truth[rig->frames++ % TRUTHS] = (struct truth){t_close - raw * 10000LL, t_close, counter, raw};
