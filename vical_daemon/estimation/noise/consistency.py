@@ -8,9 +8,11 @@ the eight smooth modes of a plane's image, make it honest again:
 
 * `scale` multiplies the variance of the corners until the innovations have the size they should have. It
   changes the weight of images against the IMU, so it moves slowly and within bounds.
-* `factor` is the long-run over the instantaneous variance of the innovations: errors that last for k images
-  are k times less informative than the filter counts. It multiplies the *reported* covariance only; fed back
-  into the gain it would run away (less weight for images, more drift, larger innovations).
+* `factor` is the long-run variance of the innovations over the variance that the filter predicts: errors that
+  last for k images are k times less informative than it counts. It multiplies the *reported* covariance only;
+  fed back into the gain it would run away (less weight for images, more drift, larger innovations). It also
+  contains what `scale` cannot explain: at few images a second the predicted motion adds more to an innovation
+  than the corners do.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from vical_daemon.estimation.model.unscented import root, solve_lower
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 MODES = 8
-TELLING = 100  # images; the correlation of neighbours is then known to 0.1
+_TELLING = 30
+"""Images: the long-run variance is then known to 20 % where innovations are white."""
 _LASTS_S = 2.99  # no multiple of usual intervals, where rounding would decide
 """Errors of lens, target and motion change within so long: a board crosses the image, a hand turns back. On
 EuRoC stretches of 2 to 4 s move the lever arm by 12 to 16 times the filter's variance; sums over
@@ -144,7 +147,7 @@ class Consistency:
     @property
     def fits(self) -> bool:
         """Enough images have been seen, and their errors neither last nor exceed their noise."""
-        return self._weight >= TELLING and self.factor == self.scale == 1.0
+        return self._weight >= _TELLING and self.factor == self.scale == 1.0
 
     @property
     def level(self) -> float:
@@ -215,8 +218,8 @@ class Consistency:
         images = len(self._recent)
         self._short += float(normal @ normal)
         self._long += float(self._sum @ self._sum) / images
-        if self._weight < TELLING:
+        if self._weight < _TELLING:
             return
-        more = self._long / self._short - 1.0
+        more = self._long / (MODES * self._weight) - 1.0
         noise = math.sqrt(4.0 * images / (3.0 * MODES * self._weight))  # of white innovations
         self.factor = 1.0 + more if more > max(SURE_SIGMAS * noise, _FLOOR) else 1.0

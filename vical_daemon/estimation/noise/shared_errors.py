@@ -16,11 +16,11 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
-from vical_daemon.estimation.noise.consistency import TELLING
 from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
 MEMORY = 400  # images by which a noise is known
+TELLING = 100  # images; the correlation of neighbours is then known to 0.1
 _EVERY = 20  # images that are added together; nothing is said before, unless a start said it
 JITTERS_S = grid(5e-5)  # up to 8 ms
 SHIFTS_PX = grid(2e-2)  # up to 3 px

@@ -14,9 +14,8 @@ from vical_daemon.estimation.model.priors import KNOWN_OFF_SIGMA, KNOWN_SIZE_SIG
 from vical_daemon.estimation.model.retract import retract
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.noise.consistency import TELLING
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
-from vical_daemon.estimation.noise.shared_errors import MEMORY
+from vical_daemon.estimation.noise.shared_errors import MEMORY, TELLING
 from vical_daemon.estimation.selection.model_mixture import Block, lens_block, not_zero
 from vical_daemon.estimation.selection.model_selection import IMU, LAG, SIZE, TARGET, blocks, factor, weights
 from vical_daemon.estimation.significance import EVERY_S

@@ -57,14 +57,26 @@ def test_errors_that_last_raise_the_factor_to_their_long_run_variance():
     for k in range(1, n):
         a[k] = rho * a[k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=8)
     c = Consistency()
-    feed(c, rng, n, common=a)
-    assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)  # 9, less what the window cuts
+    feed(c, rng, n, common=a)  # they are larger than what the scale can explain, too
+    assert c.level > 5.0
+    assert c.factor == pytest.approx(c.level * (1 + rho) / (1 - rho), rel=0.35)  # less what the window cuts
+    assert not c.fits
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_larger_innovations_that_the_predicted_motion_dominates_raise_the_factor(seed):
+    """At few images a second more weight for the motion than for corners: the scale explains nothing."""
+    c, rng, ways = Consistency(), np.random.default_rng(seed), modes(UV)
+    for _ in range(200):
+        common = (ways @ rng.normal(size=8) * 2.0).reshape(-1, 2)
+        c.learn(c.images / 5.0, UV, common, ways, np.eye(8), SIGMA * np.sqrt(c.scale))
+    assert 2.0 < c.factor < 6.0
     assert not c.fits
 
 
 def test_whether_the_model_fits_is_not_known_from_a_few_images():
     c = Consistency()
-    feed(c, np.random.default_rng(0), 50)
+    feed(c, np.random.default_rng(0), 30)
     assert not c.fits
 
 
@@ -78,7 +90,7 @@ def test_the_factor_does_not_depend_on_the_rate_of_the_images(rate_hz):
         a[k] = rho * a[k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=8)
     c = Consistency(memory=n)
     for k in range(n):
-        c.learn(k / rate_hz, UV, 0.03 * (modes(UV) @ a[k]).reshape(-1, 2), LINEAR, np.eye(3), SIGMA)
+        c.learn(k / rate_hz, UV, np.median(SIGMA) / np.sqrt(len(UV)) * (modes(UV) @ a[k]).reshape(-1, 2), LINEAR, np.eye(3), SIGMA)
     assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)
 
 
