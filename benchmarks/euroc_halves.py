@@ -20,7 +20,7 @@ from vical_daemon.estimation.calibrator import Calibrator
 from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, ImuNoise, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.noise.consistency import MODES, modes
-from vical_daemon.estimation.result import CameraEstimate
+from vical_daemon.estimation.result import CameraEstimate, Status
 from vical_daemon.vision.target import load_target
 
 FOLDER = Path(__file__).parents[2] / "shared" / "data" / "euroc_imu_april"
@@ -33,11 +33,12 @@ _PART_PX = 24
 
 
 class Half(NamedTuple):
-    """A stretch calibrated: the answer, its images, CPU of each (s)."""
+    """A stretch calibrated: the answer, its images, CPU of each (s), whether it converged."""
 
     camera: CameraEstimate
     used: list[FrameReport]
     steady_s: list[float]
+    converged: bool
 
 
 def calibrate(
@@ -58,7 +59,8 @@ def calibrate(
         else:
             c.add_imu(item.stamp_ns, item.gyro_rps, item.specific_force_mps2)
     c.finish()
-    return Half(c.estimate().cameras["cam0"], used, steady_s)
+    estimate = c.estimate()
+    return Half(estimate.cameras["cam0"], used, steady_s, estimate.status is Status.CONVERGED)
 
 
 def rms_px(reports: list[FrameReport]) -> float:
