@@ -29,7 +29,7 @@ from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
 
 MODES = 8
 _TELLING = 30
-"""Images: the long-run variance is then known to 20 % where innovations are white."""
+"""Images after which a model that fits is believed to: sums over six of them are known to 20 %."""
 _LASTS_S = 2.99  # no multiple of usual intervals, where rounding would decide
 """Errors of lens, target and motion change within so long: a board crosses the image, a hand turns back. On
 EuRoC stretches of 2 to 4 s move the lever arm by 12 to 16 times the filter's variance; sums over
@@ -220,8 +220,6 @@ class Consistency:
         images = len(self._recent)
         self._short += float(normal @ normal)
         self._long += float(self._sum @ self._sum) / images
-        if self._weight < _TELLING:
-            return
         more = self._long / (MODES * self._weight) - 1.0
-        noise = math.sqrt(4.0 * images / (3.0 * MODES * self._weight))  # of white innovations
+        noise = math.sqrt((4.0 * images + 2.0 / images) / (3.0 * MODES * self._weight))  # of white innovations
         self.factor = 1.0 + more if more > max(SURE_SIGMAS * noise, _FLOOR) else 1.0
