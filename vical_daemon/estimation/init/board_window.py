@@ -24,6 +24,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import (
+    LEAST_POINTS,
     BoolArray,
     FloatArray,
     Frames,
@@ -324,7 +325,7 @@ class BoardWindow:
             since_s = node.at.t_s - self.nodes[0].at.t_s
             by_error[:, where.skew] = since_s * by_error[:, where.timeshift]
         seen: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
-        if seen.sum() < 4:
+        if seen.sum() < LEAST_POINTS:
             return None
         residual = np.where(seen[:, None], frame.uv_px - np.where(seen[:, None], uv, 0.0), 0.0)
         ways = np.where(np.repeat(seen, 2)[:, None], ways, 0.0)
