@@ -406,7 +406,7 @@ class CalibrationFilter:
     def keep_from(self, known: CalibrationFilter) -> None:
         """After a change of the mounting: take all from an earlier filter but what the change may have moved.
 
-        Found anew, and left as they are here, are motion, gravity in the target's frame, mountings, lever
+        Found again, and left as they are here, are motion, gravity in the target's frame, mountings, lever
         arms and time shifts.
 
         Args:

@@ -1,8 +1,8 @@
 """One window of inertial bundle adjustment over the first seconds, with the target's points known.
 
 Unknowns are the motion at some of the images, and the filter's own constant errors with its own prior and
-its own model of an image; links are those of the calibration without a target. All is linearised anew until
-nothing changes: where the closed form had put lever arm and mounting no longer matters.
+its own model of an image; links are those of the calibration without a target. Everything is relinearised
+until nothing changes, so the lever arm and mounting of the closed form no longer matter.
 [docs/math/filter.md, eq. (20)]
 """
 

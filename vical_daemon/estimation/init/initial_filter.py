@@ -1,4 +1,4 @@
-"""The filter that a start begins with: sigmas many times what the start is really worth."""
+"""The filter that a start begins with: its sigmas are many times the errors of the closed form."""
 
 from __future__ import annotations
 

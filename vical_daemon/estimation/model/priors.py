@@ -1,4 +1,4 @@
-"""What is taken as known before any data: one table for calibration with a target and without.
+"""Priors: one table for calibration with a target and without.
 
 Prior sigmas are many times what a start is worth, so that its data do not count twice.
 [docs/math/filter.md, eq. (16), (18) and (20)]

@@ -130,7 +130,7 @@ def upper_root(rows: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _lower(n: int) -> FloatArray:
-    """Ones on and below the diagonal (numpy's `tril` makes them anew at each call)."""
+    """Ones on and below the diagonal (numpy's `tril` makes them at each call)."""
     return np.tri(n)
 
 
