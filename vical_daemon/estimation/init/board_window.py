@@ -50,7 +50,7 @@ from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
 _MOST_STEPS = 20
-_DONE = 0.1  # a step that promises less than this of the sum of squares is the last
+_DONE = 0.1  # the last step is one with a smaller predicted reduction of the sum of squares
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _OF_POSE = 6  # degrees of freedom of an image that its pose takes up
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
