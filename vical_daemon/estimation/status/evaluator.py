@@ -11,7 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import WeakDirection
-from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 from vical_daemon.estimation.result import (
@@ -88,7 +88,7 @@ class Evaluator:
 
     def saw_points(self, t_s: float, count: int) -> None:
         """Count one image with `count` points or tracks in it."""
-        if count >= 4:
+        if count >= LEAST_POINTS:
             self.frames_seen += 1
             if self.first_frame_s is None:
                 self.first_frame_s = t_s
