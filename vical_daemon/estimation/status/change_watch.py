@@ -23,7 +23,6 @@ _IMAGES = 10
 """So many refused in a row: the pose is found again, and soon after that the calibration. So many images
 after an alarm show what has changed."""
 _SOON_S = 4.0
-_SETTLE_S = 3.0  # after a start the innovations still move
 _DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 _DRIFT_AFTER_S = 2.0
 
@@ -88,7 +87,7 @@ class ChangeWatch:
         consistency = f.consistency[report.camera]
         if consistency.alarmed:
             consistency.alarm = 0.0
-            if t > self._started_s + _SETTLE_S and not self._closer:
+            if not self._closer:
                 self._closer = _IMAGES
         if self._closer:
             self._closer -= 1
