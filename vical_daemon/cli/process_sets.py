@@ -112,9 +112,9 @@ class RoleThreads:
             _log.error("role %s does not stop", role)
         return not stuck
 
-    def stop_all(self, timeout_s: float | None = None) -> bool:
+    def stop_all(self) -> bool:
         """End all roles, the last started first: consumers are started first and see the last data."""
-        ended = [self.stop(role, timeout_s) for role in reversed(list(self._threads))]
+        ended = [self.stop(role) for role in reversed(list(self._threads))]
         return all(ended)
 
     def raise_failure(self) -> None:

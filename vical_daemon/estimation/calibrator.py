@@ -22,6 +22,7 @@ from vical_daemon.estimation.init.motion_restart import MotionRestart, motion_is
 from vical_daemon.estimation.init.recording_start import RecordingStart
 from vical_daemon.estimation.init.rig_model import RigModel
 from vical_daemon.estimation.measurements import (
+    LEAST_POINTS,
     CalibrationOptions,
     CameraPrior,
     FloatArray,
@@ -304,7 +305,7 @@ class Calibrator:
         if segment is None:
             return None
         f.predict(segment)  # of no length at the first image: that one, too, must know how the rig turns
-        if len(frame.ids) < 4:
+        if len(frame.ids) < LEAST_POINTS:
             return None
         return f.update(f.image(frame, t_cam_s, self.rig.target[frame.ids]))
 

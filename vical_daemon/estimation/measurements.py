@@ -19,6 +19,8 @@ ROWS, COLUMNS = "rows", "columns"
 IMAGE_GAP_S = 0.5
 """Between images further apart, s, is a gap: it is reported, and nothing is followed across it. A track may
 belong to another point, and the motion may be better known from the next image."""
+LEAST_POINTS = 4
+"""An image with fewer points of the target is not used: a homography needs four."""
 
 
 @dataclass(frozen=True, slots=True)

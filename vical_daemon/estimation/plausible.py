@@ -1,4 +1,4 @@
-"""What a measurement can be at all: bounds on everything that enters an estimator, whoever sent it.
+"""Plausibility bounds on everything that enters an estimator, whoever sent it.
 
 The bounds are those of the devices, wide enough for every rig: a value outside of them is junk or a fault,
 never data. Values inside may still be wrong; that is for the estimator's own gates.

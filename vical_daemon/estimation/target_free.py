@@ -18,7 +18,7 @@ from vical_daemon.estimation.events import Cause
 from vical_daemon.estimation.filter.sensor_intake import SensorIntake
 from vical_daemon.estimation.filter.unobservable_directions import has_turned
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
-from vical_daemon.estimation.measurements import CalibrationOptions, CameraPrior, PointsFrame
+from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, CameraPrior, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.state import make_layout
@@ -141,7 +141,7 @@ class TargetFreeCalibrator:
         if not self._thinning.takes(t_cam_s):
             return
         self.evaluator.saw_points(t_cam_s, len(frame.ids))
-        if len(frame.ids) >= 4:
+        if len(frame.ids) >= LEAST_POINTS:
             self._pending.append((t_cam_s, frame))
 
     def _clock_was_set(self) -> None:

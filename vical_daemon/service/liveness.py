@@ -23,12 +23,10 @@ class Liveness:
     Args:
         roles: The roles of this process.
         begin_s: When the roles were started, by the clock of `now_s`.
-        fresh_s: A status older than this means that the role hangs.
     """
 
-    def __init__(self, roles: Sequence[str], begin_s: float, fresh_s: float = FRESH_S) -> None:
+    def __init__(self, roles: Sequence[str], begin_s: float) -> None:
         self._roles, self._begin_s = tuple(roles), begin_s
-        self._fresh_s = fresh_s
         self._seen: dict[str, tuple[float, DiagnosticsMessage]] = {}
         self._lock = threading.Lock()
 
@@ -57,7 +55,7 @@ class Liveness:
                     return f"{role} has not started within {START_S:.0f} s"
                 continue
             at_s, message = seen[role]
-            if now_s - at_s > self._fresh_s:
+            if now_s - at_s > FRESH_S:
                 return f"{role} has been silent for {now_s - at_s:.0f} s"
             for status in message.statuses:
                 if status.level is Level.STALE:

@@ -15,6 +15,8 @@ import numpy.typing as npt
 
 from vical_daemon.vision.detection import FloatArray, IntArray, median
 
+_TOLERANCE_PX = 4.0  # at which the first, linear fit calls a point wrong
+
 BoolArray = npt.NDArray[np.bool_]
 
 CONVERGED = 2e-3
@@ -65,7 +67,7 @@ class GridModel:
 
 
 def fit_grid(
-    xy_m: FloatArray, uv_px: FloatArray, shape: tuple[int, int], lens: float = -0.1, tolerance_px: float = 4.0
+    xy_m: FloatArray, uv_px: FloatArray, shape: tuple[int, int], lens: float = -0.1
 ) -> GridModel | None:
     """Fit a model to at least four points, some of which may be wrong.
 
@@ -74,7 +76,6 @@ def fit_grid(
         uv_px: Their pixels, shape (n, 2).
         shape: Image height and width.
         lens: First guess of the lens coefficient (negative: barrel).
-        tolerance_px: Distance at which the first, linear fit calls a point wrong.
     """
     if len(xy_m) < 4:
         return None
@@ -85,7 +86,7 @@ def fit_grid(
     q = (uv_px - middle) / half
     undistorted = q / (1 + lens * np.sum(q * q, axis=1, keepdims=True))
     cv2.setRNGSeed(1)
-    H, _ = cv2.findHomography(x, undistorted, cv2.RANSAC, tolerance_px / half, maxIters=400)
+    H, _ = cv2.findHomography(x, undistorted, cv2.RANSAC, _TOLERANCE_PX / half, maxIters=400)
     if H is None or abs(H[2, 2]) < 1e-12:
         return None
     parameters = np.append((H / H[2, 2]).ravel()[:8], lens)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -36,7 +35,7 @@ from vical_daemon.estimation.filter.unobservable_directions import UnobservableD
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuSegment
 from vical_daemon.estimation.inertial.imu_model import Influence
-from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise, PointsFrame
+from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatArray, ImuNoise, PointsFrame
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.inertial_links import ROUNDING
@@ -176,9 +175,9 @@ class CalibrationFilter:
             blur = blurred(image, innovation, lin)
             image = replace(image, sigma_px=blur * image.sigma_px)
             keep = lin.valid & self._belonging(image, innovation, lin)
-        if keep.sum() < 4:
+        if keep.sum() < LEAST_POINTS:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
-        fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
+        fit = solve(image, self.S, lin, keep)
         level = fit.nis / max(fit.dof, 1)
         if self._misses_gate(fit):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
@@ -286,13 +285,9 @@ class CalibrationFilter:
             return self._with_shared(
                 image, by_derivatives(self.state, self.layout, self.rates, image, self.S)
             )
-        lin = self._by_points(image, np.zeros(self.layout.size), self.S)
-        straight.measured(sigmas, curved_share(image, lin, lin.valid))
+        lin = self._with_shared(image, by_sigma_points(self.state, self.layout, self.rates, image, self.S))
+        straight.measured(sigmas, curved_share(image, lin))
         return lin
-
-    def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
-        lin = by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
-        return self._with_shared(image, lin)
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""
@@ -411,7 +406,7 @@ class CalibrationFilter:
     def keep_from(self, known: CalibrationFilter) -> None:
         """After a change of the mounting: take all from an earlier filter but what the change may have moved.
 
-        Found anew, and left as they are here, are motion, gravity in the target's frame, mountings, lever
+        Found again, and left as they are here, are motion, gravity in the target's frame, mountings, lever
         arms and time shifts.
 
         Args:

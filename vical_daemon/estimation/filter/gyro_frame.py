@@ -1,7 +1,7 @@
-"""The frame of whoever integrates a gyro's readings as they are.
+"""The IMU frame in which the gyro's matrix is symmetric: that of a plain integration of its readings.
 
-Where scale and alignment of an IMU are not true, its gyro's matrix is symmetric in one frame and its
-accelerometer's lower triangular in another; the mounting is known twice as well in the first.
+With errors of scale and alignment, the gyro's matrix is symmetric in one frame, and the accelerometer's is
+lower triangular in another. The mounting is known twice as well in the first.
 [docs/math/filter.md, after eq. (18)]
 """
 

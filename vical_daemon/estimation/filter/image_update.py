@@ -1,16 +1,15 @@
-"""The linear algebra of one image's correction: gates, compression, and iteration while far from straight."""
+"""The linear algebra of one image's correction: gates and compression."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from vical_daemon.estimation.filter.linearise import Image, Linear
-from vical_daemon.estimation.measurements import BoolArray, FloatArray
+from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatArray
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.noise.corner_noise import MOST_PX, noise_of_image
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
@@ -21,14 +20,9 @@ from vical_daemon.estimation.significance import (
     chi_square_limit,
 )
 
-_ITERATIONS = 5
-_LEAST = 4  # points for a correction
-_CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
 _CORNER_GATE = chi_square_limit(2, CORNER_REFUSED)
 _RESIDUAL_GATE = chi_square_limit(2, RESIDUAL_REFUSED)
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
-
-Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
 
 
 @lru_cache(maxsize=256)
@@ -102,52 +96,19 @@ def blurred(image: Image, innovation: FloatArray, lin: Linear) -> float:
     sigma, shown = image.sigma_px[lin.valid, None], rows_of(lin.valid)
     ways, r = lin.ways[shown] / np.repeat(sigma, 2, axis=0), innovation[lin.valid] / sigma
     spare = r.size - ways.shape[1]
-    if spare < _LEAST:
+    if spare < LEAST_POINTS:
         return 1.0
     left = r - (ways @ np.linalg.lstsq(ways, r.ravel())[0]).reshape(-1, 2)
     noise = float(np.median(np.linalg.norm(left, axis=1))) / MEDIAN_RAYLEIGH * math.sqrt(r.size / spare)
     return max(noise, 1.0) if noise * float(np.median(sigma)) < MOST_PX else 1.0
 
 
-def curved_share(image: Image, lin: Linear, keep: BoolArray) -> float:
+def curved_share(image: Image, lin: Linear) -> float:
     """Largest second-order standard deviation of a corner over its noise."""
-    if not lin.curved.size or not keep.any():
+    if not lin.curved.size or not lin.valid.any():
         return 0.0
     share = np.sqrt((lin.curved**2).sum(axis=1)).reshape(-1, 2).max(axis=1) / image.sigma_px
-    return float(share[keep].max())
-
-
-def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, linearise: Linearise) -> ImageFit:
-    """Iterated posterior linearisation (once is enough when the prior is tight).
-
-    Args:
-        image: The points.
-        prior: Square root of the covariance, shape (c, c).
-        lin: The image linearised about the prior.
-        keep: Points that passed the gate, shape (n,).
-        linearise: Linearises anew about a step and a spread.
-
-    Returns:
-        The fit. [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
-    """
-    S, dx = prior, np.zeros(len(prior))
-    spread, offset = lin.spread, np.zeros(2 * len(image.ids))
-    for step in range(_ITERATIONS):
-        if step:
-            lin = linearise(dx, S)
-            if (keep & lin.valid).sum() < _LEAST:  # about this step most points are behind the camera
-                break
-            keep = keep & lin.valid
-            # the innovation refers to the prior mean
-            spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
-        fit = _correct(prior, spread, image, (image.uv - lin.z).ravel() + offset, lin, keep)
-        if curved_share(image, lin, fit.keep) < _CURVED:
-            break
-        step_size = unscented.solve_lower(fit.S, fit.dx - dx)
-        S, dx, keep = fit.S, fit.dx, fit.keep
-        if step and float(np.linalg.norm(step_size)) < 0.05:
-            break
-    return fit
+    return float(share[lin.valid].max())
 
 
 def _moved(solution: FloatArray, spread: FloatArray, shared: FloatArray) -> FloatArray:
@@ -167,12 +128,17 @@ def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
     return float(left @ left), count
 
 
-def _correct(
-    prior: FloatArray, spread: FloatArray, image: Image, innovation: FloatArray, lin: Linear, keep: BoolArray
-) -> ImageFit:
-    """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
-    weight = 1.0 / np.repeat(image.sigma_px, 2)
-    ways, r = lin.ways * weight[:, None], innovation * weight
+def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray) -> ImageFit:
+    """Correct the state by one image; corners with impossible residuals are left out and it is repeated.
+
+    Args:
+        image: The points.
+        prior: Square root of the covariance, shape (c, c).
+        lin: The image linearised about the prior.
+        keep: Points that passed the gate, shape (n,).
+    """
+    weight, spread = 1.0 / np.repeat(image.sigma_px, 2), lin.spread
+    ways, r = lin.ways * weight[:, None], (image.uv - lin.z).ravel() * weight
     k = ways.shape[1]
     if lin.curved.size:
         curved = lin.curved * weight[:, None]
@@ -191,7 +157,7 @@ def _correct(
         moved = _moved(c.solution, spread, lin.shared)
         left = (r - ways @ moved).reshape(-1, 2)
         bad = keep & (np.einsum("ij,ij->i", left, left) > _RESIDUAL_GATE * max(1.0, rest / max(dof_rest, 1)))
-        if not bad.any() or (keep & ~bad).sum() < _LEAST:
+        if not bad.any() or (keep & ~bad).sum() < LEAST_POINTS:
             break
         keep = keep & ~bad
     return ImageFit(

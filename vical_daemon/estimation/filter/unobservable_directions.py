@@ -1,15 +1,15 @@
-"""What the motion shows nothing of: held in the filter, unknown in what is said.
+"""Unobservable directions: held in the filter, reported at prior sigma.
 
-Where an axis `a` of the imu keeps its direction R a in the world, a lever arm longer by `a` and an imu that
-stands back by `R a` give the same images: the motion shows nothing of it, and whatever it is assumed to be,
-the rest comes out the same. A filter that lets it float sees `R a` in slightly different directions at each
-image and takes that for information (as SLAM filters do; Huang et al. 2010): its sigma collapses while it
-runs off. So it is held, its variance is added where the estimate leaves, and the first real turn of the
-axis releases it.
+If an axis `a` of the imu keeps its direction R a in the world, a lever arm longer by `a` and an imu moved
+back by `R a` give the same images. The lever arm along `a` is unobservable, and its assumed value changes
+nothing else. A filter that leaves it free sees `R a` in slightly different directions at each image and
+takes that for information (as SLAM filters do; Huang et al. 2010): its sigma collapses while the estimate
+drifts off. So it is held, its variance is added to what is reported, and the first real turn of the axis
+releases it.
 
-Where the rig turns at one rate about one axis all the time, another delay is another angle about that axis,
-and whatever that angle is assumed to be, gravity follows; a longer lever arm is another bias of the
-accelerometer. So all of these are held, until another motion starts all anew.
+If the rig turns at one rate about one axis all the time, another delay is equivalent to another angle about
+that axis, with another direction of gravity, and a longer lever arm to another bias of the accelerometer. So
+all of these are held until another motion allows a complete start.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ STILL_RAD = 0.05
 HELD_M = 1e-3
 """Sigma with which a lever arm is held at zero along such an axis, m."""
 UNKNOWN_M = WINDOW_START.lever_arm_m
-"""Sigma of a lever arm that nothing is known of, m."""
+"""Sigma of an unknown lever arm, m."""
 BENT_M = 1e-3
 """By how much holding one axis bends the others, m: the axis is known to a milliradian, what is held along it
 is wrong by centimetres, and the filter's own sigmas come out below the bound (errors of 1 to 1.5 mm seen)."""
 UNKNOWN_S = 0.3
-"""Sigma of a delay that nothing is known of, s."""
+"""Sigma of an unknown delay, s."""
 UNKNOWN_RAD = float(np.pi / np.sqrt(3.0))
-"""Sigma of an angle that nothing is known of: any is as likely."""
+"""Sigma of an unknown angle: all are equally likely."""
 _HELD_S, _HELD_SKEW, _HELD_RAD = 1e-6, 1e-9, 1e-6
 
 

@@ -63,7 +63,7 @@ class _Run:
         before: Stamps, ns, and values of the readings before.
         readings: From the first clipped one on.
         clipped: Which of them are.
-        after: How many readings of late are not.
+        after: How many of the latest readings are not.
     """
 
     before: list[tuple[int, float]]
@@ -193,7 +193,7 @@ class ClippedReadings:
             cubic: Its values by the other readings, shape (m, n).
 
         Returns:
-            Root mean square over the stretches of late; 0 where there are too few.
+            Root mean square over the latest stretches; 0 where there are too few.
         """
         if len(self._recent) < len(clipped):
             return 0.0

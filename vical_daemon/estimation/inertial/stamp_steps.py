@@ -1,10 +1,10 @@
-"""Steps in the stamps of an IMU: its device's clock was found to be elsewhere on the host's.
+"""Steps in the stamps of an IMU: its driver has corrected the mapping of the device's clock.
 
-A driver that maps a device's clock learns it from arrivals, and where the first ones were late it finds out
-some seconds later, by milliseconds: from one reading to the next all stamps move. To a filter that is a rig
-whose time shift jumps, and motion that is missing. The device's clock itself is even; so readings are put on
-an even axis, and the step belongs to the reported time shift: t_imu = t_cam + shift by the stamps of *now*.
-Only stamps that are even but for such steps are touched; others (taken on arrival) are as they are.
+A driver learns the clock of a device from arrivals. If the first ones were late, it notices some seconds
+later, and from one reading to the next all stamps move by milliseconds. To a filter this is a jump of the
+time shift, with motion missing. The device's clock itself is even. So readings are put on an even axis, and
+the step is added to the reported time shift: t_imu = t_cam + shift by the stamps of *now*. Only stamps that
+are even except for such steps are changed; others (taken on arrival) are left alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""When a start is tried: as soon as there are data enough, then ever less often, for more data add little."""
+"""Schedule of the attempts to start: at once when there are enough data, then less and less often."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Attempts:
         return t_s >= self._next_s
 
     def tried(self, t_s: float) -> None:
-        """Take down an attempt; `count` is the number of them since `anew`."""
+        """Note an attempt; `count` is the number of them since `anew`."""
         self._next_s = t_s + self._pause_s
         self._pause_s = min(_GROWTH * self._pause_s, _MOST_S)
         self.count += 1

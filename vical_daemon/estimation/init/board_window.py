@@ -1,8 +1,8 @@
 """One window of inertial bundle adjustment over the first seconds, with the target's points known.
 
 Unknowns are the motion at some of the images, and the filter's own constant errors with its own prior and
-its own model of an image; links are those of the calibration without a target. All is linearised anew until
-nothing changes: where the closed form had put lever arm and mounting no longer matters.
+its own model of an image; links are those of the calibration without a target. Everything is relinearised
+until nothing changes, so the lever arm and mounting of the closed form no longer matter.
 [docs/math/filter.md, eq. (20)]
 """
 
@@ -24,6 +24,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import (
+    LEAST_POINTS,
     BoolArray,
     FloatArray,
     Frames,
@@ -49,7 +50,7 @@ from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
 _MOST_STEPS = 20
-_DONE = 0.1  # a step that promises less than this of the sum of squares is the last
+_DONE = 0.1  # the last step is one with a smaller predicted reduction of the sum of squares
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _OF_POSE = 6  # degrees of freedom of an image that its pose takes up
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
@@ -324,7 +325,7 @@ class BoardWindow:
             since_s = node.at.t_s - self.nodes[0].at.t_s
             by_error[:, where.skew] = since_s * by_error[:, where.timeshift]
         seen: BoolArray = np.asarray(np.isfinite(uv).all(axis=1))
-        if seen.sum() < 4:
+        if seen.sum() < LEAST_POINTS:
             return None
         residual = np.where(seen[:, None], frame.uv_px - np.where(seen[:, None], uv, 0.0), 0.0)
         ways = np.where(np.repeat(seen, 2)[:, None], ways, 0.0)

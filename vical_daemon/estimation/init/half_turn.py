@@ -15,12 +15,11 @@ import numpy as np
 from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.inertial.imu_model import products, rotation_steps
-from vical_daemon.estimation.measurements import FloatArray, PointsFrame
+from vical_daemon.estimation.measurements import LEAST_POINTS, FloatArray, PointsFrame
 
 _NEXT_NS = 400_000_000  # a hand turns a camera by less than 90 degrees in 0.4 s, as the detector assumes
 _CLEARLY = 0.5
 """The other numbering moves the points by less than half as much: they jump by half the board."""
-_FEWEST = 4
 _BEHIND_S = 0.1  # readings may end so much before an image: 30 degrees at 5 rad/s
 
 
@@ -47,7 +46,7 @@ class HalfTurns:
             f: The filter, after the image before; None: there is none yet.
             buffer: Readings.
         """
-        if not self._alike or len(frame.ids) < _FEWEST:
+        if not self._alike or len(frame.ids) < LEAST_POINTS:
             return frame
         last, other = self._last.get(frame.camera), self._turned(frame)
         if last is not None and 0 < frame.t_cam_ns - last.t_cam_ns <= _NEXT_NS:
@@ -88,6 +87,6 @@ class HalfTurns:
 def _moved_px(a: PointsFrame, b: PointsFrame) -> float:
     """Median distance of the points from one image to the next, px; inf: they share too few."""
     _, at_a, at_b = np.intersect1d(a.ids, b.ids, return_indices=True)
-    if len(at_a) < _FEWEST:
+    if len(at_a) < LEAST_POINTS:
         return np.inf
     return float(np.median(np.linalg.norm(a.uv_px[at_a] - b.uv_px[at_b], axis=1)))

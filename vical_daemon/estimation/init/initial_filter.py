@@ -1,4 +1,4 @@
-"""The filter that a start begins with: sigmas many times what the start is really worth."""
+"""The filter that a start begins with: its sigmas are many times the errors of the closed form."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from vical_daemon.estimation.model.priors import (
     GYRO_BIAS_SIGMA_RPS,
     KNOWN_OFF_SIGMA,
     KNOWN_SIZE_SIGMA,
-    PARTIAL_START_RAD,
     SIZE_SIGMA,
 )
 from vical_daemon.estimation.model.start_sigmas import start_sigmas
@@ -66,7 +65,7 @@ def initial_filter(
     consistency = {name: Consistency() for name in layout.cameras}
     walk = np.zeros(layout.size)
     off = {IMU, LAG, SIZE, TARGET} & options.estimate
-    root = np.diag(filter_sigmas(state, layout, off, partial=still_axes is not None))
+    root = np.diag(filter_sigmas(state, layout, off))
     unobservable = None if still_axes is None else UnobservableDirections(still_axes, turn_axis_cam)
     if unobservable is not None:
         for where in layout.cameras.values():
@@ -88,15 +87,13 @@ def initial_filter(
     )
 
 
-def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool) -> FloatArray:
+def filter_sigmas(state: State, layout: Layout, off: set[str]) -> FloatArray:
     """Standard deviations the filter starts with: many times what the start is really worth.
 
-    The frames of the start are filtered again; were its own (small) sigmas used they would count twice.
+    The images of the start are filtered again: with its own (small) sigmas they would count twice. A lever
+    arm that is not known leaves the position of the IMU as unknown.
     """
-    # Whoever does not know the lever arm must not know where the imu is, nor bend it by a wide attitude.
-    start, position = FILTER_START, 3.0 * UNKNOWN_M
-    if partial:
-        start = start._replace(attitude_rad=PARTIAL_START_RAD, rotation_rad=PARTIAL_START_RAD)
+    start = FILTER_START
     s = start_sigmas(
         layout,
         state.cameras,
@@ -104,6 +101,6 @@ def filter_sigmas(state: State, layout: Layout, off: set[str], *, partial: bool)
         imu_sigma=KNOWN_OFF_SIGMA if IMU in off else ENTRY_SIGMA,
         size_sigma=KNOWN_SIZE_SIGMA if SIZE in off else SIZE_SIGMA,
     )
-    s[ATTITUDE], s[POSITION], s[VELOCITY] = start.attitude_rad, position, start.velocity_mps
+    s[ATTITUDE], s[POSITION], s[VELOCITY] = start.attitude_rad, 3.0 * UNKNOWN_M, start.velocity_mps
     s[GYRO_BIAS], s[ACCEL_BIAS], s[GRAVITY] = GYRO_BIAS_SIGMA_RPS, ACCEL_BIAS_SIGMA_MPS2, GRAVITY_SIGMA_RAD
     return s

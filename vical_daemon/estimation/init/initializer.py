@@ -1,4 +1,4 @@
-"""The first seconds: what was seen is kept, and a start is tried from it, ever less often, not at rest."""
+"""The first seconds: images are kept, and starts are tried from them, less and less often, never at rest."""
 
 from __future__ import annotations
 

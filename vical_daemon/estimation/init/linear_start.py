@@ -1,4 +1,4 @@
-"""Motion that is linear in what a start does not know: velocity, gravity, lever arm and accelerometer bias.
+"""Motion as a linear function of the unknowns of a start: velocity, gravity, lever arm, accelerometer bias.
 
 With attitudes and the gyro's bias known, from images of a target or from the gyro, a camera on the imu is at
 

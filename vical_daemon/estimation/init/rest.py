@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.measurements import LEAST_POINTS, PointsFrame
 
 MOVED_PX = 1.0  # at 500 px of focal length 0.1 deg, a tenth of the rotation that a start must know
 _REST_S = 1.0  # so long without moving that far is rest: slower than any rotation that shows a time shift
-_LEAST_COMMON = 4  # corners; an affine motion has six unknowns
 
 
 class RestDetector:
@@ -45,7 +44,7 @@ def _moved_px(before: PointsFrame, after: PointsFrame) -> float:
     The affine part, and not the corners themselves: their noise averages out.
     """
     _, k_before, k_after = np.intersect1d(before.ids, after.ids, return_indices=True)
-    if len(k_before) < _LEAST_COMMON:
+    if len(k_before) < LEAST_POINTS:
         return np.inf
     uv_px = before.uv_px[k_before]
     basis = np.linalg.qr(np.column_stack([uv_px - uv_px.mean(axis=0), np.ones(len(uv_px))]))[0]

@@ -1,4 +1,4 @@
-"""What a rig with a target is taken to be, and what of it is estimated; data that contradict it change it."""
+"""The model of a rig with a target: what is assumed and what is estimated; contradicting data change it."""
 
 from __future__ import annotations
 

@@ -6,14 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import LinearMotion, LinearStart, linear_start, still_axes
 from vical_daemon.estimation.init.target_poses import TargetPose
 from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.significance import SURE_SIGMAS
-from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _STRETCH_S = 10.0
 _FAR_SIZE = 0.1  # from here to the size of a target the filter does not get by itself
@@ -103,7 +101,7 @@ def motion_start(
         R, p, sigma, t = _poses_of_imu(inside, camera)
         axes: FloatArray | None = None
         if partial:
-            R, sigma = _smooth(buffer, t, R, gyro_bias), np.maximum(sigma, _DRIFT_M)
+            sigma = np.maximum(sigma, _DRIFT_M)
             axes = still_axes(R.mean(axis=0)) if turn_axis_cam is None else np.eye(3)
         motion = LinearMotion.between(buffer, t, R, gyro_bias)
         if motion is not None and may_resize and not partial:
@@ -150,22 +148,6 @@ def _poses_of_imu(
     p = np.array([p.p_target_cam for p in poses])
     sigma = np.maximum([s.sigma_m for s in poses], 5e-4)
     return R, p, sigma, np.array([s.t_cam_s for s in poses]) + camera.timeshift_s
-
-
-def _smooth(buffer: ImuBuffer, t_s: FloatArray, R_world_imu: FloatArray, gyro_bias: FloatArray) -> FloatArray:
-    """Attitudes by the gyro, bent slowly onto those of vision.
-
-    Noise of attitudes, times gravity, integrated twice, is centimetres: with little motion to hold them in
-    place, biases and gravity would be bent to explain it.
-    """
-    rows = buffer.rows
-    curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], gyro_bias)
-    by_gyro = so3.matrix_from_quat(curve.quaternion(t_s))
-    by_gyro = R_world_imu[0] @ by_gyro[0].T @ by_gyro
-    miss = so3.log(R_world_imu @ np.swapaxes(by_gyro, 1, 2))
-    slow = np.vander(t_s - t_s[0], 3)
-    bent: FloatArray = so3.exp(slow @ np.linalg.lstsq(slow, miss, rcond=None)[0]) @ by_gyro
-    return bent
 
 
 def _state_at(

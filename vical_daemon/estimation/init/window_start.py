@@ -43,7 +43,7 @@ class WindowStart(NamedTuple):
     Attributes:
         filter: Begins at the first image and is to take them all.
         size: How large the target is, relative to what it was taken to be, where that is surely and by far
-            another size, or where the size in its file fits as well: to be started with anew. None: it fits.
+            another size, or where the size in its file fits as well: start again with it. None: it fits.
     """
 
     filter: LinearisedFilter

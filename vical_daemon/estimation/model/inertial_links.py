@@ -17,8 +17,8 @@ from vical_daemon.estimation.inertial.imu_model import over_intervals, strapdown
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise
 from vical_daemon.estimation.model.imu_scale import ENTRIES, by_entries, matrices
 
-_MAX_HOLE_S = 0.1  # between readings; a window bridges twice what the filter does, as it would begin anew
-RELINK_S = 3e-4  # of change of the time shift: links are integrated anew between the new instants
+_MAX_HOLE_S = 0.1  # between readings; a window bridges twice what the filter does: it would have to restart
+RELINK_S = 3e-4  # of change of the time shift: links are integrated again between the new instants
 ROUNDING = 1e-18 * np.eye(9)  # (1e-9 rad, m/s, m)^2: noise densities may be given as zero
 _ORDER = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5])  # velocity before position
 

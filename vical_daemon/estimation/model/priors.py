@@ -1,4 +1,4 @@
-"""What is taken as known before any data: one table for calibration with a target and without.
+"""Priors: one table for calibration with a target and without.
 
 Prior sigmas are many times what a start is worth, so that its data do not count twice.
 [docs/math/filter.md, eq. (16), (18) and (20)]
@@ -72,7 +72,5 @@ AGAIN_SIGMAS = 5.0
 """Prior over sigma of what was found from data that are used once more: they count again by 4 % at most."""
 FILTER_START = StartSigmas(0.1, 0.5, 0.3, 0.1, 5e-3, 0.05, 0.05, 0.1, 0.1, 0.1, 0.01)
 """With a target: the closed form has found all of it but lever arms, to about a fifth of these."""
-PARTIAL_START_RAD = 0.03
-"""Attitude and mounting of a partial start, whose lever arm is unknown: a wider one would bend it."""
 WINDOW_START = StartSigmas(1.0, 5.0, 0.3, 0.2, 0.05, 0.05, 0.03, 0.1, 0.01, 0.05, 0.015)
 """Without a target: next to nothing is known of the motion, and of the rest what a rig can be."""

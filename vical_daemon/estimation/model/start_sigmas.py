@@ -1,4 +1,4 @@
-"""How far the constants of a rig may be off at a start: with a target and without."""
+"""Prior sigmas of the constants of a rig at a start, with a target and without."""
 
 from __future__ import annotations
 

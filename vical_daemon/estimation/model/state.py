@@ -214,7 +214,7 @@ class State:
         target_scale: True size of the board over its stated size.
         target_shape: How far the board is off in each of `Layout.target_modes`, m, shape (11,).
         tilt: Two unit vectors across gravity, shape (3, 2): the errors of its direction are turns about them.
-            They turn with it: a basis worked out anew from each gravity must jump somewhere, and the
+            They turn with it: a basis computed from gravity alone must jump somewhere, and the
             covariance would not jump with it.
     """
 

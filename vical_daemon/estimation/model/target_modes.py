@@ -1,4 +1,4 @@
-"""The ways in which a printed target is wrong as a whole: narrow, skew, bowed, bent, twisted.
+"""Modes of deformation of a printed target as a whole: narrow, skew, bowed, bent, twisted.
 
 A board printed 0.3 % narrower than tall, or bent by half a millimetre, is taken for another lens and another
 mounting, for it is wrong in the same way in every image. So its shape can be estimated with them: a

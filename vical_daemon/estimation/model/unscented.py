@@ -20,9 +20,9 @@ SPREAD = np.sqrt(3.0)  # matches the kurtosis of a Gaussian
 _BLOCK = 16  # columns that LAPACK's QR of triangle and rows takes at once; 8 to 32 are alike
 
 
-def offsets(S: FloatArray, columns: int | None = None) -> FloatArray:
+def offsets(S: FloatArray) -> FloatArray:
     """Return the sigma points as offsets: first 0, then +, then - each column of S; shape (2c + 1, n)."""
-    scaled = SPREAD * S[:, :columns].T
+    scaled = SPREAD * S.T
     return np.concatenate([np.zeros((1, S.shape[0])), scaled, -scaled])
 
 
@@ -130,7 +130,7 @@ def upper_root(rows: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _lower(n: int) -> FloatArray:
-    """Ones on and below the diagonal (numpy's `tril` makes them anew at each call)."""
+    """Ones on and below the diagonal (numpy's `tril` makes them at each call)."""
     return np.tri(n)
 
 

@@ -1,12 +1,11 @@
-"""What stretches of the data say about some unknowns, and how far they agree.
+"""Block jackknife: what stretches of the data say about some unknowns, and how far they agree.
 
-What a model gets wrong is wrong in the same way for seconds at a time: images next to each other are no
-independent witnesses, and residuals hardly show it (the unknowns bend to fit). So images are gathered to
-stretches of some seconds; the answer with each run of neighbouring stretches left out in turn shows how far
-it rests on any of them. That block-jackknife variance, over the one that independent errors would give, is
-the factor by which variances are too small. It is known from few runs only: as for a Student variable, less
-is known. [Kunsch, "The jackknife and the bootstrap for general stationary observations", 1989;
-docs/math/filter.md]
+Errors of a model last for seconds. Neighbouring images are therefore not independent, and residuals hardly
+show it, because the unknowns follow the errors. So images are grouped into stretches of some seconds. Each
+run of neighbouring stretches is left out in turn, and the change of the answer shows how much it depends on
+them. The block-jackknife variance over that of independent errors is the factor by which variances are too
+small. It comes from few runs, so it is uncertain itself, as for a Student variable. [Kunsch, "The jackknife
+and the bootstrap for general stationary observations", 1989; docs/math/filter.md]
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measured consistency of the filter: how much larger its innovations are than it thinks, and for how long.
+"""Measured consistency of the filter: how much larger innovations are than predicted, and how long they last.
 
 Lens models that do not quite fit, blur, a board that is not quite flat and an IMU that is not quite linear
 move all corners of an image together, and much the same way in the next images. To a filter that takes
@@ -130,7 +130,7 @@ class Consistency:
     _recent: deque[tuple[float, FloatArray]] = field(default_factory=deque)
 
     def settle(self) -> None:
-        """A filter starts anew with what was learnt: let its first images pass."""
+        """A filter restarts with what was learnt: its first images are not counted."""
         self._skip, self.alarm = _SETTLE, 0.0
         self._interrupt()
 

@@ -1,4 +1,4 @@
-"""How well a lens can be known at all: what a detector gets wrong alike everywhere does not average out."""
+"""Floor on the sigmas of a lens: the bias of a detector does not average out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _UNSEEN = 1e-2  # of the weight of a patch: its error is a hundred times as larg
 Numbers = tuple[float, ...]
 
 SYSTEMATIC_PX = 0.003
-"""Error that corners of one patch of the image share for ever, px; the curvature of edges alone makes up to
+"""Constant error that corners of one patch of the image share, px; the curvature of edges alone makes up to
 0.005 px at the border of a picture (docs/detection.md)."""
 
 
@@ -23,7 +23,7 @@ def limit(camera: CameraState) -> FloatArray:
     """Standard deviations below which no lens is known: fx fy cx cy (px), distortion; shape (n,).
 
     Least squares of the lens to patches, eight by six over the image, that are each off by as much. It hardly
-    depends on the lens: rounded to three digits, it seldom has to be computed anew.
+    depends on the lens: rounded to three digits, it rarely has to be computed again.
     """
     return np.asarray(SYSTEMATIC_PX * np.linalg.norm(np.linalg.inv(patches(camera)), axis=1))
 

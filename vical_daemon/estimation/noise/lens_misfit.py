@@ -1,4 +1,4 @@
-"""How far a lens model misses what a camera does, by the lenses of several windows.
+"""Misfit of a lens model, measured by the lenses of several windows.
 
 No lens model fits exactly. What it leaves over depends on where in the image the features are. So each window
 has a lens of its own, l + d with d ~ N(0, s^2 (J'J)^-1). J are the derivatives by the lens at those of 48

@@ -1,6 +1,6 @@
-"""From when on a jitter of stamps is announced, and how it is drawn from errors and their variances.
+"""Stamp jitter: the size from which it is announced, and its estimate from errors and their variances.
 
-The second is for use without a board; with one, `shared_errors` does it.
+The estimate is for use without a board; with one, `shared_errors` does it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Two variances from many small sums: that of the first way in which an image moves, and that of the others.
+"""Variance components of errors that an image shares: of the first mode in which it moves, and of the others.
 
 An image gives b = A e + noise with e ~ N(0, diag(v0, v1, v1)) and noise of covariance C. The likelihood of
-both variances is added up over images on a grid of standard deviations. What is used are means of the
-posterior: few images leave open which of the two makes them differ, and then both are allowed for.
+both variances is added up over images on a grid of standard deviations. The means of the posterior are used:
+few images do not distinguish the two, and then both are allowed for.
 [Harville, "Maximum likelihood approaches to variance component estimation and to related problems", 1977]
 """
 

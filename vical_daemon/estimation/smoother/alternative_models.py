@@ -47,7 +47,7 @@ class AlternativeModels:
     Args:
         layout: Where the errors live.
         asked: What is asked for (`CalibrationOptions.estimate`): estimated whatever the evidence.
-        rolling: The shutter is said to be a rolling one, or its readout is asked for.
+        rolling: The shutter is configured as a rolling one, or its readout is asked for.
         term: Its last coefficient is one more than its model has.
 
     Attributes:

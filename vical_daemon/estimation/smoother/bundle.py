@@ -32,14 +32,13 @@ from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
 _OUT = np.sqrt(chi_square_limit(2, RESIDUAL_REFUSED))  # sigmas; an observation beyond is taken out
-_DONE = 1.0  # a step that promises less than this of the sum of squares is the last
+_DONE = 1.0  # the last step is one with a smaller predicted reduction of the sum of squares
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
-_SMALL = 0.1  # of the sum of squares: where a step promises no more, outliers stand out
+_SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the jitter that is allowed for: so much does not end a window
-_STUCK = 0.02  # of the sum of squares: where a step brought no more, outliers may be why
 
 
 class Fit(NamedTuple):
@@ -109,8 +108,7 @@ class Bundle:
         seen = w.observe()
         if len(seen.begin) < 8:
             return None
-        lam, steps, gain = _DAMPING, 0, np.inf
-        cleaned = False
+        lam, steps, cleaned = _DAMPING, 0, False
         links = w.stacked()
         view = self.problem.view(seen)
         normal = self.problem.normal(view, links)
@@ -120,7 +118,7 @@ class Bundle:
             if step is None:
                 return None
             if cleaned and step.predicted_reduction < _DONE and lam > _DAMPING:
-                lam = max(0.01 * lam, _DAMPING)  # damped, a step promises little
+                lam = max(0.01 * lam, _DAMPING)  # with damping, little is predicted
                 continue
             if cleaned and step.predicted_reduction < _DONE:
                 view = self._applied(step, seen)
@@ -129,12 +127,10 @@ class Bundle:
                     if fit is None or 2 * steps > most or not self._jitters_more(fit):
                         return fit
                 w.bad.clear()  # late images had looked like outliers
-                seen, cleaned, gain = w.observe(), False, np.inf
+                seen, cleaned = w.observe(), False
                 view = self.problem.view(seen)
-            elif not cleaned and (
-                step.predicted_reduction < _SMALL * normal.cost or gain < _STUCK * normal.cost
-            ):
-                # close enough to tell what does not belong; or stuck, because of it
+            elif not cleaned and step.predicted_reduction < _SMALL * normal.cost:
+                # close enough to tell outliers
                 view = self._applied(step, seen)
                 cleaned = True
                 self._learn_noise(view)
@@ -153,7 +149,6 @@ class Bundle:
                     if lam > 1e6:
                         break
                     continue
-                gain = normal.cost - trial.cost
                 view, normal, lam = there, trial, max(0.01 * lam, _DAMPING)
                 if not w.stale():
                     continue
@@ -198,7 +193,7 @@ class Bundle:
     def _bounded(self, normal: Normal) -> Normal:
         """Normal equations with distances held that would go beyond infinity, where no landmark may be.
 
-        A step that counts on them never brings what it promises. [Bertsekas, "Projected Newton methods for
+        A step that moves them never brings the predicted reduction. [Bertsekas, "Projected Newton methods for
         optimization problems with simple constraints", 1982]
         """
         held = (self.window.landmarks.inverse < _FAR) & (normal.gl[:, 2] > 0.0)

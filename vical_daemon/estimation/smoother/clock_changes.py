@@ -1,10 +1,10 @@
-"""Whether, when and how the relation of the clocks changed: hypotheses about a carry, and their mixture.
+"""Whether, when and how the relation of the clocks changed: hypotheses about a prior, and their mixture.
 
 At the start of a window the time shift may step and its drift may change: two unknowns, a jump. Jumps are
-part of the carry and are estimated as if all had happened. That none happened, or one of them, or only a
-step, are conditions on that Gaussian. Their odds follow from how far the jumps lie from zero (Savage-Dickey
-density ratio). [Willsky and Jones, "A generalized likelihood ratio approach to the detection and estimation
-of jumps in linear systems", 1976; docs/math/target_free.md, (4)]
+part of the marginal prior and are estimated as if all had happened. That none happened, or one of them, or
+only a step, are conditions on that Gaussian. Their odds follow from how far the jumps lie from zero
+(Savage-Dickey density ratio). [Willsky and Jones, "A generalized likelihood ratio approach to the detection
+and estimation of jumps in linear systems", 1976; docs/math/target_free.md, (4)]
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ class FirstWindow:
         return not (self._prior.readout_axis or self._prior.readout_s)
 
     def by_columns(self, buffer: ImuBuffer, bundle: Bundle, fit: Fit) -> Begun | None:
-        """Begin anew with a complete window that shows a readout by columns, which is known from then on.
+        """Restart with a complete window that shows a readout by columns, which is known from then on.
 
         The first window may have had too little motion, or too much noise, to show it. What was found before,
         with rows, is not kept.
@@ -136,7 +136,7 @@ class FirstWindow:
         return bundle, carry, bundle.solve(buffer, _STEPS)
 
     def anew(self) -> None:
-        """Seek everything anew, from what was given; the mounting that was given is no longer the rig's."""
+        """Estimate everything again from the config; its mounting is no longer that of the rig."""
         if self._layout.camera.position is not None:
             self._prior = replace(self._prior, T_imu_cam=None)
         self.initializer = TargetFreeInitializer(self._options, self._prior)

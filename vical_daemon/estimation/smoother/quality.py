@@ -1,4 +1,4 @@
-"""What an adjusted window says about its data: how long pixel errors last, how widely points are seen."""
+"""Quality of the data of an adjusted window: how long pixel errors last, and the parallax of its points."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ class TargetFreeInitializer:
         return found if isinstance(found, str) else self._structure(buffer, frames, found)
 
     def window_anew(self, buffer: ImuBuffer, frames: Frames, known: MarginalPrior) -> Window | str:
-        """Make a window of a stretch with mounting and time shift found anew, and all else as known.
+        """Make a window of a stretch with mounting and time shift found again, and all else as known.
 
         Args:
             buffer: Inertial readings.

@@ -39,7 +39,7 @@ class TargetFreeStatus(Evaluator):
     Args:
         options: Switches and targets.
         layout: Where the errors live.
-        rolling: The camera is said to have a rolling shutter, or its readout is asked for.
+        rolling: The camera is configured with a rolling shutter, or its readout is asked for.
         term: Its last coefficient is one more than its model has.
     """
 
@@ -248,7 +248,7 @@ class TargetFreeStatus(Evaluator):
             return self.factor()
         return max(self.factor(), _measured_over_stated([*self._squares, self._growing]))
 
-    # ------------------------------------------------------------------ what is said
+    # ------------------------------------------------------------------ output
     def estimate(
         self, carry: MarginalPrior | None, *, running: bool, gravity: list[float]
     ) -> CalibrationEstimate:

@@ -1,4 +1,4 @@
-"""Leaves out images of a fast camera: neighbours add little, and cost does not follow what they add."""
+"""Leaves out images of a fast camera: neighbouring images add little and cost as much as others."""
 
 from __future__ import annotations
 

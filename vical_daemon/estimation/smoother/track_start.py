@@ -2,7 +2,7 @@
 
 With attitudes from the gyro, every camera centre is linear in z (`LinearMotion`): c_i = D_i + A_i z, and a
 landmark X seen along d_i obeys (I - d d^T)(X - c_i) = 0. The metric scale comes from the accelerometer, so
-that the system is inhomogeneous; gravity's size is known and its direction is linearised anew each round.
+that the system is inhomogeneous; gravity's size is known and its direction is relinearised in each round.
 Squares are divided by the distances found in the round before, or near points would draw everything towards
 the camera. [Martinelli, "Closed-form solution of visual-inertial structure from motion", 2014]
 """

@@ -190,7 +190,7 @@ class Window:
         self.turning = np.array(buffer.turning(instants, _HALF_S))
 
     def relink(self, buffer: ImuBuffer) -> bool:
-        """Integrate anew at the present time shift and biases; False where inertial data do not reach."""
+        """Integrate again at the present time shift and biases; False where inertial data do not reach."""
         shift_s = self.camera.timeshift_s
         d = shift_s - self.shift_s
         instants = np.array([t for t, _ in self.frames]) + shift_s

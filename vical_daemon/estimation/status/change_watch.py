@@ -1,8 +1,8 @@
-"""Decides when the rig is no longer what the filter learnt, and what to do about it.
+"""Decides when the rig has changed, and what to do about it.
 
 A strong jump makes images unusable (they are refused); a weaker one raises the innovations (CUSUM in
 `Consistency`); a time shift that begins to drift, or steps by a little, shows in its drift (`DriftWatch`). A
-lost pose looks like a jump, too, so the pose is taken anew first; only if images still do not fit is the
+lost pose looks like a jump, too, so the pose is found again first; only if images still do not fit is the
 calibration itself in doubt.
 """
 
@@ -20,10 +20,9 @@ from vical_daemon.estimation.selection.clock_drift import stamps_variance, surel
 from vical_daemon.estimation.status.drift_watch import DriftWatch
 
 _IMAGES = 10
-"""So many refused in a row: the pose is taken anew, and soon after that the calibration. So many images after
-an alarm show what has changed."""
+"""So many refused in a row: the pose is found again, and soon after that the calibration. So many images
+after an alarm show what has changed."""
 _SOON_S = 4.0
-_SETTLE_S = 3.0  # after a start the innovations still move
 _DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
 _DRIFT_AFTER_S = 2.0
 
@@ -64,7 +63,7 @@ class ChangeWatch:
         self._refused, self._pose_taken_s = 0, t_s
 
     def shift_reopened(self) -> None:
-        """A time shift is to be found anew: what is known of its drift says nothing now."""
+        """A time shift is to be found again: what is known of its drift no longer holds."""
         self._refused = self._closer = 0
         self._drift.clear()
 
@@ -88,7 +87,7 @@ class ChangeWatch:
         consistency = f.consistency[report.camera]
         if consistency.alarmed:
             consistency.alarm = 0.0
-            if t > self._started_s + _SETTLE_S and not self._closer:
+            if not self._closer:
                 self._closer = _IMAGES
         if self._closer:
             self._closer -= 1

@@ -11,7 +11,7 @@ import numpy as np
 
 from vical_daemon.estimation.events import Cause, Event, EventKind, EventLog
 from vical_daemon.estimation.guidance import WeakDirection
-from vical_daemon.estimation.measurements import CalibrationOptions, FloatArray
+from vical_daemon.estimation.measurements import LEAST_POINTS, CalibrationOptions, FloatArray
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.stamp_jitter import ANNOUNCED_S
 from vical_daemon.estimation.result import (
@@ -44,7 +44,7 @@ class Evaluator:
 
     Args:
         options: Switches and targets.
-        nothing_seen: What is said while no image shows anything.
+        nothing_seen: Reason while no image shows anything.
         squares: How many sums of squares the consistency is the mean of.
 
     Attributes:
@@ -88,7 +88,7 @@ class Evaluator:
 
     def saw_points(self, t_s: float, count: int) -> None:
         """Count one image with `count` points or tracks in it."""
-        if count >= 4:
+        if count >= LEAST_POINTS:
             self.frames_seen += 1
             if self.first_frame_s is None:
                 self.first_frame_s = t_s
@@ -131,7 +131,7 @@ class Evaluator:
             self.announce(event, once=f"jitter {camera}")
 
     def _change(self, why: Cause, status: Status, camera: str = "") -> None:
-        """The rig is not what it was: the calibration is being taken anew."""
+        """The rig has changed: the calibration is found again."""
         self.bumped, self.believed, self._started_s = why, False, None
         kind = EventKind.BUMPED if self._ever_converged else EventKind.STARTED_OVER
         self.announce(Event(kind, camera, cause=why))
@@ -162,7 +162,7 @@ class Evaluator:
         return reported
 
     def _before_start(self) -> Verdict:
-        """What is said before there is a calibration."""
+        """The estimate before there is a calibration."""
         if self.bumped:
             why = f"{cause_text(self.bumped)}; calibrating again: {self.reason}"
             return Verdict(Status.INCONSISTENT, why)
@@ -188,7 +188,7 @@ class Evaluator:
 
     @staticmethod
     def _once_known(*, enough: bool, doubt: str, pause: str = "") -> Verdict:
-        """What is said where all directions are known well enough.
+        """The verdict where all directions are known well enough.
 
         Args:
             enough: There are data enough to confirm them.
@@ -271,14 +271,14 @@ def lens_known(e: CameraEstimate) -> CameraEstimate:
 
 
 def lens_verdict(worst: WeakDirection, camera: str, *, off: bool) -> Verdict:
-    """What is said where nothing is missing but for a fixed lens; `off`: images contradict it."""
+    """The verdict where nothing is missing but for a fixed lens; `off`: images contradict it."""
     how = "not this camera's" if off else "not known better"
     text = f"{direction_sigma(worst)}: the fixed lens of {camera} is {how}: leave it free"
     return Verdict(Status.CONVERGING, text)
 
 
 def lacking_verdict(lacking: list[WeakDirection], *, shown_s: float, pause: str = "") -> Verdict:
-    """What is said of directions that are not known well enough, the worst first.
+    """The verdict on directions that are not known well enough, the worst first.
 
     Args:
         lacking: These, at least one.

@@ -34,7 +34,7 @@ ALL_WAYS = Guidance(Verb.TURN_AND_MOVE, AXES)
 
 
 class RunningMotion:
-    """How the rig turned of late: what `weak_directions` needs to know of the gyro, kept for next to nothing.
+    """How the rig turned lately: what `weak_directions` needs to know of the gyro, at little cost.
 
     Rates are averaged over tenths of a second, so that the gyro's noise is not taken for acceleration.
 
@@ -119,7 +119,7 @@ def excitation_advice(
     """What is wrong with the motion as a whole, and what to do; nothing where it is rich enough.
 
     Args:
-        motion: How the rig turned of late.
+        motion: How the rig turned lately.
         R_imu_cam: Present mounting, for naming axes, shape (3, 3); None: not known yet.
         bias_rps: The gyro's bias, shape (3,).
     """

@@ -1,7 +1,7 @@
 """The held-back check: now and then a copy of the filter predicts an image by the IMU alone.
 
-What the filter learnt from its images is tested on one it has not used, some tenths of a second ahead: a
-calibration that only explains its own data fails here.
+The filter is tested on an image it has not used, some tenths of a second ahead. A calibration that only
+explains its own data fails here.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def imu_noise_error(ratios: Sequence[float], scale: float) -> float | None:
     """What held-back predictions say about the imu's noise densities; None: they agree.
 
     Args:
-        ratios: What `HoldoutCheck.follow` returned of late.
+        ratios: What `HoldoutCheck.follow` returned lately.
         scale: `Consistency.scale` of the camera: with images that do not fit nothing can be said.
 
     Returns:

@@ -66,12 +66,12 @@ class StatusEvaluator(Evaluator):
         self._after_change()
 
     def reopened(self, t_s: float) -> None:
-        """Something that was known has to be found anew: patience begins again at `t_s`."""
+        """Something that was known has to be found again: patience begins again at `t_s`."""
         self._reopened_s = t_s
         self._steady.reset(min(self.status, Status.CONVERGING, key=list(Status).index))
 
     def changed(self, why: Cause) -> None:
-        """The rig is not what it was: the calibration is being taken anew."""
+        """The rig has changed: the calibration is found again."""
         self._change(why, Status.INCONSISTENT)
 
     def held_back(self, ratio: float, scale: float) -> None:
@@ -117,13 +117,13 @@ class StatusEvaluator(Evaluator):
             imu = imu_estimate(known, matrices=False)
             trace.add(f.state.t_s, self._camera(camera, known), self.nis_per_dof(), self.status, imu)
 
-    # ------------------------------------------------------------------ what is said
+    # ------------------------------------------------------------------ output
     def estimate(
         self,
         f: CalibrationFilter | None,
         stale: CalibrationFilter | None = None,
     ) -> CalibrationEstimate:
-        """Put everything together; `stale`: what was known before a change, shown while starting anew."""
+        """Put everything together; `stale`: what was known before a change, shown while restarting."""
         shares = None if f is None else model_selection.weights(f)
         self.in_doubt = "" if f is None else self._doubt(f, shares)
         self.believed &= not self.in_doubt

@@ -33,6 +33,7 @@ from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _ITERATIONS = 18
+_MOST_STEP_S = 0.02  # of the delay, in one iteration
 # What a lens may be off by: focal length and its ratio (relative), distortion.
 _FOCAL_SIGMA, _RATIO_SIGMA = 0.1, 0.003
 _DISTORTION_SIGMA = {
@@ -90,7 +91,6 @@ def epipolar_fit(
     timeshift_s: float,
     *,
     fit_lens: bool = False,
-    max_step_s: float = 0.02,
     most: int = _ITERATIONS,
     every: int = 1,
     gyro_density: float | None = None,
@@ -105,7 +105,6 @@ def epipolar_fit(
         R_imu_cam: Start of the mounting, good to some 20 degrees.
         timeshift_s: Start of the delay, good to some 0.1 s.
         fit_lens: Fit the lens too, within what a rough lens may be off by.
-        max_step_s: Largest change of the delay in one iteration, s.
         most: Iterations.
         every: See `make_pairs`.
         gyro_density: Of the gyro's noise, rad/s/sqrt(Hz); where given, what is known of errors that persist
@@ -118,7 +117,7 @@ def epipolar_fit(
     pairs = make_pairs(frames, every=every)
     if pairs is None:
         return None
-    fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens, max_step_s)
+    fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens)
     fit.gyro_density, fit.frames = gyro_density, frames
     return fit.run(R_imu_cam.copy(), timeshift_s, most)
 
@@ -139,10 +138,9 @@ class _Fit:
         pairs: Pairs,
         lens: tuple[FloatArray, FloatArray, str],
         fit_lens: bool,
-        max_step_s: float,
     ) -> None:
         self.t_imu, self.gyro, self.t_cam = t_imu, gyro, t_cam
-        self.pairs, self.fit_lens, self.max_step_s = pairs, fit_lens, max_step_s
+        self.pairs, self.fit_lens = pairs, fit_lens
         self.intrinsics, self.distortion, self.model = lens[0].copy(), lens[1].copy(), lens[2]
         self.given = (lens[0].copy(), lens[1].copy())
         self.gyro_density: float | None = None
@@ -195,7 +193,7 @@ class _Fit:
             self._prior(H, g, bias)
             dx = np.asarray(-np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g), np.float64)
             dx *= min(
-                1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12), self.max_step_s / max(abs(dx[3]), 1e-12)
+                1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12), _MOST_STEP_S / max(abs(dx[3]), 1e-12)
             )
             R = R @ so3.exp(dx[:3])
             shift += float(dx[3])

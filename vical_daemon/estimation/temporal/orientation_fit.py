@@ -127,7 +127,7 @@ def _update(
     *,
     rescale: bool,
 ) -> tuple[tuple[OrientationSensor, ...], float]:
-    """Apply a step, and judge every orientation anew by what the solution leaves to its noise."""
+    """Apply a step, and gate every orientation again by its residual over its noise."""
     noise = np.empty_like(solution.noise)
     noise[linear.order] = solution.noise  # back from time order to sensor order
     lost = np.empty_like(noise)

@@ -103,7 +103,7 @@ def debiased_start(
     q_world_cam: FloatArray,
     shifts_s: tuple[float, float],
 ) -> tuple[Start | None, FloatArray]:
-    """Find a start from a raw gyro, anew with the bias it reveals where that bias blurs the agreement.
+    """Find a start from a raw gyro, and again with the bias it reveals if that bias blurs the agreement.
 
     Args:
         t_imu_s: Stamps, s, shape (m,).

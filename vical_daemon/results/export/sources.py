@@ -16,7 +16,6 @@ from vical_daemon.results.export.rig import ExportError, Rig, RigCamera
 def rig_from_estimate(
     estimate: CalibrationEstimate,
     resolutions: dict[str, tuple[int, int]] | None = None,
-    noise: ImuNoise | None = None,
     note: str = "",
 ) -> Rig:
     """Make a rig from an estimate.
@@ -24,7 +23,6 @@ def rig_from_estimate(
     Args:
         estimate: The estimate.
         resolutions: Image sizes by camera name (an estimate that came over the bus does not hold them).
-        noise: Densities of the imu.
         note: Comment for the files.
 
     Raises:
@@ -34,10 +32,10 @@ def rig_from_estimate(
     for name, size in (resolutions or {}).items():
         if name in document["cameras"]:
             document["cameras"][name]["resolution"] = list(size)
-    return rig_from_json(document, noise=noise, note=note)
+    return rig_from_json(document, note)
 
 
-def rig_from_json(document: dict[str, Any], noise: ImuNoise | None = None, note: str = "") -> Rig:
+def rig_from_json(document: dict[str, Any], note: str = "") -> Rig:
     """Make a rig from a result as `vical calibrate --json` prints it (or as `vical export --format json`).
 
     Raises:
@@ -54,7 +52,7 @@ def rig_from_json(document: dict[str, Any], noise: ImuNoise | None = None, note:
     )
     return Rig(
         cameras=rig_cameras,
-        noise=noise or _noise(imu.get("noise")),
+        noise=_noise(imu.get("noise")),
         gyro_bias_rps=_array(imu, "gyro_bias_rps", (3,), np.zeros(3)),
         accel_bias_mps2=_array(imu, "accel_bias_mps2", (3,), np.zeros(3)),
         gyro_matrix=_array(imu, "gyro_matrix", (3, 3), np.eye(3)),

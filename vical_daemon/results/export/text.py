@@ -38,11 +38,11 @@ def matrix_rows(matrix: FloatArray, indent: int) -> str:
     return "\n".join(f"{pad}- {row(line)}" for line in matrix)
 
 
-def opencv_matrix(matrix: FloatArray, indent: int = 3, kind: str = "d") -> str:
+def opencv_matrix(matrix: FloatArray, kind: str = "d") -> str:
     """Write the body of an ``!!opencv-matrix`` node; `kind` is d (float64) or f (float32)."""
-    pad = " " * indent
+    pad = " " * 3
     rows, cols = matrix.shape
-    lines = ",\n".join(" " * (indent + 7) + ", ".join(number(v) for v in line) for line in matrix).lstrip()
+    lines = ",\n".join(" " * 10 + ", ".join(number(v) for v in line) for line in matrix).lstrip()
     return f"{pad}rows: {rows}\n{pad}cols: {cols}\n{pad}dt: {kind}\n{pad}data: [ {lines} ]"
 
 

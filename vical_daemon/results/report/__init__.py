@@ -9,6 +9,6 @@ from __future__ import annotations
 
 from vical_daemon.results.report.provenance import Provenance, collect
 from vical_daemon.results.report.residuals import FrameResiduals
-from vical_daemon.results.report.writer import ClockSeries, ReportError, write_report
+from vical_daemon.results.report.writer import ReportError, write_report
 
-__all__ = ["ClockSeries", "FrameResiduals", "Provenance", "ReportError", "collect", "write_report"]
+__all__ = ["FrameResiduals", "Provenance", "ReportError", "collect", "write_report"]

@@ -247,16 +247,3 @@ def correlation(covariance: FloatArray) -> Drawing:
     style(axes, "Correlation")
     axes.grid(visible=False)
     return figure
-
-
-def clock(t_s: FloatArray, residual_us: FloatArray, name: str) -> Drawing:
-    """Draw how late each sample arrived against the fitted device clock."""
-    figure, ((left, right),) = panels(2.4, 1, 2, (2.0, 1.0))
-    thin = slice(None, None, max(1, len(t_s) // 20000))
-    left.plot(t_s[thin], residual_us[thin], ".", color=Z, markersize=1.5, alpha=0.5, rasterized=True)
-    top = float(np.percentile(residual_us, 99.5)) * 1.2 + 1e-9
-    left.set_ylim(min(0.0, float(np.percentile(residual_us, 0.5)) * 1.2), top)
-    style(left, f"{name}: arrival behind the fitted clock", "time, s", "us")
-    right.hist(residual_us, bins=60, range=left.get_ylim(), color=Z, alpha=0.75)
-    style(right, "Distribution", "us")
-    return figure

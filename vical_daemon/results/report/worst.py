@@ -17,7 +17,7 @@ _ARROW_PX = 14.0  # of an image 640 px wide: length at which the RMS residual is
 _SCALES = (5, 10, 20, 50, 100)
 
 
-def worst_frames(frames: Iterable[FrameResiduals], camera: str, count: int = COUNT) -> list[FrameResiduals]:
+def worst_frames(frames: Iterable[FrameResiduals], camera: str) -> list[FrameResiduals]:
     """Return the images with the largest RMS residual among those that were used, worst first."""
     ranked = [(rms(f), f) for f in frames if f.camera == camera and f.dof > 0]
     ranked = sorted((entry for entry in ranked if np.isfinite(entry[0])), key=lambda entry: -entry[0])
@@ -25,7 +25,7 @@ def worst_frames(frames: Iterable[FrameResiduals], camera: str, count: int = COU
     for _, frame in ranked:
         if all(abs(frame.t_ns - other.t_ns) >= APART_S * 1e9 for other in chosen):
             chosen.append(frame)
-        if len(chosen) == count:
+        if len(chosen) == COUNT:
             break
     return chosen
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,24 +19,11 @@ if TYPE_CHECKING:
 Images = Callable[[str, Sequence[int]], Mapping[int, bytes]]
 """Returns JPEG files by stamp, given the camera and the stamps (ns) that are wanted; may leave out any."""
 
+_TITLE = "Camera-IMU calibration"
+
 
 class ReportError(ValueError):
     """The report cannot be made or written; the message has the reason."""
-
-
-@dataclass(frozen=True, slots=True)
-class ClockSeries:
-    """How a device's samples arrived against its fitted clock.
-
-    Attributes:
-        name: Of the device.
-        t_s: Time of each sample, s, shape (n,).
-        residual_us: Arrival minus fitted time, us, shape (n,).
-    """
-
-    name: str
-    t_s: FloatArray
-    residual_us: FloatArray
 
 
 class Gallery:
@@ -70,10 +56,8 @@ def write_report(
     image_sizes: Mapping[str, tuple[int, int]] | None = None,
     target_m: FloatArray | None = None,
     images: Images | None = None,
-    clocks: Sequence[ClockSeries] = (),
     provenance: Provenance | None = None,
     png_folder: Path | None = None,
-    title: str = "Camera-IMU calibration",
 ) -> None:
     """Write the report of one calibration.
 
@@ -85,10 +69,8 @@ def write_report(
         image_sizes: width, height by camera; None: `resolution` in the result, else from the points.
         target_m: Points of the board by id, target frame, m, shape (n, 3); None: not known, or target-free.
         images: Where the images that fit worst come from; None: only their corners are drawn.
-        clocks: Arrival against fitted clock, per device.
         provenance: What made the result; None: collected now, without inputs.
         png_folder: Figures also as PNG files there (made where it does not exist).
-        title: Heading.
 
     Raises:
         ReportError: No camera in the result, or the file cannot be written.
@@ -104,29 +86,28 @@ def write_report(
         if png_folder is not None:
             png_folder.mkdir(parents=True, exist_ok=True)
         gallery = Gallery(png_folder)
-        body = [_head(result, title)]
+        body = [_head(result)]
         for name in cameras:
             size = (image_sizes or {}).get(name)
             body += CameraPart(result, name, frames or (), size, target_m, images, gallery).sections()
         body += _inputs_section(result)
         body += _imu_section(result, gallery)
-        body += _clock_section(clocks, gallery)
         rows = values.event_rows(result.get("events") or [])
         if rows:
             body.append(page.section("What was announced, when", page.table(("time", "event"), rows, 9)))
         body.append(provenance_section(provenance or collect()))
-        path.write_text(page.document(title, body), encoding="utf-8")
+        path.write_text(page.document(_TITLE, body), encoding="utf-8")
     except OSError as error:
         raise ReportError(f"{path}: cannot write the report: {error.strerror or error}") from error
 
 
-def _head(result: Mapping[str, Any], title: str) -> str:
+def _head(result: Mapping[str, Any]) -> str:
     facts = [f"{float(result.get('duration_s') or 0):.1f} s of data"]
     facts += [f"{int(result[k])} {label}" for k, label in _COUNTS if result.get(k)]
     if result.get("cpu_s"):
         facts.append(f"{float(result['cpu_s']):.1f} s of CPU")
     facts.append(f"{100 * float(result.get('rejected_fraction') or 0):.2f} % of the points refused")
-    return page.head(title, str(result.get("status", "unknown")), verdict(result), facts)
+    return page.head(_TITLE, str(result.get("status", "unknown")), verdict(result), facts)
 
 
 _COUNTS = (("frames", "frames"), ("imu_samples", "inertial samples"))
@@ -173,17 +154,6 @@ def _inputs_section(result: Mapping[str, Any]) -> list[str]:
         rows.append((part["path"], f"{part['begin_s']:.1f}", f"{part['duration_s']:.1f}", frames, *texts))
     head = ("recording", "begins, s", "length, s", "frames", "gyro bias, rad/s", "accelerometer bias, m/s²")
     return [page.section("Recordings", page.table(head, rows, 1))]
-
-
-def _clock_section(clocks: Sequence[ClockSeries], gallery: Gallery) -> list[str]:
-    from vical_daemon.results.report import figures
-
-    drawn = [
-        gallery.add(f"clock-{c.name}", figures.clock(c.t_s, c.residual_us, c.name), f"clock of {c.name}")
-        for c in clocks
-        if len(c.t_s) > 1
-    ]
-    return [page.section("Clocks", *drawn)] if drawn else []
 
 
 def provenance_section(provenance: Provenance) -> str:

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vical_daemon.estimation.geometry.camera_model import project
-from vical_daemon.results.report import ClockSeries, ReportError, collect, worst, write_report
+from vical_daemon.results.report import ReportError, collect, worst, write_report
 from vical_daemon.results.report.board_views import board_views
 from vical_daemon.results.report.residuals import cells, gather, per_point_rms
 from vical_daemon.results.report.values import value, warnings_of
@@ -129,7 +129,6 @@ def test_report_is_complete_and_self_contained(result, tmp_path):
         path,
         result,
         make_frames(rng, 40),
-        clocks=[ClockSeries("imu0", np.arange(500) / 100, rng.exponential(80, 500))],
         provenance=collect("vical calibrate input.bin --target t.yaml", [data], {"seed": 1}),
     )
     text = path.read_text()
@@ -144,7 +143,6 @@ def test_report_is_complete_and_self_contained(result, tmp_path):
         "gyro bias",
         "SHA-256",
         "--target t.yaml",
-        "Clocks",
     ):
         assert needed in text, needed
     assert "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad" in text  # sha256("abc")
