@@ -6,7 +6,6 @@ import gzip
 import io
 import os
 import re
-import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy.typing as npt
 from vical_drivers.user_files import open_file, read_file, read_text
 
 from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
+from vical_daemon.logs.encoded_size import HEAD, encoded_size
 from vical_daemon.logs.model import RecordingError
 
 _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
@@ -187,7 +187,7 @@ def image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[s
 
 
 def image_size(folder: Path) -> tuple[int, int] | None:
-    """Return the size of the images from ``sensor.yaml`` or the first PNG."""
+    """Return the size of the images from ``sensor.yaml`` or the first image."""
     sensor = folder / "sensor.yaml"
     if sensor.is_file():
         import yaml
@@ -199,11 +199,10 @@ def image_size(folder: Path) -> tuple[int, int] | None:
             return int(size[0]), int(size[1])
         except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
             pass  # EuRoC's own files begin with %YAML:1.0, which some parsers refuse
-    first = next(iter(sorted((folder / "data").glob("*.png"))), None)
-    if first is not None:
-        with open_file(first) as file:
-            head = file.read(24)
-        if head[12:16] == b"IHDR":
-            width, height = struct.unpack(">II", head[16:24])
-            return width, height
-    return None
+    places = (folder / "data", folder)
+    images = (p for place in places if place.is_dir() for p in sorted(place.iterdir()))
+    first = next((p for p in images if p.suffix.lower() in IMAGE_SUFFIXES), None)
+    if first is None:
+        return None
+    with open_file(first) as file:
+        return encoded_size(file.read(HEAD))
