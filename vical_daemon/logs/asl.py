@@ -20,6 +20,7 @@ from vical_daemon.logs.asl_tables import (
     columns_of,
     image_list,
     image_size,
+    images_by_name,
     load_table,
     read_table,
     without_cut_line,
@@ -161,7 +162,10 @@ class AslRecording(Recording):
                 if path.is_file():
                     return self._read_points(path, folder.name, kind)
         path = folder / "data.csv"
-        return self._read_images(path, folder) if path.is_file() else None
+        if path.is_file():
+            return self._read_images(path, *image_list(path, folder))
+        stamps, files = images_by_name(folder)
+        return self._read_images(path, stamps, files, []) if files else None
 
     def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
         rows = self._load(path, _POINT_ROW, "timestamp [ns], id, u and v columns")
@@ -183,8 +187,8 @@ class AslRecording(Recording):
         t_ns = self._even_images(kind, name, t_ns, build)
         return _Source(self._stream(kind, name, path, t_ns), t_ns, build)
 
-    def _read_images(self, table: Path, folder: Path) -> _Source:
-        stamps, files, lost = image_list(table, folder)
+    def _read_images(self, table: Path, stamps: list[str], files: list[Path], lost: list[str]) -> _Source:
+        folder = table.parent
         if lost and not stamps:
             raise RecordingError(
                 f"{table} line 1: there is no image {lost[0]} next to it, nor any other listed"

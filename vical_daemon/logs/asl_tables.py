@@ -23,6 +23,8 @@ _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 _SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
 IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+_STAMP_DIGITS = 13
+"""Least digits of a name that is a stamp: UNIX time has 13 in ms, 16 in us, 19 in ns."""
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _SMALL = 2**25  # bytes; a packed table may always unpack to this size
 _SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
@@ -184,6 +186,17 @@ def image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[s
         stamps.append(stamp)
         files.append(path)
     return stamps, files, lost
+
+
+def images_by_name(folder: Path) -> tuple[list[str], list[Path]]:
+    """Return stamps and files of a folder without ``data.csv`` whose images are named by their stamps.
+
+    Kalibr's `kalibr_bagcreater` reads such folders. Images that are merely numbered have no stamps.
+    """
+    places = [place for place in (folder / "data", folder) if place.is_dir()]
+    images = [p for place in places for p in sorted(place.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES]
+    stamped = bool(images) and all(len(p.stem) >= _STAMP_DIGITS and p.stem.isdecimal() for p in images)
+    return ([p.stem for p in images], images) if stamped else ([], [])
 
 
 def image_size(folder: Path) -> tuple[int, int] | None:

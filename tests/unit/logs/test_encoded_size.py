@@ -12,6 +12,7 @@ from vical_daemon.bus.messages import encode_compressed_image, encode_imu
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.encoded_size import encoded_size
 from vical_daemon.logs.mcap import LogWriter
+from vical_daemon.logs.recorded_logs import stamp_of
 from vical_daemon.vision.image_codec import decode_image
 
 PICTURE = np.random.default_rng(1).integers(0, 255, (48, 64), np.uint8)
@@ -60,6 +61,20 @@ def test_a_folder_of_jpegs(tmp_path, write_asl, place) -> None:
         (camera / place / f"{t}.jpg").write_bytes(jpeg())
     (camera / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{t},{t}.jpg\n" for t in stamps))
     assert open_recording(folder, check=False).cameras["cam0"].resolution == (64, 48)
+
+
+def test_images_without_a_list_are_dated_by_their_names(tmp_path, write_asl) -> None:
+    """As `kalibr_bagcreater` reads them; merely numbered images have no stamps."""
+    folder = write_asl(tmp_path / "a", corners=False)
+    camera = folder / "mav0/cam0"
+    stamps = [1_600_000_000_000_000_000 + 50_000_000 * k for k in range(20)]
+    for t in stamps:
+        (camera / f"{t}.jpg").write_bytes(jpeg())
+    recording = open_recording(folder, check=False)
+    assert [stamp_of(p) for key, p in recording.messages() if "/camera/" in key] == stamps
+    for k, t in enumerate(stamps):
+        (camera / f"{t}.jpg").rename(camera / f"{k:06d}.jpg")
+    assert not open_recording(folder, check=False).cameras
 
 
 def test_a_log_of_compressed_images(tmp_path, a_motion) -> None:
