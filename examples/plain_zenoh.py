@@ -9,6 +9,7 @@ own, richer message.
 from __future__ import annotations
 
 import json
+import os
 import sys
 import time
 
@@ -36,7 +37,8 @@ def main(endpoint: str = "unixsock-stream//run/vical/zenoh.sock") -> int:
     try:
         session = zenoh.open(config)
     except zenoh.ZError:
-        print(f"no bus at {endpoint}; start `vical run -c FILE` there", file=sys.stderr)
+        own = f"unixsock-stream/{os.environ.get('XDG_RUNTIME_DIR', '/run/user/1000')}/vical/zenoh.sock"
+        print(f"no bus at {endpoint}; start `vical run -c FILE`, or name its bus: {own}", file=sys.stderr)
         return 1
     with session:
         for reply in session.get("vical/*/calibration/*/pose"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import threading
 import time
 from dataclasses import replace
@@ -42,6 +43,8 @@ SIGMAS = 4.0
 IRRELEVANT_M, IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
 
 
+_LOGGED = {EventKind.RESUMED, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED}
+"""Kinds that are in the log already, by whoever announces them."""
 _JOURNAL_NAMES = {
     EventKind.DEVICE_REPLACED: "calibration_restarted",
     EventKind.ESTIMATOR_RESTARTED: "estimator_restarted",
@@ -171,7 +174,10 @@ class CalibrationPersistence:
         fields |= {"sigma": event.sigma} if event.sigma is not None else {}
         name = "bumped" if event.changed else _JOURNAL_NAMES.get(event.kind, "calibration")
         level = "notice" if event.kind is EventKind.STORED_HOLDS else "warning"
-        notify.event(name, event_text(event), level=level, rig=self._config.rig, **fields)
+        text = event_text(event)
+        notify.event(name, text, level=level, rig=self._config.rig, **fields)
+        if event.kind not in _LOGGED and "JOURNAL_STREAM" not in os.environ:
+            _log.warning("%s", text)  # a terminal does not show the journal
 
     def save(self, estimate: CalibrationEstimate | None) -> None:
         """Store an estimate if it has converged."""

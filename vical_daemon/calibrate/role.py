@@ -16,6 +16,7 @@ from vical_daemon.bus.interface import Bus, Sample, Subscription
 from vical_daemon.bus.messages import DiagnosticStatus, Level, MessageError, decode_string
 from vical_daemon.bus.outgoing import Message, publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
+from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.checkpoint import Checkpoint
 from vical_daemon.calibrate.estimators import Estimator, input_keys, make_estimator
 from vical_daemon.calibrate.persistence import CalibrationPersistence
@@ -68,6 +69,7 @@ def calibrate(
     clock: WallClock,
     until: Until | None = None,
     folder: Path | None = None,
+    stamps: LiveStamps | None = None,
 ) -> None:
     """Calibrate until `stop`, or until `until` says that it is enough.
 
@@ -78,13 +80,14 @@ def calibrate(
         clock: Monotonic to UNIX time.
         until: Gets the last estimate and the commands that came since; True: enough.
         folder: Where the running estimator is saved; None: nowhere.
+        stamps: Those of the cameras, as known from earlier data.
     """
     queue = SubscriberQueue(bus, input_keys(config), QUEUE_LIMIT)
     persistence = CalibrationPersistence(config, bus, clock)
     priors = persistence.priors()
     checkpoint = Checkpoint(folder, config, clock)
     estimator = _resumed(checkpoint, persistence) or _new_estimator(config, priors, persistence)
-    role = EstimateRole(config, estimator, inspect=persistence.watch)
+    role = EstimateRole(config, estimator, inspect=persistence.watch, stamps=stamps or LiveStamps())
     supervisor = _Supervisor(config, role, persistence, checkpoint)
     publish(bus, persistence.stored_messages())
     commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
@@ -97,13 +100,11 @@ def calibrate(
             publish(bus, persistence.stored_messages())
         if words & {"discard", "reset"}:
             _log.info("starting over by command")
-            checkpoint.forget()
             priors = persistence.discard() if "discard" in words else priors
-            role.reset(make_estimator(config, priors))
+            supervisor.start_over(make_estimator(config, priors))
         if persistence.replaced:
-            checkpoint.forget()
             priors = persistence.begin_again()
-            role.reset(_new_estimator(config, priors, persistence))
+            supervisor.start_over(_new_estimator(config, priors, persistence))
             publish(bus, persistence.stored_messages())
         while True:  # in batches, so that a backlog does not delay publications
             publish(bus, supervisor.work(queue.take(256), time.monotonic()))
@@ -155,6 +156,9 @@ class _Supervisor:
         except Exception as error:
             self._failed(_describe(error))
             return []
+        for event in self._role.news():
+            self._persistence.announce(event)
+            self.start_over()
         self._stuck_s = self._progress.look(self._role.images, self._role.settled, now_s)
         if self._stuck_s > 1.5 * STUCK_S:  # the status has reported it by then
             self._failed(f"images arrived and none was used or refused for {self._stuck_s:.0f} s")
@@ -168,11 +172,16 @@ class _Supervisor:
             _log.error("the estimator failed at the end: %s", _describe(error))
             return []
 
-    def _failed(self, why: str) -> None:
+    def start_over(self, estimator: Estimator | None = None) -> None:
+        """Go on with another estimator; None: a new one, from the stored calibration."""
         self._stuck_s = 0.0
         self._checkpoint.forget()
-        priors = self._persistence.priors(wait_s=0.0)
-        self._role.reset(make_estimator(self._config, priors))
+        if estimator is None:
+            estimator = make_estimator(self._config, self._persistence.priors(wait_s=0.0))
+        self._role.reset(estimator)
+
+    def _failed(self, why: str) -> None:
+        self.start_over()
         pause_s = self._restarts.failed(why, time.monotonic())
         text = f"the estimator failed and starts again{f' in {pause_s:.0f} s' if pause_s else ''}: {why}"
         _log.error("%s", text)

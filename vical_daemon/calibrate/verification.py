@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from vical_daemon.bus.interface import Sample
 from vical_daemon.bus.messages import Change
+from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.estimators import make_estimator
 from vical_daemon.calibrate.in_use import InUse
 from vical_daemon.calibrate.worker import EstimateRole
@@ -61,9 +62,10 @@ class Verification:
     Args:
         config: The rig.
         in_use: What is checked.
+        stamps: Those of the cameras, as known from earlier data.
     """
 
-    def __init__(self, config: Config, in_use: InUse) -> None:
+    def __init__(self, config: Config, in_use: InUse, stamps: LiveStamps | None = None) -> None:
         self._in_use = in_use
         held = "intrinsics" in config.calibration.fix or any(k.lens is None for k in in_use.known.values())
         calibration = replace(config.calibration, fix=("intrinsics",) if held else ())
@@ -77,6 +79,7 @@ class Verification:
         self.answered_ns = 0
         self._suspects: set[str] = set()
         self._events: list[Event] = []
+        self._stamps = stamps or LiveStamps()
         self.begin_check()
 
     def begin_check(self) -> None:
@@ -88,7 +91,7 @@ class Verification:
         )
         priors = {name: self._in_use.prior(self._config, name) for name in known}
         estimator = make_estimator(self._config, priors)
-        self.role = EstimateRole(self._config, estimator, LOOK_S, inspect=self._look)
+        self.role = EstimateRole(self._config, estimator, LOOK_S, inspect=self._look, stamps=self._stamps)
         self.used_s = 0.0
         self._decided = False
 
@@ -99,6 +102,10 @@ class Verification:
     def step(self) -> bool:
         """Process what was taken; True: the check has ended, and the next has begun."""
         self.role.step()
+        found = self.role.news()
+        if found:  # the check up to now rests on other stamps
+            self._events += found
+            self.begin_check()
         return self._conclude()
 
     def end_stretch(self) -> None:
@@ -154,7 +161,7 @@ class Verification:
         """Take the answer of a check that has one, and begin the next."""
         if not self._decided and self.used_s < LONGEST_S:
             return False
-        if self._decided:
+        if self._decided and not self._stamps.in_doubt:
             self._answer()
         self.begin_check()
         return True

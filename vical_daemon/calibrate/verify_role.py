@@ -26,6 +26,7 @@ from vical_daemon.bus.messages import (
 )
 from vical_daemon.bus.outgoing import publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
+from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.estimators import input_keys
 from vical_daemon.calibrate.in_use import DevicesUnknownError, InUse, NothingInUseError, calibration_in_use
 from vical_daemon.calibrate.motion import LISTEN_S, Motion
@@ -72,6 +73,7 @@ class _VerifyService:
         self._pause = Pause(config.verify.cpu_percent / 100.0)
         self._state, self._image_rate_hz = CheckState.RESTING, 0.0
         self._words: set[str] = set()
+        self._stamps = LiveStamps()
         self._published_s = -np.inf
         self._unable = ""
         self._early = False  # devices are not there yet
@@ -106,7 +108,7 @@ class _VerifyService:
             _log.warning("cannot verify: %s", error)
             return
         self._unable, self._early = "", False
-        self._verification = Verification(self._config, self._in_use)
+        self._verification = Verification(self._config, self._in_use, self._stamps)
         self._state = CheckState.RESTING
 
     def _calibration_wanted(self) -> bool:
@@ -215,7 +217,7 @@ class _VerifyService:
             converged_s = min(converged_s, now_s)
             return "verify" in words or _verifiable(self._config, estimate) or now_s - converged_s > _FINE_S
 
-        calibrate(self._config, self._bus, self._stop, self._clock, until)
+        calibrate(self._config, self._bus, self._stop, self._clock, until, stamps=self._stamps)
         self._pause.excuse()
         self._words.clear()
         self._persistence.priors(wait_s=0.0)

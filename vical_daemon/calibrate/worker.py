@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -21,6 +22,7 @@ from vical_daemon.bus.messages import (
     decode_diagnostics,
 )
 from vical_daemon.bus.outgoing import Message
+from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.calibrate.predictions import Predictions
 from vical_daemon.calibrate.publications import (
@@ -31,6 +33,7 @@ from vical_daemon.calibrate.publications import (
 from vical_daemon.calibrate.reorder_buffer import ReorderBuffer
 from vical_daemon.calibrate.stamp_gate import StampGate
 from vical_daemon.config.model import Config
+from vical_daemon.estimation.events import Event
 from vical_daemon.estimation.measurements import PointsFrame
 from vical_daemon.estimation.result import CalibrationEstimate
 
@@ -52,6 +55,7 @@ class EstimateRole:
         period_s: Time between two publications.
         keep: Gets the report on every frame; None: they are dropped.
         inspect: Gets every estimate before it is published and may add to it.
+        stamps: Of live cameras; None: recorded images come with the stamps to use.
     """
 
     def __init__(
@@ -62,8 +66,10 @@ class EstimateRole:
         *,
         keep: Keep | None = None,
         inspect: Inspect | None = None,
+        stamps: LiveStamps | None = None,
     ) -> None:
         self.config, self.estimator = config, estimator
+        self._stamps, self._imu_sigma_s = stamps, 0.0
         self._period_s, self._keep, self._inspect = period_s, keep, inspect
         self._predictions = Predictions(config.rig)
         self._imu_key = topics.IMU.key(config.rig, config.calibration_imu)
@@ -104,10 +110,20 @@ class EstimateRole:
 
     def _pass(self, items: list[tuple[int, ImuMessage | PointsFrame]]) -> None:
         for stamp_ns, item in items:
-            self._order.push(stamp_ns, item)
-            self._images_in_order += isinstance(item, PointsFrame)
-            first_ns, newest_ns = self._span_ns or (stamp_ns, stamp_ns)
-            self._span_ns = min(first_ns, stamp_ns), max(newest_ns, stamp_ns)
+            if self._stamps is None or not isinstance(item, PointsFrame):
+                self._put(stamp_ns, item)
+            else:
+                self._put_all(self._stamps.push(item))
+
+    def _put_all(self, frames: list[PointsFrame]) -> None:
+        for frame in frames:
+            self._put(frame.t_cam_ns, frame)
+
+    def _put(self, stamp_ns: int, item: ImuMessage | PointsFrame) -> None:
+        self._order.push(stamp_ns, item)
+        self._images_in_order += isinstance(item, PointsFrame)
+        first_ns, newest_ns = self._span_ns or (stamp_ns, stamp_ns)
+        self._span_ns = min(first_ns, stamp_ns), max(newest_ns, stamp_ns)
 
     @property
     def settled(self) -> int:
@@ -115,10 +131,19 @@ class EstimateRole:
         return self.images - self._images_in_order - self.estimator.waiting
 
     def _stamps_known(self, message: DiagnosticsMessage) -> None:
-        """Pass the driver's stamp uncertainty to the estimator."""
+        """Pass on the uncertainty of stamps: of the IMU's by its driver, of images taken on arrival."""
         for status in message.statuses:
             if status.name == f"imu/{self.config.calibration_imu}" and "stamp_sigma_us" in status.values:
-                self.estimator.stamps_known_to(admit_stamp_sigma_s(status.values["stamp_sigma_us"]))
+                self._imu_sigma_s = admit_stamp_sigma_s(status.values["stamp_sigma_us"])
+                self._tell_sigma()
+
+    def _tell_sigma(self) -> None:
+        images_s = self._stamps.sigma_s if self._stamps is not None else 0.0
+        self.estimator.stamps_known_to(math.hypot(self._imu_sigma_s, images_s))
+
+    def news(self) -> list[Event]:
+        """Return what was found of the stamps: the estimate up to now rests on others."""
+        return [] if self._stamps is None else self._stamps.news()
 
     def step(self, now_s: float | None = None) -> list[Message]:
         """Process what was taken and return the messages to publish.
@@ -135,6 +160,7 @@ class EstimateRole:
         """Process the rest at the end of the data and return the last messages."""
         for gate in self._gates.values():
             self._pass(gate.flush())
+        self._put_all(self._stamps.flush() if self._stamps is not None else [])
         self._feed(self._order.pop_all())
         self._report(self.estimator.finish())
         self._next_s = self._next_companion_s = -float("inf")
@@ -150,6 +176,7 @@ class EstimateRole:
         self._order.pop_all()
         self._images_in_order = 0
         self.estimator, self.latest = estimator, None
+        self._tell_sigma()
         self._next_s = self._next_companion_s = -float("inf")
 
     def _feed(self, items: list[ImuMessage | PointsFrame]) -> None:
@@ -162,7 +189,7 @@ class EstimateRole:
                 self._report(self.estimator.process())
 
     def _report(self, frames: Sequence[Any]) -> None:
-        self._predictions.take(frames)
+        self._predictions.take(frames if self._stamps is None else self._stamps.as_they_came(frames))
         if self._keep is not None:
             self._keep(frames)
 

@@ -70,7 +70,7 @@ class DetectRole:
         self._detect = self._make()
         self._size: tuple[int, int] | None = None  # of the images of this camera: height, width
         self._other: tuple[tuple[int, int], int] = ((0, 0), 0)  # another size, and how often in a row
-        self._problem = ""
+        self._problem = self._why_malformed = ""
         self.rate_hz = config.calibration.detect_rate_hz  # images per second at most
         self._next_ns = 0.0
         self._images = self._found = self._malformed = self._skipped = self._failures = 0
@@ -81,8 +81,9 @@ class DetectRole:
         begin_s = time.perf_counter()
         try:
             stamp_ns, image = _decode(sample)
-        except (MessageError, ValueError):
+        except (MessageError, ValueError) as error:
             self._malformed += 1
+            self._why_malformed = str(error)
             return []
         if not self._of_usual_size(image.shape[:2]):
             self._malformed += 1
@@ -159,6 +160,9 @@ class DetectRole:
         if busy_s > STUCK_S:
             text = f"stuck: at one image for {busy_s:.0f} s"
             return DiagnosticStatus(Level.STALE, f"detect/{self.camera}", text, "", values)
+        if self._malformed and not self._images:
+            text = f"none of {self._malformed} images can be read: {self._why_malformed}"
+            return DiagnosticStatus(Level.ERROR, f"detect/{self.camera}", text, "", values)
         message = f"{share:.0%} of {self._images} images show points"
         level = Level.WARN if self._images > 50 and share < 0.1 else Level.OK
         return DiagnosticStatus(level, f"detect/{self.camera}", message, "", values)

@@ -481,7 +481,8 @@ class Calibrator:
     def estimate(self) -> CalibrationEstimate:
         """Return what is known now."""
         self.evaluator.clocks_doubtful = self.watch.doubtful
-        return self._intake.by_present_stamps(self.evaluator.estimate(self.filter, self._stale))
+        estimate = self.evaluator.estimate(self.filter, self._stale)
+        return self._intake.by_present_stamps(estimate, self.options.targets.timeshift_s)
 
     def trace(self, camera: str) -> list[TracePoint]:
         """Return one entry a second of how a camera's calibration developed."""

@@ -28,6 +28,7 @@ class EventKind(StrEnum):
     CLOCK_DRIFT = "clock_drift"
     CLOCK_WANDER = "clock_wander"
     STAMP_JITTER = "stamp_jitter"
+    STAMPED_ON_ARRIVAL = "stamped_on_arrival"
     STAMPS_STEPPED = "stamps_stepped"
     IMU_CLOCK_SET_BACK = "imu_clock_set_back"
     IMU_CLOCK_REMAPPED = "imu_clock_remapped"
@@ -239,6 +240,12 @@ REFERENCE: dict[EventKind, About] = {
         "s",
         "Once per camera, from 0.3 ms; with a board, once neighbours are known to be late independently. "
         "Without one, images that are shifted as a whole are not distinguished: cause `images_shifted`.",
+    ),
+    EventKind.STAMPED_ON_ARRIVAL: About(
+        "A live camera samples evenly, but stamps on arrival. From now on its images are put on an even "
+        "grid, and the calibration starts over. Value: standard deviation of the delays.",
+        "s",
+        "Once per camera, when points are found to move more smoothly over the even grid, by 5 sigma.",
     ),
     EventKind.IMAGES_WANDER: About(
         "Whole images move against the motion of the IMU, for seconds: image stabilisation, a loose lens or "

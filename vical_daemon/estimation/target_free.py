@@ -461,7 +461,7 @@ class TargetFreeCalibrator:
         if known is not None and self._buffer is not None:
             known = known.at(self._buffer.newest_s - known.camera.timeshift_s)
         estimate = self.evaluator.estimate(known, running=self.window is not None, gravity=gravity)
-        return self._intake.by_present_stamps(estimate)
+        return self._intake.by_present_stamps(estimate, self.options.targets.timeshift_s)
 
     def held_out(self) -> list[HeldOutCheck]:
         """Return nothing: there is no such check without a target."""

@@ -354,6 +354,13 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
             + "; allowed for"
         ),
     ),
+    EventKind.STAMPED_ON_ARRIVAL: (
+        "",
+        lambda e: (
+            f"its stamps jitter by {_of(e, 1e3, 'ms', '.1f')} but it samples evenly: its images are put on "
+            "an even grid from now on; the calibration starts over"
+        ),
+    ),
     EventKind.IMAGES_WANDER: (
         "",
         lambda e: (

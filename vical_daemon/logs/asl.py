@@ -20,6 +20,7 @@ from vical_daemon.logs.asl_tables import (
     columns_of,
     image_list,
     image_size,
+    images_by_name,
     load_table,
     read_table,
     without_cut_line,
@@ -161,7 +162,10 @@ class AslRecording(Recording):
                 if path.is_file():
                     return self._read_points(path, folder.name, kind)
         path = folder / "data.csv"
-        return self._read_images(path, folder) if path.is_file() else None
+        if path.is_file():
+            return self._read_images(path, *image_list(path, folder))
+        stamps, files = images_by_name(folder)
+        return self._read_images(path, stamps, files, []) if files else None
 
     def _read_points(self, path: Path, name: str, kind: Kind) -> _Source:
         rows = self._load(path, _POINT_ROW, "timestamp [ns], id, u and v columns")
@@ -183,8 +187,8 @@ class AslRecording(Recording):
         t_ns = self._even_images(kind, name, t_ns, build)
         return _Source(self._stream(kind, name, path, t_ns), t_ns, build)
 
-    def _read_images(self, table: Path, folder: Path) -> _Source:
-        stamps, files, lost = image_list(table, folder)
+    def _read_images(self, table: Path, stamps: list[str], files: list[Path], lost: list[str]) -> _Source:
+        folder = table.parent
         if lost and not stamps:
             raise RecordingError(
                 f"{table} line 1: there is no image {lost[0]} next to it, nor any other listed"
@@ -194,13 +198,12 @@ class AslRecording(Recording):
         if not stamps:
             raise RecordingError(f"{table}: no images listed")
         try:
-            t_ns, report = column_ns(numbers(stamps), "", imu=False)
+            column = column_ns(numbers(stamps), "", imu=False)
         except StampError as error:
             raise RecordingError(f"{table}: the stamp {stamps[error.index]} is no number") from None
-        if report:
-            self.warnings.append(f"{folder.name}: {report}")
-        order = np.argsort(t_ns, kind="stable")
-        t_ns = t_ns[order]
+        self._note_stamps(folder.name, column.sigma_s, column.report)
+        order = np.argsort(column.t_ns, kind="stable")
+        t_ns = column.t_ns[order]
         files = [files[i] for i in order.tolist()]
 
         def build(i: int) -> bytes:
@@ -234,20 +237,26 @@ class AslRecording(Recording):
         rows = load_table(whole, path, dtype, columns)
         try:
             stamps = rows["t"] if rows["t"].dtype.kind == "i" else numbers(rows["t"].tolist())
-            t_ns, report = column_ns(stamps, title, imu=dtype == _IMU_ROW)
+            column = column_ns(stamps, title, imu=dtype == _IMU_ROW)
         except StampError as error:
             raise RecordingError(
                 f"{path}: row {error.index + 1} of the data: its stamp is no number"
             ) from None
-        if report:
-            self.warnings.append(f"{path.parent.name}: {report}")
+        self._note_stamps(path.parent.name, column.sigma_s, column.report)
         if dtype == _IMU_ROW and rows["t"].dtype.kind == "U":
-            _refuse_lost_digits(path, rows["t"], t_ns)
+            _refuse_lost_digits(path, rows["t"], column.t_ns)
         out = np.empty(len(rows), dtype)
-        out["t"] = t_ns
+        out["t"] = column.t_ns
         for name in (dtype.names or ())[1:]:
             out[name] = rows[name]
         return out
+
+    def _note_stamps(self, name: str, sigma_s: float, report: str = "") -> None:
+        """Add what is found about the stamps of a sensor; errors of several causes add up."""
+        if report:
+            self.warnings.append(f"{name}: {report}")
+        if sigma_s:
+            self.stamp_sigma_s[name] = float(np.hypot(self.stamp_sigma_s.get(name, 0.0), sigma_s))
 
     def _even(self, rows: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
         """Put readings that were stamped on arrival on an even grid; others in order of their stamps."""
@@ -256,7 +265,7 @@ class AslRecording(Recording):
         if even is None:
             return self._sorted(rows, name, drop_equal=True)
         self.warnings.append(even.describe(name))
-        self.stamp_sigma_s[name] = even.sigma_s
+        self._note_stamps(name, even.sigma_s)
         rows = rows[~again]
         rows["t"] = even.t_ns
         return rows
@@ -277,7 +286,7 @@ class AslRecording(Recording):
         if even is None:
             return t_ns
         self.warnings.append(even.describe(name, "images"))
-        self.stamp_sigma_s[name] = even.sigma_s
+        self._note_stamps(name, even.sigma_s)
         better = dict(zip(stamps.t_ns.tolist(), even.t_ns.tolist(), strict=True))
         return np.array([better[t] for t in t_ns.tolist()], dtype=np.int64)
 

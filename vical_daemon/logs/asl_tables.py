@@ -6,7 +6,6 @@ import gzip
 import io
 import os
 import re
-import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,12 +16,15 @@ import numpy.typing as npt
 from vical_drivers.user_files import open_file, read_file, read_text
 
 from vical_daemon.config.strict_yaml import MAX_BYTES, ConfigError, refuse_hostile
+from vical_daemon.logs.encoded_size import HEAD, encoded_size
 from vical_daemon.logs.model import RecordingError
 
 _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 _SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
 IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+_STAMP_DIGITS = 13
+"""Least digits of a name that is a stamp: UNIX time has 13 in ms, 16 in us, 19 in ns."""
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
 _SMALL = 2**25  # bytes; a packed table may always unpack to this size
 _SHRINKS = 100  # times; tables of numbers shrink to a third or a tenth, a file of zeros to a thousandth
@@ -186,8 +188,19 @@ def image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[s
     return stamps, files, lost
 
 
+def images_by_name(folder: Path) -> tuple[list[str], list[Path]]:
+    """Return stamps and files of a folder without ``data.csv`` whose images are named by their stamps.
+
+    Kalibr's `kalibr_bagcreater` reads such folders. Images that are merely numbered have no stamps.
+    """
+    places = [place for place in (folder / "data", folder) if place.is_dir()]
+    images = [p for place in places for p in sorted(place.iterdir()) if p.suffix.lower() in IMAGE_SUFFIXES]
+    stamped = bool(images) and all(len(p.stem) >= _STAMP_DIGITS and p.stem.isdecimal() for p in images)
+    return ([p.stem for p in images], images) if stamped else ([], [])
+
+
 def image_size(folder: Path) -> tuple[int, int] | None:
-    """Return the size of the images from ``sensor.yaml`` or the first PNG."""
+    """Return the size of the images from ``sensor.yaml`` or the first image."""
     sensor = folder / "sensor.yaml"
     if sensor.is_file():
         import yaml
@@ -199,11 +212,10 @@ def image_size(folder: Path) -> tuple[int, int] | None:
             return int(size[0]), int(size[1])
         except (yaml.YAMLError, ConfigError, OSError, KeyError, TypeError, ValueError, IndexError):
             pass  # EuRoC's own files begin with %YAML:1.0, which some parsers refuse
-    first = next(iter(sorted((folder / "data").glob("*.png"))), None)
-    if first is not None:
-        with open_file(first) as file:
-            head = file.read(24)
-        if head[12:16] == b"IHDR":
-            width, height = struct.unpack(">II", head[16:24])
-            return width, height
-    return None
+    places = (folder / "data", folder)
+    images = (p for place in places if place.is_dir() for p in sorted(place.iterdir()))
+    first = next((p for p in images if p.suffix.lower() in IMAGE_SUFFIXES), None)
+    if first is None:
+        return None
+    with open_file(first) as file:
+        return encoded_size(file.read(HEAD))

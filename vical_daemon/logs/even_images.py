@@ -35,6 +35,10 @@ _NEAR = 0.35
 """90 % of the images of an even camera lie within so much of a period of the middle; of any other, 0.45."""
 _CHUNKS, _CHUNK = 10, 60
 """So many stretches of so many images decide, spread over the recording."""
+_SPANS = (1, 3, 9)
+"""Images over which the period is found: the number of periods in each span follows from the span before."""
+_PARTS = (1, 2, 3)
+"""The usual interval may hold so many periods: a limited rate lets every second or third image pass."""
 _MOST = 3.0  # of the logarithm of one ratio of errors: an image counts twenty times at most
 _TINY_PX = 1e-3
 
@@ -60,13 +64,19 @@ class CameraStamps:
     Args:
         t_ns: Stamps in the order of the recording, ns, shape (n,).
         marks: By which an image that was delivered twice is recognised (`mark_of`), shape (n,).
+        until_ns: Later images show which of those before were late, and get no stamps; None: all get some.
     """
 
-    def __init__(self, t_ns: IntArray, marks: IntArray) -> None:
+    def __init__(self, t_ns: IntArray, marks: IntArray, until_ns: int | None = None) -> None:
         self.t_ns, first = np.unique(t_ns, return_index=True)
         marks = marks[first]
         self._again: BoolArray = np.append(False, marks[1:] == marks[:-1])[: len(self.t_ns)]
-        self._grid = even_grid(self.t_ns[~self._again])
+        first_ns, count = self.t_ns[~self._again], None
+        if until_ns is not None:
+            count = int(np.searchsorted(first_ns, until_ns, "right"))
+            kept = self.t_ns <= until_ns
+            self.t_ns, self._again = self.t_ns[kept], self._again[kept]
+        self._grid = even_grid(first_ns, count)
         self._images: dict[int, ImagePoints] = {}
 
     @property
@@ -88,8 +98,11 @@ class CameraStamps:
         if image is not None:
             self._images[t_ns] = image
 
-    def even(self) -> EvenStamps | None:
+    def even(self, certain: float = CERTAIN) -> EvenStamps | None:
         """Decide.
+
+        Args:
+            certain: Standard errors by which points must move more smoothly over the even grid.
 
         Returns:
             Stamps for `t_ns`; None where these stay as they are.
@@ -101,10 +114,16 @@ class CameraStamps:
         for chunk in self._chunks():
             images = [self._images.get(t) for t in old_ns[chunk].tolist()]
             found += gains(images, *((t[chunk] - old_ns[0]) * 1e-9 for t in (old_ns, new_ns)))
-        if len(found) < 3 or not np.mean(found) > CERTAIN * np.std(found) / np.sqrt(len(found)):
+        if len(found) < 3 or not np.mean(found) > certain * np.std(found) / np.sqrt(len(found)):
+            return None
+        return self.on_grid()
+
+    def on_grid(self) -> EvenStamps | None:
+        """Return stamps for `t_ns` on the even grid, better or not; None: there is none."""
+        if self._grid is None:
             return None
         stamps = np.empty_like(self.t_ns)
-        stamps[~self._again] = new_ns
+        stamps[~self._again] = self._grid.t_ns
         for k in np.flatnonzero(self._again).tolist():
             stamps[k] = stamps[k - 1] + 1000  # the same image once more: the estimator leaves it out
         return self._grid._replace(t_ns=stamps)
@@ -152,11 +171,12 @@ class PointReader:
         return self._tracker.detect(image_codec.decode_image(data))
 
 
-def even_grid(t_ns: IntArray) -> EvenStamps | None:
+def even_grid(t_ns: IntArray, count: int | None = None) -> EvenStamps | None:
     """Put images on the even grid of their camera, whether or not it samples evenly.
 
     Args:
         t_ns: Sorted stamps of different images, ns, shape (n,).
+        count: Only so many get new stamps; those after them show which of them were late. None: all.
 
     Returns:
         None where the stamps are even already, rounded, or far from any grid.
@@ -165,15 +185,35 @@ def even_grid(t_ns: IntArray) -> EvenStamps | None:
         return None
     t_s = (t_ns - t_ns[0]) * 1e-9
     intervals_s = np.diff(t_s)
-    period_s = float(np.median(intervals_s))
-    if not period_s > 0.0:
+    usual_s = float(np.median(intervals_s))
+    if not usual_s > 0.0:
         return None
-    period_s = float(np.median(intervals_s[np.abs(intervals_s / period_s - 1.0) < 0.5]))  # nothing is lost
+    usual_s = float(np.median(intervals_s[np.abs(intervals_s / usual_s - 1.0) < 0.5]))  # nothing is lost
+    for parts in _PARTS:
+        grid = _grid_of(t_ns, t_s, _refined_s(t_s, usual_s / parts), count)
+        if grid is not None:
+            return grid
+    return None
+
+
+def _refined_s(t_s: FloatArray, period_s: float) -> float:
+    """A period from longer and longer intervals, whose number of periods the shorter ones show, s."""
+    for span in _SPANS:
+        intervals_s = t_s[span:] - t_s[:-span]
+        periods = np.maximum(np.round(intervals_s / period_s), 1.0)
+        period_s = float(np.median(intervals_s / periods))
+    return period_s
+
+
+def _grid_of(t_ns: IntArray, t_s: FloatArray, period_s: float, count: int | None) -> EvenStamps | None:
+    """See `even_grid`: the grid with about this period."""
     cuts = np.flatnonzero(np.diff(t_s) > _GAP * period_s) + 1
     bounds = [0, *cuts.tolist(), len(t_s)]
     for _ in range(2):  # the second time with the period of the first fit
         slots = np.concatenate([_slots(t_s[a:b], period_s) for a, b in pairwise(bounds)])
         period_s = _period_s(t_s, slots, bounds, period_s)
+    t_ns, t_s, slots = t_ns[:count], t_s[:count], slots[:count]
+    bounds = [*(bound for bound in bounds if bound < len(t_s)), len(t_s)]
     even_s, scatter_s = np.empty_like(t_s), []
     for a, b in pairwise(bounds):
         grid_s = period_s * slots[a:b]

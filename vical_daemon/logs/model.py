@@ -78,7 +78,8 @@ class Recording(ABC):
         rig: Name of the rig in the keys.
         streams: Its sensors.
         warnings: Problems, one line each.
-        stamp_sigma_s: Of each sensor whose stamps were put on an even grid, how well that is known, s.
+        stamp_sigma_s: By how much the stamps of a sensor may be off together, s: of those that were put on an
+            even grid, or are written in coarse steps.
     """
 
     path: Path

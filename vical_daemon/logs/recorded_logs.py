@@ -20,12 +20,14 @@ from vical_daemon.bus.messages import (
     POINTS_TYPE,
     TRACKS_TYPE,
     MessageError,
+    decode_compressed_image,
     decode_image,
     decode_imu,
     decode_points,
 )
 from vical_daemon.bus.topics import BY_KIND, PREDICTED, STATUS, parse_key
 from vical_daemon.estimation.measurements import FloatArray, IntArray
+from vical_daemon.logs.encoded_size import encoded_size
 from vical_daemon.logs.even_images import CameraStamps, PointReader, mark_of
 from vical_daemon.logs.even_stamps import even_stamps
 from vical_daemon.logs.mcap import LogError, LogReader
@@ -97,6 +99,7 @@ class _Channel:
     values: bytearray = field(default_factory=bytearray)
     resolution: tuple[int, int] | None = None
     unreadable: int = 0
+    problem: str = ""  # why the first one was unreadable
     even_ns: IntArray | None = None  # of each of `stamps` the one to use instead
 
 
@@ -163,7 +166,9 @@ class LogRecording(Recording):
             self._order.saw(stamp_ns, raw.log_time_ns)
         for channel in self._channels.values():
             if channel.unreadable:
-                self.warnings.append(f"{channel.name}: {channel.unreadable} unreadable messages left out")
+                why = f" ({channel.problem})" if channel.problem else ""
+                text = f"{channel.name}: {channel.unreadable} unreadable messages left out{why}"
+                self.warnings.append(text)
 
     def _meet(self, raw: RawMessage) -> _Channel | None:
         """Classify a topic by its first message."""
@@ -326,11 +331,15 @@ def _readable(channel: _Channel, payload: bytes) -> bool:
             decode_imu(payload)
         elif channel.kind == "image":
             image = decode_image(payload)
+            image.pixels()
             channel.resolution = (image.width, image.height)
+        elif channel.kind == "compressed":
+            channel.resolution = encoded_size(decode_compressed_image(payload).data)
         elif channel.kind in ("points", "tracks"):
             size = decode_points(payload).image_size
             channel.resolution = size if all(size) else None
-    except MessageError:
+    except MessageError as error:
+        channel.problem = channel.problem or str(error)
         return False
     return True
 

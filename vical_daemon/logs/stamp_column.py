@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from decimal import Decimal
+from typing import NamedTuple
 
 import numpy as np
 
 from vical_daemon.estimation.measurements import IntArray
-from vical_daemon.logs.stamps import UNIT_WORDS, to_ns, unit_by_spacing, unit_named
+from vical_daemon.logs.stamps import UNIT_WORDS, resolution_ns, to_ns, unit_by_spacing, unit_named
 
 _IMU_HZ = (5.0, 20_000.0, 200.0)
 """Slowest, fastest and typical rate, Hz: a gyro below 10 Hz is of no use; the fastest MEMS IMUs give 32 kHz
@@ -16,8 +17,28 @@ _CAMERA_HZ = (0.5, 400.0, 20.0)
 """Likewise of images; one a second in microseconds would be 1 kHz in nanoseconds."""
 
 
-def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: bool) -> tuple[IntArray, str]:
-    """Return the stamps of a table in ns, and what to report: empty where they are nanoseconds already.
+_COARSE_NS = 100_000
+"""Steps in which stamps are written from which on it is reported, ns: at 1 rad/s and f = 500 px, half of it
+is 0.025 px, a tenth of what corners have."""
+
+
+class StampColumn(NamedTuple):
+    """The stamps of a table.
+
+    Attributes:
+        t_ns: In ns, shape (n,).
+        report: On their unit; empty where they are nanoseconds.
+        sigma_s: By how much all may be off together as they are written in steps of their last digit, s: one
+            step over the root of 12 (GUM, JCGM 100:2008, F.2.2.1). 0 where that is a nanosecond.
+    """
+
+    t_ns: IntArray
+    report: str
+    sigma_s: float
+
+
+def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: bool) -> StampColumn:
+    """Read the stamps of a table.
 
     The spacing decides, not the title: EuRoC's title, which says ns, is copied above any numbers. It says ns
     wherever ns are plausible.
@@ -35,12 +56,17 @@ def column_ns(values: list[int] | list[Decimal] | IntArray, title: str, *, imu: 
         distinct: list[int] = np.unique(values).tolist()
         unit = unit_by_spacing(distinct, slowest, fastest, usual)
         if unit == "ns":
-            return values, ""
+            return StampColumn(values, "", 0.0)
     else:
         unit = unit_by_spacing(values, slowest, fastest, usual)
     named = unit_named(title.split(",")[0])
     if named is not None and named != "ns" and unit != "ns":
         unit = named
-    stamps = to_ns(values.tolist() if isinstance(values, np.ndarray) else values, unit)
+    listed = values.tolist() if isinstance(values, np.ndarray) else values
+    step_ns = resolution_ns(listed, unit)
     report = "" if unit == "ns" else f"by their spacing the stamps are {UNIT_WORDS[unit]}; read as such"
-    return stamps, report
+    if step_ns >= _COARSE_NS:
+        coarse = f"stamps are written in steps of {1e-6 * step_ns:g} ms, which limits the time shift"
+        report = f"{report}; {coarse}" if report else coarse
+    sigma_s = 1e-9 * step_ns / np.sqrt(12.0) if step_ns > 1.0 else 0.0
+    return StampColumn(to_ns(listed, unit), report, float(sigma_s))

@@ -62,6 +62,16 @@ def to_ns(values: list[int] | list[Decimal], unit: str) -> IntArray:
     return np.array(whole, dtype=np.int64)
 
 
+def resolution_ns(values: list[int] | list[Decimal], unit: str) -> float:
+    """Return the value of the last digit that stamps of a unit of `FACTOR_NS` are written with, ns.
+
+    >>> resolution_ns([Decimal("1.25"), Decimal("1.5")], "s")
+    10000000.0
+    """
+    finest = min((v.as_tuple().exponent for v in values if isinstance(v, Decimal)), default=0)
+    return FACTOR_NS[unit] * 10.0 ** int(finest)
+
+
 def unit_named(title: str) -> str | None:
     """Return the unit that the title of a column names: `timestamp [ns]`, `time_us`; None: none.
 

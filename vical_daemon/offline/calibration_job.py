@@ -109,8 +109,10 @@ def make_job(
     imu_stream = _choose("imu", recording.imus, imu)
     chosen = {camera: _choose("camera", recording.cameras, camera)} if camera else dict(recording.cameras)
     if not chosen:
+        unread = "; ".join(w for w in recording.warnings if "unreadable" in w)
         raise InputError(
-            f"{recording.path} holds no camera, neither images nor points; `vical info` shows what is in it"
+            f"{recording.path} holds no camera, neither images nor points{f' ({unread})' if unread else ''}; "
+            "`vical info` shows what is in it"
         )
     cameras = _cameras_meant(initial, chosen)
     priors = {name: _prior(name, stream, cameras.get(name), fix) for name, stream in chosen.items()}

@@ -29,6 +29,7 @@ from vical_daemon.service.device_serials import DeviceSerials
 from vical_daemon.service.wall_clock import WallClock
 
 _log = logging.getLogger(__name__)
+_NO_ROOM = "the disk has reached record.reserve_bytes; waiting for space"
 _RETRY_NS = 5_000_000_000
 _RECOVERY_S = 5.0
 _KEYS = 512
@@ -162,7 +163,7 @@ class Recorder:
                 self._session.tick(now_ns)
                 self._folder.enforce_quota(self._session.segment_bytes)
                 if not self._folder.has_room():
-                    self._end("the disk has reached record.reserve_bytes; waiting for space")
+                    self._end(_NO_ROOM)
             elif self._wanted and now_ns >= self._retry_ns:
                 self._retry_ns = now_ns + _RETRY_NS
                 self._begin(now_ns)
@@ -176,7 +177,9 @@ class Recorder:
         self._start_recovery()
         self._folder.enforce_quota(0)
         if not self._folder.has_room(resuming=bool(self._problem)):
-            self._problem = "the disk has reached record.reserve_bytes; waiting for space"
+            if self._problem != _NO_ROOM:
+                _log.warning("not recording: %s", _NO_ROOM)
+            self._problem = _NO_ROOM
             return
         record = self._config.record
         self._session = LogSession(

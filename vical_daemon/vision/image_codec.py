@@ -10,7 +10,7 @@ Image = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
 def decode_image(data: npt.NDArray[np.uint8], *, colour: bool = False) -> npt.NDArray[np.uint8]:
-    """Decompress one JPEG or PNG.
+    """Decompress one JPEG or PNG, as the sensor read it: a tag that asks for a turned display is ignored.
 
     Args:
         data: The file's bytes, shape (n,), uint8.
@@ -23,7 +23,8 @@ def decode_image(data: npt.NDArray[np.uint8], *, colour: bool = False) -> npt.ND
         ValueError: The bytes are no image, or a damaged one.
     """
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
+        flags = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
+        image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ValueError(f"no image: {error}") from error
     if image is None:

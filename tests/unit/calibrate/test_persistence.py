@@ -201,6 +201,21 @@ def test_the_journal_gets_an_event_as_fields_and_its_name_from_its_kind(
     assert (written[2][1]["camera"], written[2][1]["value"]) == ("cam0", 1e-3)
 
 
+@pytest.mark.parametrize("under_systemd", [False, True])
+def test_a_terminal_shows_what_goes_to_the_journal(
+    config: Config, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, under_systemd: bool
+) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    if under_systemd:
+        monkeypatch.setenv("JOURNAL_STREAM", "8:1")
+    persistence = _later(config)
+    caplog.clear()
+    persistence.announce(Event(EventKind.BUMPED, cause=Cause.IMAGES_REFUSED))
+    persistence.announce(Event(EventKind.ESTIMATOR_RESTARTED, said="logged where it happens"))
+    lines = [r.message for r in caplog.records]
+    assert ["bumped" in line for line in lines] == ([] if under_systemd else [True])
+
+
 def _said(persistence: CalibrationPersistence, estimate: CalibrationEstimate) -> list[str]:
     return [event_text(event) for event in persistence.watch(estimate).events]
 

@@ -85,12 +85,12 @@ def checks(run, folder, turned_deg=0.0):
     return Verification(config, InUse("store", known, {}, stored))
 
 
-def stream(run, begin_ns=T0_NS):
-    """What IMU and detector send: stamp, key, payload."""
-    shift_ns = begin_ns - run.options.epoch_ns
+def stream(run, begin_ns=T0_NS, late_s=0.0):
+    """What IMU and detector send: stamp, key, payload; images are stamped `late_s` late on average."""
+    shift_ns, rng = begin_ns - run.options.epoch_ns, np.random.default_rng(begin_ns // 10**9)
     for _, event in events_in_order(run):
         if isinstance(event, SimulatedFrame):
-            t_ns = event.t_cam_ns + shift_ns
+            t_ns = event.t_cam_ns + shift_ns + round(min(rng.exponential(late_s), 0.03) * 1e9)
             payload = encode_points(t_ns, "cam0", event.ids, event.uv_px, None, run.rig.lens.resolution)
             yield t_ns, topics.POINTS.key("rig0", "cam0"), payload
         else:
@@ -103,9 +103,9 @@ def stream(run, begin_ns=T0_NS):
             )
 
 
-def play(verification, run, seconds, *, begin_ns=T0_NS):
+def play(verification, run, seconds, *, begin_ns=T0_NS, late_s=0.0):
     """Feed messages until a check ends; True if one did."""
-    for stamp_ns, key, payload in stream(run, begin_ns):
+    for stamp_ns, key, payload in stream(run, begin_ns, late_s):
         if stamp_ns > begin_ns + seconds * 1e9:
             break
         verification.take(Sample(key, payload, 0))
@@ -145,6 +145,19 @@ def test_a_wrong_calibration_needs_two_checks_and_is_named_with_its_size(run, tm
     assert event.kind is EventKind.CAMERA_TURNED and event.camera == "cam0" and event.changed
     assert play(verification, run, 20.0, begin_ns=T0_NS + 120 * 10**9)
     assert verification.verdict is Answer.CHANGED and not verification.events()  # announced once
+
+
+def test_images_stamped_on_arrival_are_no_change_of_the_time_shift(run, tmp_path):
+    """Stored by a recording, whose stamps were corrected: 4 ms of delay are not in its time shift."""
+    verification, events = checks(run, tmp_path), []
+    for k in range(8):
+        play(verification, run, 20.0, begin_ns=T0_NS + 60 * k * 10**9, late_s=4e-3)
+        verification.end_stretch()
+        events += verification.events()
+        if verification.checks:
+            break
+    assert verification.verdict is Answer.HOLDS
+    assert [e.kind for e in events] == [EventKind.STAMPED_ON_ARRIVAL, EventKind.STORED_HOLDS]
 
 
 def test_a_check_goes_on_after_a_pause(run, tmp_path):

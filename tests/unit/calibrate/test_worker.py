@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,16 +15,19 @@ from vical_daemon.bus.messages import (
     Level,
     decode_calibration,
     decode_camera_info,
+    decode_points,
     decode_pose,
     decode_transforms,
     encode_diagnostics,
     encode_imu,
     encode_points,
 )
+from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.estimators import input_keys
 from vical_daemon.calibrate.worker import EstimateRole
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
@@ -178,3 +182,35 @@ class TestEstimate:
         EstimateRole(config, estimator).take(Sample("vical/rover/status/imu", payload, 0))
         heard = getattr(estimator, "stamp_sigma_s", None)
         assert heard == (None if known is None else pytest.approx(known))
+
+    def test_live_images_that_are_stamped_on_arrival_get_even_stamps(self, config: Config) -> None:
+        class Reporting(FakeEstimator):
+            def add_points(self, frame: PointsFrame) -> None:
+                super().add_points(frame)
+                self.newest = frame
+
+            def process(self) -> list[Any]:
+                f, none = self.newest, np.zeros(0, bool)
+                report = FrameReport(f.t_cam_ns, f.camera, f.ids, f.uv_px, f.uv_px, none, used=True)
+                return [replace(report, predicted_px=f.uv_px)]
+
+        estimator, stamps = Reporting(), LiveStamps()
+        role = EstimateRole(config, estimator, stamps=stamps)
+        rng, begin_ns, sent, predicted = np.random.default_rng(1), 10**18, set(), []
+        corners = rng.uniform(1.0, 15.0, (12, 2))
+        for k in range(600):
+            t_s = 0.05 * k
+            uv = corners + 0.5 * np.sin(3.0 * t_s) + rng.normal(0.0, 1e-3, (12, 2))
+            stamp_ns = begin_ns + round((t_s + rng.exponential(4e-3)) * 1e9)
+            sent.add(stamp_ns)
+            payload = encode_points(stamp_ns, "cam0", range(12), uv, image_size=(16, 16))
+            role.take(Sample("vical/rover/camera/cam0/points", payload, 0))
+            predicted += [p for key, p in role.step() if key.endswith("/predicted")]
+        assert len(stamps.news()) == 1
+        even_s = np.array([(t - begin_ns) * 1e-9 for _, t in estimator.fed[-200:]])
+        late_s = even_s - 0.05 * np.round(even_s / 0.05)
+        assert np.abs(late_s).max() < 1e-3 and late_s.std() < 2e-4
+        assert {decode_points(p).stamp_ns for p in predicted} <= sent  # the page shows them in their images
+        fresh = Reporting()
+        role.reset(fresh)
+        assert fresh.stamp_sigma_s == pytest.approx(stamps.sigma_s) and 0.0 < stamps.sigma_s < 1e-3

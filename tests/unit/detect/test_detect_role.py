@@ -10,6 +10,7 @@ from vical_drivers.samples import Frame
 
 from vical_daemon.bus.interface import Sample
 from vical_daemon.bus.messages import (
+    Level,
     decode_points,
     encode_image,
 )
@@ -60,6 +61,8 @@ class TestDetect:
         role = self._role(config, None)
         assert role.points(Sample("vical/rover/camera/cam0/image", b"junk", 0)) == []
         assert role.status(3).values["malformed"] == "1" and role.status(3).values["dropped"] == "3"
+        assert role.status().level is Level.ERROR  # not one image could be read
+        assert role.status().message.startswith("none of 1 images can be read: ")
 
     def test_rate_limit_counts_in_the_time_of_the_images(self, config: Config) -> None:
         role = self._role(config, None)  # detect_rate_hz is 30

@@ -18,7 +18,7 @@ from vical_daemon.logs import RecordingError, open_recording
 from vical_daemon.logs.checks import gyro_scale
 from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.logs.model import ImuArrays, Stamped, in_stamp_order
-from vical_daemon.logs.recorded_logs import stamp_of
+from vical_daemon.logs.recorded_logs import stamp_of, with_stamp
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 G = 9.80665
@@ -402,3 +402,16 @@ def test_junk_on_the_imu_topic_of_a_log_is_left_out(asl_folder, tmp_path):
     recording = open_recording(tmp_path / "a.mcap")
     assert recording.imu_samples == folder.imu_samples
     assert any("unreadable messages left out" in warning for warning in recording.warnings)
+
+
+def test_images_in_a_format_that_cannot_be_read_are_named(tmp_path, a_motion):
+    t_ns, gyro, force = a_motion(seconds=5.0)
+    image = m.encode_image(0, "cam0", np.zeros((6, 8), np.uint8), "mono8")
+    with LogWriter(tmp_path / "a.mcap") as writer:
+        for t, w, f in zip(t_ns.tolist(), gyro.tolist(), force.tolist(), strict=True):
+            writer.write("vical/rig0/imu/imu0", m.encode_imu(t, "imu0", w, f), t)
+        for t in t_ns[::5].tolist():
+            writer.write("vical/rig0/camera/cam0/image", with_stamp(image, t).replace(b"mono8", b"hsv99"), t)
+    recording = open_recording(tmp_path / "a.mcap", check=False)
+    assert not recording.cameras
+    assert any("(pixel format 'hsv99' is not supported" in warning for warning in recording.warnings)

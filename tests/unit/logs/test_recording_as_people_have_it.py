@@ -122,6 +122,32 @@ def _in_unit(path, factor, digits):
 
 
 @pytest.mark.parametrize(
+    ("write", "sigma_s"),
+    [
+        (str, 0.0),
+        (lambda t: str(t // 10**3), 1e-6 / 12**0.5),
+        (lambda t: str(t // 10**6), 1e-3 / 12**0.5),
+        (lambda t: f"{t * 1e-9:.3f}", 1e-3 / 12**0.5),
+        (lambda t: f"{t // 10**9}.{t % 10**9:09d}", 0.0),
+        (lambda t: f"{t:.15e}", 1e3 * 1e-9 / 12**0.5),
+    ],
+)
+def test_coarse_stamps_leave_the_time_shift_uncertain(tmp_path, write_asl, write, sigma_s):
+    """Steps of a millisecond may move all readings alike: no image can show that."""
+    folder = write_asl(tmp_path / "a")
+    path = folder / "mav0/imu0/data.csv"
+    lines = path.read_text().splitlines()
+    for i, line in enumerate(lines):
+        stamp, comma, rest = line.partition(",")
+        if stamp.isdigit():
+            lines[i] = write(int(stamp)) + comma + rest
+    path.write_text("\n".join(lines) + "\n")
+    recording = open_recording(folder)
+    assert recording.stamp_sigma_s.get("imu0", 0.0) == pytest.approx(sigma_s)
+    assert any("in steps of 1 ms" in w for w in recording.warnings) == (sigma_s > 1e-4)
+
+
+@pytest.mark.parametrize(
     ("unit", "factor", "digits"),
     [("seconds", 10**9, 9), ("milliseconds", 10**6, 3), ("microseconds", 10**3, 0)],
 )

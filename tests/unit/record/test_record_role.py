@@ -202,6 +202,17 @@ def test_quota_deletes_the_oldest_of_ours_only(make, tmp_path):
     assert int(recorder.status(RecordQueue(), 0).values["files_deleted"]) > 0
 
 
+def test_a_disk_without_room_from_the_start_is_reported_once(make, tmp_path, monkeypatch, caplog):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=4_000_000))
+    recorder = make(reserve_bytes=5_000_000)
+    for _ in range(3):
+        recorder._retry_ns = 0
+        recorder.tick()
+    assert not recorder.recording
+    assert [r.levelname for r in caplog.records if "not recording: the disk" in r.message] == ["WARNING"]
+
+
 def test_reserve_stops_before_the_disk_is_full(make, tmp_path, monkeypatch):
     free = [10_000_000]
     usage = shutil.disk_usage(tmp_path)

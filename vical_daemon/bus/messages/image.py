@@ -21,6 +21,8 @@ _ENCODINGS = {
     "bgr8": ("u1", 3), "rgb8": ("u1", 3), "8UC3": ("u1", 3), "bgra8": ("u1", 4), "rgba8": ("u1", 4),
     "bayer_rggb8": ("u1", 1), "bayer_bggr8": ("u1", 1), "bayer_gbrg8": ("u1", 1), "bayer_grbg8": ("u1", 1),
 }  # fmt: skip
+_LUMINANCE = {"yuyv": 0, "yuv422_yuy2": 0, "uyvy": 1, "yuv422": 1}
+"""Formats of two bytes a pixel: which of them is its luminance (ROS 2, image_encodings.hpp)."""
 # our name of a lens model -> ROS name; radtan is plumb_bob without its fifth coefficient k3
 _MODEL_TO_ROS = {"radtan": "plumb_bob"}
 _MODEL_FROM_ROS = {"fisheye": "equidistant"}
@@ -53,9 +55,14 @@ class ImageMessage:
     def pixels(self) -> npt.NDArray[Any]:
         """Return the image, shape (height, width) or (height, width, channels); a read-only view.
 
+        Of YUV 4:2:2 it is the luminance, as a copy.
+
         Raises:
             MessageError: A pixel format that this program does not know.
         """
+        if self.encoding in _LUMINANCE and self.step >= 2 * self.width:
+            rows = np.frombuffer(self.data, np.uint8).reshape(self.height, self.step)
+            return np.ascontiguousarray(rows[:, _LUMINANCE[self.encoding] : 2 * self.width : 2])
         if self.encoding not in _ENCODINGS:
             raise MessageError(f"pixel format {self.encoding!r} is not supported; use mono8, mono16 or bgr8")
         code, channels = _ENCODINGS[self.encoding]

@@ -11,7 +11,7 @@ import numpy as np
 from vical_daemon.estimation.events import Event, EventKind
 from vical_daemon.estimation.inertial.imu_buffer import GAP_PERIODS
 from vical_daemon.estimation.measurements import IMAGE_GAP_S, PointsFrame
-from vical_daemon.estimation.result import CalibrationEstimate, TracePoint
+from vical_daemon.estimation.result import CalibrationEstimate, Status, TracePoint
 
 SEARCHED_S = 1.5
 """Steps of the time shift up to this size are found from the motion, s; of larger ones, the order in which
@@ -156,15 +156,22 @@ class ImageIntake:
 
 
 def by_present_stamps(
-    estimate: CalibrationEstimate, offsets_s: Mapping[str, float], stamp_sigma_s: float
+    estimate: CalibrationEstimate, offsets_s: Mapping[str, float], stamp_sigma_s: float, limit_s: float
 ) -> CalibrationEstimate:
     """Return an estimate made on axes without steps, with time shifts by the stamps as they come now.
+
+    It has not converged while the stamps themselves are known worse than a time shift must be.
 
     Args:
         estimate: By axes without steps.
         offsets_s: Added to the time shift of each camera, s.
-        stamp_sigma_s: How well the imu's stamps are known now, s; no image can show that.
+        stamp_sigma_s: How well stamps are known now, s; no image can show that.
+        limit_s: Largest sigma of a time shift that has converged, s.
     """
+    estimated = any(e.timeshift_sigma_s for e in estimate.cameras.values())
+    if estimate.status is Status.CONVERGED and estimated and stamp_sigma_s > limit_s:
+        reason = f"stamps are known to {1e3 * stamp_sigma_s:.1f} ms only, by how they arrive"
+        estimate = replace(estimate, status=Status.CONVERGING, reason=reason)
     cameras = {
         name: replace(
             e,

@@ -108,10 +108,10 @@ class SensorIntake:
         """Time shift by the stamps as they come now, minus that on the axis without steps, s."""
         return self._imu.shift_s + self._images.offset_s(camera)
 
-    def by_present_stamps(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
-        """Return an estimate with time shifts by the stamps as they come now."""
+    def by_present_stamps(self, estimate: CalibrationEstimate, limit_s: float) -> CalibrationEstimate:
+        """Return an estimate with time shifts by the stamps as they come now; `limit_s`: see there."""
         offsets = {name: self.offset_s(name) for name in estimate.cameras}
-        return by_present_stamps(estimate, offsets, self.stamp_sigma_s)
+        return by_present_stamps(estimate, offsets, self.stamp_sigma_s, limit_s)
 
     def trace_by_present_stamps(self, points: list[TracePoint], camera: str) -> list[TracePoint]:
         """Return the trace of a camera likewise."""

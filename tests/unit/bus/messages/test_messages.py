@@ -121,6 +121,18 @@ def test_image_is_what_rosbags_writes(encoding, shape, dtype, rng):
     np.testing.assert_array_equal(decoded.pixels(), image)
 
 
+@pytest.mark.parametrize(("encoding", "first"), [("yuyv", 0), ("yuv422_yuy2", 0), ("uyvy", 1), ("yuv422", 1)])
+def test_of_yuv_the_luminance_is_used(encoding: str, first: int) -> None:
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    raw = np.full((6, 8, 2), 128, np.uint8)
+    raw[:, :, first] = grey
+    decoded = m.decode_image(m.encode_image(1, "cam0", raw.reshape(6, 16), "mono8"))
+    message = replace(decoded, encoding=encoding, width=8)
+    np.testing.assert_array_equal(message.pixels(), grey)
+    with pytest.raises(m.MessageError, match="not supported"):
+        replace(message, width=9).pixels()
+
+
 def test_image_that_contradicts_itself_is_refused():
     image = np.zeros((4, 6), np.uint8)
     with pytest.raises(m.MessageError, match="cannot be sent"):

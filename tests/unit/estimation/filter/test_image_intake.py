@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from vical_daemon.estimation.filter.image_intake import ImageIntake
+from vical_daemon.estimation.filter.image_intake import ImageIntake, by_present_stamps
 from vical_daemon.estimation.measurements import PointsFrame
+from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
 from vical_daemon.estimation.wording import event_text
 
 RNG = np.random.default_rng(1)
@@ -99,3 +100,22 @@ def test_a_clock_that_is_set_forwards_is_no_gap(step_s):
     intake = ImageIntake()
     feed(intake, np.where(t < 2.5, t, t + step_s), t)
     assert intake.news() == []
+
+
+@pytest.mark.parametrize(
+    ("shift_sigma_s", "stamp_sigma_s", "status"),
+    [
+        (2e-5, 4e-4, Status.CONVERGED),
+        (2e-5, 5.4e-3, Status.CONVERGING),  # the acquiring process was stopped for 5 s
+        (0.0, 5.4e-3, Status.CONVERGED),  # a fixed time shift
+    ],
+)
+def test_nothing_has_converged_while_the_stamps_are_known_worse(shift_sigma_s, stamp_sigma_s, status):
+    pose = PoseEstimate([0.0] * 3, [1.0, 0.0, 0.0, 0.0], np.eye(6).tolist())
+    camera = CameraEstimate(pose, 0.0, shift_sigma_s, [], [], "", [], [], 0.0)
+    known = CalibrationEstimate(
+        1, Status.CONVERGED, "", 1.0, "", 30.0, 300, 3000, {"cam0": camera}, None, [], 1.0, 0.0
+    )
+    shown = by_present_stamps(known, {"cam0": 0.0}, stamp_sigma_s, limit_s=5e-4)
+    assert shown.status is status
+    assert ("known to 5.4 ms" in shown.reason) == (status is Status.CONVERGING)
