@@ -2,8 +2,8 @@
 
 python -m benchmarks euroc_stretches [--seconds 16] [--every 1 4 10]
 
-Stretches begun every 5 s are calibrated on their own, with all images and with each K-th alone, as of a slower
-camera. Differences from the answer of the whole are divided by the stretch's own sigmas.
+Stretches begun every 5 s are calibrated on their own, with all images and with each K-th alone, as of a
+slower camera. Differences from the answer of the whole are divided by the stretch's own sigmas.
 """
 
 from __future__ import annotations
@@ -69,7 +69,9 @@ def main(argv: list[str]) -> int:
     """Print a row for each lens and rate."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks euroc_stretches", description=__doc__)
     parser.add_argument("--seconds", type=float, default=16.0, help="of a stretch (default: 16)")
-    parser.add_argument("--every", type=int, nargs="+", default=[1, 4, 10], metavar="K", help="each K-th image")
+    parser.add_argument(
+        "--every", type=int, nargs="+", default=[1, 4, 10], metavar="K", help="each K-th image"
+    )
     args = parser.parse_args(argv)
     items, points = read(FOLDER), load_target(FOLDER / "target.yaml").points_m
     print(

@@ -38,8 +38,8 @@ _SHARE = 0.2  # of all images, at most in one sum: the long-run variance is then
 _FLOOR = 0.5
 _GAIN_START, _GAIN_END = 0.1, 0.01
 _MAX_SCALE = 4.0
-"""Corners twice as noisy as they look. What exceeds it at few images a second is the motion: with 16, EuRoC at
-5 Hz is weighted so that neither lens nor target are found to be off."""
+"""Corners twice as noisy as they look. What exceeds it at few images a second is the motion: with 16, the
+corners of EuRoC at 5 Hz weigh so little that neither lens nor target is found to be off."""
 _DEAD_BAND = 1.3
 _USUAL_AFTER = 20  # images that show the usual size of innovations
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
@@ -221,5 +221,7 @@ class Consistency:
         self._short += float(normal @ normal)
         self._long += float(self._sum @ self._sum) / images
         more = self._long / (MODES * self._weight) - 1.0
-        noise = math.sqrt((4.0 * images + 2.0 / images) / (3.0 * MODES * self._weight))  # of white innovations
+        noise = math.sqrt(
+            (4.0 * images + 2.0 / images) / (3.0 * MODES * self._weight)
+        )  # of white innovations
         self.factor = 1.0 + more if more > max(SURE_SIGMAS * noise, _FLOOR) else 1.0

@@ -90,7 +90,14 @@ def test_the_factor_does_not_depend_on_the_rate_of_the_images(rate_hz):
         a[k] = rho * a[k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=8)
     c = Consistency(memory=n)
     for k in range(n):
-        c.learn(k / rate_hz, UV, np.median(SIGMA) / np.sqrt(len(UV)) * (modes(UV) @ a[k]).reshape(-1, 2), LINEAR, np.eye(3), SIGMA)
+        c.learn(
+            k / rate_hz,
+            UV,
+            np.median(SIGMA) / np.sqrt(len(UV)) * (modes(UV) @ a[k]).reshape(-1, 2),
+            LINEAR,
+            np.eye(3),
+            SIGMA,
+        )
     assert c.factor == pytest.approx((1 + rho) / (1 - rho), rel=0.35)
 
 
