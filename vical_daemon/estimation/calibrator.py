@@ -263,12 +263,14 @@ class Calibrator:
             item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
             if item is None:
                 break
-            if self._lost is None and motion_is_lost(self.filter, self._buffer, item[1].camera, item[0]):
+            t_cam_s, frame = item
+            target = self.rig.target
+            if self._lost is None and motion_is_lost(self.filter, self._buffer, frame, t_cam_s, target):
                 self._lose_motion()
             if self._lost is None:
-                reports += self._one(item[1], item[0])
+                reports += self._one(frame, t_cam_s)
             else:
-                reports += self._find_motion(self._lost, item[1], item[0])
+                reports += self._find_motion(self._lost, frame, t_cam_s)
         return reports
 
     def _lose_motion(self) -> None:
@@ -286,7 +288,7 @@ class Calibrator:
                 return []
             lost = self._seek(f, lost, frame.camera)
         self._buffer.trim((lost.frames[0][0] if lost.frames else t_cam_s) - _KEEP_S)
-        motion = lost.motion(f.state, self.rig.layout, f.sigmas(), self._buffer)
+        motion = lost.motion(f, self._buffer)
         if motion is None:
             return []
         self._lost = None
