@@ -264,3 +264,17 @@ def test_images_that_hardly_show_the_pose_begin_no_motion_until_better_ones_come
     assert late.motion(f, c._buffer).sigmas[0] > 0.03
     whole = collected(frames[:10], everything)
     assert whole.motion(f, c._buffer).sigmas[0] == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("step_s", [2e-3, 5e-3])
+def test_a_step_of_milliseconds_is_a_step_and_no_bump(step_s):
+    rig = reference_rig(141, bumps=(Bump(BEGIN_S, timeshift_s=step_s),))
+    stepped = simulate(141, BEGIN_S + 6.0, rig=rig)
+    estimate, events, _ = calibrate(stepped)
+    found = [e for e in events if e.kind is EventKind.TIMESHIFT_STEPPED]
+    assert not any(
+        e.kind in (EventKind.BUMPED, EventKind.STARTED_OVER, EventKind.CLOCK_WANDER) for e in events
+    )
+    assert [e.value for e in found] == pytest.approx([step_s], abs=3e-4)
+    cam = estimate.cameras["cam0"]
+    assert abs(cam.timeshift_cam_imu_s - rig.timeshift_cam_imu_s - step_s) < 4.0 * cam.timeshift_sigma_s

@@ -173,7 +173,7 @@ def _sigmas_seen(seen: TargetPose, f: CalibrationFilter) -> tuple[float, float]:
 
 
 def motion_is_lost(
-    f: CalibrationFilter, buffer: ImuBuffer, frame: PointsFrame, t_cam_s: float, target: FloatArray
+    f: CalibrationFilter, buffer: ImuBuffer, t_cam_s: float, frame: PointsFrame, target: FloatArray
 ) -> bool:
     """Whether the motion at an image cannot be had from the one before: readings miss, or it drifted far.
 
@@ -182,8 +182,8 @@ def motion_is_lost(
     Args:
         f: The filter, after an image before.
         buffer: Inertial readings.
+        t_cam_s: Stamp of the image, s.
         frame: The image.
-        t_cam_s: Its stamp, s.
         target: Points of the target, m, shape (n, 3).
     """
     camera = _camera(f.state, frame)
