@@ -350,7 +350,7 @@ class Calibrator:
         assert self._buffer is not None
         ratio = self._held_back.follow(f, report, frame, t_cam_s, self.rig.target, self._buffer)
         if ratio is not None:
-            self.evaluator.held_back(ratio, f.consistency[frame.camera])
+            self.evaluator.held_back(ratio, f, frame.camera)
 
     def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""

@@ -17,7 +17,6 @@ from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.frame_report import FrameReport
 from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
-from vical_daemon.estimation.noise.consistency import Consistency
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, HeldOutCheck, Status
 from vical_daemon.estimation.selection import clock_drift, model_mixture, model_selection
 from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict, lens_known, lens_verdict
@@ -75,16 +74,17 @@ class StatusEvaluator(Evaluator):
         """The rig is not what it was: the calibration is being taken anew."""
         self._change(why, Status.INCONSISTENT)
 
-    def held_back(self, ratio: float, consistency: Consistency) -> None:
+    def held_back(self, ratio: float, f: CalibrationFilter, camera: str) -> None:
         """Take in how well the imu alone predicted an image.
 
         Args:
             ratio: Squared error over its predicted variance.
-            consistency: Of the camera.
+            f: The filter.
+            camera: Its name.
         """
         self._held_back.append(ratio)
         self.held_out.append(HeldOutCheck(self.elapsed_s, ratio))
-        error = imu_noise_error(self._held_back, consistency)
+        error = imu_noise_error(self._held_back, f, camera)
         if error is not None:
             self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
 
