@@ -39,6 +39,7 @@ from vical_daemon.estimation.status.change_watch import Action, ChangeWatch
 from vical_daemon.estimation.status.holdout_check import HoldoutCheck
 from vical_daemon.estimation.status.recent_past import RecentPast
 from vical_daemon.estimation.status.status_evaluator import StatusEvaluator
+from vical_daemon.estimation.status.what_jumped import Part, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
@@ -241,20 +242,18 @@ class Calibrator:
     def _estimate_readout(self, camera: str, axis: str) -> None:
         """A rolling shutter of which nothing was said: its readout is one more unknown from now on."""
         self.rig.estimate_readout(camera, axis)
-        self.evaluator.layout = self.rig.layout
-        self._initializer.go_on_with(self.rig.layout, self.rig.target, self._resized)
+        self._rig_changed()
         self.evaluator.announce(Event(ROLLING[axis], camera))
 
     def _resize(self, size: float) -> None:
         """Take the target for `size` times as large as in its file; where that is far off, estimate it."""
         self.rig.resize(size)
-        self.evaluator.layout = self.rig.layout
-        self._initializer.go_on_with(self.rig.layout, self.rig.target, self._resized)
+        self._rig_changed()
 
-    @property
-    def _resized(self) -> set[str]:
-        """Whether the target is by far not as large as in its file, as what is known to be off."""
-        return {model_selection.SIZE} if self.rig.size != 1.0 else set()
+    def _rig_changed(self) -> None:
+        self.evaluator.layout = self.rig.layout
+        off = {model_selection.SIZE} if self.rig.size != 1.0 else set()
+        self._initializer.go_on_with(self.rig.layout, self.rig.target, off)
 
     def _follow(self, *, flush: bool) -> list[FrameReport]:
         """Filter every pending frame that inertial data already bracket."""
@@ -264,7 +263,7 @@ class Calibrator:
             item = self._pending.pop(shifts, self._buffer.newest_s, flush=flush)
             if item is None:
                 break
-            if self._lost is None and motion_is_lost(self.filter, self._buffer, item[1].camera, item[0]):
+            if self._lost is None and motion_is_lost(self.filter, self._buffer, *item, self.rig.target):
                 self._lose_motion()
             if self._lost is None:
                 reports += self._one(item[1], item[0])
@@ -287,7 +286,7 @@ class Calibrator:
                 return []
             lost = self._seek(f, lost, frame.camera)
         self._buffer.trim((lost.frames[0][0] if lost.frames else t_cam_s) - _KEEP_S)
-        motion = lost.motion(f.state, self.rig.layout, f.sigmas(), self._buffer)
+        motion = lost.motion(f, self._buffer)
         if motion is None:
             return []
         self._lost = None
@@ -331,8 +330,9 @@ class Calibrator:
             return [report]
         self._note(f, report, frame, t_cam_s)
         if self._unproven is not None and f.state.t_s > self._unproven[0]:
-            self._announce_step(f, *self._unproven[1:])
-            self._unproven = None
+            (_, camera, before_s), self._unproven = self._unproven, None
+            step_s = f.state.cameras[camera].timeshift_s - before_s
+            self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
         for block, event in self._acceptance.look(f).items():
             self.evaluator.announce(event, once=block)
         self._act(self.watch.look(report, f), frame)
@@ -351,14 +351,14 @@ class Calibrator:
         assert self._buffer is not None
         ratio = self._held_back.follow(f, report, frame, t_cam_s, self.rig.target, self._buffer)
         if ratio is not None:
-            self.evaluator.held_back(ratio, f.consistency[frame.camera].scale)
+            self.evaluator.held_back(ratio, f, frame.camera)
 
     def _act(self, action: Action, frame: PointsFrame) -> None:
         """Do what the watch over changes asks for."""
         f = self.filter
         assert f is not None
         changed = action in (Action.POSE, Action.RESTART)
-        if changed and self._unproven is None and self._shift_stepped(f, frame.camera):
+        if changed and self._unproven is None and self._clock_changed(f, frame.camera):
             return
         if action is Action.POSE:
             self._lose_motion()
@@ -370,11 +370,10 @@ class Calibrator:
         elif action is Action.RESTART:
             self._restart(f)
 
-    def _shift_stepped(self, f: CalibrationFilter, camera: str) -> bool:
-        """See whether images disagree because the time shift stepped; then go on with that alone unknown.
+    def _clock_changed(self, f: CalibrationFilter, camera: str) -> bool:
+        """See whether images disagree because of the camera's clock; then go on with that alone unknown.
 
-        Asked of the calibration as it was before: images after the step have moved the present one, above all
-        its lens, until the misfit is no longer one of the time shift alone.
+        Asked of the calibration from before: images since have moved the present one, above all its lens.
         """
         assert self._buffer is not None
         if self.rig.layout.cameras[camera].timeshift is None or f.unobservable is not None:
@@ -382,7 +381,7 @@ class Calibrator:
         before = self._past.filter(f)
         fit = self._past.find_shift(before, camera, self._buffer, self.rig.target)
         if fit is None or not fit.stepped:
-            return False
+            return self._clock_jumped(before, camera)
         self.filter = before
         for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
             self._step(before, kept, t_cam_s)
@@ -391,9 +390,19 @@ class Calibrator:
         self._lose_motion()
         return True
 
-    def _announce_step(self, f: CalibrationFilter, camera: str, before_s: float) -> None:
-        step_s = f.state.cameras[camera].timeshift_s - before_s
-        self.evaluator.announce(Event(EventKind.TIMESHIFT_STEPPED, camera, step_s))
+    def _clock_jumped(self, before: CalibrationFilter, camera: str) -> bool:
+        """See whether a step that orientations do not show, or another rate, explains the images best."""
+        part, f = what_jumped(before, self._past.since(before), camera, self._step)
+        if part in (Part.NONE, Part.MOUNTING):
+            return False
+        self.filter = f
+        if part is Part.DRIFT:
+            self.evaluator.announce(clock_drift.let_drift(f, camera, anew=True), once=f"wander {camera}")
+        else:
+            self._unproven = (f.state.t_s + _STANDS_S, camera, before.state.cameras[camera].timeshift_s)
+        self.watch.shift_reopened()
+        self.evaluator.reopened(f.state.t_s)
+        return True
 
     def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
         """Take a time shift as found anew, all else as it is known; the step, s."""

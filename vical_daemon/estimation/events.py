@@ -289,7 +289,8 @@ REFERENCE: dict[EventKind, About] = {
         "The IMU's noise densities in the config are wrong. Value: error of predictions over the expected "
         "one.",
         "1",
-        "Once, after 20 predicted images, outside of 0.74 to 1.22.",
+        "Once, after 20 predicted images, outside of 0.74 to 1.22; not where the readings show their white "
+        "noise and errors of the images last.",
     ),
     EventKind.IMU_INTRINSICS: About(
         "Scale or alignment of the IMU is off; allowed for. Value: the most certain entry.",

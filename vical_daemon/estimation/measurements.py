@@ -37,6 +37,12 @@ class ImuNoise:
     rate_hz: float = 100.0
 
 
+class MeasuredNoise(ImuNoise):
+    """White noise of both sensors is what the readings show, whatever was stated."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True, slots=True)
 class CameraPrior:
     """What is known about a camera before the first frame.

@@ -19,7 +19,7 @@ import numpy as np
 
 from vical_daemon.bus.messages import MessageError, decode_compressed_image, decode_image, decode_points
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
-from vical_daemon.logs.even_stamps import CERTAIN, EvenStamps, envelope, rounded
+from vical_daemon.logs.even_stamps import CERTAIN, EvenStamps, envelope, rounded, summary
 
 _BLOCK = 20
 """Of so many images the earliest arrival counts: with exponential delays it is late by 1/20 of their mean."""
@@ -214,12 +214,11 @@ def _grid_of(t_ns: IntArray, t_s: FloatArray, period_s: float, count: int | None
         period_s = _period_s(t_s, slots, bounds, period_s)
     t_ns, t_s, slots = t_ns[:count], t_s[:count], slots[:count]
     bounds = [*(bound for bound in bounds if bound < len(t_s)), len(t_s)]
-    even_s, scatter_s = np.empty_like(t_s), []
+    even_s, found = np.empty_like(t_s), []
     for a, b in pairwise(bounds):
         grid_s = period_s * slots[a:b]
-        line_s, scatter = envelope(grid_s, t_s[a:b] - grid_s, _BLOCK)
-        even_s[a:b] = grid_s + line_s
-        scatter_s.append(scatter)
+        found.append(envelope(grid_s, t_s[a:b] - grid_s, _BLOCK))
+        even_s[a:b] = grid_s + found[-1].late_s
     taken_s = t_s - even_s
     new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
     middle_s = float(np.median(taken_s))
@@ -229,7 +228,7 @@ def _grid_of(t_ns: IntArray, t_s: FloatArray, period_s: float, count: int | None
     if jitter_s < _EVEN_S or rounded(t_ns, taken_s, period_s):
         return None
     largest_s = float(taken_s.max()) - middle_s
-    return EvenStamps(new_ns, jitter_s, largest_s, float(np.median(scatter_s)), len(bounds) - 1)
+    return EvenStamps(new_ns, jitter_s, largest_s, *summary(found))
 
 
 def _slots(t_s: FloatArray, period_s: float) -> IntArray:

@@ -229,10 +229,52 @@ def test_the_motion_found_anew_is_the_true_one(run, so_far):
     for x in frames:
         t_cam_s = (x.t_cam_ns - int(run.t_imu_ns[0])) * 1e-9
         restart.take(PointsFrame("cam0", x.t_cam_ns, x.ids, x.uv_px), t_cam_s, f.state, c._buffer)
-    motion = restart.motion(f.state, c.rig.layout, f.sigmas(), c._buffer)
+    motion = restart.motion(f, c._buffer)
     tau = np.array([motion.t_s + base_s])
     truth = run.rig.trajectory
     turn = np.arccos(np.clip((np.trace(truth.R_world_imu(tau)[0].T @ motion.R_world_imu) - 1) / 2, -1, 1))
     assert turn < 0.3 * motion.sigmas[0]
     assert np.abs(truth.p_world_imu(tau)[0] - motion.p_world_imu).max() < 0.5 * motion.sigmas[3]
     assert np.abs(truth.v_world_imu(tau)[0] - motion.v_world_imu).max() < motion.sigmas[6]
+
+
+def test_images_that_hardly_show_the_pose_begin_no_motion_until_better_ones_come(run, so_far):
+    """A corner of the board, where innovations have shown that the images of the camera are off by more."""
+    c, events, shots = pickle.loads(so_far)
+    follow(c, events, shots, [x for x in stream(run) if COMMON_S <= x[0] < BEGIN_S + BACK_S])
+    f = c.filter
+    f.consistency["cam0"].scale, f.consistency["cam0"].factor = 12.0, 6.0
+    frames = [x for x in run.frames if BEGIN_S < x.t_s < BEGIN_S + BACK_S - 0.5]
+
+    def collected(images, ids):
+        restart = MotionRestart(run.points_m, {})
+        for x in images:
+            seen = np.isin(x.ids, ids)
+            t_cam_s = (x.t_cam_ns - int(run.t_imu_ns[0])) * 1e-9
+            restart.take(
+                PointsFrame("cam0", x.t_cam_ns, x.ids[seen], x.uv_px[seen]), t_cam_s, f.state, c._buffer
+            )
+        return restart
+
+    corner, everything = [0, 1, 2, 3, 9, 10, 11, 12], np.arange(len(run.points_m))
+    few = collected(frames[:10], corner)
+    assert len(few.frames) >= 3
+    assert few.motion(f, c._buffer) is None
+    late = collected(frames, corner)
+    assert late.motion(f, c._buffer).sigmas[0] > 0.03
+    whole = collected(frames[:10], everything)
+    assert whole.motion(f, c._buffer).sigmas[0] == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("step_s", [2e-3, 5e-3])
+def test_a_step_of_milliseconds_is_a_step_and_no_bump(step_s):
+    rig = reference_rig(141, bumps=(Bump(BEGIN_S, timeshift_s=step_s),))
+    stepped = simulate(141, BEGIN_S + 6.0, rig=rig)
+    estimate, events, _ = calibrate(stepped)
+    found = [e for e in events if e.kind is EventKind.TIMESHIFT_STEPPED]
+    assert not any(
+        e.kind in (EventKind.BUMPED, EventKind.STARTED_OVER, EventKind.CLOCK_WANDER) for e in events
+    )
+    assert [e.value for e in found] == pytest.approx([step_s], abs=3e-4)
+    cam = estimate.cameras["cam0"]
+    assert abs(cam.timeshift_cam_imu_s - rig.timeshift_cam_imu_s - step_s) < 4.0 * cam.timeshift_sigma_s

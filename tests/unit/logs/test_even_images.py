@@ -81,6 +81,16 @@ def test_exponential_delays_are_taken_off(mean_s, seed) -> None:
     assert "images were put on an even grid" in even.describe("cam0", "images")
 
 
+@pytest.mark.parametrize("seed", [700, 701, 702])
+def test_stamps_that_are_early_and_late_alike_follow_their_mean(seed) -> None:
+    taken_s = truth_s()
+    even = decided(taken_s, taken_s + 1e-3 * np.random.default_rng(seed).standard_normal(len(taken_s)))
+    assert even is not None
+    assert not even.delays
+    assert "mean of the stamps" in even.describe("cam0", "images")
+    assert np.abs(errors_ms(even, taken_s)).max() < 0.4
+
+
 def test_a_first_image_that_is_late() -> None:
     late_s = delays_s(COUNT, 2e-3)
     late_s[0] = 18e-3

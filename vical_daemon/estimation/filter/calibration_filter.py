@@ -18,9 +18,11 @@ from vical_daemon.estimation.filter.image_update import (
     corner_gate,
     curved_share,
     frame_limit,
+    log_likelihood,
     rows_of,
     solve,
 )
+from vical_daemon.estimation.filter.jump_scores import JumpScores
 from vical_daemon.estimation.filter.lever_arm_score import MOTION_ERRORS, UNCERTAIN, LeverArmScore
 from vical_daemon.estimation.filter.linearise import (
     Image,
@@ -85,6 +87,7 @@ class CalibrationFilter:
         arm_score: Bias of lever arms by noise of the gyro; None: no image yet, or the motion was lost.
         arm_scores: What it has given so far, 1/m, shape (3 cameras,); 0: nothing yet.
         by_clipping: See `Influence`, of the latest segment.
+        jumps: Asked for while something has changed, and nobody knows what.
     """
 
     state: State
@@ -106,6 +109,7 @@ class CalibrationFilter:
     arm_score: LeverArmScore | None = None
     arm_scores: FloatArray | float = 0.0
     by_clipping: FloatArray | None = None
+    jumps: JumpScores | None = None
     _motion_straight: LinearityMonitor = field(default_factory=LinearityMonitor)
     _view_straight: dict[str, LinearityMonitor] = field(default_factory=dict)
 
@@ -118,6 +122,8 @@ class CalibrationFilter:
         state = self.state
         moved, Q = self._moved(segment)
         self.by_clipping = moved.influence.by_clipping()
+        if self.jumps is not None:
+            self.jumps.predict(moved.linear, self.S[: self.layout.dynamic, : self.layout.dynamic])
         self._grow(moved, Q)
         self._predict_score(moved, Q)
         state.R_world_imu, state.p_world_imu, state.v_world_imu = orthonormal(moved.R), moved.p, moved.v
@@ -216,6 +222,7 @@ class CalibrationFilter:
             fit.dof,
             float(np.median(image.sigma_px)) * fit.noise,
             predicted_px=predicted,
+            log_likelihood=log_likelihood(fit, len(keep) - int(keep.sum())),
         )
 
     def _by_held(self, lin: Linear) -> FloatArray:
@@ -261,7 +268,10 @@ class CalibrationFilter:
     def _refused(image: Image, residual: FloatArray, predicted: FloatArray, why: str) -> FrameReport:
         none = np.zeros(len(image.ids), dtype=bool)
         return FrameReport(
-            image.t_ns, image.camera, image.ids, image.uv, residual, none, False, 0.0, 0, 0.0, why, predicted
+            *(image.t_ns, image.camera, image.ids, image.uv, residual, none, False),
+            reason=why,
+            predicted_px=predicted,
+            log_likelihood=log_likelihood(None, 0),
         )
 
     def prediction_nis(self, image: Image) -> float | None:

@@ -20,6 +20,7 @@ from vical_daemon.estimation.significance import (
     chi_square_limit,
 )
 
+_POSE = 6  # degrees of freedom
 _CORNER_GATE = chi_square_limit(2, CORNER_REFUSED)
 _RESIDUAL_GATE = chi_square_limit(2, RESIDUAL_REFUSED)
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
@@ -47,6 +48,7 @@ class ImageFit:
         ways: The ways of the kept rows, whitened and compressed: sums over the rows stay, shape (m, k).
         r: Their innovation, shape (m,).
         rows: Ways and innovation of the kept rows, whitened, where the fit is linearised; (2n, k), (2n,).
+        log_det: Logarithm of the determinant of the covariance of what the state can explain, whitened.
         noise: Of the kept corners over `Image.sigma_px`; by both all but `rest` and `left` is whitened.
     """
 
@@ -61,7 +63,21 @@ class ImageFit:
     ways: FloatArray
     r: FloatArray
     rows: tuple[FloatArray, FloatArray]
+    log_det: float
     noise: float
+
+
+def log_likelihood(fit: ImageFit | None, refused: int) -> float:
+    """Of an image, by its innovation, up to a constant: what is refused counts as if it were at its gate.
+
+    Args:
+        fit: Its correction; None: it was refused.
+        refused: Corners that did not take part.
+    """
+    if fit is None:
+        return -0.5 * frame_limit(_POSE)
+    squares, rows = fit.nis + fit.rest / fit.noise**2, 2 * int(np.count_nonzero(fit.keep))
+    return -0.5 * (squares + fit.log_det - rows + refused * _CORNER_GATE) - rows * math.log(fit.noise)
 
 
 def rows_of(keep: BoolArray) -> BoolArray | slice:
@@ -172,5 +188,6 @@ def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray) -> Imag
         R[:, :k] / noise,
         r_small / noise,
         (kept[:, :k] / noise, r_kept / noise),
+        c.log_det,
         noise,
     )

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> None:
-    """Take what an image says about shared errors and lens.
+    """Take what an image says about shared errors, lens and jumps.
 
     Args:
-        f: The filter, still as predicted; its `shared` and `agreement` learn.
+        f: The filter, still as predicted; its `shared`, `agreement` and `jumps` learn.
         image: The image.
         lin: The image about the prediction.
         fit: Its correction, not yet accepted.
@@ -27,6 +27,8 @@ def learn(f: CalibrationFilter, image: Image, lin: Linear, fit: ImageFit) -> Non
     where = f.layout.cameras[image.camera]
     # a fit far from straight is linearised elsewhere
     rows = whitened(image, lin, fit) if lin.curved.size else fit.rows
+    if f.jumps is not None:
+        f.jumps.update(rows, lin.by_error, lin.moves, f.S)
     shared, agreement = f.shared.get(image.camera), f.agreement.get(image.camera)
     if shared is not None:
         ways, innovation = rows if lin.curved.size else (fit.ways, fit.r)

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise
+from vical_daemon.estimation.measurements import FloatArray, ImuNoise, MeasuredNoise
 
 _LENGTH = 64  # readings of a stretch
 _LEAST = 6  # stretches: with 16 frequencies and three channels the density is known to 5 %
@@ -35,10 +35,13 @@ def measured_noise(stated: ImuNoise, rows: FloatArray) -> ImuNoise:
         rows: Readings: t_s, gyro xyz, rad/s, accelerometer xyz, m/s^2; shape (n, 7).
     """
     gyro, accel = white_noise(rows)
-    return replace(
-        stated,
-        gyro_density=_within(stated.gyro_density, gyro),
-        accel_density=_within(stated.accel_density, accel),
+    kind = ImuNoise if gyro is None or accel is None else MeasuredNoise
+    return kind(
+        _within(stated.gyro_density, gyro),
+        stated.gyro_walk,
+        _within(stated.accel_density, accel),
+        stated.accel_walk,
+        stated.rate_hz,
     )
 
 

@@ -1,10 +1,15 @@
 """The motion anew from a few images, with the calibration as it is known: after gaps and lost poses.
 
 Pose from the target; velocity linear in positions: `LinearMotion` with everything but p_0 and v_0 known.
+
+A few corners at the edge of an image, where the lens fits least, give a pose that is off by many times what
+its residuals say: on EuRoC 16 to 24 corners by 4 to 12 deg, at 0.7 to 1.0 deg. What innovations have shown to
+be wrong with the images of a camera widens its poses, too.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -21,7 +26,6 @@ from vical_daemon.estimation.model.state import (
     POSITION,
     VELOCITY,
     CameraState,
-    Layout,
     MotionStart,
     State,
 )
@@ -32,7 +36,8 @@ _WIDE_RAD = 0.03
 """Sigma of attitude up to which images are near to linear, rad."""
 _WIDE_SHARE = 0.03
 """Likewise of position, of the distance to the target."""
-_WIDE_MPS = 0.3  # of velocity: ten times what the images give
+_WAIT_S = 2.0  # for an image that shows the pose so well: a board comes back into view within seconds, or not
+_WIDE_MPS = 0.3  # of velocity: ten times what a board in full view gives
 
 
 class Poses(NamedTuple):
@@ -94,17 +99,16 @@ class MotionRestart:
         if self.frames and self.frames[0][0] < t_cam_s:
             self.frames, self._seen = self.frames[first:], self._seen[first:]
 
-    def motion(
-        self, state: State, layout: Layout, sigmas: FloatArray, buffer: ImuBuffer
-    ) -> MotionStart | None:
+    def motion(self, f: CalibrationFilter, buffer: ImuBuffer) -> MotionStart | None:
         """Motion at the first image collected; None while the images do not suffice.
 
         Args:
-            state: With the calibration as it is known.
-            layout: Where the errors live.
-            sigmas: Of all errors, shape (n,).
+            f: With the calibration as it is known.
             buffer: Inertial readings.
         """
+        state = f.state
+        if not self._begins_well(f):
+            return None
         poses = self._poses(state)
         if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
             return None
@@ -114,9 +118,17 @@ class MotionRestart:
             return None
         known = np.concatenate([np.zeros(3), state.gravity, np.zeros(3), state.accel_bias])
         start = linear_start(found, poses.p, np.ones(len(t_s)), unknown=[SPEED], known=known)
-        wide = self._sigmas(poses.first, layout, sigmas, float(found.T[-1]))
+        wide = sigmas_of_motion(poses.first, f, float(found.T[-1]))
         elapsed_s = self._elapsed_s(poses.first.frame, float(t_s[0]) - state.t_s)
         return MotionStart(float(t_s[0]), R[0], start.p_world_cam, start.v_world_imu, wide, elapsed_s)
+
+    def _begins_well(self, f: CalibrationFilter) -> bool:
+        """Begin with an image that shows the pose; False: none does so far, and better ones may come."""
+        for (t_cam_s, _), seen in zip(self.frames, self._seen, strict=True):
+            if seen is not None and _near(*_sigmas_seen(seen, f), _distance_m(seen.p_target_cam)):
+                self.drop_before(t_cam_s)
+                return True
+        return bool(self.frames) and self.frames[-1][0] - self.frames[0][0] > _WAIT_S
 
     def _poses(self, state: State) -> Poses | None:
         """Poses of the imu by the images collected and the calibration as it is known."""
@@ -136,24 +148,46 @@ class MotionRestart:
         by_camera_s = np.inf if before_ns is None else 1e-9 * (frame.t_cam_ns - before_ns)
         return max(min(by_imu_s, by_camera_s), 0.0)
 
-    def _sigmas(self, seen: TargetPose, layout: Layout, sigmas: FloatArray, span_s: float) -> FloatArray:
-        """Many times what the images give, which will be used once more to correct the motion."""
-        where = layout.cameras[seen.frame.camera]
-        turn = float(sigmas[where.rotation].max()) if where.rotation is not None else 0.0
-        arm = float(sigmas[where.position].max()) if where.position is not None else 0.0
-        out = np.empty(9)
-        out[ATTITUDE] = max(_WIDE_RAD, AGAIN_SIGMAS * turn)
-        out[POSITION] = max(_WIDE_SHARE * _distance_m(seen.p_target_cam), AGAIN_SIGMAS * arm)
-        out[VELOCITY] = max(_WIDE_MPS, AGAIN_SIGMAS * arm / span_s)
-        return out
+
+def sigmas_of_motion(seen: TargetPose, f: CalibrationFilter, span_s: float) -> FloatArray:
+    """Sigmas of the motion, shape (9,): many times what the images give where these show a whole board.
+
+    They will be used once more to correct the motion.
+    """
+    where, sigmas = f.layout.cameras[seen.frame.camera], f.sigmas()
+    turn = float(sigmas[where.rotation].max()) if where.rotation is not None else 0.0
+    arm = float(sigmas[where.position].max()) if where.position is not None else 0.0
+    seen_rad, seen_m = _sigmas_seen(seen, f)
+    out = np.empty(9)
+    out[ATTITUDE] = max(_WIDE_RAD, AGAIN_SIGMAS * turn, seen_rad)
+    out[POSITION] = max(_WIDE_SHARE * _distance_m(seen.p_target_cam), AGAIN_SIGMAS * arm, seen_m)
+    out[VELOCITY] = max(_WIDE_MPS, AGAIN_SIGMAS * arm / span_s, seen_m / span_s)
+    return out
 
 
-def motion_is_lost(f: CalibrationFilter, buffer: ImuBuffer, camera: str, t_cam_s: float) -> bool:
+def _sigmas_seen(seen: TargetPose, f: CalibrationFilter) -> tuple[float, float]:
+    """Sigmas of a pose by one image, rad and m, with what is known of errors that its corners share."""
+    consistency = f.consistency[seen.frame.camera]
+    wider = math.sqrt(consistency.scale * consistency.factor)
+    return wider * seen.sigma_rad, wider * seen.sigma_m
+
+
+def motion_is_lost(
+    f: CalibrationFilter, buffer: ImuBuffer, t_cam_s: float, frame: PointsFrame, target: FloatArray
+) -> bool:
     """Whether the motion at an image cannot be had from the one before: readings miss, or it drifted far.
 
-    Far is where the pose from the image itself would be as good.
+    Far is where images are not near to linear, and the pose from the image itself would be as good.
+
+    Args:
+        f: The filter, after an image before.
+        buffer: Inertial readings.
+        t_cam_s: Stamp of the image, s.
+        frame: The image.
+        target: Points of the target, m, shape (n, 3).
     """
-    t_s = t_cam_s + f.state.cameras[camera].timeshift_s
+    camera = _camera(f.state, frame)
+    t_s = t_cam_s + camera.timeshift_s
     if buffer.gap_within(f.state.t_s, t_s):
         return True
     if t_s < f.state.t_s + IMAGE_GAP_S:
@@ -164,8 +198,19 @@ def motion_is_lost(f: CalibrationFilter, buffer: ImuBuffer, camera: str, t_cam_s
     ahead = f.copy()
     ahead.predict(segment)
     sigmas = ahead.sigmas()
-    away_m = _distance_m(ahead.state.p_world_imu)
-    return bool(sigmas[ATTITUDE].max() > _WIDE_RAD or sigmas[POSITION].max() > _WIDE_SHARE * away_m)
+    turn, away = float(sigmas[ATTITUDE].max()), float(sigmas[POSITION].max())
+    if _near(turn, away, _distance_m(ahead.state.p_world_imu)):
+        return False
+    seen = pose_of(frame, t_cam_s, camera, target)
+    if seen is None:
+        return True
+    seen_rad, seen_m = _sigmas_seen(seen, f)
+    return turn > seen_rad or away > seen_m
+
+
+def _near(turn_rad: float, away_m: float, distance_m: float) -> bool:
+    """Whether images are near to linear about a pose, by its sigmas and the distance to the target."""
+    return turn_rad <= _WIDE_RAD and away_m <= _WIDE_SHARE * distance_m
 
 
 def _distance_m(p_target_cam: FloatArray) -> float:

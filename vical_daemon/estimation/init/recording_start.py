@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.init.linear_start import (
@@ -19,14 +20,14 @@ from vical_daemon.estimation.init.linear_start import (
     LinearStart,
     linear_start,
 )
-from vical_daemon.estimation.init.motion_restart import MotionRestart
+from vical_daemon.estimation.init.motion_restart import MotionRestart, sigmas_of_motion
 from vical_daemon.estimation.measurements import FloatArray, PointsFrame
 from vical_daemon.estimation.model.priors import (
     ACCEL_BIAS_SIGMA_MPS2,
     GRAVITY_SIGMA_RAD,
     GYRO_BIAS_SIGMA_RPS,
 )
-from vical_daemon.estimation.model.state import BiasStart, Layout, MotionStart, State
+from vical_daemon.estimation.model.state import BiasStart, MotionStart, State
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _LEAST_IMAGES = 8
@@ -44,10 +45,9 @@ class RecordingStart(MotionRestart):
         super().take(frame, t_cam_s, state, buffer)
         self.drop_before(t_cam_s - _MOST_S)
 
-    def motion(
-        self, state: State, layout: Layout, sigmas: FloatArray, buffer: ImuBuffer
-    ) -> MotionStart | None:
+    def motion(self, f: CalibrationFilter, buffer: ImuBuffer) -> MotionStart | None:
         """See `MotionRestart.motion`; the time between the recordings is not known, and taken as none."""
+        state = f.state
         poses = self._poses(state)
         if poses is None or len(poses.t_s) < _LEAST_IMAGES or poses.t_s[-1] - poses.t_s[0] < _LEAST_S:
             return None
@@ -59,7 +59,7 @@ class RecordingStart(MotionRestart):
             return None
         start = _linear(found, poses.p, state)
         span_s = float(poses.t_s[-1] - poses.t_s[0])
-        wide = self._sigmas(poses.first, layout, sigmas, span_s)
+        wide = sigmas_of_motion(poses.first, f, span_s)
         biases = BiasStart(
             gyro_bias,
             start.accel_bias,

@@ -27,6 +27,7 @@ class FrameReport:
         reason: Why a frame was refused; empty otherwise.
         predicted_px: Where the points were expected before the update, shape (n, 2); not-a-number where
             they could not be.
+        log_likelihood: Of the image by what was predicted, up to a constant.
     """
 
     t_ns: int
@@ -41,3 +42,4 @@ class FrameReport:
     sigma_px: float = 0.0
     reason: str = ""
     predicted_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    log_likelihood: float = 0.0

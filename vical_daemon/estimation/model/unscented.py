@@ -171,12 +171,14 @@ class Correction(NamedTuple):
         dx: State correction, shape (n,).
         nis: Normalised innovation squared of the rows given.
         solution: Most likely e and common c, shape (n + k,): dx = S_old e.
+        log_det: Logarithm of the determinant of the innovation's covariance, whitened.
     """
 
     S: FloatArray
     dx: FloatArray
     nis: float
     solution: FloatArray
+    log_det: float
 
 
 def correct(S: FloatArray, M: FloatArray, r: FloatArray) -> Correction:
@@ -203,4 +205,5 @@ def correct(S: FloatArray, M: FloatArray, r: FloatArray) -> Correction:
     signs = np.where(new.diagonal() < 0.0, -1.0, 1.0)
     dx = new @ y[:n]
     solution = solve_lower(Lambda, y)
-    return Correction(new * signs * _lower(n), dx, float(r @ r - y @ y), solution)
+    log_det = 2.0 * float(np.log(np.abs(Lambda.diagonal())).sum())
+    return Correction(new * signs * _lower(n), dx, float(r @ r - y @ y), solution, log_det)

@@ -67,6 +67,18 @@ class RecentPast:
                 return fit
         return None
 
+    def since(self, f: CalibrationFilter) -> Frames:
+        """Images that `f`, a filter from before, has not taken yet: stamps, s, and points, oldest first."""
+        shifts_s = {name: f.state.cameras[name].timeshift_s for name in self._frames}
+        newer = [
+            (t + shifts_s[name], t, frame)
+            for name, frames in self._frames.items()
+            for t, frame, _ in frames
+            if t + shifts_s[name] > f.state.t_s
+        ]
+        newer.sort(key=lambda x: x[0])
+        return [(t, frame) for _, t, frame in newer]
+
     def before_step(
         self, f: CalibrationFilter, fit: ShiftFit, camera: str, buffer: ImuBuffer, target: FloatArray
     ) -> Frames:
@@ -82,26 +94,18 @@ class RecentPast:
         Returns:
             Stamps, s, and points, of all cameras, oldest first.
         """
-        shifts_s = {name: f.state.cameras[name].timeshift_s for name in self._frames}
-        newer = [
-            (t + shifts_s[name], t, frame)
-            for name, frames in self._frames.items()
-            for t, frame, _ in frames
-            if t + shifts_s[name] > f.state.t_s
-        ]
-        own = [(t, frame) for _, t, frame in newer if frame.camera == camera]
+        newer = self.since(f)
+        own = [(t, frame) for t, frame in newer if frame.camera == camera]
         seen, rows = _orientations(own, f, target), buffer.rows
         if seen is None or len(rows) < 2:
             return []
-        curve = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias)
-        at = first_after_step(
-            curve, seen, f.state.cameras[camera].R_imu_cam, (shifts_s[camera], fit.timeshift_s)
-        )
+        curve, known = GyroCurve.integrate(rows[:, 0], rows[:, 1:4], f.state.gyro_bias), f.state.cameras
+        shift_s = known[camera].timeshift_s
+        at = first_after_step(curve, seen, known[camera].R_imu_cam, (shift_s, fit.timeshift_s))
         if at is None:
             return []
-        step_s = float(seen.t_cam_s[at]) + shifts_s[camera]
-        newer.sort(key=lambda x: x[0])
-        return [(t, frame) for t_s, t, frame in newer if t_s < step_s]
+        step_s = float(seen.t_cam_s[at]) + shift_s
+        return [(t, frame) for t, frame in newer if t + known[frame.camera].timeshift_s < step_s]
 
     def shift_of(
         self,

@@ -74,16 +74,17 @@ class StatusEvaluator(Evaluator):
         """The rig has changed: the calibration is found again."""
         self._change(why, Status.INCONSISTENT)
 
-    def held_back(self, ratio: float, scale: float) -> None:
+    def held_back(self, ratio: float, f: CalibrationFilter, camera: str) -> None:
         """Take in how well the imu alone predicted an image.
 
         Args:
             ratio: Squared error over its predicted variance.
-            scale: `Consistency.scale` of the camera.
+            f: The filter.
+            camera: Its name.
         """
         self._held_back.append(ratio)
         self.held_out.append(HeldOutCheck(self.elapsed_s, ratio))
-        error = imu_noise_error(self._held_back, scale)
+        error = imu_noise_error(self._held_back, f, camera)
         if error is not None:
             self.announce(Event(EventKind.IMU_NOISE, value=error), once="imu noise")
 

@@ -1,0 +1,54 @@
+"""Likelihood ratios of jumps from one run, against runs of a Kalman filter that knows of each jump."""
+
+import numpy as np
+import pytest
+
+from vical_daemon.estimation.filter.jump_scores import JumpScores
+
+IMAGES, SIGMA = 12, np.array([0.7, 0.4])
+
+
+@pytest.fixture
+def problem():
+    """Nine errors that move and three that do not; images of five rows in four ways."""
+    rng = np.random.default_rng(3)
+    F = np.eye(12)
+    F[:9, :9] += 0.1 * rng.standard_normal((9, 9))
+    images = [
+        (rng.standard_normal((5, 4)), rng.standard_normal((4, 12)), rng.standard_normal(5))
+        for _ in range(IMAGES)
+    ]
+    return F, images
+
+
+def run(F, images, jump_at=None):
+    """Log-likelihood, and the scores where no jump is known."""
+    S = 0.5 * np.eye(12)
+    mean, total = np.zeros(12), 0.0
+    scores = JumpScores.of(np.array([9, 11]), 12)
+    P = S @ S.T
+    for k, (ways, by_error, z) in enumerate(images):
+        if k == jump_at:
+            P = P.copy()
+            P[[9, 11], [9, 11]] += SIGMA**2
+        H = ways @ by_error
+        V = np.eye(5) + H @ P @ H.T
+        r = z - H @ mean
+        total -= 0.5 * (r @ np.linalg.solve(V, r) + np.linalg.slogdet(V)[1])
+        L = np.linalg.cholesky(P)
+        scores.begin()
+        scores.update((ways, r), by_error, by_error @ L, L)
+        K = P @ H.T @ np.linalg.inv(V)
+        mean, P = mean + K @ r, P - K @ H @ P
+        L = np.linalg.cholesky(P)
+        scores.predict(F[:9, :9] @ L[:9, :9], L[:9, :9])
+        mean, P = F @ mean, F @ P @ F.T
+    return total, scores
+
+
+def test_ratios_are_those_of_filters_that_know_of_the_jump(problem):
+    F, images = problem
+    without, scores = run(F, images)
+    ratios = scores.log_ratios(slice(0, 2), SIGMA)
+    expected = [run(F, images, k)[0] - without for k in range(IMAGES)]
+    assert ratios == pytest.approx(expected, abs=1e-9)
