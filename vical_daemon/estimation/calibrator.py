@@ -385,8 +385,8 @@ class Calibrator:
         self.filter = before
         for t_cam_s, kept in self._past.before_step(before, fit, camera, self._buffer, self.rig.target):
             self._step(before, kept, t_cam_s)
-        step_s = self._set_shift(before, camera, fit)
-        self._unproven = (f.state.t_s + _STANDS_S, camera, fit.timeshift_s - step_s)
+        self._unproven = (f.state.t_s + _STANDS_S, camera, before.state.cameras[camera].timeshift_s)
+        self._set_shift(before, camera, fit)
         self._lose_motion()
         return True
 
@@ -404,16 +404,14 @@ class Calibrator:
         self.evaluator.reopened(f.state.t_s)
         return True
 
-    def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> float:
-        """Take a time shift as found anew, all else as it is known; the step, s."""
-        index, known = self.rig.layout.cameras[camera].timeshift, f.state.cameras[camera]
+    def _set_shift(self, f: CalibrationFilter, camera: str, fit: ShiftFit) -> None:
+        """Take a time shift as found again, all else as it is known."""
+        index = self.rig.layout.cameras[camera].timeshift
         assert index is not None
-        step_s = fit.timeshift_s - known.timeshift_s
-        known.timeshift_s = fit.timeshift_s
+        f.state.cameras[camera].timeshift_s = fit.timeshift_s
         f.forget(index, max(AGAIN_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
         self.watch.shift_reopened()
         self.evaluator.reopened(f.state.t_s)
-        return step_s
 
     def _restart(self, f: CalibrationFilter) -> None:
         """The rig has changed: find mounting and delay anew in the data to come, and keep all else.
