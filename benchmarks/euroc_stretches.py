@@ -78,7 +78,8 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     items, points = read(FOLDER), load_target(FOLDER / "target.yaml").points_m
     print(
-        "| lens | images a second | mean z^2 (median) | largest z: median, largest | answered | converged | of these |\n"
+        "| lens | images a second | mean z^2 (median) | largest z: median, largest | answered | converged "
+        "| of these |\n"
         "|---|---|---|---|---|---|---|"
     )
     for lens, prior in LENSES.items():
