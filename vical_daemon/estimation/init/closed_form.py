@@ -23,6 +23,7 @@ from vical_daemon.estimation.init.accel_evidence import CameraPath
 from vical_daemon.estimation.init.attempts import LONG_S
 from vical_daemon.estimation.init.camera_start import camera_by_rotations, not_sure_yet, starting_camera
 from vical_daemon.estimation.init.linear_start import still_axes
+from vical_daemon.estimation.init.numbering import numbered_differently
 from vical_daemon.estimation.init.readout_start import lens_fit, likely_axis, looks_rolling, readout
 from vical_daemon.estimation.init.rolling_shutter_correction import at_middle_row
 from vical_daemon.estimation.init.target_poses import TargetPose, attitude_sigmas, recent_poses
@@ -115,6 +116,9 @@ def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
             lens, data.priors[name], data.options.fix, found.R_imu_cam, found.timeshift_cam_imu_s
         )
         rough[name] = RotationsKnown(camera, poses, found.gyro_bias_rps)
+    why = numbered_differently(rough)
+    if why:
+        return StartResult(None, why)
     return motion_start(data.buffer, rough, data.options, may_resize=data.may_resize)
 
 
