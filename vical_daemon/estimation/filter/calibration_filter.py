@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -183,7 +184,7 @@ class CalibrationFilter:
             keep = lin.valid & self._belonging(image, innovation, lin)
         if keep.sum() < LEAST_POINTS:
             return self._refused(image, innovation, predicted, "too few corners pass the gate")
-        fit = solve(image, self.S, lin, keep)
+        fit = solve(image, self.S, lin, keep, partial(self._by_points, image))
         level = fit.nis / max(fit.dof, 1)
         if self._misses_gate(fit):
             self.nis_level += 0.02 * (min(level, 4.0 * self.nis_level) - self.nis_level)
@@ -295,9 +296,13 @@ class CalibrationFilter:
             return self._with_shared(
                 image, by_derivatives(self.state, self.layout, self.rates, image, self.S)
             )
-        lin = self._with_shared(image, by_sigma_points(self.state, self.layout, self.rates, image, self.S))
-        straight.measured(sigmas, curved_share(image, lin))
+        lin = self._by_points(image, np.zeros(self.layout.size), self.S)
+        straight.measured(sigmas, curved_share(image, lin, lin.valid))
         return lin
+
+    def _by_points(self, image: Image, dx: FloatArray, S: FloatArray) -> Linear:
+        lin = by_sigma_points(self.state, self.layout, self.rates, image, dx, S)
+        return self._with_shared(image, lin)
 
     def _accept(self, S: FloatArray, dx: FloatArray) -> None:
         """Move the nominal state and carry the covariance into the new chart (reset Jacobian of the GRP)."""

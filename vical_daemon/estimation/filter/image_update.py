@@ -1,8 +1,9 @@
-"""The linear algebra of one image's correction: gates and compression."""
+"""The linear algebra of one image's correction: gates, compression, and iteration while far from straight."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,9 +22,13 @@ from vical_daemon.estimation.significance import (
 )
 
 _POSE = 6  # degrees of freedom
+_ITERATIONS = 5
+_CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
 _CORNER_GATE = chi_square_limit(2, CORNER_REFUSED)
 _RESIDUAL_GATE = chi_square_limit(2, RESIDUAL_REFUSED)
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
+
+Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
 
 
 @lru_cache(maxsize=256)
@@ -119,12 +124,45 @@ def blurred(image: Image, innovation: FloatArray, lin: Linear) -> float:
     return max(noise, 1.0) if noise * float(np.median(sigma)) < MOST_PX else 1.0
 
 
-def curved_share(image: Image, lin: Linear) -> float:
+def curved_share(image: Image, lin: Linear, keep: BoolArray) -> float:
     """Largest second-order standard deviation of a corner over its noise."""
-    if not lin.curved.size or not lin.valid.any():
+    if not lin.curved.size or not keep.any():
         return 0.0
     share = np.sqrt((lin.curved**2).sum(axis=1)).reshape(-1, 2).max(axis=1) / image.sigma_px
-    return float(share[lin.valid].max())
+    return float(share[keep].max())
+
+
+def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray, linearise: Linearise) -> ImageFit:
+    """Iterated posterior linearisation (once is enough when the prior is tight).
+
+    Args:
+        image: The points.
+        prior: Square root of the covariance, shape (c, c).
+        lin: The image linearised about the prior.
+        keep: Points that passed the gate, shape (n,).
+        linearise: Linearises again, about a step and with a spread.
+
+    Returns:
+        The fit. [Garcia-Fernandez et al., "Posterior linearization filter", 2015]
+    """
+    S, dx = prior, np.zeros(len(prior))
+    spread, offset = lin.spread, np.zeros(2 * len(image.ids))
+    for step in range(_ITERATIONS):
+        if step:
+            lin = linearise(dx, S)
+            if (keep & lin.valid).sum() < LEAST_POINTS:  # about this step most points are behind the camera
+                break
+            keep = keep & lin.valid
+            # the innovation refers to the prior mean
+            spread, offset = lin.by_error @ prior, lin.ways @ (lin.by_error @ dx)
+        fit = _correct(prior, spread, image, (image.uv - lin.z).ravel() + offset, lin, keep)
+        if curved_share(image, lin, fit.keep) < _CURVED:
+            break
+        step_size = unscented.solve_lower(fit.S, fit.dx - dx)
+        S, dx, keep = fit.S, fit.dx, fit.keep
+        if step and float(np.linalg.norm(step_size)) < 0.05:
+            break
+    return fit
 
 
 def _moved(solution: FloatArray, spread: FloatArray, shared: FloatArray) -> FloatArray:
@@ -144,17 +182,12 @@ def _unmoved(rows: FloatArray, r: FloatArray) -> tuple[float, int]:
     return float(left @ left), count
 
 
-def solve(image: Image, prior: FloatArray, lin: Linear, keep: BoolArray) -> ImageFit:
-    """Correct the state by one image; corners with impossible residuals are left out and it is repeated.
-
-    Args:
-        image: The points.
-        prior: Square root of the covariance, shape (c, c).
-        lin: The image linearised about the prior.
-        keep: Points that passed the gate, shape (n,).
-    """
-    weight, spread = 1.0 / np.repeat(image.sigma_px, 2), lin.spread
-    ways, r = lin.ways * weight[:, None], (image.uv - lin.z).ravel() * weight
+def _correct(
+    prior: FloatArray, spread: FloatArray, image: Image, innovation: FloatArray, lin: Linear, keep: BoolArray
+) -> ImageFit:
+    """One linear correction; corners whose residual stays impossible are dropped and it is done again."""
+    weight = 1.0 / np.repeat(image.sigma_px, 2)
+    ways, r = lin.ways * weight[:, None], innovation * weight
     k = ways.shape[1]
     if lin.curved.size:
         curved = lin.curved * weight[:, None]

@@ -133,9 +133,11 @@ def project_errors(
     return view(world, motion, cam, rates, ahead, known.distortion_model, rows)
 
 
-def by_sigma_points(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
-    """Statistical linearisation about the nominal state with spread S."""
-    errors = unscented.offsets(S)
+def by_sigma_points(
+    state: State, layout: Layout, rates: Rates, image: Image, dx: FloatArray, S: FloatArray
+) -> Linear:
+    """Statistical linearisation about `dx` with spread S (all in the chart of the prior)."""
+    errors = dx + unscented.offsets(S)
     pixels = project_errors(state, layout, rates, image.camera, image.t_cam_s, image.points, image.uv, errors)
     with np.errstate(invalid="ignore"):  # nan is behind the camera
         valid: BoolArray = np.asarray((np.abs(pixels) < _FAR_PX).all(axis=(0, 2)))
@@ -150,7 +152,7 @@ def by_sigma_points(state: State, layout: Layout, rates: Rates, image: Image, S:
 def by_small_steps(state: State, layout: Layout, rates: Rates, image: Image, S: FloatArray) -> Linear:
     """The same to first order about the nominal state, by differences; for rolling shutters."""
     steps = np.diag(_STEP * np.sqrt((S**2).sum(axis=1)))
-    lin = by_sigma_points(state, layout, rates, image, steps)
+    lin = by_sigma_points(state, layout, rates, image, np.zeros(len(S)), steps)
     return replace(lin, spread=lin.by_error @ S, curved=np.zeros((len(lin.ways), 0)))
 
 

@@ -82,7 +82,7 @@ def test_derivatives_of_the_view_are_those_of_the_projection(model):
 def test_both_ways_to_linearise_agree_when_the_spread_is_small():
     state, layout, rates, image = scene("radtan")
     S = np.diag(np.full(layout.size, 1e-5))
-    points = by_sigma_points(state, layout, rates, image, S)
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
     straight = by_derivatives(state, layout, rates, image, S)
     np.testing.assert_allclose(
         straight.ways @ straight.spread, points.ways @ points.spread, rtol=1e-4, atol=1e-7
@@ -95,7 +95,7 @@ def test_points_behind_the_camera_are_invalid_either_way():
     state, layout, rates, image = scene("radtan")
     image.points[3] = state.p_world_imu - 2.0 * (image.points[3] - state.p_world_imu)
     S = np.diag(np.full(layout.size, 1e-5))
-    points = by_sigma_points(state, layout, rates, image, S)
+    points = by_sigma_points(state, layout, rates, image, np.zeros(layout.size), S)
     straight = by_derivatives(state, layout, rates, image, S)
     np.testing.assert_array_equal(straight.valid, points.valid)
     assert not straight.valid[3]
