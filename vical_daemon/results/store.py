@@ -19,6 +19,7 @@ import numpy as np
 from vical_drivers.user_files import read_file
 
 from vical_daemon.bus.messages.poses import rotation_matrix
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.measurements import CameraPrior
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate
 from vical_daemon.service.atomic_file import atomic_write
@@ -66,12 +67,11 @@ class StoredCalibration:
         known = self.known
         pose = rotation_matrix(known.T_imu_cam.q_wxyz), np.array(known.T_imu_cam.p_m, dtype=np.float64)
         fx, fy, cx, cy = known.intrinsics
-        k1, k2, p1, p2 = known.distortion
         return CameraPrior(
             resolution=resolution,
             intrinsics=(fx, fy, cx, cy),
             distortion_model=known.distortion_model,
-            distortion=(k1, k2, p1, p2),
+            distortion=tuple(known.distortion),
             T_imu_cam=pose,
             timeshift_cam_imu_s=known.timeshift_cam_imu_s,
             readout_s=known.readout_s,
@@ -189,7 +189,7 @@ def _problem(stored: StoredCalibration) -> str:
         len(pose.p_m) != 3
         or len(pose.q_wxyz) != 4
         or len(known.intrinsics) != 4
-        or len(known.distortion) != 4
+        or len(known.distortion) != len(COEFFICIENTS.get(known.distortion_model, ()))
     ):
         return "wrong number of values"
     numbers = [*pose.p_m, *pose.q_wxyz, *known.intrinsics, *known.distortion, known.timeshift_cam_imu_s]

@@ -8,6 +8,7 @@ import os
 import numpy as np
 import pytest
 
+from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS
 from vical_daemon.estimation.result import (
     CalibrationEstimate,
     CameraEstimate,
@@ -70,6 +71,15 @@ def test_prior_of_a_stored_calibration(store):
     assert prior.intrinsics == (450.0, 451.0, 320.0, 240.0)
 
 
+@pytest.mark.parametrize("model", COEFFICIENTS)
+def test_a_lens_of_any_model_is_stored(store, model):
+    coefficients = np.linspace(-0.3, 0.1, len(COEFFICIENTS[model])).tolist()
+    lens = {"distortion_model": model, "distortion": coefficients}
+    store.save("a", "b", "cam0", estimate(**lens), 1)
+    prior = store.load("a", "b").prior((640, 480))
+    assert (prior.distortion_model, list(prior.distortion)) == (model, coefficients)
+
+
 @pytest.mark.parametrize(
     "serial", ["../../etc/passwd", "a/b", "", "x" * 500, "usb-0000:00:14.0-1", "..", "\n", "ü"]
 )
@@ -81,7 +91,7 @@ def test_serial_numbers_cannot_leave_the_folder(store, serial):
 
 
 @pytest.mark.parametrize("change", [
-    {"intrinsics": [1.0]}, {"timeshift_cam_imu_s": float("nan")}, {"timeshift_cam_imu_s": 100.0},
+    {"intrinsics": [1.0]}, {"distortion": [0.1] * 5}, {"distortion_model": "fov"}, {"timeshift_cam_imu_s": float("nan")}, {"timeshift_cam_imu_s": 100.0},
     {"intrinsics": [-1.0, 1.0, 1.0, 1.0]},
     {"T_imu_cam": PoseEstimate([0.0] * 3, [1.0, 1.0, 0.0, 0.0], np.eye(6).tolist())},
     {"T_imu_cam": PoseEstimate([99.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], np.eye(6).tolist())},
