@@ -50,7 +50,7 @@ class HalfTurns:
             return frame
         last, other = self._last.get(frame.camera), self._turned(frame)
         if last is not None and 0 < frame.t_cam_ns - last.t_cam_ns <= _NEXT_NS:
-            turned = _moved_px(last, other) < _CLEARLY * _moved_px(last, frame)
+            turned = self._moved_px(last, other) < _CLEARLY * self._moved_px(last, frame)
         else:
             turned = self._upside_down(frame, t_cam_s, f, buffer)
         self._last[frame.camera] = other if turned else frame
@@ -83,10 +83,11 @@ class HalfTurns:
         seen = (frame.uv_px - frame.uv_px.mean(axis=0)).T @ board  # how its axes stand in the image
         return bool((seen * R_cam_target[:2, :2]).sum() < 0.0)
 
+    def _moved_px(self, a: PointsFrame, b: PointsFrame) -> float:
+        """Median distance of the points of an image from where the board was in another one, px.
 
-def _moved_px(a: PointsFrame, b: PointsFrame) -> float:
-    """Median distance of the points from one image to the next, px; inf: they share too few."""
-    _, at_a, at_b = np.intersect1d(a.ids, b.ids, return_indices=True)
-    if len(at_a) < LEAST_POINTS:
-        return np.inf
-    return float(np.median(np.linalg.norm(a.uv_px[at_a] - b.uv_px[at_b], axis=1)))
+        The two may show different parts of the board: an affine map takes the board into the first image.
+        """
+        board = np.append(self._target_m[:, :2], np.ones((len(self._target_m), 1)), axis=1)
+        to_image, *_ = np.linalg.lstsq(board[a.ids], a.uv_px, rcond=None)
+        return float(np.median(np.linalg.norm(b.uv_px - board[b.ids] @ to_image, axis=1)))

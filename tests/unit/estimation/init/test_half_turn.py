@@ -69,6 +69,20 @@ def test_a_detector_that_loses_the_board_and_finds_it_upside_down() -> None:
     assert found.cameras == undisturbed(True).cameras
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_images_that_show_other_parts_of_the_board(turned: bool) -> None:
+    x, y = np.meshgrid(np.arange(8), np.arange(6))
+    target = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1) * 0.05
+    uv = target[:, :2] * 1000.0 + [100.0, 80.0] + np.random.default_rng(703).normal(0.0, 0.5, (POINTS, 2))
+    left, right = np.flatnonzero(x.ravel() < 4), np.flatnonzero(x.ravel() >= 4)
+    turns = HalfTurns(target, alike=True)
+    turns.numbered(PointsFrame("cam0", 0, left, uv[left]), 0.0, None, None)
+    ids = (POINTS - 1 - right)[::-1] if turned else right
+    seen = uv[right][::-1] if turned else uv[right]
+    found = turns.numbered(PointsFrame("cam0", 50_000_000, ids, seen + 3.0), 0.05, None, None)
+    assert found.ids.tolist() == right.tolist() and np.allclose(found.uv_px, uv[right] + 3.0)
+
+
 def test_ids_of_other_boards_are_kept() -> None:
     frame = PointsFrame("cam0", 0, np.arange(40), np.random.default_rng(702).uniform(0.0, 400.0, (40, 2)))
     turns = HalfTurns(np.zeros((40, 3)), alike=False)
