@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +33,7 @@ _WAIT_NS = 300_000_000
 be late."""
 _EVERY_NS = 500_000_000
 """Time between two fits of the grid; each takes 10 to 20 ms."""
+_NO_IDS, _NO_POINTS = np.zeros(0, np.int64), np.zeros((0, 2))
 
 
 class ArrivalStamps:
@@ -41,13 +42,17 @@ class ArrivalStamps:
     Attributes:
         found: What was found; None: nothing, stamps pass as they come.
         in_doubt: They jitter about an even grid, and there were too few images yet for a decision.
+
+    Args:
+        known: Last images of this camera, without points, if its stamps were found to be taken on arrival
+            before.
     """
 
-    def __init__(self) -> None:
-        self.found: EvenStamps | None = None
+    def __init__(self, known: Sequence[PointsFrame] = ()) -> None:
         self.in_doubt = False
         self._looks = 0
-        self._window: deque[PointsFrame] = deque(maxlen=_WINDOW)
+        self._window: deque[PointsFrame] = deque(known, maxlen=_WINDOW)
+        self.found: EvenStamps | None = self._stamps().on_grid() if known else None
         self._unseen = 0  # images since the last decision
         self._held: deque[PointsFrame] = deque()
         self._fitted_ns = self._last_ns = 0
@@ -84,6 +89,10 @@ class ArrivalStamps:
     def original_ns(self, t_ns: int) -> int:
         """Return the stamp that an image came with, ns; that of an image that did not pass: the same."""
         return self._original_ns.get(t_ns, t_ns)
+
+    def known_ns(self) -> list[int]:
+        """Return the last stamps as they came, ns, if they are taken on arrival; else nothing."""
+        return [] if self.found is None else self._stamps().first_ns.tolist()
 
     def _stamps(self, until_ns: int | None = None) -> CameraStamps:
         t_ns = np.array([frame.t_cam_ns for frame in self._window], dtype=np.int64)
@@ -124,11 +133,21 @@ class LiveStamps:
     """The stamps of all cameras of a rig.
 
     Outlives the estimator: a new one gets the stamps that the last one had.
+
+    Args:
+        known_ns: What `known_ns` returned in an earlier process.
     """
 
-    def __init__(self) -> None:
-        self._cameras: dict[str, ArrivalStamps] = {}
-        self._announced: set[str] = set()
+    def __init__(self, known_ns: Mapping[str, Sequence[int]] | None = None) -> None:
+        self._cameras = {
+            name: ArrivalStamps([PointsFrame(name, t_ns, _NO_IDS, _NO_POINTS) for t_ns in stamps_ns])
+            for name, stamps_ns in (known_ns or {}).items()
+        }
+        self._announced = {name for name, camera in self._cameras.items() if camera.found}
+
+    def known_ns(self) -> dict[str, list[int]]:
+        """Return the last stamps of the cameras that stamp on arrival, ns: another process may go on."""
+        return {name: known for name, camera in self._cameras.items() if (known := camera.known_ns())}
 
     def push(self, frame: PointsFrame) -> list[PointsFrame]:
         """Take an image; return those that may pass now."""

@@ -17,13 +17,14 @@ import time
 from collections.abc import Mapping
 from enum import EnumType
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from vical_drivers.user_files import read_file
 
 from vical_daemon import estimation
+from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.estimators import Estimator
 from vical_daemon.config.model import Config
 from vical_daemon.config.strict_yaml import MAX_BYTES
@@ -56,6 +57,22 @@ class _Head(msgspec.Struct, frozen=True):
     identity: str
     devices: dict[str, str]
     saved_ns: int  # UNIX, by the service's clock
+    image_stamps_ns: dict[str, list[int]]
+
+
+class Kept(NamedTuple):
+    """What an earlier process saved.
+
+    Attributes:
+        estimator: Its estimator.
+        age_s: Time since then, s.
+        image_stamps_ns: Last stamps of the cameras that stamp on arrival, see `LiveStamps.known_ns`. The
+            estimator never got these stamps, but the even ones that follow from them.
+    """
+
+    estimator: Estimator
+    age_s: float
+    image_stamps_ns: dict[str, list[int]]
 
 
 class Checkpoint:
@@ -73,8 +90,8 @@ class Checkpoint:
         self._identity = _identity(config, clock)
         self._next_s = time.monotonic() + PROVEN_S
 
-    def load(self, devices: Mapping[str, str]) -> tuple[Estimator, float] | None:
-        """Return the state that an earlier process saved for these devices, and its age, s; or None.
+    def load(self, devices: Mapping[str, str]) -> Kept | None:
+        """Return the state that an earlier process saved for these devices, or None.
 
         Args:
             devices: Serial numbers by component; empty: unknown, so no state is loaded.
@@ -91,20 +108,23 @@ class Checkpoint:
                 return None
             if not 0.0 <= age_s <= OLDEST_S:
                 return None
-            return _Unpickler(io.BytesIO(body)).load(), age_s
+            return Kept(_Unpickler(io.BytesIO(body)).load(), age_s, head.image_stamps_ns)
         except FileNotFoundError:
             return None
         except Exception as error:  # any damaged file: the estimator then starts without it
             _log.warning("%s is not used: %s", self._path, " ".join(str(error).split()))
             return None
 
-    def save(self, estimator: Estimator, devices: Mapping[str, str]) -> None:
+    def save(
+        self, estimator: Estimator, devices: Mapping[str, str], stamps: LiveStamps | None = None
+    ) -> None:
         """Save a converged estimator, if enough time has passed since the last save. Never raises."""
         begin_s = time.monotonic()
         if self._path is None or begin_s < self._next_s or not devices:
             return
         try:
-            head = _Head(self._identity, dict(devices), self._clock.now_ns())
+            known_ns = {} if stamps is None else stamps.known_ns()
+            head = _Head(self._identity, dict(devices), self._clock.now_ns(), known_ns)
             body = pickle.dumps(estimator, protocol=5)
             atomic_write(self._path, msgspec.json.encode(head) + b"\n" + body)
         except Exception as error:

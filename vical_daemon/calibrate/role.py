@@ -17,7 +17,7 @@ from vical_daemon.bus.messages import DiagnosticStatus, Level, MessageError, dec
 from vical_daemon.bus.outgoing import Message, publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
 from vical_daemon.calibrate.arrival_stamps import LiveStamps
-from vical_daemon.calibrate.checkpoint import Checkpoint
+from vical_daemon.calibrate.checkpoint import Checkpoint, Kept
 from vical_daemon.calibrate.estimators import Estimator, input_keys, make_estimator
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.calibrate.worker import PUBLISH_S, STUCK_S, EstimateRole
@@ -86,8 +86,10 @@ def calibrate(
     persistence = CalibrationPersistence(config, bus, clock)
     priors = persistence.priors()
     checkpoint = Checkpoint(folder, config, clock)
-    estimator = _resumed(checkpoint, persistence) or _new_estimator(config, priors, persistence)
-    role = EstimateRole(config, estimator, inspect=persistence.watch, stamps=stamps or LiveStamps())
+    kept = _resumed(checkpoint, persistence)
+    estimator = kept.estimator if kept else _new_estimator(config, priors, persistence)
+    stamps = stamps or LiveStamps(kept.image_stamps_ns if kept else None)
+    role = EstimateRole(config, estimator, inspect=persistence.watch, stamps=stamps)
     supervisor = _Supervisor(config, role, persistence, checkpoint)
     publish(bus, persistence.stored_messages())
     commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
@@ -110,7 +112,7 @@ def calibrate(
             publish(bus, supervisor.work(queue.take(256), time.monotonic()))
             status.tick(lambda: supervisor.statuses(queue.dropped, time.monotonic()))
             if role.latest is not None and role.latest.status is Status.CONVERGED and supervisor.keeps_up:
-                checkpoint.save(role.estimator, persistence.devices)
+                checkpoint.save(role.estimator, persistence.devices, stamps)
             if not len(queue) or stop.is_set():
                 break
         if until is not None and until(role.latest, words):
@@ -207,16 +209,14 @@ def _describe(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:200] + where
 
 
-def _resumed(checkpoint: Checkpoint, persistence: CalibrationPersistence) -> Estimator | None:
-    """Return the saved estimator of a process that crashed or was killed, or None."""
-    found = checkpoint.load(persistence.devices)
-    if found is None:
-        return None
-    estimator, age_s = found
-    event = Event(EventKind.RESUMED, value=age_s)
-    _log.info("%s", event_text(event))
-    persistence.announce(event)
-    return estimator
+def _resumed(checkpoint: Checkpoint, persistence: CalibrationPersistence) -> Kept | None:
+    """Return what a process saved that crashed or was killed, or None."""
+    kept = checkpoint.load(persistence.devices)
+    if kept is not None:
+        event = Event(EventKind.RESUMED, value=kept.age_s)
+        _log.info("%s", event_text(event))
+        persistence.announce(event)
+    return kept
 
 
 def _new_estimator(

@@ -250,7 +250,9 @@ _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.FEATURES_MISS: lambda v: f"features are {v:.1f} px from where they are expected",
     Cause.INERTIAL_MISFIT: lambda v: f"inertial data and images disagree ({v:.1f} times their noise)",
     Cause.SCENE_MOVES: lambda v: f"{v:.0%} of the features do not move with the scene",
-    Cause.NO_PARALLAX: lambda _: "the camera stands still, or features are lost before they show depth",
+    Cause.NO_PARALLAX: lambda _: (
+        "the camera stands still, everything is far away, or features are lost before they show depth"
+    ),
     Cause.IMAGES_SHIFTED: lambda _: "whole images are shifted: not distinguished without a board",
     Cause.SECOND_AXIS: lambda _: (
         "the rig now turns about a second axis: restarting, to estimate the whole lever arm"

@@ -84,7 +84,12 @@ class CameraStamps:
         """Stamps of the images that are needed for a decision; empty: the stamps stay as they are."""
         if self._grid is None:
             return set()
-        return {int(t) for chunk in self._chunks() for t in self.t_ns[~self._again][chunk]}
+        return {int(t) for chunk in self._chunks() for t in self.first_ns[chunk]}
+
+    @property
+    def first_ns(self) -> IntArray:
+        """Stamps of the images, ns; of one that was delivered twice the first, shape (m,)."""
+        return self.t_ns[~self._again]
 
     def _chunks(self) -> list[slice]:
         count = int((~self._again).sum())
@@ -109,7 +114,7 @@ class CameraStamps:
         """
         if self._grid is None:
             return None
-        old_ns, new_ns = self.t_ns[~self._again], self._grid.t_ns
+        old_ns, new_ns = self.first_ns, self._grid.t_ns
         found: list[float] = []
         for chunk in self._chunks():
             images = [self._images.get(t) for t in old_ns[chunk].tolist()]

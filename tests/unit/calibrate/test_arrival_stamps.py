@@ -151,3 +151,22 @@ def test_every_camera_is_announced_once() -> None:
     assert "cam0: its stamps jitter by" in event_text(event)
     assert 0.0 < stamps.sigma_s < 1e-3
     assert len(stamps.flush()) > 0 and stamps.flush() == []
+
+
+def test_another_process_goes_on_with_even_stamps() -> None:
+    taken_s = np.arange(1200) / 20.0
+    taken_s[600:] += 5.0  # the process was killed, and another one began
+    stamps_s = late(taken_s)
+    first = LiveStamps()
+    for taken, stamp in zip(taken_s[:600].tolist(), stamps_s[:600].tolist(), strict=True):
+        first.push(frame(taken, stamp))
+    second, taken_of, errors_s = LiveStamps(first.known_ns()), {}, []
+    for taken, stamp in zip(taken_s[600:].tolist(), stamps_s[600:].tolist(), strict=True):
+        new = frame(taken, stamp)
+        taken_of[new.t_cam_ns] = taken
+        for out in second.push(new):
+            came_ns = second._cameras["cam0"].original_ns(out.t_cam_ns)
+            errors_s.append((out.t_cam_ns - BEGIN_NS) * 1e-9 - taken_of[came_ns])
+    assert second.news() == [] and not second.in_doubt
+    assert len(errors_s) > 550 and np.abs(errors_s).max() < 2e-3
+    assert LiveStamps().known_ns() == {}

@@ -12,6 +12,7 @@ import pytest
 from vical_mocks.points import SimulatedRun, simulate
 
 from vical_daemon.calibrate import checkpoint
+from vical_daemon.calibrate.arrival_stamps import LiveStamps
 from vical_daemon.calibrate.checkpoint import FILE_NAME, OLDEST_S, Checkpoint
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.calibrator import Calibrator
@@ -81,6 +82,16 @@ def test_it_goes_on_where_it_was(
     a, b = resumed.estimate(), straight.estimate()
     assert a.status is Status.CONVERGED and a.frames > 0
     assert a.to_json() == b.to_json()
+
+
+def test_stamps_on_arrival_are_kept(tmp_path: Path, config: Config, converged: Calibrator) -> None:
+    late_ns = np.random.default_rng(1).exponential(4e6, 120).astype(np.int64)
+    known = {"cam0": (10**18 + 50_000_000 * np.arange(120) + late_ns).tolist()}
+    stamps = LiveStamps(known)
+    Checkpoint(tmp_path, config, CLOCK).save(converged, DEVICES, stamps)
+    found = Checkpoint(tmp_path, config, CLOCK).load(DEVICES)
+    assert found is not None and found.image_stamps_ns == known
+    assert LiveStamps(found.image_stamps_ns).sigma_s == stamps.sigma_s > 0.0
 
 
 def test_a_state_of_other_code_is_not_taken(

@@ -80,13 +80,14 @@ class Initializer:
     def take(self, items: Sequence[tuple[float, PointsFrame]]) -> None:
         """Keep images (stamp in the camera's clock in s, points).
 
-        Of too many, the older half is dropped; of a rest before any motion, all but the last image.
+        Of too many, the older half is dropped, if the other half is long enough for a start; of a rest before
+        any motion, all but the last image.
         """
         for t_cam_s, frame in items:
             frames, rest = self._frames[frame.camera], self._rest[frame.camera]
             frames.append((t_cam_s, frame))
             rest.take(t_cam_s, frame)
-            if len(frames) > _MAX_FRAMES:
+            if len(frames) > _MAX_FRAMES and t_cam_s - frames[len(frames) // 2][0] > _MIN_SPAN_S:
                 del frames[: len(frames) // 2]
             if rest.rests_since(frames[0][0]):
                 for name, kept in self._frames.items():

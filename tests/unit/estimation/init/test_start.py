@@ -104,6 +104,14 @@ def test_a_slow_camera_starts_within_five_seconds():
     within(record, 4.5, parameters=15)
 
 
+def test_a_fast_camera_starts():
+    run = simulate(
+        5, 4.0, rig=reference_rig(5, timeshift_cam_imu_s=0.01), camera_rate_hz=240, imu_rate_hz=500
+    )
+    record, _ = answer(run, lens_known=True)
+    within(record, 4.5)
+
+
 def test_very_sharp_corners_start_at_once():
     """With 0.01 px a first run, far from straight, refused what followed: 7 s until the first answer."""
     rig = rig_before(APRILGRID, 0.8, 4, timeshift_cam_imu_s=-0.027)
