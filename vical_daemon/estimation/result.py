@@ -156,6 +156,8 @@ class CalibrationEstimate:
         rejected_fraction: Share of measurements that the gates refused.
         events: Announcements since the last estimate.
         next_motion: The same as `guidance`, as data; says nothing in logs of older versions.
+        reading_hashes: By which data are recognised that two calibrations have used, see `ReadingSample`; []:
+            not known (it does not travel in the message).
     """
 
     t_ns: int
@@ -173,6 +175,7 @@ class CalibrationEstimate:
     rejected_fraction: float
     events: list[Event] = field(default_factory=list)
     next_motion: Guidance = field(default_factory=Guidance)
+    reading_hashes: list[int] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         """Return the dictionary that COMMANDS promises (without trace, cpu_s and truth)."""

@@ -125,6 +125,7 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
     all_ = list(estimates.values())
     status = min((e.status for e in all_), key=_ORDER.index)
     behind = {name: e for name, e in estimates.items() if e.status == status}
+    longest = max(all_, key=lambda e: e.imu_samples)
     frames = np.array([max(e.frames, 1) for e in all_], np.float64)
     return CalibrationEstimate(
         t_ns=max(e.t_ns for e in all_),
@@ -134,7 +135,7 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
         guidance=next((e.guidance for e in behind.values() if e.guidance), ""),
         duration_s=max(e.duration_s for e in all_),
         frames=sum(e.frames for e in all_),
-        imu_samples=max(e.imu_samples for e in all_),
+        imu_samples=longest.imu_samples,
         cameras={name: camera for e in all_ for name, camera in e.cameras.items()},
         imu=_best_known([e.imu for e in all_ if e.imu is not None]),
         gravity_world_mps2=next((e.gravity_world_mps2 for e in all_ if e.gravity_world_mps2), []),
@@ -142,6 +143,7 @@ def together(estimates: dict[str, CalibrationEstimate]) -> CalibrationEstimate:
         rejected_fraction=float(np.average([e.rejected_fraction for e in all_], weights=frames)),
         events=_events(estimates),
         next_motion=next((e.next_motion for e in behind.values() if e.next_motion), Guidance()),
+        reading_hashes=longest.reading_hashes,
     )
 
 

@@ -10,6 +10,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, project, project_jacobians
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.camera_rays import rays_over_image
+from vical_daemon.estimation.status.reading_sample import common_share
 from vical_daemon.results.known import KnownCamera
 
 _LEAST_SHARE = 0.1
@@ -127,13 +128,12 @@ def _joint(a: KnownCamera, b: KnownCamera, A: FloatArray, B: FloatArray) -> tupl
     any other estimate [Hausman 1978]: for data that are all common, cov(B - A) = P_less - P_more; for a
     share s of the shorter, P_a + P_b - 2 s P_more.
     """
-    common_s = max(0.0, (min(a.end_ns, b.end_ns) - max(a.begin_ns, b.begin_ns)) * 1e-9)
-    if not (common_s and a.begin_ns and b.begin_ns):
+    share = common_share(a.reading_hashes, b.reading_hashes)
+    if not share:
         return A + B, 0.0
-    spans_s = [(k.end_ns - k.begin_ns) * 1e-9 for k in (a, b)]
+    spans_s = [a.duration_s, b.duration_s]
     scale = np.sqrt(np.diag(A + B))
     A, B = A / np.outer(scale, scale), B / np.outer(scale, scale)
-    share = min(common_s / min(spans_s), 1.0)
     alike = abs(spans_s[0] - spans_s[1]) < 0.1 * max(spans_s)
     more = A if (np.trace(A) < np.trace(B) if alike else spans_s[0] > spans_s[1]) else B
     root = np.linalg.cholesky(A + B + 1e-12 * np.eye(len(A)))
@@ -141,7 +141,7 @@ def _joint(a: KnownCamera, b: KnownCamera, A: FloatArray, B: FloatArray) -> tupl
     values, vectors = np.linalg.eigh(inverse @ (A + B - 2.0 * share * more) @ inverse.T)
     root = root @ vectors
     S = (root * np.maximum(values, _LEAST_SHARE)) @ root.T
-    return np.asarray(S * np.outer(scale, scale)), common_s
+    return np.asarray(S * np.outer(scale, scale)), share * min(spans_s)
 
 
 def _sigmas(a: KnownCamera, b: KnownCamera, A: FloatArray, B: FloatArray, S: FloatArray) -> FloatArray:

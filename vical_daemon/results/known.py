@@ -43,7 +43,8 @@ class KnownCamera:
         covariance: Of [position, rotation (local), time shift, lens], m, rad, s, px, shape (7 + n, 7 + n).
         inflation: By what `covariance` is too large on its diagonal, because correlations are not known.
         lens_held: The lens was held at given values, not estimated.
-        begin_ns, end_ns: Stretch of time whose data were used, UNIX ns; 0: not known.
+        duration_s: Seconds of data used; 0: not known.
+        reading_hashes: See `CalibrationEstimate`; (): not known.
         serials: Serial numbers of imu and camera; "": not known.
         notes: What was assumed, in words.
     """
@@ -59,8 +60,8 @@ class KnownCamera:
     covariance: FloatArray
     inflation: float = 1.0
     lens_held: bool = False
-    begin_ns: int = 0
-    end_ns: int = 0
+    duration_s: float = 0.0
+    reading_hashes: tuple[int, ...] = ()
     serials: tuple[str, str] = ("", "")
     notes: tuple[str, ...] = ()
 
@@ -137,7 +138,6 @@ def _known(camera: RigCamera, rig: Rig, source: str) -> KnownCamera:
     elif camera.covariance is not None:
         covariance, inflation = _of_blocks(camera, size)
         notes = (f"{source}: no correlations between pose, time and lens; bounded, not known",)
-    end_ns = rig.t_ns
     return _completed(
         KnownCamera(
             camera.name,
@@ -151,8 +151,8 @@ def _known(camera: RigCamera, rig: Rig, source: str) -> KnownCamera:
             covariance,
             inflation,
             "intrinsics" in rig.fixed or (bool(camera.lens_sigma) and not any(camera.lens_sigma)),
-            end_ns - round(rig.duration_s * 1e9) if end_ns and rig.duration_s else 0,
-            end_ns if rig.duration_s else 0,
+            rig.duration_s,
+            rig.reading_hashes,
             (rig.devices.get("imu", ""), rig.devices.get(f"camera/{camera.name}", "")),
             notes,
         )

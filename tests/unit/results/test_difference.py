@@ -74,13 +74,16 @@ def test_the_block_that_has_moved_is_named(known, at, size, name):
 
 def test_data_that_both_used_count_once(known, covariance):
     """Half of the data, and all of it: the difference varies by P_half - P_all = P_all, not by 3 P_all."""
-    whole = replace(known, begin_ns=1, end_ns=60_000_000_001)
-    half = replace(known, covariance=2.0 * covariance, begin_ns=1, end_ns=30_000_000_001)
+    hashes = tuple(range(64))
+    whole = replace(known, duration_s=60.0, reading_hashes=hashes)
+    wider = replace(known, covariance=2.0 * covariance, duration_s=30.0)
+    half = replace(wider, reading_hashes=hashes[::2] + tuple(range(64, 96)))
     d = difference(half, whole)
     assert d.common_s == pytest.approx(30.0)
     assert d.covariance == pytest.approx(covariance, rel=1e-6)
-    later = replace(half, begin_ns=60_000_000_001, end_ns=90_000_000_001)
-    assert difference(later, whole).covariance == pytest.approx(3.0 * covariance)
+    later = replace(wider, reading_hashes=tuple(range(100, 164)))
+    for other in (later, wider):
+        assert difference(other, whole).covariance == pytest.approx(3.0 * covariance)
 
 
 def test_a_lens_with_one_more_power_is_compared_by_what_it_projects(known, covariance):

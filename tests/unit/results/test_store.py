@@ -91,7 +91,8 @@ def test_serial_numbers_cannot_leave_the_folder(store, serial):
 
 
 @pytest.mark.parametrize("change", [
-    {"intrinsics": [1.0]}, {"distortion": [0.1] * 5}, {"distortion_model": "fov"}, {"timeshift_cam_imu_s": float("nan")}, {"timeshift_cam_imu_s": 100.0},
+    {"intrinsics": [1.0]}, {"distortion": [0.1] * 5}, {"distortion_model": "fov"},
+    {"timeshift_cam_imu_s": float("nan")}, {"timeshift_cam_imu_s": 100.0},
     {"intrinsics": [-1.0, 1.0, 1.0, 1.0]},
     {"T_imu_cam": PoseEstimate([0.0] * 3, [1.0, 1.0, 0.0, 0.0], np.eye(6).tolist())},
     {"T_imu_cam": PoseEstimate([99.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], np.eye(6).tolist())},

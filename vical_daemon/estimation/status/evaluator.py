@@ -28,6 +28,7 @@ from vical_daemon.estimation.status.excitation import (
     excitation_advice,
     weak_directions,
 )
+from vical_daemon.estimation.status.reading_sample import ReadingSample
 from vical_daemon.estimation.status.steady_status import CONFIRMING, SteadyStatus, Verdict
 from vical_daemon.estimation.wording import cause_text, direction_line, direction_sigma, guidance_text
 
@@ -67,6 +68,7 @@ class Evaluator:
         self.first_frame_s: float | None = None
         self.reason, self.motion_missing = "", False
         self.motion = RunningMotion()
+        self._readings = ReadingSample()
         self._events, self._steady = EventLog(), SteadyStatus()
         self._started_s: float | None = None
         self.bumped = Cause.NONE
@@ -83,6 +85,7 @@ class Evaluator:
         self.newest_ns = t_ns
         self._events.now_s = self.elapsed_s
         self.motion.add(self.elapsed_s, gyro)
+        self._readings.add(gyro, accel)
         if self.imu_samples % _EVERY_READINGS == 1:
             self._size.append(math.hypot(*accel))
 
@@ -241,6 +244,7 @@ class Evaluator:
             refused,
             self._events.take(),
             reported.guidance,
+            self._readings.hashes,
         )
 
     def _progress(self, status: Status, known: bool, weak: list[WeakDirection]) -> float:

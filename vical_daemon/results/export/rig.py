@@ -119,6 +119,7 @@ class Rig:
         t_ns: Stamp of the newest data used, UNIX ns; 0: not known.
         devices: Serial numbers by device, e.g. ``camera/cam0``.
         duration_s: Seconds of data used; 0: not known.
+        reading_hashes: See `CalibrationEstimate`; (): not known.
         fixed: What was held at given values (as `--fix`).
         bias_sigmas: Of gyro (rad/s) and accelerometer (m/s^2) biases, shape (6,); None: not known.
     """
@@ -138,6 +139,7 @@ class Rig:
     t_ns: int = 0
     devices: dict[str, str] = field(default_factory=dict)
     duration_s: float = 0.0
+    reading_hashes: tuple[int, ...] = ()
     fixed: tuple[str, ...] = ()
     bias_sigmas: FloatArray | None = None
 

@@ -65,6 +65,7 @@ def rig_from_json(document: dict[str, Any], note: str = "") -> Rig:
         t_ns=int(document.get("t_ns") or 0),
         devices={str(k): str(v) for k, v in (document.get("devices") or {}).items()},
         duration_s=float(document.get("duration_s") or 0.0),
+        reading_hashes=tuple(int(value) for value in document.get("reading_hashes") or ()),
         fixed=tuple(str(what) for what in document.get("fixed") or ()),
         bias_sigmas=_bias_sigmas(imu),
     )
