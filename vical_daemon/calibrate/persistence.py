@@ -8,15 +8,11 @@ nothing is saved until `begin_again`. Otherwise the calibration would be stored 
 from __future__ import annotations
 
 import logging
-import math
 import os
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
-import numpy.typing as npt
 
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import Bus, Sample
@@ -26,9 +22,9 @@ from vical_daemon.config.model import Config
 from vical_daemon.config.paths import state_directory
 from vical_daemon.config.priors import camera_prior
 from vical_daemon.estimation.events import Cause, Event, EventKind
-from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import CameraPrior
-from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
+from vical_daemon.estimation.result import CalibrationEstimate, Status
+from vical_daemon.estimation.status.mounting_changes import differences
 from vical_daemon.estimation.wording import event_text
 from vical_daemon.results.store import CalibrationStore, StoredCalibration, StoreError
 from vical_daemon.service import notify
@@ -38,10 +34,6 @@ from vical_daemon.service.wall_clock import WallClock
 _log = logging.getLogger(__name__)
 SAVE_EVERY_S = 60.0
 SERIALS_WITHIN_S = 3.0
-SIGMAS = 4.0
-# Smaller changes are not announced, however significant: thermal play of a mount.
-IRRELEVANT_M, IRRELEVANT_RAD, IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
-
 
 _LOGGED = {EventKind.RESUMED, EventKind.DEVICE_REPLACED, EventKind.ESTIMATOR_RESTARTED}
 """Kinds that are in the log already, by whoever announces them."""
@@ -272,7 +264,8 @@ class CalibrationPersistence:
         for name, stored in self._before.items():
             if name in estimate.cameras and name not in self._compared:
                 self._compared.add(name)
-                found += differences(name, stored.known, estimate.cameras[name], estimate.duration_s)
+                now, t_s = estimate.cameras[name], estimate.duration_s
+                found += differences(name, stored.known, now, t_s, Cause.STORED_DIFFERS)
         return found
 
     def _listen(self, sample: Sample) -> None:
@@ -298,43 +291,6 @@ class CalibrationPersistence:
 def _of_camera(stored: StoredCalibration, name: str) -> CalibrationEstimate:
     """Return a stored estimate under the name that its camera has now."""
     return replace(stored.estimate, cameras={name: stored.known}, events=[])
-
-
-def differences(camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float) -> list[Event]:
-    """Return the significant differences of a mounting from an earlier one, above the `IRRELEVANT_` limits.
-
-    Compares each component with the sum of both variances, and rotations as the angle about each axis.
-
-    Args:
-        camera: Name of the camera.
-        before: Stored calibration.
-        now: Current estimate.
-        t_s: Time of the comparison, s since the first inertial reading.
-    """
-    old, new = before.T_imu_cam, now.T_imu_cam
-    covariance = np.asarray(old.covariance) + np.asarray(new.covariance)
-    limit = SIGMAS * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    move_m = np.subtract(new.p_m, old.p_m)
-    R_old, R_new = (so3.matrix_from_quat(np.asarray(pose.q_wxyz)) for pose in (old, new))
-    turn_rad = so3.log(R_old.T @ R_new)
-    shift_s = now.timeshift_cam_imu_s - before.timeshift_cam_imu_s
-    found: list[tuple[EventKind, float, float]] = []
-    if np.any(np.abs(move_m) > np.maximum(limit[:3], IRRELEVANT_M)):
-        found.append((EventKind.CAMERA_MOVED, *_length(move_m, covariance[:3, :3])))
-    if np.any(np.abs(turn_rad) > np.maximum(limit[3:], IRRELEVANT_RAD)):
-        found.append((EventKind.CAMERA_TURNED, *_length(turn_rad, covariance[3:, 3:])))
-    sigma_s = math.hypot(before.timeshift_sigma_s, now.timeshift_sigma_s)
-    if abs(shift_s) > max(SIGMAS * sigma_s, IRRELEVANT_S):
-        found.append((EventKind.TIMESHIFT_CHANGED, shift_s, sigma_s))
-    why = Cause.STORED_DIFFERS
-    return [Event(kind, camera, value, sigma, t_s, why) for kind, value, sigma in found]
-
-
-def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:
-    """Return the length of a vector, and its standard deviation."""
-    length = float(np.linalg.norm(vector))
-    along = vector / length
-    return length, math.sqrt(max(float(along @ covariance @ along), 0.0))
 
 
 def _merge(given: CameraPrior, stored: CameraPrior, fix: tuple[str, ...]) -> CameraPrior:

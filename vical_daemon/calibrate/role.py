@@ -17,7 +17,7 @@ from vical_daemon.bus.messages import DiagnosticStatus, Level, MessageError, dec
 from vical_daemon.bus.outgoing import Message, publish
 from vical_daemon.bus.subscriber_queue import SubscriberQueue
 from vical_daemon.calibrate.arrival_stamps import LiveStamps
-from vical_daemon.calibrate.checkpoint import Checkpoint, Kept
+from vical_daemon.calibrate.checkpoint import Checkpoint
 from vical_daemon.calibrate.estimators import Estimator, input_keys, make_estimator
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.calibrate.worker import PUBLISH_S, STUCK_S, EstimateRole
@@ -86,10 +86,7 @@ def calibrate(
     persistence = CalibrationPersistence(config, bus, clock)
     priors = persistence.priors()
     checkpoint = Checkpoint(folder, config, clock)
-    kept = _resumed(checkpoint, persistence)
-    estimator = kept.estimator if kept else _new_estimator(config, priors, persistence)
-    stamps = stamps or LiveStamps(kept.image_stamps_ns if kept else None)
-    role = EstimateRole(config, estimator, inspect=persistence.watch, stamps=stamps)
+    role, stamps = _begin(config, persistence, checkpoint, priors, stamps)
     supervisor = _Supervisor(config, role, persistence, checkpoint)
     publish(bus, persistence.stored_messages())
     commands = bus.subscribe(topics.COMMAND.key(config.rig, "estimate"), depth=8)
@@ -209,14 +206,22 @@ def _describe(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:200] + where
 
 
-def _resumed(checkpoint: Checkpoint, persistence: CalibrationPersistence) -> Kept | None:
-    """Return what a process saved that crashed or was killed, or None."""
+def _begin(
+    config: Config,
+    persistence: CalibrationPersistence,
+    checkpoint: Checkpoint,
+    priors: dict[str, CameraPrior],
+    stamps: LiveStamps | None,
+) -> tuple[EstimateRole, LiveStamps]:
+    """Return the role and its stamps: as a process saved them that crashed or was killed, or new ones."""
     kept = checkpoint.load(persistence.devices)
     if kept is not None:
         event = Event(EventKind.RESUMED, value=kept.age_s)
         _log.info("%s", event_text(event))
         persistence.announce(event)
-    return kept
+    estimator = kept.estimator if kept else _new_estimator(config, priors, persistence)
+    stamps = stamps or LiveStamps(kept.image_stamps_ns if kept else None)
+    return EstimateRole(config, estimator, inspect=persistence.watch, stamps=stamps), stamps
 
 
 def _new_estimator(

@@ -16,6 +16,7 @@ class EventKind(StrEnum):
     BUMPED = "bumped"
     STARTED_OVER = "started_over"
     STARTED_ANEW = "started_anew"
+    NOT_BUMPED = "not_bumped"
     WENT_ON = "went_on"
     RESUMED = "resumed"
     CAMERA_MOVED = "camera_moved"
@@ -61,6 +62,7 @@ class Cause(StrEnum):
 
     NONE = ""
     STORED_DIFFERS = "stored_differs"
+    BUMPED = "bumped"
     IMAGES_REFUSED = "images_refused"
     IMAGES_DISAGREE = "images_disagree"
     ESTIMATE_IMPLAUSIBLE = "estimate_implausible"
@@ -179,6 +181,12 @@ REFERENCE: dict[EventKind, About] = {
     EventKind.STARTED_ANEW: About(
         "There is a calibration again.", "", "At the first solution after `bumped` or `started_over`."
     ),
+    EventKind.NOT_BUMPED: About(
+        "Mounting and time shift show no change since before `bumped`. The target was moved, or images were "
+        "wrong.",
+        "",
+        "With a target: at the next convergence after `bumped`, if nothing differs as for `camera_moved`.",
+    ),
     EventKind.WENT_ON: About(
         "Target-free: images are used again; the calibration was kept.", "", "When a pause ends."
     ),
@@ -189,8 +197,8 @@ REFERENCE: dict[EventKind, About] = {
         "The lever arm differs. Value: distance.",
         "m",
         "Once per start, at convergence, if a component differs from the stored calibration by more than 4 "
-        "joint sigma and 2 mm; target-free also with `bumped`. With `mode: verify`, when a second check "
-        "confirms that the stored calibration no longer holds.",
+        "joint sigma and 2 mm; after `bumped` also from the calibration before. With `mode: verify`, when a "
+        "second check confirms that the stored calibration no longer holds.",
     ),
     EventKind.CAMERA_TURNED: About(
         "The mounting rotation differs. Value: angle.",

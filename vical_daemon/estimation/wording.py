@@ -235,8 +235,11 @@ def cause_text(cause: Cause, value: float | None = None) -> str:
 _CAUSES: dict[Cause, Callable[[float], str]] = {
     Cause.NONE: lambda _: "",
     Cause.STORED_DIFFERS: lambda _: "since the stored calibration",
+    Cause.BUMPED: lambda _: "since before the bump",
     Cause.IMAGES_REFUSED: lambda _: "images no longer fit the motion, even after the pose was re-initialised",
-    Cause.IMAGES_DISAGREE: lambda _: "images and motion disagree by more than before: the camera moved",
+    Cause.IMAGES_DISAGREE: lambda _: (
+        "images and motion disagree by more than before: the camera or the target moved"
+    ),
     Cause.ESTIMATE_IMPLAUSIBLE: lambda _: "the estimate is not finite",
     Cause.CALIBRATION_CONTRADICTED: lambda _: (
         "the last seconds move the calibration by more than the sigmas allow"
@@ -319,6 +322,10 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.BUMPED: ("bumped: ", lambda e: cause_text(e.cause, e.cause_value)),
     EventKind.STARTED_OVER: ("started over: ", lambda e: cause_text(e.cause, e.cause_value)),
     EventKind.STARTED_ANEW: ("", lambda _: "restarted after the change"),
+    EventKind.NOT_BUMPED: (
+        "",
+        lambda _: "no change since before the bump: the target was moved, or images were wrong",
+    ),
     EventKind.WENT_ON: ("", lambda e: f"continued after: {cause_text(e.cause, e.cause_value)}"),
     EventKind.RESUMED: (
         "",

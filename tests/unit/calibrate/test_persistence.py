@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
 from vical_daemon.bus.messages import DiagnosticStatus, Level, decode_calibration, encode_diagnostics
-from vical_daemon.calibrate.persistence import CalibrationPersistence, differences
+from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.events import Cause, Event, EventKind
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, PoseEstimate, Status
+from vical_daemon.estimation.status.mounting_changes import differences
 from vical_daemon.estimation.wording import event_text
 from vical_daemon.service.wall_clock import private_clock
 
@@ -168,7 +169,7 @@ def test_a_changed_mounting_is_announced_once(config: Config) -> None:
 
 
 def _differences(before: CameraEstimate, now: CameraEstimate) -> list[tuple[EventKind, float]]:
-    found = differences("cam0", before, now, 30.0)
+    found = differences("cam0", before, now, 30.0, Cause.STORED_DIFFERS)
     assert all(e.camera == "cam0" and e.t_s == 30.0 and e.cause is Cause.STORED_DIFFERS for e in found)
     return [(e.kind, round(e.value or 0.0, 5)) for e in found]
 

@@ -23,6 +23,7 @@ from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict,
 from vical_daemon.estimation.status.excitation import ALL_WAYS
 from vical_daemon.estimation.status.holdout_check import EVERY_S, imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
+from vical_daemon.estimation.status.mounting_changes import differences
 from vical_daemon.estimation.status.steady_status import Verdict
 
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
@@ -55,6 +56,7 @@ class StatusEvaluator(Evaluator):
         self.held_out: deque[HeldOutCheck] = deque(maxlen=_KEPT_CHECKS)
         self._residuals: dict[str, deque[tuple[float, int]]] = {}
         self._cover = Cover()
+        self._before: dict[str, CameraEstimate] = {}  # from before a bump, until it is known what changed
 
     # ------------------------------------------------------------------ what happens
     def started(self, t_s: float, partial: str = "") -> None:
@@ -141,6 +143,10 @@ class StatusEvaluator(Evaluator):
             reported = self._followed(verdict, first.R_imu_cam, f.state.gyro_bias)
             if not reported.guidance and self.status != Status.INCONSISTENT:
                 reported = reported._replace(guidance=self._cover.advice())
+        if f is None and stale is not None and self._ever_converged:
+            self._before = self._before or cameras
+        elif self._before and self.status == Status.CONVERGED:
+            self._report_change(cameras)
         return self._put_together(
             reported,
             cameras,
@@ -151,6 +157,13 @@ class StatusEvaluator(Evaluator):
             gravity=[] if shown is None else shown.state.gravity.tolist(),
             refused=self._points[0] / max(self._points[1], 1),
         )
+
+    def _report_change(self, now: dict[str, CameraEstimate]) -> None:
+        """Report what differs from before the bump, or that nothing does."""
+        for name, before in self._before.items():
+            found = differences(name, before, now[name], self.elapsed_s, Cause.BUMPED)
+            self.announce_all(found or [Event(EventKind.NOT_BUMPED, name)])
+        self._before = {}
 
     def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:
         """What keeps small sigmas from being believed, in words; empty: nothing."""

@@ -1,0 +1,55 @@
+"""Whether the mounting of a camera, or its time shift, is another than in an earlier estimate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from vical_daemon.estimation.events import Cause, Event, EventKind
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.result import CameraEstimate
+
+_SIGMAS = 4.0
+_IRRELEVANT_M, _IRRELEVANT_RAD, _IRRELEVANT_S = 2e-3, math.radians(0.1), 2e-4
+"""Smaller changes are not announced, however significant: thermal play of a mount."""
+
+
+def differences(
+    camera: str, before: CameraEstimate, now: CameraEstimate, t_s: float, cause: Cause
+) -> list[Event]:
+    """Return the significant differences of a mounting from an earlier one, above the `_IRRELEVANT_` limits.
+
+    Compares each component with the sum of both variances, and rotations as the angle about each axis.
+
+    Args:
+        camera: Name of the camera.
+        before: Earlier estimate.
+        now: Current estimate.
+        t_s: Time of the comparison, s since the first inertial reading.
+        cause: What the earlier estimate is.
+    """
+    old, new = before.T_imu_cam, now.T_imu_cam
+    covariance = np.asarray(old.covariance) + np.asarray(new.covariance)
+    limit = _SIGMAS * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    move_m = np.subtract(new.p_m, old.p_m)
+    R_old, R_new = (so3.matrix_from_quat(np.asarray(pose.q_wxyz)) for pose in (old, new))
+    turn_rad = so3.log(R_old.T @ R_new)
+    shift_s = now.timeshift_cam_imu_s - before.timeshift_cam_imu_s
+    found: list[tuple[EventKind, float, float]] = []
+    if np.any(np.abs(move_m) > np.maximum(limit[:3], _IRRELEVANT_M)):
+        found.append((EventKind.CAMERA_MOVED, *_length(move_m, covariance[:3, :3])))
+    if np.any(np.abs(turn_rad) > np.maximum(limit[3:], _IRRELEVANT_RAD)):
+        found.append((EventKind.CAMERA_TURNED, *_length(turn_rad, covariance[3:, 3:])))
+    sigma_s = math.hypot(before.timeshift_sigma_s, now.timeshift_sigma_s)
+    if abs(shift_s) > max(_SIGMAS * sigma_s, _IRRELEVANT_S):
+        found.append((EventKind.TIMESHIFT_CHANGED, shift_s, sigma_s))
+    return [Event(kind, camera, value, sigma, t_s, cause) for kind, value, sigma in found]
+
+
+def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Return the length of a vector, and its standard deviation."""
+    length = float(np.linalg.norm(vector))
+    along = vector / length
+    return length, math.sqrt(max(float(along @ covariance @ along), 0.0))
