@@ -80,6 +80,7 @@ class CalibrationFilter:
         shared: Measured errors that the corners of an image share, by camera.
         unobservable: After a partial start: axes along which lever arms are not known.
         drifting: Cameras whose clocks are known not to run as the imu's does (see `clock_drift`).
+        wandered: When their drift was last found to be another, s, and its value, s/s.
         off: What is known to be off, as in `CalibrationOptions.estimate` (see `model_selection`).
         rates: Rates at the state's instant.
         nis_level: Recent level of NIS per degree of freedom; starts tolerant, scales the gate of images.
@@ -102,6 +103,7 @@ class CalibrationFilter:
     shared: dict[str, SharedErrors] = field(default_factory=dict)
     unobservable: UnobservableDirections | None = None
     drifting: set[str] = field(default_factory=set)
+    wandered: dict[str, tuple[float, float]] = field(default_factory=dict)
     off: set[str] = field(default_factory=set)
     rates: Rates = field(default_factory=lambda: Rates(np.zeros(3), np.zeros(3)))
     nis_level: float = 4.0
@@ -462,6 +464,7 @@ class CalibrationFilter:
         self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
         self.agreement, self.walk = known.agreement, known.walk
         self.drifting, self.off, self.began_s = known.drifting, known.off, known.began_s
+        self.wandered = known.wandered
         for consistency in self.consistency.values():
             consistency.settle()
 

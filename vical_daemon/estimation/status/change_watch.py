@@ -109,8 +109,9 @@ class ChangeWatch:
         )
         if not watch.due(t_s):
             return Action.NONE
-        variance = float(f.S[index] @ f.S[index])
-        changes = watch.drifts(t_s, f.state.cameras[camera].skew, variance, f.consistency[camera].factor)
+        variance, walk = float(f.S[index] @ f.S[index]), float(f.walk[index])
+        skew, factor = f.state.cameras[camera].skew, f.consistency[camera].factor
+        changes = watch.drifts(t_s, skew, variance, factor, walk)
         begins = camera not in f.drifting and surely_apart(f, camera)
         if changes or (begins and watch.doubtful):
             self._drift.pop(camera)

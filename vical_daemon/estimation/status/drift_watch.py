@@ -34,7 +34,7 @@ class DriftWatch:
         """Whether it is time for the next estimate; more would only be more of the same."""
         return not self._past or t_s >= self._past[-1][0] + EVERY_S
 
-    def drifts(self, t_s: float, value: float, variance: float, factor: float) -> bool:
+    def drifts(self, t_s: float, value: float, variance: float, factor: float, walk: float = 0.0) -> bool:
         """Take the estimate at `t_s`; True when it has left where an earlier one said it would be.
 
         Args:
@@ -42,13 +42,15 @@ class DriftWatch:
             value: Estimate.
             variance: The filter's own.
             factor: Measured correlation factor (`Consistency.factor`), widens the test.
+            walk: Variance that the parameter may gain in a second.
         """
         if not self.due(t_s):
             return False
         far = max(
             (
-                abs(value - old) / np.sqrt(factor * max(old_variance - variance, 0.0) + self.floor**2)
-                for _, old, old_variance in self._past
+                abs(value - old)
+                / np.sqrt(factor * max(old_variance + walk * (t_s - at_s) - variance, 0.0) + self.floor**2)
+                for at_s, old, old_variance in self._past
             ),
             default=0.0,
         )
