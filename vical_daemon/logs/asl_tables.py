@@ -22,7 +22,9 @@ from vical_daemon.logs.model import RecordingError
 _NUMBER = re.compile(r"-?\d+(\.\d*)?([eE][+-]?\d+)?")
 _NUMBER_BYTES = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.IGNORECASE)
 _SEPARATORS = {b";": "semicolons", b"\t": "tabs", b" ": "spaces"}
-IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+IMAGE_SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"} | {
+    f".{kind}": kind for kind in ("pgm", "ppm", "bmp")
+}
 _STAMP_DIGITS = 13
 """Least digits of a name that is a stamp: UNIX time has 13 in ms, 16 in us, 19 in ns."""
 TABLE_LIMIT = 2**30  # bytes; two hours of a board's 144 corners at 30 Hz
@@ -182,7 +184,7 @@ def image_list(table: Path, folder: Path) -> tuple[list[str], list[Path], list[s
             lost.append(name)
             continue
         if path.suffix.lower() not in IMAGE_SUFFIXES:
-            raise RecordingError(f"{path}: images must be png or jpg")
+            raise RecordingError(f"{path}: images must be png, jpg, pgm, ppm or bmp")
         stamps.append(stamp)
         files.append(path)
     return stamps, files, lost

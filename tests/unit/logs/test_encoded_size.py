@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vical_daemon.bus.messages import encode_compressed_image, encode_imu
+from vical_daemon.bus.messages import decode_compressed_image, encode_compressed_image, encode_imu
 from vical_daemon.logs import open_recording
 from vical_daemon.logs.encoded_size import encoded_size
 from vical_daemon.logs.mcap import LogWriter
@@ -39,6 +39,10 @@ def with_orientation(data: bytes, turned: int) -> bytes:
         jpeg()[:2] + b"\xff\xe2\xff\xff" + bytes(65_533) + jpeg()[2:],  # a large preview
         cv2.imencode(".png", PICTURE)[1].tobytes(),
         cv2.imencode(".png", PICTURE.astype(np.uint16) * 257)[1].tobytes(),
+        cv2.imencode(".pgm", PICTURE)[1].tobytes(),
+        b"P5\n# taken by hand\n64 48\n255\n" + PICTURE.tobytes(),
+        cv2.imencode(".ppm", cv2.cvtColor(PICTURE, cv2.COLOR_GRAY2BGR))[1].tobytes(),
+        cv2.imencode(".bmp", PICTURE)[1].tobytes(),
     ],
 )
 def test_sizes_are_those_of_the_decoded_image(data: bytes) -> None:
@@ -46,21 +50,38 @@ def test_sizes_are_those_of_the_decoded_image(data: bytes) -> None:
     assert decode_image(np.frombuffer(data, np.uint8)).shape == (48, 64)
 
 
-@pytest.mark.parametrize("data", [b"", b"\xff\xd8", jpeg()[:20], b"\x89PNG\r\n\x1a\n", b"GIF89a" + bytes(30)])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xd8",
+        jpeg()[:20],
+        b"\x89PNG\r\n\x1a\n",
+        b"GIF89a" + bytes(30),
+        b"P5",
+        b"P5 9",
+        b"BM" + bytes(9),
+    ],
+)
 def test_damaged_and_other_images_have_none(data: bytes) -> None:
     assert encoded_size(data) is None
 
 
-@pytest.mark.parametrize("place", ["data", "."])
-def test_a_folder_of_jpegs(tmp_path, write_asl, place) -> None:
+@pytest.mark.parametrize(("place", "kind"), [("data", "jpg"), (".", "jpg"), ("data", "pgm"), (".", "bmp")])
+def test_a_folder_of_images(tmp_path, write_asl, place, kind) -> None:
     folder = write_asl(tmp_path / "a", corners=False)
     camera = folder / "mav0/cam0"
     (camera / place).mkdir(exist_ok=True)
     stamps = [1_600_000_000_000_000_000 + 50_000_000 * k for k in range(20)]
     for t in stamps:
-        (camera / place / f"{t}.jpg").write_bytes(jpeg())
-    (camera / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{t},{t}.jpg\n" for t in stamps))
-    assert open_recording(folder, check=False).cameras["cam0"].resolution == (64, 48)
+        (camera / place / f"{t}.{kind}").write_bytes(cv2.imencode(f".{kind}", PICTURE)[1].tobytes())
+    lines = "".join(f"{t},{t}.{kind}\n" for t in stamps)
+    (camera / "data.csv").write_text("#timestamp [ns],filename\n" + lines)
+    recording = open_recording(folder, check=False)
+    assert recording.cameras["cam0"].resolution == (64, 48)
+    first = next(payload for key, payload in recording.messages() if "/camera/" in key)
+    image = decode_image(np.frombuffer(decode_compressed_image(first).data, np.uint8))
+    assert image.shape == (48, 64) and (kind == "jpg" or (image == PICTURE).all())
 
 
 def test_images_without_a_list_are_dated_by_their_names(tmp_path, write_asl) -> None:
