@@ -183,8 +183,8 @@ REFERENCE: dict[EventKind, About] = {
     ),
     EventKind.NOT_BUMPED: About(
         "Mounting and time shift show no change since before `bumped`. The target was moved, or images were "
-        "wrong.",
-        "",
+        "wrong. Value: the least move of the camera that would show.",
+        "m",
         "With a target: at the next convergence after `bumped`, if nothing differs as for `camera_moved`.",
     ),
     EventKind.WENT_ON: About(

@@ -324,7 +324,10 @@ _EVENTS: dict[EventKind, tuple[str, Callable[[Event], str]]] = {
     EventKind.STARTED_ANEW: ("", lambda _: "restarted after the change"),
     EventKind.NOT_BUMPED: (
         "",
-        lambda _: "no change since before the bump: the target was moved, or images were wrong",
+        lambda e: (
+            "no change since before the bump: the target was moved, or images were wrong "
+            f"(a camera that moved by more than {_of(e, 1e3, 'mm', '.1f')} would show)"
+        ),
     ),
     EventKind.WENT_ON: ("", lambda e: f"continued after: {cause_text(e.cause, e.cause_value)}"),
     EventKind.RESUMED: (

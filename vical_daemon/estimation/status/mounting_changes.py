@@ -48,6 +48,14 @@ def differences(
     return [Event(kind, camera, value, sigma, t_s, cause) for kind, value, sigma in found]
 
 
+def visible_move_m(before: CameraEstimate, now: CameraEstimate) -> float:
+    """Return the least move of a camera, in any direction, that `differences` reports, m."""
+    covariance = np.asarray(before.T_imu_cam.covariance) + np.asarray(now.T_imu_cam.covariance)
+    return max(
+        _IRRELEVANT_M, _SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
+    )
+
+
 def _length(vector: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]) -> tuple[float, float]:
     """Return the length of a vector, and its standard deviation."""
     length = float(np.linalg.norm(vector))

@@ -23,7 +23,7 @@ from vical_daemon.estimation.status.evaluator import Evaluator, lacking_verdict,
 from vical_daemon.estimation.status.excitation import ALL_WAYS
 from vical_daemon.estimation.status.holdout_check import EVERY_S, imu_noise_error
 from vical_daemon.estimation.status.image_coverage import Cover
-from vical_daemon.estimation.status.mounting_changes import differences
+from vical_daemon.estimation.status.mounting_changes import differences, visible_move_m
 from vical_daemon.estimation.status.steady_status import Verdict
 
 IMAGES_WANDER = "whole images move against the motion of the IMU: image stabilisation, or something is loose"
@@ -162,7 +162,8 @@ class StatusEvaluator(Evaluator):
         """Report what differs from before the bump, or that nothing does."""
         for name, before in self._before.items():
             found = differences(name, before, now[name], self.elapsed_s, Cause.BUMPED)
-            self.announce_all(found or [Event(EventKind.NOT_BUMPED, name)])
+            unchanged = Event(EventKind.NOT_BUMPED, name, visible_move_m(before, now[name]))
+            self.announce_all(found or [unchanged])
         self._before = {}
 
     def _doubt(self, f: CalibrationFilter, shares: model_mixture.Weights | None) -> str:
