@@ -15,6 +15,7 @@ from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.lens_misfit import WINDOWS
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
+from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
@@ -67,6 +68,7 @@ class TargetFreeStatus(Evaluator):
         self._quiet: tuple[Cause, float | None] = Cause.NONE, None  # why images were not used of late
         self._given_up: tuple[Cause, float | None] = Cause.NONE, None
         self.models = AlternativeModels(layout, asked=options.estimate, rolling=rolling, term=term)
+        self._clock_changed_s: deque[float] = deque(maxlen=2)  # when the relation of the clocks last changed
         self.held: FloatArray | None = None  # axis of the imu along which the lever arm is not known
 
     # ------------------------------------------------------------------ what happens
@@ -141,7 +143,16 @@ class TargetFreeStatus(Evaluator):
     def stepped(self, step_s: float) -> None:
         """The time shift stepped, s; all else is kept."""
         self._announce(EventKind.TIMESHIFT_STEPPED, step_s)
+        self._clock_changed_s.append(self.elapsed_s)
         self._quiet, self._against_since_s = (Cause.NONE, None), None
+
+    @property
+    def _clock_wanders(self) -> bool:
+        """Whether the clocks changed twice, and may well change again: no time as long has passed since."""
+        if len(self._clock_changed_s) < 2:
+            return False
+        before_s, last_s = self._clock_changed_s
+        return self.elapsed_s - last_s < last_s - before_s
 
     def _announce(
         self,
@@ -181,6 +192,8 @@ class TargetFreeStatus(Evaluator):
     def window_done(self, carry: MarginalPrior) -> MarginalPrior:
         """What goes on from a complete window: what happened to the clocks is decided where that is clear."""
         carry, events = self.models.window_done(carry, self.factor())
+        if any(event.kind in (EventKind.TIMESHIFT_STEPPED, EventKind.CLOCK_WANDER) for event in events):
+            self._clock_changed_s.append(self.elapsed_s)
         self.announce_all(events)
         return carry
 
@@ -261,6 +274,7 @@ class TargetFreeStatus(Evaluator):
             weak = self._weak(camera, *at)
             lens_alone = self.models.lens is not None and not self._weak(lens_known(camera), *at)
             doubt = self.models.reason(carry, self.factor(), believed=self.believed)
+            doubt = doubt or (CLOCKS_IN_DOUBT if self._clock_wanders else "")
             self.believed &= not doubt
             reported = self._followed(self._decide(running, weak, doubt, lens_alone=lens_alone), *at)
             cameras, missing = {self.camera: camera}, {self.camera: weak}

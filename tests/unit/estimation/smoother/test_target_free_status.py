@@ -9,6 +9,7 @@ from tests.unit.estimation.some_layout import window_layout
 from vical_daemon.estimation.measurements import CalibrationOptions
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.result import Status
+from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
 from vical_daemon.estimation.smoother.marginal_prior import CORE, MarginalPrior, root_of
 from vical_daemon.estimation.smoother.target_free_status import TargetFreeStatus
 
@@ -78,3 +79,18 @@ def test_an_accelerometer_in_g_is_named_before_the_start():
     estimate = status.estimate(None, running=False, gravity=[])
     assert estimate.status == Status.INCONSISTENT
     assert "in g instead of m/s^2" in estimate.reason
+
+
+def test_a_clock_that_changes_again_and_again_is_in_doubt():
+    """After changes at 10 s and 19 s it may change again at 28 s; once that is over it is believed."""
+    status = TargetFreeStatus(CalibrationOptions(), LAYOUT)
+    for _ in range(3):
+        status.closed()
+    reasons = []
+    for second in range(36):
+        status.saw_reading(second * 10**9, np.zeros(3), np.array([0.0, 0.0, 9.8]))
+        if second in (10, 19):
+            status.stepped(2e-3)
+        reasons.append(status.estimate(carry(0.01), running=True, gravity=[]).reason)
+    doubtful = [k for k, reason in enumerate(reasons) if reason == CLOCKS_IN_DOUBT]
+    assert 19 <= doubtful[0] <= 21 and 27 <= doubtful[-1] <= 30 and len(doubtful) <= 9
