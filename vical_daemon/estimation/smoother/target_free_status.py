@@ -14,8 +14,8 @@ from vical_daemon.estimation.model.state import Layout
 from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.lens_misfit import WINDOWS
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
-from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
+from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
