@@ -214,8 +214,9 @@ class Recorder:
             session.close(self._clock.now_ns())
 
     def _fail(self, problem: str) -> None:
-        """Give up the segment (its part can be recovered) and retry later."""
-        _log.error("%s; trying again in %d s", problem, _RETRY_NS // 10**9)
+        """Give up the segment (its part can be recovered) and retry later; log the same problem once."""
+        if problem != self._problem:
+            _log.error("%s; trying again every %d s", problem, _RETRY_NS // 10**9)
         session, self._session = self._session, None
         self._problem, self._retry_ns = problem, self._clock.now_ns() + _RETRY_NS
         if session is not None:

@@ -6,6 +6,7 @@ import shutil
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus, Sample
 from vical_daemon.config.model import loads
 from vical_daemon.logs import open_recording
-from vical_daemon.logs.mcap import LogFolder, LogReader
+from vical_daemon.logs.mcap import LogError, LogFolder, LogReader
 from vical_daemon.record import role as record
 from vical_daemon.record.queue import Arrival, RecordQueue, arrival
 from vical_daemon.record.recorder import Recorder
@@ -211,6 +212,22 @@ def test_a_disk_without_room_from_the_start_is_reported_once(make, tmp_path, mon
         recorder.tick()
     assert not recorder.recording
     assert [r.levelname for r in caplog.records if "not recording: the disk" in r.message] == ["WARNING"]
+
+
+def test_a_folder_that_cannot_be_written_is_reported_once(make, caplog):
+    recorder = make()
+    for _ in range(2):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(LogFolder, "lock", Mock(side_effect=LogError("cannot record: read-only")))
+            for _ in range(3):
+                recorder._retry_ns = 0
+                recorder.tick()
+        assert "read-only" in recorder.status(RecordQueue(), 0).message
+        recorder._retry_ns = 0
+        recorder.tick()
+        assert recorder.recording
+        recorder.close()
+    assert caplog.text.count("cannot record: read-only") == 2  # once each time
 
 
 def test_reserve_stops_before_the_disk_is_full(make, tmp_path, monkeypatch):
