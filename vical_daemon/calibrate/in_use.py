@@ -104,6 +104,13 @@ def _from_store(config: Config, persistence: CalibrationPersistence, now_ns: int
     known, readouts_s = {}, {}
     for name in config.calibration_cameras:
         entry = stored[name]
+        if entry.resized(camera_prior(config, name)):
+            before, now = (
+                "{} x {}".format(*size) for size in (entry.known.resolution, config.cameras[name].size)
+            )
+            raise NothingInUseError(
+                f"{name}: what is stored is of images of {before} px, not {now}: `vical command calibrate`"
+            )
         estimate = replace(entry.estimate, cameras={name: entry.known})
         rig = rig_from_estimate(estimate, {name: config.cameras[name].size})
         known[name] = known_cameras(rig, "store")[name]

@@ -11,6 +11,7 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,7 +72,7 @@ class CalibrationPersistence:
     def priors(self, wait_s: float = SERIALS_WITHIN_S) -> dict[str, CameraPrior]:
         """Return the prior of each camera: the stored calibration of these devices, else the config.
 
-        Fixed parameters keep the values of the config.
+        Fixed parameters keep the values of the config, and so does a lens whose images have another size now.
 
         Args:
             wait_s: How long to wait for the serial numbers.
@@ -86,7 +87,11 @@ class CalibrationPersistence:
             stored = self._load(name)
             if stored is not None and stored.known.distortion_model == given.distortion_model:
                 self._before[name] = stored
-                known[name] = _merge(given, stored.prior(given.resolution), self._config.calibration.fix)
+                given_parts = {
+                    *self._config.calibration.fix,
+                    *(["intrinsics"] if stored.resized(given) else []),
+                }
+                known[name] = _merge(given, stored.prior(given.resolution), given_parts)
         return known
 
     @property
@@ -293,7 +298,7 @@ def _of_camera(stored: StoredCalibration, name: str) -> CalibrationEstimate:
     return replace(stored.estimate, cameras={name: stored.known}, events=[])
 
 
-def _merge(given: CameraPrior, stored: CameraPrior, fix: tuple[str, ...]) -> CameraPrior:
+def _merge(given: CameraPrior, stored: CameraPrior, fix: Collection[str]) -> CameraPrior:
     """Return the stored prior, with the fixed parameters of the config."""
     merged = replace(stored, readout_axis=given.readout_axis or stored.readout_axis)
     if given.readout_s:

@@ -58,6 +58,10 @@ class StoredCalibration:
         """The estimate of the camera."""
         return self.estimate.cameras[self.camera]
 
+    def resized(self, now: CameraPrior) -> bool:
+        """Whether images have another size now: then the lens of the calibration is of no use."""
+        return bool(self.known.resolution) and tuple(self.known.resolution) != now.resolution
+
     def prior(self, resolution: tuple[int, int]) -> CameraPrior:
         """Return it as the prior of a new calibration.
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from vical_daemon.bus import topics
 from vical_daemon.bus.interface import LocalBus
 from vical_daemon.bus.messages import DiagnosticStatus, Level, decode_calibration, encode_diagnostics
+from vical_daemon.calibrate.in_use import NothingInUseError, calibration_in_use
 from vical_daemon.calibrate.persistence import CalibrationPersistence
 from vical_daemon.config.model import Config, loads
 from vical_daemon.estimation.events import Cause, Event, EventKind
@@ -95,6 +96,20 @@ def test_what_the_config_holds_fixed_wins(config: Config) -> None:
     prior = _later(fixed).priors()["cam0"]
     assert prior.intrinsics == (460, 460, 300, 200) and prior.distortion is None
     assert prior.T_imu_cam is not None
+
+
+def test_a_stored_lens_of_another_image_size_is_not_used(config: Config) -> None:
+    _remember(config, replace(_camera(), resolution=[1280, 960]))
+    persistence = _later(config)
+    prior = persistence.priors()["cam0"]
+    assert prior.intrinsics is None and prior.resolution == (640, 480)
+    assert prior.T_imu_cam is not None
+    with pytest.raises(NothingInUseError, match="of images of 1280 x 960 px, not 640 x 480"):
+        calibration_in_use(config, persistence, 0)
+    _remember(config, replace(_camera(), resolution=[640, 480]))
+    persistence = _later(config)
+    assert persistence.priors()["cam0"].intrinsics == (500, 500, 320, 240)
+    assert set(calibration_in_use(config, persistence, 0).known) == {"cam0"}
 
 
 def test_nothing_is_stored_before_convergence(config: Config) -> None:
