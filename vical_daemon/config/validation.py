@@ -114,7 +114,8 @@ def _convert(value: Value, hint: Any, path: str, document: Document, problems: l
     if origin is Literal:
         if value not in arguments or isinstance(value, bool):
             choices = ", ".join(str(a) for a in arguments)
-            raise _MistakeError(path, f"{describe(value)} is none of {choices}")
+            wrong = "is not" if len(arguments) == 1 else "is none of"
+            raise _MistakeError(path, f"{describe(value)} {wrong} {choices}")
         return value
     if origin is tuple:
         return _convert_list(value, arguments, path, document, problems)

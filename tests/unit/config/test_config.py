@@ -258,7 +258,7 @@ class TestInitial:
                 r"expected 4 values \(k1 k2 p1 p2 of radtan\), found 5",
             ),
             ("cam0: {distortion_sigma: [1]}", r"distortion_sigma: expected 4 values"),
-            ("cam0: {camera_model: omni}", "none of pinhole"),
+            ("cam0: {camera_model: omni}", "is not pinhole"),
             ("camera: {}\nlidar0: {}", "unknown section"),
             ("cam0: 5", "unknown key"),
             ("imu0: {gyroscope_noise_density: -1}", "must be above 0"),
