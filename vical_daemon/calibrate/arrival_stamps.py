@@ -26,6 +26,8 @@ _LOOK = 60
 """Images between two decisions, as many as a recording must have."""
 _CERTAIN = 5.0
 """Standard errors for a decision: one chance in 3.5 million, as it is asked for every few seconds."""
+_SURE = math.log(1000.0)
+"""Log odds by which stamps are late, or late and early alike: the time shift depends on which."""
 _LOOKS = 5
 """Decisions after which stamps that were not found to be taken on arrival probably are not."""
 _WAIT_NS = 300_000_000
@@ -52,7 +54,8 @@ class ArrivalStamps:
         self.in_doubt = False
         self._looks = 0
         self._window: deque[PointsFrame] = deque(known, maxlen=_WINDOW)
-        self.found: EvenStamps | None = self._stamps().on_grid() if known else None
+        self.found: EvenStamps | None = None
+        self.found = self._stamps().on_grid() if known else None
         self._unseen = 0  # images since the last decision
         self._held: deque[PointsFrame] = deque()
         self._fitted_ns = self._last_ns = 0
@@ -97,7 +100,7 @@ class ArrivalStamps:
     def _stamps(self, until_ns: int | None = None) -> CameraStamps:
         t_ns = np.array([frame.t_cam_ns for frame in self._window], dtype=np.int64)
         marks = np.array([_mark(frame) for frame in self._window], dtype=np.int64)
-        return CameraStamps(t_ns, marks, until_ns)
+        return CameraStamps(t_ns, marks, until_ns, None if self.found is None else self.found.log_odds)
 
     def _decide(self) -> None:
         stamps = self._stamps()
@@ -106,7 +109,8 @@ class ArrivalStamps:
             if frame.t_cam_ns in wanted and len(frame.ids):
                 ids, first = np.unique(frame.ids, return_index=True)
                 stamps.take(frame.t_cam_ns, ImagePoints(ids, np.asarray(frame.uv_px)[first]))
-        self.found = stamps.even(_CERTAIN)
+        even = stamps.even(_CERTAIN)
+        self.found = even if even is not None and abs(even.log_odds) > _SURE else None
         self._looks += bool(wanted)
         self.in_doubt = bool(wanted) and self.found is None and self._looks < _LOOKS
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from vical_daemon.bus.messages import MessageError, decode_compressed_image, decode_image, decode_points
 from vical_daemon.estimation.measurements import BoolArray, FloatArray, IntArray
-from vical_daemon.logs.even_stamps import CERTAIN, EvenStamps, envelope, rounded, summary
+from vical_daemon.logs.even_stamps import CERTAIN, EvenStamps, lateness, rounded
 
 _BLOCK = 20
 """Of so many images the earliest arrival counts: with exponential delays it is late by 1/20 of their mean."""
@@ -65,9 +65,16 @@ class CameraStamps:
         t_ns: Stamps in the order of the recording, ns, shape (n,).
         marks: By which an image that was delivered twice is recognised (`mark_of`), shape (n,).
         until_ns: Later images show which of those before were late, and get no stamps; None: all get some.
+        log_odds: See `EvenStamps`, where known from earlier images.
     """
 
-    def __init__(self, t_ns: IntArray, marks: IntArray, until_ns: int | None = None) -> None:
+    def __init__(
+        self,
+        t_ns: IntArray,
+        marks: IntArray,
+        until_ns: int | None = None,
+        log_odds: float | None = None,
+    ) -> None:
         self.t_ns, first = np.unique(t_ns, return_index=True)
         marks = marks[first]
         self._again: BoolArray = np.append(False, marks[1:] == marks[:-1])[: len(self.t_ns)]
@@ -76,7 +83,7 @@ class CameraStamps:
             count = int(np.searchsorted(first_ns, until_ns, "right"))
             kept = self.t_ns <= until_ns
             self.t_ns, self._again = self.t_ns[kept], self._again[kept]
-        self._grid = even_grid(first_ns, count)
+        self._grid = even_grid(first_ns, count, log_odds)
         self._images: dict[int, ImagePoints] = {}
 
     @property
@@ -176,12 +183,13 @@ class PointReader:
         return self._tracker.detect(image_codec.decode_image(data))
 
 
-def even_grid(t_ns: IntArray, count: int | None = None) -> EvenStamps | None:
+def even_grid(t_ns: IntArray, count: int | None = None, log_odds: float | None = None) -> EvenStamps | None:
     """Put images on the even grid of their camera, whether or not it samples evenly.
 
     Args:
         t_ns: Sorted stamps of different images, ns, shape (n,).
         count: Only so many get new stamps; those after them show which of them were late. None: all.
+        log_odds: See `EvenStamps`, where known from earlier images.
 
     Returns:
         None where the stamps are even already, rounded, or far from any grid.
@@ -195,7 +203,7 @@ def even_grid(t_ns: IntArray, count: int | None = None) -> EvenStamps | None:
         return None
     usual_s = float(np.median(intervals_s[np.abs(intervals_s / usual_s - 1.0) < 0.5]))  # nothing is lost
     for parts in _PARTS:
-        grid = _grid_of(t_ns, t_s, _refined_s(t_s, usual_s / parts), count)
+        grid = _grid_of(t_ns, t_s, _refined_s(t_s, usual_s / parts), count, log_odds)
         if grid is not None:
             return grid
     return None
@@ -210,7 +218,9 @@ def _refined_s(t_s: FloatArray, period_s: float) -> float:
     return period_s
 
 
-def _grid_of(t_ns: IntArray, t_s: FloatArray, period_s: float, count: int | None) -> EvenStamps | None:
+def _grid_of(
+    t_ns: IntArray, t_s: FloatArray, period_s: float, count: int | None, log_odds: float | None
+) -> EvenStamps | None:
     """See `even_grid`: the grid with about this period."""
     cuts = np.flatnonzero(np.diff(t_s) > _GAP * period_s) + 1
     bounds = [0, *cuts.tolist(), len(t_s)]
@@ -219,11 +229,9 @@ def _grid_of(t_ns: IntArray, t_s: FloatArray, period_s: float, count: int | None
         period_s = _period_s(t_s, slots, bounds, period_s)
     t_ns, t_s, slots = t_ns[:count], t_s[:count], slots[:count]
     bounds = [*(bound for bound in bounds if bound < len(t_s)), len(t_s)]
-    even_s, found = np.empty_like(t_s), []
-    for a, b in pairwise(bounds):
-        grid_s = period_s * slots[a:b]
-        found.append(envelope(grid_s, t_s[a:b] - grid_s, _BLOCK))
-        even_s[a:b] = grid_s + found[-1].late_s
+    grid_s = period_s * slots
+    late = lateness(grid_s, t_s - grid_s, bounds, _BLOCK, log_odds)
+    even_s = grid_s + late.late_s
     taken_s = t_s - even_s
     new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
     middle_s = float(np.median(taken_s))
@@ -233,7 +241,7 @@ def _grid_of(t_ns: IntArray, t_s: FloatArray, period_s: float, count: int | None
     if jitter_s < _EVEN_S or rounded(t_ns, taken_s, period_s):
         return None
     largest_s = float(taken_s.max()) - middle_s
-    return EvenStamps(new_ns, jitter_s, largest_s, *summary(found))
+    return EvenStamps(new_ns, jitter_s, largest_s, late.sigma_s, len(bounds) - 1, late.log_odds)
 
 
 def _slots(t_s: FloatArray, period_s: float) -> IntArray:

@@ -9,6 +9,7 @@ alike (a noisy clock, interpolated stamps): then there is no lower envelope, and
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -26,9 +27,10 @@ _EVEN_S = 5e-5
 `estimation.inertial.stamp_steps`."""
 _LEAST_BLOCKS = 5
 """Pieces without losses must hold so many blocks on average: fewer do not show whether the device is even."""
-_NO_FLOOR = 0.3
+_FLOOR, _NO_FLOOR = 0.16, 0.53
 """Scatter of the earliest arrivals of blocks over that of all, by 20 in a block: of delays 0.05 (exponential)
 to 0.16 (even); of normal errors 0.53, and with 200 in a block 0.43."""
+_TINY_S = 1e-9
 CERTAIN = 3.0
 """Standard errors by which the motion must be smoother over the even stamps: one chance in 740."""
 
@@ -43,7 +45,7 @@ class EvenStamps(NamedTuple):
         sigma_s: How well the lower envelope is known, s: the scatter of the earliest arrivals about it. What
             every reading is delayed by at least cannot be seen from the stamps.
         pieces: Parts between losses, each with an envelope of its own.
-        delays: Stamps are late; else late and early alike, and on the grid in the mean.
+        log_odds: Logarithm of the odds that stamps are late, and not late and early alike.
     """
 
     t_ns: IntArray
@@ -51,7 +53,12 @@ class EvenStamps(NamedTuple):
     largest_s: float
     sigma_s: float
     pieces: int
-    delays: bool = True
+    log_odds: float
+
+    @property
+    def delays(self) -> bool:
+        """Stamps are late; else they are late and early alike, and on the grid in the mean."""
+        return self.log_odds >= 0.0
 
     def describe(self, name: str, what: str = "readings") -> str:
         """Return one line for the user about the sensor of this name."""
@@ -84,11 +91,10 @@ def even_stamps(t_ns: IntArray, gyro_rps: FloatArray) -> EvenStamps | None:
     starts = _pieces(t_s, period_s, block)
     if starts is None:
         return None
-    even_s, found = np.empty_like(t_s), []
-    for begin, end in zip(starts, [*starts[1:], len(t_s)], strict=True):
-        grid_s = np.asarray(period_s * np.arange(end - begin), np.float64)
-        found.append(envelope(grid_s, t_s[begin:end] - grid_s, block))
-        even_s[begin:end] = grid_s + found[-1].late_s
+    bounds = [*starts, len(t_s)]
+    grid_s = np.concatenate([period_s * np.arange(end - begin) for begin, end in pairwise(bounds)])
+    late = lateness(grid_s, t_s - grid_s, bounds, block)
+    even_s = grid_s + late.late_s
     taken_s = t_s - even_s
     jitter_s = float(taken_s.std())
     new_ns = t_ns[0] + np.round(even_s * 1e9).astype(np.int64)
@@ -98,7 +104,7 @@ def even_stamps(t_ns: IntArray, gyro_rps: FloatArray) -> EvenStamps | None:
     if not gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)):
         return None
     largest_s = float(taken_s.max() - np.median(taken_s))
-    return EvenStamps(new_ns, jitter_s, largest_s, *summary(found))
+    return EvenStamps(new_ns, jitter_s, largest_s, late.sigma_s, len(starts), late.log_odds)
 
 
 def _period_s(t_s: FloatArray) -> float:
@@ -152,54 +158,88 @@ def _earliest(late_s: FloatArray, block: int) -> IntArray:
     return np.array([a + int(late_s[a:b].argmin()) for a, b in pairwise(bounds)])
 
 
-class Envelope(NamedTuple):
-    """Where samples of one piece are against the even grid.
+class Lateness(NamedTuple):
+    """Where the samples of a sensor are against its even grid.
 
     Attributes:
         late_s: By how much the grid is to be moved at each sample, s, shape (n,).
-        scatter_s: Of the earliest arrivals, or means, of blocks about that, s.
-        delays: It is a lower envelope; else a mean.
+        sigma_s: How well that is known, s.
+        log_odds: See `EvenStamps`.
     """
 
     late_s: FloatArray
-    scatter_s: float
-    delays: bool
+    sigma_s: float
+    log_odds: float
 
 
-def summary(found: list[Envelope]) -> tuple[float, int, bool]:
-    """`sigma_s`, `pieces` and `delays` of `EvenStamps`, from its pieces."""
-    return float(np.median([x.scatter_s for x in found])), len(found), any(x.delays for x in found)
-
-
-def envelope(grid_s: FloatArray, late_s: FloatArray, block: int) -> Envelope:
-    """Lower envelope of arrivals, or their mean where they have none.
+def lateness(
+    grid_s: FloatArray, late_s: FloatArray, bounds: list[int], block: int, log_odds: float | None = None
+) -> Lateness:
+    """Lower envelopes of arrivals, one for each piece; or their means, where arrivals have no lower limit.
 
     Args:
         grid_s: Even time axis, s, shape (n,).
         late_s: How much later than on the grid each sample arrived, s, shape (n,).
+        bounds: First sample of each piece, and n.
         block: Of so many samples the earliest one counts.
+        log_odds: See `EvenStamps`, where known; None: by these samples, all pieces together.
     """
+    pieces = [slice(a, b) for a, b in pairwise(bounds)]
+    lower = [_envelope(grid_s[piece], late_s[piece], block) for piece in pieces]
+    means = [_mean(grid_s[piece], late_s[piece], block) for piece in pieces]
+    odds = _log_odds(late_s, lower, pieces) if log_odds is None else log_odds
+    lines = lower if odds >= 0.0 else means
+    apart_s = float(
+        np.median(np.concatenate([a.late_s - b.late_s for a, b in zip(means, lower, strict=True)]))
+    )
+    unsure = math.exp(-0.5 * abs(odds)) / (1.0 + math.exp(-abs(odds)))  # root of p (1 - p)
+    steps_s = np.concatenate([x.steps_s for x in lines])
+    scatter_s = float(np.sqrt((steps_s**2).mean() / 2.0)) if len(steps_s) else 0.0
+    return Lateness(np.concatenate([x.late_s for x in lines]), math.hypot(scatter_s, apart_s * unsure), odds)
+
+
+class _Line(NamedTuple):
+    """Lateness of one piece at each sample, s; steps from each of its blocks to the next, s."""
+
+    late_s: FloatArray
+    steps_s: FloatArray
+
+
+def _envelope(grid_s: FloatArray, late_s: FloatArray, block: int) -> _Line:
+    """Lower envelope of arrivals."""
     earliest = _earliest(late_s, block)
-    line_s, scatter_s = _line(grid_s, grid_s[earliest], late_s[earliest])
-    steps_s = np.diff(late_s[earliest])  # a line through a few points leaves too little of their scatter
-    if float(steps_s @ steps_s) <= 2.0 * len(steps_s) * _NO_FLOOR**2 * float(np.var(late_s - line_s)):
-        return Envelope(line_s, scatter_s, delays=True)
-    parts = np.array_split(np.arange(len(late_s)), len(earliest))
+    return _Line(_line(grid_s, grid_s[earliest], late_s[earliest]), np.diff(late_s[earliest]))
+
+
+def _mean(grid_s: FloatArray, late_s: FloatArray, block: int) -> _Line:
+    """Line through the means of blocks."""
+    parts = np.array_split(np.arange(len(late_s)), max(len(late_s) // block, 1))
     x, y = (np.array([values[part].mean() for part in parts]) for values in (grid_s, late_s))
-    return Envelope(*_line(grid_s, x, y), delays=False)
+    return _Line(_line(grid_s, x, y), np.diff(y))
 
 
-def _line(grid_s: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
-    """A smooth line through points: at each sample, shape (n,), and the scatter of the points about it."""
+def _log_odds(late_s: FloatArray, lower: list[_Line], pieces: list[slice]) -> float:
+    """Odds that there is a lower envelope, by the steps of the earliest arrivals from block to block."""
+    odds = 0.0
+    for piece, line in zip(pieces, lower, strict=True):
+        variance = float(np.var(late_s[piece] - line.late_s))
+        square = float(line.steps_s @ line.steps_s) / max(2.0 * variance, _TINY_S**2)
+        odds += len(line.steps_s) * math.log(_NO_FLOOR / _FLOOR)
+        odds -= 0.5 * square * (_FLOOR**-2 - _NO_FLOOR**-2)
+    return odds
+
+
+def _line(grid_s: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """A smooth line through points, at each sample, shape (n,)."""
     if len(x) < 2:
-        return np.full(len(grid_s), y[0]), 0.0
+        return np.full(len(grid_s), y[0])
     line = np.array([_local_line(x, y, float(at)) for at in x])
     fitted = np.interp(grid_s, x, line)
     for end, inner in ((0, 1), (-1, -2)):  # beyond the first and the last one: straight on
         outside = grid_s < x[0] if end == 0 else grid_s > x[-1]
         slope = (line[inner] - line[end]) / (x[inner] - x[end])
         fitted[outside] = line[end] + slope * (grid_s[outside] - x[end])
-    return fitted, float(np.std(y - line))
+    return fitted
 
 
 def _local_line(x: FloatArray, y: FloatArray, at: float) -> float:

@@ -8,7 +8,7 @@ import pytest
 
 from vical_daemon.bus.messages import encode_image, encode_imu, encode_points
 from vical_daemon.logs import open_recording
-from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, mark_of
+from vical_daemon.logs.even_images import CameraStamps, PointReader, already_even, even_grid, mark_of
 from vical_daemon.logs.mcap import LogWriter
 from vical_daemon.logs.recorded_logs import stamp_of
 
@@ -89,6 +89,34 @@ def test_stamps_that_are_early_and_late_alike_follow_their_mean(seed) -> None:
     assert not even.delays
     assert "mean of the stamps" in even.describe("cam0", "images")
     assert np.abs(errors_ms(even, taken_s)).max() < 0.4
+
+
+@pytest.mark.parametrize("length", [60, 100, 200])
+def test_short_pieces_decide_together(length) -> None:
+    """A robot at work sees its board for some seconds at a time."""
+    taken_s = truth_s() + 30.0 * (np.arange(COUNT) // length)
+    for seed in range(5):
+        rng = np.random.default_rng([seed, length])
+        for errors_s, delays in (
+            (1e-3 * rng.standard_normal(COUNT), False),
+            (rng.exponential(1e-3, COUNT), True),
+        ):
+            even = even_grid(stamps_ns(in_order(taken_s + errors_s)))
+            assert even is not None and even.pieces == -(-COUNT // length)
+            assert even.delays == delays and abs(even.log_odds) > np.log(1000.0)
+            assert abs(errors_ms(even, taken_s).mean()) < 3.0 * even.sigma_s * 1e3
+            assert even.sigma_s < 5e-4  # of 1 ms; a block of 20 images alone gives 0.22 (mean)
+
+
+def test_a_few_images_leave_the_time_shift_open() -> None:
+    """By 60 images: normal errors may be taken for delays, but the sigma includes that."""
+    z = []
+    for seed in range(30):
+        taken_s = truth_s()[:60]
+        even = even_grid(stamps_ns(taken_s + 1e-3 * np.random.default_rng([seed, 60]).standard_normal(60)))
+        assert even is not None
+        z.append(errors_ms(even, taken_s).mean() / even.sigma_s * 1e-3)
+    assert np.abs(z).max() < 5.0 and np.sqrt(np.mean(np.square(z))) < 2.5
 
 
 def test_a_first_image_that_is_late() -> None:
