@@ -27,7 +27,8 @@ _LOOK = 60
 _CERTAIN = 5.0
 """Standard errors for a decision: one chance in 3.5 million, as it is asked for every few seconds."""
 _SURE = math.log(1000.0)
-"""Log odds by which stamps are late, or late and early alike: the time shift depends on which."""
+"""Log odds by which stamps are late, or late and early alike. The latter stay as they are: the filter allows
+for jitter, and the mean of a few images is off by more than what it leaves."""
 _LOOKS = 5
 """Decisions after which stamps that were not found to be taken on arrival probably are not."""
 _WAIT_NS = 300_000_000
@@ -54,8 +55,8 @@ class ArrivalStamps:
         self.in_doubt = False
         self._looks = 0
         self._window: deque[PointsFrame] = deque(known, maxlen=_WINDOW)
-        self.found: EvenStamps | None = None
-        self.found = self._stamps().on_grid() if known else None
+        self._log_odds = _SURE if known else None  # once decided; None: as each window of images has it
+        self.found: EvenStamps | None = self._stamps().on_grid() if known else None
         self._unseen = 0  # images since the last decision
         self._held: deque[PointsFrame] = deque()
         self._fitted_ns = self._last_ns = 0
@@ -100,7 +101,7 @@ class ArrivalStamps:
     def _stamps(self, until_ns: int | None = None) -> CameraStamps:
         t_ns = np.array([frame.t_cam_ns for frame in self._window], dtype=np.int64)
         marks = np.array([_mark(frame) for frame in self._window], dtype=np.int64)
-        return CameraStamps(t_ns, marks, until_ns, None if self.found is None else self.found.log_odds)
+        return CameraStamps(t_ns, marks, until_ns, self._log_odds)
 
     def _decide(self) -> None:
         stamps = self._stamps()
@@ -110,9 +111,11 @@ class ArrivalStamps:
                 ids, first = np.unique(frame.ids, return_index=True)
                 stamps.take(frame.t_cam_ns, ImagePoints(ids, np.asarray(frame.uv_px)[first]))
         even = stamps.even(_CERTAIN)
-        self.found = even if even is not None and abs(even.log_odds) > _SURE else None
+        if even is not None and even.log_odds > _SURE:
+            self.found, self._log_odds = even, even.log_odds
         self._looks += bool(wanted)
-        self.in_doubt = bool(wanted) and self.found is None and self._looks < _LOOKS
+        open_yet = bool(wanted) and stamps.log_odds > -_SURE
+        self.in_doubt = open_yet and self.found is None and self._looks < _LOOKS
 
     def _even(self, until_ns: int) -> list[PointsFrame]:
         """Take the waiting images up to a stamp; return them with new stamps, if these increase."""

@@ -98,6 +98,11 @@ class CameraStamps:
         """Stamps of the images, ns; of one that was delivered twice the first, shape (m,)."""
         return self.t_ns[~self._again]
 
+    @property
+    def log_odds(self) -> float:
+        """See `EvenStamps`; 0 where there is no even grid."""
+        return 0.0 if self._grid is None else self._grid.log_odds
+
     def _chunks(self) -> list[slice]:
         count = int((~self._again).sum())
         begins = np.linspace(0, max(count - _CHUNK, 0), _CHUNKS).astype(int)

@@ -83,14 +83,14 @@ def test_a_camera_that_stamps_on_arrival(rate_hz: float, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_stamps_that_are_early_and_late_alike_keep_their_mean(seed: int) -> None:
+def test_stamps_that_are_early_and_late_alike_stay_as_they_are(seed: int) -> None:
     """In stretches of 6 to 28 s, as a robot at work makes them; 1 ms of jitter."""
     rng = np.random.default_rng([seed, 42])
     stretches = [600.0 * k + np.arange(round(10.0 * rng.uniform(6.0, 28.0))) / 10.0 for k in range(6)]
     taken_s = np.concatenate(stretches)
     run = play(taken_s, taken_s + 1e-3 * rng.standard_normal(len(taken_s)))
-    assert run.stamps.found is not None and not run.stamps.found.delays
-    assert abs(np.mean(run.errors_s)) < 2e-4
+    assert run.stamps.found is None and run.raw == len(taken_s)
+    assert not run.stamps.in_doubt
 
 
 @pytest.mark.parametrize("most_hz", [20.0, 22.0])
