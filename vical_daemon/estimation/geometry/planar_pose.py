@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -153,7 +153,7 @@ def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
         far: Distance of each point from its place, shape (n,).
     """
     sigma = np.median(far) / MEDIAN_RAYLEIGH
-    return np.asarray(far <= OUTLIER_SIGMAS * sigma)
+    return np.asarray(far <= SURE_SIGMAS * sigma)
 
 
 def _homographies(v: _Views) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

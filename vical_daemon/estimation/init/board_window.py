@@ -45,7 +45,7 @@ from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, 
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, noise_of_image, relative_noise
 from vical_daemon.estimation.noise.shared_errors import shared_ways
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, geman_mcclure_weight
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
@@ -404,14 +404,14 @@ class BoardWindow:
         left = view.residual
         for _ in range(2 if view.alike.size else 1):
             far = (left**2).sum(axis=1) / sigma**2
-            weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / OUTLIER_SIGMAS**2)), 0.0) / sigma
+            weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / SURE_SIGMAS**2)), 0.0) / sigma
             twice = np.repeat(weight, 2)
             A, r = view.alike * twice[:, None], view.residual.ravel() * twice
             shared = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ r)
             left = view.residual - (view.alike @ shared).reshape(-1, 2)
         far = (left**2).sum(axis=1) / sigma**2
         # what is lost from sight costs as much as a gross outlier
-        cost = np.where(view.seen, far / (1.0 + far / OUTLIER_SIGMAS**2), OUTLIER_SIGMAS**2)
+        cost = np.where(view.seen, far / (1.0 + far / SURE_SIGMAS**2), SURE_SIGMAS**2)
         return Whitened(view.ways * twice[:, None], A, r, left, float(cost.sum() + shared @ shared))
 
     def _cost(self, now: Present, images: list[Whitened]) -> float:

@@ -25,7 +25,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS
 
 MODES = 8
 _TELLING = 30
@@ -101,7 +101,7 @@ def normalised(
         along = directions[:, int(np.count_nonzero(size > 1.0)) :].T @ along
     state = along[:, :-1] @ moves
     out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.einsum("ij,ij->i", state, state))
-    return np.minimum(np.maximum(out, -OUTLIER_SIGMAS), OUTLIER_SIGMAS)
+    return np.minimum(np.maximum(out, -SURE_SIGMAS), SURE_SIGMAS)
 
 
 @dataclass(slots=True)
@@ -224,4 +224,4 @@ class Consistency:
         noise = math.sqrt(
             (4.0 * images + 2.0 / images) / (3.0 * MODES * self._weight)
         )  # of white innovations
-        self.factor = 1.0 + more if more > max(SURE_SIGMAS * noise, _FLOOR) else 1.0
+        self.factor = 1.0 + more if more > max(LIKELY_SIGMAS * noise, _FLOOR) else 1.0

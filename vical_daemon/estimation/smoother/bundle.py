@@ -21,7 +21,7 @@ from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
-from vical_daemon.estimation.significance import RESIDUAL_REFUSED, chi_square_limit
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
     MarginalPrior,
@@ -32,7 +32,7 @@ from vical_daemon.estimation.smoother.normal import ImageNoise, Normal, Problem,
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
-_OUT = np.sqrt(chi_square_limit(2, RESIDUAL_REFUSED))  # sigmas; an observation beyond is taken out
+_OUT = np.sqrt(chi_square_limit(2, LIKELY_SIGMAS))  # sigmas; an observation beyond is taken out
 _DONE = 1.0  # the last step is one with a smaller predicted reduction of the sum of squares
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows

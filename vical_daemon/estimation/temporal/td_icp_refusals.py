@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import CHANGED_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.temporal.rotation_reference import GyroReference, Reference
 from vical_daemon.estimation.temporal.rotation_start import Start
 from vical_daemon.estimation.temporal.rotation_suspects import stretched
@@ -144,13 +144,13 @@ def judge(result: TdIcpResult, of: int, reference: Reference) -> tuple[str, str]
     rate, rate_sigma = result.stamp_rate, result.stamp_rate_sigma
     if result.pairs < max(MIN_ORIENTATIONS, 0.25 * of):
         return REFUSED, f"only {result.pairs} of {of} orientations fit the {other} at the best delay"
-    if abs(rate) > max(_STRETCHED, CHANGED_SIGMAS * rate_sigma):
+    if abs(rate) > max(_STRETCHED, SURE_SIGMAS * rate_sigma):
         return REFUSED, stretched(rate, reference)
     if noise > _ROTATION_LOST_RAD:
         degrees = f"{np.rad2deg(noise):.1f} deg (rms)"
         return REFUSED, f"{other} and {reference.sensor} disagree by {degrees} at the best delay"
     reasons = lost_in_words(result.covariance, result.R_imu_cam)
-    if abs(rate) > max(_UNEVEN, CHANGED_SIGMAS * rate_sigma):
+    if abs(rate) > max(_UNEVEN, SURE_SIGMAS * rate_sigma):
         reasons.append(stretched(rate, reference))
     return (DEGENERATE if reasons else OK), "; ".join(reasons)
 
