@@ -46,7 +46,6 @@ WINDOW_S = 6.0
 _MIN_PARALLAX_DEG = 0.4
 _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
-_LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _STEPS_GROW = 12
 _ALWAYS = frozenset({IMU, LAG, "readout"})  # is estimated besides what is asked for
 
@@ -416,7 +415,7 @@ class TargetFreeCalibrator:
             self._confirmed = True
             self._pending = [*window.frames, *self._pending]  # all of them after the change
         if window is not None and self.carry is not None:
-            if keep and window.span_s > _LEAST_S:
+            if keep:
                 self._closed += 1
                 self.evaluator.closed()
             else:

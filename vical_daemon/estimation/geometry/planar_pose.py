@@ -29,7 +29,6 @@ _STEPS = 15
 _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / n)
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4
-_HOPELESS_CHI2 = 100.0
 _TOGETHER = 64  # views in one batch: beyond, arrays leave the cache, and nothing is gained
 
 
@@ -300,9 +299,6 @@ def _refine(
             gain = np.einsum("mci,mci->mc", g, step)  # of the cost, as the linear model promised
             worth = cost[left]
             done = (gain <= _GAIN_DONE * worth + 1e-26) | (damping[left] > 1e6) | ~alive
-            # a second pose that is clearly worse need not be refined to its last digit
-            limit = worth.min(axis=1) * (1.0 + _HOPELESS_CHI2 / (2.0 * views.points[left]))
-            done |= worth - 5.0 * gain > limit[:, None]
             left = left[~done.all(axis=1)]
             if not len(left):
                 break

@@ -41,7 +41,6 @@ _MAX_SCALE = 4.0
 """Corners twice as noisy as they look. What exceeds it at few images a second is the motion: with 16, the
 corners of EuRoC at 5 Hz weigh so little that neither lens nor target is found to be off."""
 _DEAD_BAND = 1.3
-_USUAL_AFTER = 20  # images that show the usual size of innovations
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
 _CUSUM_DRIFT = 1.6
 _CUSUM_LIMIT = 9.0
@@ -144,7 +143,7 @@ class Consistency:
 
         Where lens or board do not fit, the view decides: half a board at the image's edge is no bump.
         """
-        return self.images > _USUAL_AFTER and self.alarm > _CUSUM_LIMIT * self.factor * np.sqrt(self.scale)
+        return self.alarm > _CUSUM_LIMIT * self.factor * math.sqrt(self.scale)
 
     @property
     def fits(self) -> bool:

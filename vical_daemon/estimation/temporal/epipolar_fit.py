@@ -33,7 +33,6 @@ from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _ITERATIONS = 18
-_MOST_STEP_S = 0.02  # of the delay, in one iteration
 # What a lens may be off by: focal length and its ratio (relative), distortion.
 _FOCAL_SIGMA, _RATIO_SIGMA = 0.1, 0.003
 _DISTORTION_SIGMA = {
@@ -44,7 +43,6 @@ _DISTORTION_SIGMA = {
 _LENS_AFTER = 4  # iterations with the lens as given
 _LEAST_RAYS = 0.5  # share of the features; no lens near the given one leaves more of them without a ray
 _GOOD = 0.25  # weight of a feature that fits
-_LEAST_SLOPE = 0.2
 _BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
 _FAR_S, _FAR_EVERY = (1.0, 2.0), 4  # pairs that show how long errors last
 _BLOCK_S = 0.5  # errors of the fit are taken as independent beyond this
@@ -192,9 +190,7 @@ class _Fit:
                 g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
             self._prior(H, g, bias)
             dx = np.asarray(-np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g), np.float64)
-            dx *= min(
-                1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12), _MOST_STEP_S / max(abs(dx[3]), 1e-12)
-            )
+            dx *= min(1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12))
             R = R @ so3.exp(dx[:3])
             shift += float(dx[3])
             bias = bias + dx[4:7]
@@ -376,7 +372,6 @@ class _Fit:
         # a robust fit gives way by the slope of its influence, not by its weight: the large errors hold less
         u2 = 1.0 / np.sqrt(np.maximum(weight, 1e-12)) - 1.0
         slope = float((good * weight * (1.0 - 3.0 * u2) / (1.0 + u2)).sum() / max(good.sum(), 1.0))
-        slope = max(slope, _LEAST_SLOPE)
         # in the gradient large errors count by their weight: smaller, but as persistent
         gain = float((good * (weight * e) ** 2).sum() / max(float((good * e**2).sum()), 1e-30))
         noise = replace(self.noise, white=gain * self.noise.white, persistent=gain * self.noise.persistent)
