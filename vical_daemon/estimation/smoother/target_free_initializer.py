@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from copy import deepcopy
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -198,23 +198,11 @@ class TargetFreeInitializer:
         seeds, reason = self._seeds(t, gyro - gyro_bias, frames, camera, prior, look_around=not one_axis)
         lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
         free_lens = known is None and "intrinsics" not in self.options.fix
-        if free_lens and len(seeds) > _FULL_FITS:  # look around with the lens as given: three times quicker
-            every = _every(frames, _ROUGH_ROWS)
-            rough = [
-                epipolar_fit(t, gyro, frames, lens, R, s, most=_ROUGH_STEPS, every=every) for R, s in seeds
-            ]
-            seeds = _best_apart([f for f in rough if f is not None])
-        every = _every(frames, _FULL_ROWS)
-        fits = [epipolar_fit(t, gyro, frames, lens, R, s, fit_lens=free_lens, every=every) for R, s in seeds]
-        good = [f for f in fits if f is not None]
-        if free_lens and not good:  # turns about one axis may not show it; the window estimates it later
-            fits = [epipolar_fit(t, gyro, frames, lens, R, s, every=every) for R, s in seeds]
-            good = [f for f in fits if f is not None]
-        if not good:
+        best = _best_fit(t, gyro, frames, lens, seeds, free_lens=free_lens)
+        if best is None:
             return (
                 reason or "too few features are followed from image to image: more texture or light is needed"
             )
-        best = min(good, key=_misfit)
         about = None
         worst = float(np.sqrt(np.max(np.diag(best.rotation_covariance))))
         most = _ROTATION_SIGMA_RAD if given is None else np.inf
@@ -313,6 +301,30 @@ def _every(frames: Frames, most: int) -> int:
 
 def _misfit(fit: EpipolarFit) -> float:
     return fit.error / max(fit.inliers, 0.1)
+
+
+def _best_fit(
+    t: FloatArray,
+    gyro: FloatArray,
+    frames: Frames,
+    lens: tuple[FloatArray, FloatArray, str],
+    seeds: list[tuple[FloatArray, float]],
+    *,
+    free_lens: bool,
+) -> EpipolarFit | None:
+    """The best of the fits from some mountings and delays; None: there is none."""
+
+    def fits(rows: int, **options: Any) -> list[EpipolarFit]:
+        every = _every(frames, rows)
+        found = [epipolar_fit(t, gyro, frames, lens, R, s, every=every, **options) for R, s in seeds]
+        return [f for f in found if f is not None]
+
+    if free_lens and len(seeds) > _FULL_FITS:  # look around with the lens as given: three times quicker
+        seeds = _best_apart(fits(_ROUGH_ROWS, most=_ROUGH_STEPS))
+    good = fits(_FULL_ROWS, fit_lens=free_lens)
+    if free_lens and not good:  # turns about one axis may not show it; the window estimates it later
+        good = fits(_FULL_ROWS)
+    return min(good, key=_misfit, default=None)
 
 
 def _best_apart(fits: list[EpipolarFit]) -> list[tuple[FloatArray, float]]:
