@@ -9,7 +9,8 @@ perhaps (3e-3)
 likely (6e-5)
     Tests of every corner or window, where a false alarm costs that datum, or a parameter that is not needed:
     corners before and after the correction, windows without a target that contradict the calibration, errors
-    that last, late stamps without a target, a further power of a lens's radius, flicker of a sensor.
+    that last, late stamps without a target, a further power of a lens's radius, flicker of a sensor; and what
+    has changed (the time shift or the mounting), once something surely has.
 sure (2e-9)
     Tests of every image, or once a second over 20 spans, that announce something: a time shift that has
     moved, a rolling shutter, another size of the target. An error beyond is an outlier, and counts as if it
