@@ -17,7 +17,7 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
+from vical_daemon.estimation.model.inertial_links import DONE, PreintegratedLinks
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
@@ -33,7 +33,6 @@ from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
 _OUT = np.sqrt(chi_square_limit(2, LIKELY_SIGMAS))  # sigmas; an observation beyond is taken out
-_DONE = 1.0  # the last step is one with a smaller predicted reduction of the sum of squares
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
@@ -134,7 +133,7 @@ class Bundle:
             step = None if now is None else self._step(now.normal, now.damping)
             if now is None or step is None:
                 return None
-            if step.predicted_reduction >= (_DONE if now.cleaned else _SMALL * now.normal.cost):
+            if step.predicted_reduction >= (DONE if now.cleaned else _SMALL * now.normal.cost):
                 if not self._tried(now, step) or not w.stale():
                     continue
             elif not now.cleaned:  # close enough to tell outliers

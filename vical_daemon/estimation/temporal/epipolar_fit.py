@@ -89,7 +89,6 @@ def epipolar_fit(
     timeshift_s: float,
     *,
     fit_lens: bool = False,
-    most: int = _ITERATIONS,
     every: int = 1,
     gyro_density: float | None = None,
 ) -> EpipolarFit | None:
@@ -103,7 +102,6 @@ def epipolar_fit(
         R_imu_cam: Start of the mounting, good to some 20 degrees.
         timeshift_s: Start of the delay, good to some 0.1 s.
         fit_lens: Fit the lens too, within what a rough lens may be off by.
-        most: Iterations.
         every: See `make_pairs`.
         gyro_density: Of the gyro's noise, rad/s/sqrt(Hz); where given, what is known of errors that persist
             along tracks goes into `covariance` and `stretches`.
@@ -117,7 +115,7 @@ def epipolar_fit(
         return None
     fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens)
     fit.gyro_density, fit.frames = gyro_density, frames
-    return fit.run(R_imu_cam.copy(), timeshift_s, most)
+    return fit.run(R_imu_cam.copy(), timeshift_s)
 
 
 class _Fit:
@@ -171,10 +169,10 @@ class _Fit:
         out[~np.isfinite(out).all(axis=(1, 2))] = 0.0
         return np.asarray(out)
 
-    def run(self, R: FloatArray, shift: float, most: int) -> EpipolarFit | None:
+    def run(self, R: FloatArray, shift: float) -> EpipolarFit | None:
         bias = np.zeros(3)
         weight = np.where(self.ok, 1.0, 0.0)
-        for step in range(most):
+        for step in range(_ITERATIONS):
             lin = self._linearise(R, shift, bias)
             if lin is None:
                 return None
