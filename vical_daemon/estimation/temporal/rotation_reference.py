@@ -3,40 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, OrientationCurve, RotationCurve
 from vical_daemon.estimation.temporal.rotation_start import Start, coarse_start
-
-
-class Reference(Protocol):
-    """What registration needs of a reference."""
-
-    @property
-    def sensor(self) -> str:
-        """What the other sensor is called in messages."""
-
-    @property
-    def name(self) -> str:
-        """What the reference is called in messages."""
-
-    @property
-    def span_s(self) -> tuple[float, float]:
-        """First and last instant, s."""
-
-    def curve(self, bias_rps: FloatArray, /) -> RotationCurve:
-        """Its orientation over time, for a gyro bias (3,)."""
-
-    def start(
-        self, t_s: FloatArray, q_world_sensor: FloatArray, shifts_s: tuple[float, float]
-    ) -> tuple[Start | None, FloatArray]:
-        """Find a start for orientations (n, 4) at `t_s` (n,); also the bias to begin with, rad/s (3,)."""
-
-    def mirrored(self) -> Reference | None:
-        """The same with one axis reversed; None where no axes can be mistaken."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +18,7 @@ class GyroReference:
     Attributes:
         t_s: Stamps, increasing, s, shape (m,).
         gyro_rps: Rates in the imu frame, rad/s, shape (m, 3).
+        sensor, name: What the other sensor and the reference are called in messages.
     """
 
     t_s: FloatArray
@@ -59,13 +32,16 @@ class GyroReference:
         return float(self.t_s[0]), float(self.t_s[-1])
 
     def curve(self, bias_rps: FloatArray) -> RotationCurve:
-        """The integrated rates."""
+        """The orientation over time, for a gyro bias (3,)."""
         return GyroCurve.integrate(self.t_s, self.gyro_rps, bias_rps)
 
     def start(
         self, t_s: FloatArray, q_world_sensor: FloatArray, shifts_s: tuple[float, float]
     ) -> tuple[Start | None, FloatArray]:
-        """Find a start, and again with the bias that it reveals if that bias blurs the agreement."""
+        """Find a start for orientations (n, 4) at `t_s` (n,), and the bias to begin with, rad/s (3,).
+
+        It is found once more with the bias that it reveals if that bias blurs the agreement.
+        """
         bias = np.zeros(3)
         start: Start | None = None
         for _ in range(3):
@@ -84,7 +60,7 @@ class GyroReference:
 
 @dataclass(frozen=True)
 class StreamReference:
-    """Orientations, interpolated."""
+    """Orientations, interpolated; they have no bias. Attributes and methods as those of a gyro."""
 
     orientations: OrientationCurve
     sensor: str = "sensor"
@@ -95,8 +71,8 @@ class StreamReference:
         """First and last orientation, s."""
         return self.orientations.span_s
 
-    def curve(self, _bias_rps: FloatArray, /) -> RotationCurve:
-        """The orientations; they have no bias."""
+    def curve(self, _bias_rps: FloatArray) -> RotationCurve:
+        """The orientations."""
         return self.orientations
 
     def start(
@@ -107,3 +83,6 @@ class StreamReference:
 
     def mirrored(self) -> None:
         """Orientations are rotations: no axis can be reversed."""
+
+
+Reference = GyroReference | StreamReference
