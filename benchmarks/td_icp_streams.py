@@ -16,8 +16,13 @@ from vical_daemon.estimation.init.camera_start import starting_camera
 from vical_daemon.estimation.init.intrinsics_start import estimate_intrinsics
 from vical_daemon.estimation.measurements import CameraPrior, PointsFrame
 from vical_daemon.estimation.temporal.camera_orientations import target_orientations
-from vical_daemon.estimation.temporal.td_icp import TdIcpOptions, TdIcpResult, td_icp
-from vical_daemon.estimation.temporal.td_icp_joint import OrientationStream, joint_with_gyro
+from vical_daemon.estimation.temporal.td_icp import (
+    OrientationStream,
+    TdIcpOptions,
+    TdIcpResult,
+    joint_with_gyro,
+    td_icp,
+)
 
 FloatArray = npt.NDArray[np.float64]
 _LENS_VIEWS = 60

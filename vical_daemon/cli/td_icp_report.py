@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vical_daemon.estimation.temporal.delay_windows import DelayReport
-    from vical_daemon.estimation.temporal.td_icp import TdIcpResult
-    from vical_daemon.estimation.temporal.td_icp_joint import JointResult
+    from vical_daemon.estimation.temporal.td_icp import JointResult, TdIcpResult
     from vical_daemon.offline.td_icp.sources import LensUsed
 
 
@@ -75,7 +74,7 @@ def print_joint(result: JointResult, lenses: dict[str, LensUsed]) -> None:
             f"± {1e3 * pair.timeshift_sigma_s:.3f} ms"
         )
     for name, sensor in result.sensors.items():
-        q = quat_from_matrix(sensor.R_ref_sensor)
+        q = quat_from_matrix(sensor.R_imu_cam)
         sigma = np.rad2deg(sensor.rotation_sigma_rad).max()
         print(
             f"  {name}: R_{result.reference}_{name} q_wxyz = {q[0]:+.5f} {q[1]:+.5f} {q[2]:+.5f} {q[3]:+.5f} "

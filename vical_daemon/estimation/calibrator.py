@@ -43,7 +43,6 @@ from vical_daemon.estimation.status.what_jumped import Part, what_jumped
 from vical_daemon.estimation.temporal.shift_step import ShiftFit
 
 _KEEP_S = 5.0
-_STEPPED_LEAST_S = 1e-3
 _STANDS_S = 3.0  # so long images must agree with a step before it is announced
 _PROVEN_S = 10.0  # what is kept over a change of the mounting must fit so long
 _SEEK_IMAGES = 12  # in which a time shift is looked for after a clock was set
@@ -213,7 +212,7 @@ class Calibrator:
         self._stale = None
         self._held_back, self._lost, self._past = HoldoutCheck(), None, RecentPast()
         self.evaluator.started(f.state.t_s, found.reason)
-        self.watch.started(f.state.t_s)
+        self.watch.started()
         self._initializer.anew()
         left = self._take_start(f, found.frames)
         self.filter = f.plain()
@@ -409,7 +408,7 @@ class Calibrator:
         index = self.rig.layout.cameras[camera].timeshift
         assert index is not None
         f.state.cameras[camera].timeshift_s = fit.timeshift_s
-        f.forget(index, max(AGAIN_SIGMAS * fit.sigma_s, _STEPPED_LEAST_S))
+        f.forget(index, AGAIN_SIGMAS * fit.sigma_s)
         self.watch.shift_reopened()
         self.evaluator.reopened(f.state.t_s)
 

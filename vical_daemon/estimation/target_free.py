@@ -46,7 +46,6 @@ WINDOW_S = 6.0
 _MIN_PARALLAX_DEG = 0.4
 _KEEP_S = 12.0
 _LATE_S = 0.02  # inertial data must reach this far beyond an image
-_LEAST_S = 2.5  # a window shorter than this is not kept when it breaks off
 _STEPS_GROW = 12
 _ALWAYS = frozenset({IMU, LAG, "readout"})  # is estimated besides what is asked for
 
@@ -255,40 +254,45 @@ class TargetFreeCalibrator:
             return begun
         if begun is DOES_NOT_FIT:
             self.evaluator.contradicted(frames[-1][0] - frames[0][0])
-        if self.evaluator.against_s > PATIENCE_S:  # neither mounting nor clock: all is looked for
-            held, anew = self.initializer.held, self._first.begin(buffer, frames, None, self._noise)
-            if isinstance(anew, Begun):
-                self._closed, self._confirmed, self._seek_shift = 0, False, False
-                self.evaluator.changed()
-            else:
-                self.initializer.held = held
-            return anew
+        if self.evaluator.against_s > PATIENCE_S:
+            return self._all_anew(buffer, frames)
+        return self._after_change(buffer, frames, known) or begun
+
+    def _all_anew(self, buffer: ImuBuffer, frames: list[Stamped]) -> Begun | str:
+        """Start a window from nothing: neither another mounting nor another clock explains the images."""
+        held, anew = self.initializer.held, self._first.begin(buffer, frames, None, self._noise)
+        if isinstance(anew, Begun):
+            self._closed, self._confirmed, self._seek_shift = 0, False, False
+            self.evaluator.changed()
+        else:
+            self.initializer.held = held
+        return anew
+
+    def _after_change(self, buffer: ImuBuffer, frames: list[Stamped], known: MarginalPrior) -> Begun | None:
+        """Start a window that keeps what has not changed; None where that does not fit either.
+
+        An adjustment with mounting and clock free shows which of them has changed; a second one finds it.
+        """
         window = self.initializer.window_anew(buffer, frames, known)
         if isinstance(window, str):
-            return begun
+            return None
         arm, shift = mounting(self.layout), clock(self.layout)
         free = self._first.adjusted(buffer, window, known, self._noise, arm + shift)
         if free is None:
-            return begun
-        known = known.at(window.frames[0][0])
-        found = free.fit.carry.at(window.frames[0][0])
+            return None
+        known, found = known.at(window.frames[0][0]), free.fit.carry.at(window.frames[0][0])
         change = calibration_difference(window, known)
-        reopened = changed_blocks(
-            change,
-            found.covariance(),
-            known.covariance(),
-            self.layout,
-            self.evaluator.excess,
-        )
+        covariances = found.covariance(), known.covariance()
+        reopened = set(changed_blocks(change, *covariances, self.layout, self.evaluator.excess))
         if self._seek_shift:
-            reopened = tuple({*reopened, *shift})
-        moved = not set(reopened).isdisjoint(arm)
+            reopened |= set(shift)
+        moved = not reopened.isdisjoint(arm)
         if moved and not self.evaluator.proven:
             self._forget()
-            return begun
+            return None
         ended = self._first.adjusted(buffer, window, known, self._noise, reopened)
         if ended is None:
-            return begun
+            return None
         change = calibration_difference(window, known)
         change[[k for k in arm + shift if k not in reopened]] = 0.0
         if moved:
@@ -416,7 +420,7 @@ class TargetFreeCalibrator:
             self._confirmed = True
             self._pending = [*window.frames, *self._pending]  # all of them after the change
         if window is not None and self.carry is not None:
-            if keep and window.span_s > _LEAST_S:
+            if keep:
                 self._closed += 1
                 self.evaluator.closed()
             else:

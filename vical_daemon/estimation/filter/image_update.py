@@ -14,18 +14,13 @@ from vical_daemon.estimation.measurements import LEAST_POINTS, BoolArray, FloatA
 from vical_daemon.estimation.model import unscented
 from vical_daemon.estimation.noise.corner_noise import MOST_PX, noise_of_image
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
-from vical_daemon.estimation.significance import (
-    CORNER_REFUSED,
-    IMAGE_REFUSED,
-    RESIDUAL_REFUSED,
-    chi_square_limit,
-)
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 
 _POSE = 6  # degrees of freedom
 _ITERATIONS = 5
 _CURVED = 0.1  # iterate while the second-order part exceeds this share of the corner noise
-_CORNER_GATE = chi_square_limit(2, CORNER_REFUSED)
-_RESIDUAL_GATE = chi_square_limit(2, RESIDUAL_REFUSED)
+_CORNER_GATE = chi_square_limit(2, LIKELY_SIGMAS)
+_RESIDUAL_GATE = chi_square_limit(2, LIKELY_SIGMAS)
 _ALONE = 1e-2  # of the corner variance: what the states add to a row that is called residual
 
 Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread S
@@ -34,7 +29,7 @@ Linearise = Callable[[FloatArray, FloatArray], Linear]  # about dx, with spread 
 @lru_cache(maxsize=256)
 def frame_limit(dof: int) -> float:
     """Chi-square limit of a whole frame (scipy takes half a millisecond for it)."""
-    return chi_square_limit(dof, IMAGE_REFUSED)
+    return chi_square_limit(dof, SURE_SIGMAS)
 
 
 @dataclass(slots=True)

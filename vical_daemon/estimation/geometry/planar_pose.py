@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,7 +29,6 @@ _STEPS = 15
 _GAIN_DONE = 1e-6  # of the cost: far below what the noise makes uncertain (1 / n)
 _COLLINEAR = 1e-6  # ratio of the board's two extents below which it is a line
 _SAME_ROTATION_RAD = 1e-4
-_HOPELESS_CHI2 = 100.0
 _TOGETHER = 64  # views in one batch: beyond, arrays leave the cache, and nothing is gained
 
 
@@ -153,7 +152,7 @@ def inliers(far: FloatArray) -> npt.NDArray[np.bool_]:
         far: Distance of each point from its place, shape (n,).
     """
     sigma = np.median(far) / MEDIAN_RAYLEIGH
-    return np.asarray(far <= OUTLIER_SIGMAS * sigma)
+    return np.asarray(far <= SURE_SIGMAS * sigma)
 
 
 def _homographies(v: _Views) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
@@ -300,9 +299,6 @@ def _refine(
             gain = np.einsum("mci,mci->mc", g, step)  # of the cost, as the linear model promised
             worth = cost[left]
             done = (gain <= _GAIN_DONE * worth + 1e-26) | (damping[left] > 1e6) | ~alive
-            # a second pose that is clearly worse need not be refined to its last digit
-            limit = worth.min(axis=1) * (1.0 + _HOPELESS_CHI2 / (2.0 * views.points[left]))
-            done |= worth - 5.0 * gain > limit[:, None]
             left = left[~done.all(axis=1)]
             if not len(left):
                 break

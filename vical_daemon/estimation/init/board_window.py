@@ -34,6 +34,7 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.model.imu_scale import numbers_of
 from vical_daemon.estimation.model.inertial_links import (
+    DONE,
     RELINK_S,
     PreintegratedLink,
     PreintegratedLinks,
@@ -45,12 +46,11 @@ from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, 
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, noise_of_image, relative_noise
 from vical_daemon.estimation.noise.shared_errors import shared_ways
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, geman_mcclure_weight
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
 _LEAST_IMAGES = 3
 _MOST_STEPS = 20
-_DONE = 0.1  # the last step is one with a smaller predicted reduction of the sum of squares
 _TOGETHER_S = 2e-3  # images of several cameras less apart share the motion of one instant
 _OF_POSE = 6  # degrees of freedom of an image that its pose takes up
 _EDGE_S = 0.01  # by which the time shift may still move: five sigmas of the least a start is made with
@@ -211,14 +211,14 @@ class BoardWindow:
                 return False
             trial = self.present()
             beyond = [] if trial is None else self.whitened(trial)
-            if trial is None or not self._cost(trial, beyond) < cost + _DONE:
+            if trial is None or not self._cost(trial, beyond) < cost + DONE:
                 self.state, self.offset, motion, self._links, self._measured = before
                 for node, at in zip(self.nodes, motion, strict=True):
                     node.at = at
                 self._find_rates()
                 damping = max(10.0 * damping, 1e-9)
                 continue
-            if float(g @ dx) < _DONE and not damping:
+            if float(g @ dx) < DONE and not damping:
                 return self._relink()
             now, images, damping = trial, beyond, 0.1 * damping if damping > 1e-9 else 0.0
         return False
@@ -404,14 +404,14 @@ class BoardWindow:
         left = view.residual
         for _ in range(2 if view.alike.size else 1):
             far = (left**2).sum(axis=1) / sigma**2
-            weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / OUTLIER_SIGMAS**2)), 0.0) / sigma
+            weight = np.where(view.seen, np.sqrt(geman_mcclure_weight(far / SURE_SIGMAS**2)), 0.0) / sigma
             twice = np.repeat(weight, 2)
             A, r = view.alike * twice[:, None], view.residual.ravel() * twice
             shared = np.linalg.solve(np.eye(A.shape[1]) + A.T @ A, A.T @ r)
             left = view.residual - (view.alike @ shared).reshape(-1, 2)
         far = (left**2).sum(axis=1) / sigma**2
         # what is lost from sight costs as much as a gross outlier
-        cost = np.where(view.seen, far / (1.0 + far / OUTLIER_SIGMAS**2), OUTLIER_SIGMAS**2)
+        cost = np.where(view.seen, far / (1.0 + far / SURE_SIGMAS**2), SURE_SIGMAS**2)
         return Whitened(view.ways * twice[:, None], A, r, left, float(cost.sum() + shared @ shared))
 
     def _cost(self, now: Present, images: list[Whitened]) -> float:

@@ -36,9 +36,9 @@ from vical_daemon.estimation.measurements import (
 )
 from vical_daemon.estimation.model.state import CameraState, Layout
 from vical_daemon.estimation.temporal.td_icp import TdIcpResult, td_icp
+from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS
 from vical_daemon.estimation.temporal.td_icp_refusals import is_constant_rotation
 
-_LEAST_POSES = 20  # of two seconds at 10 Hz
 PARTIAL_S = 6.0  # before, a second axis may come yet
 _PARTIAL_SHIFTS_S = (-1.0, 1.0)
 
@@ -98,7 +98,7 @@ def _complete(data: StartData, seen: dict[str, Seen]) -> StartResult:
     """A start with everything known, or the reason why not."""
     rough: dict[str, RotationsKnown] = {}
     for name, (lens, _, poses) in seen.items():
-        if len(poses) < _LEAST_POSES:
+        if len(poses) < MIN_ORIENTATIONS:
             return StartResult(
                 None, f"{name}: the target is seen in {len(poses)} frames so far: show the whole board"
             )

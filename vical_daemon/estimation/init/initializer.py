@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -15,7 +15,8 @@ from vical_daemon.estimation.init import closed_form as start
 from vical_daemon.estimation.init.attempts import Attempts
 from vical_daemon.estimation.init.initial_filter import initial_filter
 from vical_daemon.estimation.init.rest import RestDetector
-from vical_daemon.estimation.init.window_start import Step, window_start
+from vical_daemon.estimation.init.velocity_gravity_init import StartResult
+from vical_daemon.estimation.init.window_start import Step, WindowStart, window_start
 from vical_daemon.estimation.measurements import (
     CalibrationOptions,
     CameraPrior,
@@ -45,9 +46,9 @@ class Attempt:
         size: The target seems to be so many times as large as in its file, and is to be taken as that large.
     """
 
-    filter: LinearisedFilter | None
-    frames: Frames
-    reason: str
+    filter: LinearisedFilter | None = None
+    frames: Frames = field(default_factory=list)
+    reason: str = ""
     motion_missing: bool = False
     rolling: tuple[str, str] | None = None
     size: float | None = None
@@ -127,28 +128,55 @@ class Initializer:
             size: Of the target as it is taken to be, over the one in its file.
             may_resize: The closed form may suggest another size.
         """
-        spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
-        if len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S:
+        if self._too_short:
             if self._rests:
                 return _none("the rig is at rest: turn it about two axes, keep the target in view", True)
             return _none("collecting the first seconds: move the rig, keep the target in view")
         if self._attempts.due(self._newest_s):  # not again for another model of the rig
             self._attempts.tried(self._newest_s)
-        look = self._newest_s >= self._next_look_s
-        if look:
-            self._next_look_s = self._newest_s + _LOOK_S
         noise = measured_noise(self._options.imu_noise, buffer.rows)
         options = replace(self._options, imu_noise=noise)
         data = start.StartData(
-            buffer, self._frames, priors, options, self._layout, self._target, may_resize, look
+            buffer, self._frames, priors, options, self._layout, self._target, may_resize, self._may_look()
         )
         result = start.attempt(data, may_be_partial=may_be_partial)
         if result.rolling is not None:
-            return Attempt(None, [], "", rolling=result.rolling)
-        other = None if result.size is None else Attempt(None, [], "", size=size * result.size)
+            return Attempt(rolling=result.rolling)
+        other = None if result.size is None else Attempt(size=size * result.size)
         if result.state is None:
             return other or _none(result.reason, result.motion_missing)
-        frames = self._frames_from(result.state)
+        frames, stated = self._frames_from(result.state), 1.0 / size
+        found = self._window(buffer, options, result.state, result, frames, stated)
+        if found is None:
+            why = "the first seconds do not fit together yet: keep the board in view and moving"
+            return other or _none(result.reason or why, result.still_axes is not None)
+        if found.size is not None:
+            return Attempt(size=1.0 if found.size == stated else size * found.size)
+        return Attempt(found.filter, frames, result.reason)
+
+    @property
+    def _too_short(self) -> bool:
+        """Whether some camera has not seen enough yet."""
+        spans = [f[-1][0] - f[0][0] for f in self._frames.values() if len(f) > 1]
+        return len(spans) < len(self._frames) or min(spans) < _MIN_SPAN_S
+
+    def _may_look(self) -> bool:
+        """Whether enough is new to look for a rolling shutter once more."""
+        look = self._newest_s >= self._next_look_s
+        if look:
+            self._next_look_s = self._newest_s + _LOOK_S
+        return look
+
+    def _window(
+        self,
+        buffer: ImuBuffer,
+        options: CalibrationOptions,
+        state: State,
+        result: StartResult,
+        frames: Frames,
+        stated: float,
+    ) -> WindowStart | None:
+        """Adjust a window from `state` on; see `window_start`."""
         make = partial(
             initial_filter,
             layout=self._layout,
@@ -156,18 +184,9 @@ class Initializer:
             still_axes=result.still_axes,
             turn_axis_cam=result.turn_axis_cam,
         )
-        stated = 1.0 / size
-        found = window_start(
-            result.state, result.poses, frames, make, self._step, buffer, self._target, stated=stated
+        return window_start(
+            state, result.poses, frames, make, self._step, buffer, self._target, stated=stated
         )
-        if found is None and other is not None:
-            return other
-        if found is None:
-            why = "the first seconds do not fit together yet: keep the board in view and moving"
-            return _none(result.reason or why, result.still_axes is not None)
-        if found.size is not None:
-            return Attempt(None, [], "", size=1.0 if found.size == stated else size * found.size)
-        return Attempt(found.filter, frames, result.reason)
 
     def _frames_from(self, state: State) -> Frames:
         """Images from the time of the state on, with their stamps, s; in the order of IMU time."""
@@ -187,4 +206,4 @@ class Initializer:
 
 
 def _none(reason: str, motion_missing: bool = False) -> Attempt:
-    return Attempt(None, [], reason, motion_missing)
+    return Attempt(reason=reason, motion_missing=motion_missing)

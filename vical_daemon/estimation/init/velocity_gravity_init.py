@@ -14,8 +14,6 @@ from vical_daemon.estimation.model.state import CameraState, State
 from vical_daemon.estimation.significance import SURE_SIGMAS
 
 _STRETCH_S = 10.0
-_FAR_SIZE = 0.1  # from here to the size of a target the filter does not get by itself
-_SIZES = (0.02, 50.0)  # true over stated, metres for inches included; beyond, something else is wrong
 _DRIFT_M = 5e-3  # of the double integral over the stretch; with little motion it counts
 
 
@@ -132,9 +130,7 @@ def _other_size(motion: LinearMotion, p: FloatArray, sigma: FloatArray, gravity_
     Gravity must come out right with it: an accelerometer in g, too, makes the world look another size.
     """
     found = linear_start(motion, p, sigma, free_size=True)
-    if not _SIZES[0] < found.size < _SIZES[1]:
-        return None
-    if abs(found.size - 1.0) < max(_FAR_SIZE, SURE_SIGMAS * found.sigma_size):
+    if found.size <= 0.0 or abs(found.size - 1.0) < SURE_SIGMAS * found.sigma_size:
         return None
     gravity = float(np.linalg.norm(found.gravity)) / gravity_mps2
     return found.size if 0.9 < gravity < 1.1 else None

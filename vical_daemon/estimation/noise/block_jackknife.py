@@ -18,7 +18,7 @@ from scipy.special import chdtri
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.significance import STRETCHES_DISAGREE
+from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chance
 
 _LEAST_INFORMATION = 1e-9  # of the variance of all: a run with less has none
 _MOST = 40  # stretches kept apart; beyond, the oldest two become one
@@ -130,6 +130,6 @@ class BlockJackknife:
         ratio = ((without - values) ** 2 / usual).mean(axis=0)
         # a mean of dependent squares: a chi-square of as many degrees as have its variance [Satterthwaite]
         dof = len(runs) ** 2 / (C**2 / (usual[:, None] * usual[None])).sum(axis=(0, 1))
-        limit = chdtri(dof, STRETCHES_DISAGREE / k) / dof
+        limit = chdtri(dof, chance(PERHAPS_SIGMAS) / k) / dof
         student = dof / np.maximum(dof - 2.0, 1.0)
         return JackknifeResult(values, P, np.where(ratio > limit, student * ratio, 1.0))

@@ -25,7 +25,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.unscented import root, solve_lower
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS
 
 MODES = 8
 _TELLING = 30
@@ -41,7 +41,6 @@ _MAX_SCALE = 4.0
 """Corners twice as noisy as they look. What exceeds it at few images a second is the motion: with 16, the
 corners of EuRoC at 5 Hz weigh so little that neither lens nor target is found to be off."""
 _DEAD_BAND = 1.3
-_USUAL_AFTER = 20  # images that show the usual size of innovations
 _SETTLE = 10  # images: the first updates of a wide prior are not yet linear
 _CUSUM_DRIFT = 1.6
 _CUSUM_LIMIT = 9.0
@@ -101,7 +100,7 @@ def normalised(
         along = directions[:, int(np.count_nonzero(size > 1.0)) :].T @ along
     state = along[:, :-1] @ moves
     out: FloatArray = along[:, -1] / np.sqrt(1.0 + np.einsum("ij,ij->i", state, state))
-    return np.minimum(np.maximum(out, -OUTLIER_SIGMAS), OUTLIER_SIGMAS)
+    return np.minimum(np.maximum(out, -SURE_SIGMAS), SURE_SIGMAS)
 
 
 @dataclass(slots=True)
@@ -144,7 +143,7 @@ class Consistency:
 
         Where lens or board do not fit, the view decides: half a board at the image's edge is no bump.
         """
-        return self.images > _USUAL_AFTER and self.alarm > _CUSUM_LIMIT * self.factor * np.sqrt(self.scale)
+        return self.alarm > _CUSUM_LIMIT * self.factor * math.sqrt(self.scale)
 
     @property
     def fits(self) -> bool:
@@ -224,4 +223,4 @@ class Consistency:
         noise = math.sqrt(
             (4.0 * images + 2.0 / images) / (3.0 * MODES * self._weight)
         )  # of white innovations
-        self.factor = 1.0 + more if more > max(SURE_SIGMAS * noise, _FLOOR) else 1.0
+        self.factor = 1.0 + more if more > max(LIKELY_SIGMAS * noise, _FLOOR) else 1.0

@@ -15,7 +15,7 @@ import numpy as np
 from vical_daemon.estimation.geometry.camera_model import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RADTAN
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.noise.block_jackknife import BlockJackknife
-from vical_daemon.estimation.significance import STRETCH_S, TERM_SIGMAS
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, STRETCH_S
 
 _WEAK = 0.1  # of the focal length: as good as nothing known
 _WEAK_DISTORTION = 0.5
@@ -65,7 +65,7 @@ class LensAgreement:
         self.factors = self._stretches.compared(weak[:n]).factors
         free = self._stretches.compared(weak)
         power, variance = free.values[n], free.covariance[n, n]
-        doubt = TERM_SIGMAS**2 * free.factors[n] * variance
+        doubt = LIKELY_SIGMAS**2 * free.factors[n] * variance
         there = power if power**2 > doubt else 0.0
         self.moved = free.covariance[:n, n] * (there / variance)
 

@@ -17,7 +17,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.state import ATTITUDE, Layout, State
 from vical_daemon.estimation.noise.variance_components import SIZE, Observed, grid, of_images, posterior
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 MEMORY = 400  # images by which a noise is known
 TELLING = 100  # images; the correlation of neighbours is then known to 0.1
@@ -126,7 +126,7 @@ class SharedErrors:
             return math.inf
         late, usual = self._b[:n, way] / size, self._C[:n, way, way] / size**2
         weight = 1.0 / (usual + sigma**2)
-        most = OUTLIER_SIGMAS / np.sqrt(weight)  # one outlier is no correlation
+        most = SURE_SIGMAS / np.sqrt(weight)  # one outlier is no correlation
         late = np.clip(late, -most, most)
         pairs = weight[1:] * weight[:-1]
         newest = self.images % MEMORY  # where the oldest follows the newest

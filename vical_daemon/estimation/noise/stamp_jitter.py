@@ -9,7 +9,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.robust import MEDIAN_CHI2
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS, SURE_SIGMAS
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS
 
 FLOOR_S = 2e-5  # of a jitter that is one
 _ROUNDS = 8
@@ -24,15 +24,15 @@ def excess(square: FloatArray, usual: FloatArray) -> float:
         square: Squared errors, s^2, shape (n,).
         usual: Their variances without, s^2, shape (n,).
     """
-    ratio = np.minimum(square / usual, OUTLIER_SIGMAS**2)
+    ratio = np.minimum(square / usual, SURE_SIGMAS**2)
     telling = 1.0 / np.maximum(usual, np.median(usual))  # images with a wide prior have little to say
-    if telling @ (ratio - 1.0) < SURE_SIGMAS * np.sqrt(2.0 * float(telling @ telling)):
+    if telling @ (ratio - 1.0) < LIKELY_SIGMAS * np.sqrt(2.0 * float(telling @ telling)):
         return 0.0
     # maximum likelihood by scoring
     variance = max(float(np.median(square)) / MEDIAN_CHI2 - float(np.median(usual)), 0.0)
     for _ in range(_ROUNDS):
         expected = usual + variance
         weight = expected**-2
-        excess = np.minimum(square, OUTLIER_SIGMAS**2 * expected) - usual
+        excess = np.minimum(square, SURE_SIGMAS**2 * expected) - usual
         variance = max(float(weight @ excess / weight.sum()), 0.0)
     return float(np.sqrt(variance)) if variance > FLOOR_S**2 else 0.0

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from vical_daemon.estimation.measurements import FloatArray, IntArray
-from vical_daemon.estimation.significance import OUTLIER_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 
 STEP = 1.2
 """Ratio of neighbours on the grid: a sigma between two is met to a tenth."""
@@ -79,7 +79,7 @@ def of_images(observed: Observed, first: FloatArray, others: FloatArray) -> Floa
     det = 1.0 + _determinant(G) @ powers
     explained = (_quadratic(G, h) @ powers) / det
     size = np.einsum("ni,nij,nj->n", b, whiten, b)
-    far = size > OUTLIER_SIGMAS**2
+    far = size > SURE_SIGMAS**2
     if far.any():
         before = size[far, None]
         explained[far] = _clipped(before) - _clipped(np.maximum(before - explained[far], 0.0))
@@ -139,7 +139,7 @@ def _between(nodes: IntArray, places: IntArray) -> FloatArray:
 
 def _clipped(square: FloatArray) -> FloatArray:
     """Squared sizes, of which those of outliers grow by their logarithm only."""
-    limit = OUTLIER_SIGMAS**2
+    limit = SURE_SIGMAS**2
     return np.where(square > limit, limit * (1.0 + np.log(np.maximum(square, limit) / limit)), square)
 
 

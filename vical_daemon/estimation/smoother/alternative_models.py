@@ -31,7 +31,6 @@ from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.snapshot import ReportedModels
 
 _TERM = "lens_term"
-_SHORTEST_S = 1e-3  # of a readout that is worth a word
 
 _WINDOWS_SHOW = 2  # beginning with that in which something changed, until what it was is clear
 
@@ -124,7 +123,7 @@ class AlternativeModels:
     def rolls(carry: MarginalPrior, factor: float = 1.0) -> bool:
         """Whether a readout is beyond doubt; `factor`: measured variance over the stated one."""
         sigma_s = float(np.sqrt(factor)) * carry.sigma(carry.layout.camera.readout)
-        return abs(carry.camera.readout_s) > max(SURE_SIGMAS * sigma_s, _SHORTEST_S)
+        return abs(carry.camera.readout_s) > SURE_SIGMAS * sigma_s
 
     def reason(self, carry: MarginalPrior, factor: float, *, believed: bool) -> str:
         """What may not be as it is taken to be, in words; empty where nothing speaks for it.

@@ -6,6 +6,7 @@ long its errors last, are measured on the way. [docs/math/target_free.md]
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +17,11 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.geometry.so3 import tangents
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.model.inertial_links import PreintegratedLinks
+from vical_daemon.estimation.model.inertial_links import DONE, PreintegratedLinks
 from vical_daemon.estimation.model.retract import moved_camera, orthonormal
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH
-from vical_daemon.estimation.significance import RESIDUAL_REFUSED, chi_square_limit
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.inertial import links_left
 from vical_daemon.estimation.smoother.marginal_prior import (
     MarginalPrior,
@@ -31,11 +32,11 @@ from vical_daemon.estimation.smoother.normal import ImageNoise, Normal, Problem,
 from vical_daemon.estimation.smoother.quality import correlation, parallax_deg
 from vical_daemon.estimation.smoother.window import Landmarks, Seen, Window
 
-_OUT = np.sqrt(chi_square_limit(2, RESIDUAL_REFUSED))  # sigmas; an observation beyond is taken out
-_DONE = 1.0  # the last step is one with a smaller predicted reduction of the sum of squares
+_OUT = np.sqrt(chi_square_limit(2, LIKELY_SIGMAS))  # sigmas; an observation beyond is taken out
 _DAMPING = 1e-12
 """Of the diagonal, while steps succeed. Links make the entries of each image 1e10 times what a window knows
 of the tilt of them all: at 1e-9 windows stopped with 20 deg of tilt hidden in the accelerometer's bias."""
+_LEAST_LANDMARKS = 8
 _FAR = 1e-3  # 1/m: nearer to infinity no image shows a distance
 _SMALL = 0.1  # of the sum of squares: outliers stand out once a step is predicted to reduce it by less
 _MORE = 1.2  # times the jitter that is allowed for: so much does not end a window
@@ -82,6 +83,29 @@ class _Step(NamedTuple):
     root: FloatArray | None  # see `_root`; None where the step was damped or bounded
 
 
+@dataclass(slots=True)
+class _Present:
+    """A window about its present values.
+
+    Attributes:
+        view: Of the observations.
+        links: Between the images.
+        normal: Normal equations.
+        damping: Of the next step.
+        cleaned: Observations that do not fit have been taken out.
+    """
+
+    view: View
+    links: PreintegratedLinks
+    normal: Normal
+    damping: float = _DAMPING
+    cleaned: bool = False
+
+    def relax(self) -> None:
+        """A step succeeded."""
+        self.damping = max(0.01 * self.damping, _DAMPING)
+
+
 _Saved = tuple[
     FloatArray, FloatArray, FloatArray, FloatArray, CameraState, Landmarks, FloatArray, FloatArray, FloatArray
 ]
@@ -104,60 +128,65 @@ class Bundle:
     # ------------------------------------------------------------------ the loop
     def solve(self, buffer: ImuBuffer, most: int) -> Fit | None:
         """Iterate until nothing changes or `most` steps are done; None where it does not hold together."""
-        w = self.window
-        seen = w.observe()
-        if len(seen.begin) < 8:
-            return None
-        lam, steps, cleaned = _DAMPING, 0, False
-        links = w.stacked()
-        view = self.problem.view(seen)
-        normal = self.problem.normal(view, links)
-        while steps < most:
-            steps += 1
-            step = self._step(normal, lam)
-            if step is None:
+        w, now = self.window, self._present()
+        for steps in range(1, most + 1):
+            step = None if now is None else self._step(now.normal, now.damping)
+            if now is None or step is None:
                 return None
-            if cleaned and step.predicted_reduction < _DONE and lam > _DAMPING:
-                lam = max(0.01 * lam, _DAMPING)  # with damping, little is predicted
+            if step.predicted_reduction >= (DONE if now.cleaned else _SMALL * now.normal.cost):
+                if not self._tried(now, step) or not w.stale():
+                    continue
+            elif not now.cleaned:  # close enough to tell outliers
+                now.view = self._applied(step, now.view.seen)
+                self._learn_noise(now.view)
+                if self._refuse(now.view):
+                    now.view = self.problem.view(w.observe())
+                now.cleaned = True
+            elif now.damping > _DAMPING:  # with damping, little is predicted
+                now.relax()
                 continue
-            if cleaned and step.predicted_reduction < _DONE:
-                view = self._applied(step, seen)
-                if not self._suspects_jitter(view, links):
-                    fit = self._result(view, links, normal, step.root, steps, settled=True)
+            else:
+                now.view = self._applied(step, now.view.seen)
+                if not self._suspects_jitter(now):
+                    fit = self._result(now, step.root, steps, settled=True)
                     if fit is None or 2 * steps > most or not self._jitters_more(fit):
                         return fit
                 w.bad.clear()  # late images had looked like outliers
-                seen, cleaned = w.observe(), False
-                view = self.problem.view(seen)
-            elif not cleaned and step.predicted_reduction < _SMALL * normal.cost:
-                # close enough to tell outliers
-                view = self._applied(step, seen)
-                cleaned = True
-                self._learn_noise(view)
-                if self._refuse(view):
-                    seen = w.observe()
-                    if len(seen.begin) < 8:
-                        return None
-                    view = self.problem.view(seen)
-            else:
-                saved = self._save()
-                there = self._applied(step, seen)
-                trial = self.problem.normal(there, links)
-                if not np.isfinite(trial.cost) or trial.cost > normal.cost:
-                    self._restore(saved)
-                    lam *= 100.0
-                    if lam > 1e6:
-                        break
-                    continue
-                view, normal, lam = there, trial, max(0.01 * lam, _DAMPING)
-                if not w.stale():
-                    continue
-            if w.stale():
-                if not w.relink(buffer):
-                    return None
-                links, view = w.stacked(), self.problem.view(seen)
-            normal = self.problem.normal(view, links)
-        return self._result(view, links, normal, None, steps, settled=False)
+                now.view, now.cleaned = self.problem.view(w.observe()), False
+            now = self._relinearised(now, buffer)
+        return None if now is None else self._result(now, None, most, settled=False)
+
+    def _present(self) -> _Present | None:
+        """The window as it is given; None where too few features are followed."""
+        seen = self.window.observe()
+        if len(seen.begin) < _LEAST_LANDMARKS:
+            return None
+        links, view = self.window.stacked(), self.problem.view(seen)
+        return _Present(view, links, self.problem.normal(view, links))
+
+    def _tried(self, now: _Present, step: _Step) -> bool:
+        """Take a step if it lowers the sum of squares; else damp the next one."""
+        saved = self._save()
+        there = self._applied(step, now.view.seen)
+        trial = self.problem.normal(there, now.links)
+        if np.isfinite(trial.cost) and trial.cost <= now.normal.cost:
+            now.view, now.normal = there, trial
+            now.relax()
+            return True
+        self._restore(saved)
+        now.damping *= 100.0
+        return False
+
+    def _relinearised(self, now: _Present, buffer: ImuBuffer) -> _Present | None:
+        """Normal equations about what has changed; None where readings or features do not reach."""
+        if len(now.view.seen.begin) < _LEAST_LANDMARKS:
+            return None
+        if self.window.stale():
+            if not self.window.relink(buffer):
+                return None
+            now.links, now.view = self.window.stacked(), self.problem.view(now.view.seen)
+        now.normal = self.problem.normal(now.view, now.links)
+        return now
 
     def _save(self) -> _Saved:
         w = self.window
@@ -254,12 +283,12 @@ class Bundle:
         return self.problem.view(seen)
 
     # ------------------------------------------------------------------ noise, outliers, result
-    def _suspects_jitter(self, view: View, links: PreintegratedLinks) -> bool:
+    def _suspects_jitter(self, now: _Present) -> bool:
         """Whether what was adjusted with stamps believed shows that they jitter; from then on they may."""
         problem = self.problem
         if problem.noise.jitter_s:
             return False
-        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(view, links))
+        problem.noise = problem.noise._replace(jitter_s=problem.suspected_jitter_s(now.view, now.links))
         return problem.noise.jitter_s > 0.0
 
     def _jitters_more(self, fit: Fit) -> bool:
@@ -298,19 +327,10 @@ class Bundle:
             w.bad.add((w.frames[seen.frame[n]][1].t_cam_ns, int(w.landmarks.ids[seen.landmark[n]])))
         return int(out.sum())
 
-    def _result(
-        self,
-        view: View,
-        links: PreintegratedLinks,
-        normal: Normal,
-        root: FloatArray | None,
-        steps: int,
-        *,
-        settled: bool,
-    ) -> Fit | None:
+    def _result(self, now: _Present, root: FloatArray | None, steps: int, *, settled: bool) -> Fit | None:
         """How the window came out, by its last normal equations and their root, if that is known."""
-        w, order, seen = self.window, self.problem.order(), view.seen
-        root = self._root(normal) if root is None else root
+        w, order, view, seen = self.window, self.problem.order(), now.view, now.view.seen
+        root = self._root(now.normal) if root is None else root
         if root is None:
             return None
         own = len(order.own)
@@ -321,7 +341,7 @@ class Bundle:
             return None
         e, ok = self.problem.pixel_errors(view)[0], view.valid
         self.view = view
-        inertial, jitter_s = links_left(w, links, self.problem.noise.jitter_s, order, np.tril(root))
+        inertial, jitter_s = links_left(w, now.links, self.problem.noise.jitter_s, order, np.tril(root))
         good = ok & ((e**2).sum(axis=1) <= _OUT**2)
         squares = float((np.minimum((e[ok] ** 2).sum(axis=1), _OUT**2)).sum())
         change = np.concatenate([calibration_difference(w, self.carry), w.jumps - self.carry.jumps])

@@ -6,7 +6,7 @@ from copy import deepcopy
 from dataclasses import replace
 
 from vical_daemon.estimation.measurements import COLUMNS
-from vical_daemon.estimation.significance import COLUMNS_TRIED, chi_square_limit
+from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.bundle import Bundle, Fit
 from vical_daemon.estimation.smoother.marginal_prior import MarginalPrior
 from vical_daemon.estimation.smoother.window import Window
@@ -20,7 +20,7 @@ def shows_columns(bundle: Bundle, fit: Fit) -> bool:
     """
     if bundle.view is None:
         return False
-    chance = chi_square_limit(1, COLUMNS_TRIED) * max(fit.squares / fit.dof, 1.0)
+    chance = chi_square_limit(1, PERHAPS_SIGMAS) * max(fit.squares / fit.dof, 1.0)
     return bundle.problem.late_by_columns(bundle.view) > chance
 
 

@@ -55,9 +55,7 @@ _LEAST_S, _LEAST_KNOWN_S = 3.5, 2.0
 _ROTATION_SIGMA_RAD = float(np.deg2rad(2.0))
 _SHIFT_SIGMA_S = 4e-3
 _MOST_IMAGES = 120  # of a start: its cost grows with the cube
-_FULL_FITS = 2
-_ROUGH_STEPS = 8
-_ROUGH_ROWS, _FULL_ROWS = 4000, 20000  # features in pairs of images: more of the same images add little
+_MOST_FEATURES = 20_000  # in pairs of images: more of the same images add little
 
 
 class TargetFreeInitializer:
@@ -198,23 +196,11 @@ class TargetFreeInitializer:
         seeds, reason = self._seeds(t, gyro - gyro_bias, frames, camera, prior, look_around=not one_axis)
         lens = (camera.intrinsics, camera.distortion, camera.distortion_model)
         free_lens = known is None and "intrinsics" not in self.options.fix
-        if free_lens and len(seeds) > _FULL_FITS:  # look around with the lens as given: three times quicker
-            every = _every(frames, _ROUGH_ROWS)
-            rough = [
-                epipolar_fit(t, gyro, frames, lens, R, s, most=_ROUGH_STEPS, every=every) for R, s in seeds
-            ]
-            seeds = _best_apart([f for f in rough if f is not None])
-        every = _every(frames, _FULL_ROWS)
-        fits = [epipolar_fit(t, gyro, frames, lens, R, s, fit_lens=free_lens, every=every) for R, s in seeds]
-        good = [f for f in fits if f is not None]
-        if free_lens and not good:  # turns about one axis may not show it; the window estimates it later
-            fits = [epipolar_fit(t, gyro, frames, lens, R, s, every=every) for R, s in seeds]
-            good = [f for f in fits if f is not None]
-        if not good:
+        best = _best_fit(t, gyro, frames, lens, seeds, free_lens=free_lens)
+        if best is None:
             return (
                 reason or "too few features are followed from image to image: more texture or light is needed"
             )
-        best = min(good, key=_misfit)
         about = None
         worst = float(np.sqrt(np.max(np.diag(best.rotation_covariance))))
         most = _ROTATION_SIGMA_RAD if given is None else np.inf
@@ -306,23 +292,34 @@ def _chained(t_cam_s: FloatArray, chain: CameraOrientations) -> Orientations:
     return Orientations(t_cam_s, chain.R_world_cam, np.sqrt(walked))
 
 
-def _every(frames: Frames, most: int) -> int:
-    """In which images pairs are to begin, so that there are at most so many features in pairs."""
-    return max(1, math.ceil(len(LAGS_S) * sum(len(f.ids) for _, f in frames) / most))
-
-
 def _misfit(fit: EpipolarFit) -> float:
     return fit.error / max(fit.inliers, 0.1)
 
 
-def _best_apart(fits: list[EpipolarFit]) -> list[tuple[FloatArray, float]]:
-    """Where the best fits ended that did not end in the same place, as seeds."""
-    out: list[tuple[FloatArray, float]] = []
-    for fit in sorted(fits, key=_misfit):
-        turns = [float(np.linalg.norm(so3.log(R.T @ fit.R_imu_cam))) for R, _ in out]
-        if len(out) < _FULL_FITS and min(turns, default=np.inf) > _ROTATION_SIGMA_RAD:
-            out.append((fit.R_imu_cam, fit.timeshift_s))
-    return out
+def _best_fit(
+    t: FloatArray,
+    gyro: FloatArray,
+    frames: Frames,
+    lens: tuple[FloatArray, FloatArray, str],
+    seeds: list[tuple[FloatArray, float]],
+    *,
+    free_lens: bool,
+) -> EpipolarFit | None:
+    """The best of the fits from some mountings and delays; None: there is none."""
+    features = len(LAGS_S) * sum(len(f.ids) for _, f in frames)
+    every = max(1, math.ceil(features / _MOST_FEATURES))
+
+    def fit(R: FloatArray, shift_s: float, *, fit_lens: bool = False) -> EpipolarFit | None:
+        return epipolar_fit(t, gyro, frames, lens, R, shift_s, fit_lens=fit_lens, every=every)
+
+    if len(seeds) != 1 or not free_lens:  # look around with the lens as given: three times quicker
+        fits = [f for f in (fit(*seed) for seed in seeds) if f is not None]
+        best = min(fits, key=_misfit, default=None)
+        if best is None or not free_lens:
+            return best
+        seeds = [(best.R_imu_cam, best.timeshift_s)]
+    # turns about one axis may not show the lens; the window estimates it later
+    return fit(*seeds[0], fit_lens=True) or fit(*seeds[0])
 
 
 def _only_unsure_about(fit: EpipolarFit, axis: FloatArray | None) -> FloatArray | None:

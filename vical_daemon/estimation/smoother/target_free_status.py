@@ -15,7 +15,7 @@ from vical_daemon.estimation.model.trace import Trace
 from vical_daemon.estimation.noise.lens_misfit import WINDOWS
 from vical_daemon.estimation.result import CalibrationEstimate, CameraEstimate, Status
 from vical_daemon.estimation.selection.clock_drift import CLOCKS_IN_DOUBT
-from vical_daemon.estimation.significance import WINDOW_CONTRADICTS, chi_square_limit
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, chi_square_limit
 from vical_daemon.estimation.smoother.alternative_models import AlternativeModels
 from vical_daemon.estimation.smoother.bundle import Fit
 from vical_daemon.estimation.smoother.clock_changes import compared_by
@@ -244,7 +244,7 @@ class TargetFreeStatus(Evaluator):
         return square / self._limit(dof)
 
     def _limit(self, dof: int) -> float:
-        limit = chi_square_limit(dof, WINDOW_CONTRADICTS) * self.factor()
+        limit = chi_square_limit(dof, LIKELY_SIGMAS) * self.factor()
         # at first not enough is seen to tell a poor model from a changed rig
         return limit if self._windows >= _LEARNING else 50.0 * limit
 

@@ -24,11 +24,9 @@ from vical_daemon.estimation.model.priors import ACCEL_BIAS_SIGMA_MPS2, WINDOW_S
 from vical_daemon.estimation.model.state import CameraState
 from vical_daemon.estimation.robust import geman_mcclure_weight, sigma_by_median
 from vical_daemon.estimation.smoother.window import FARTHEST_M, NEAREST_M, Landmarks, Window, rays_of
+from vical_daemon.estimation.temporal.track_orientations import MIN_FEATURES
 
 ROUNDS = 8
-_MIN_FEATURES = 15
-_MAX_ARM_M = 1.5
-_MOST_BEHIND = 0.3  # share of the observations
 _RAY_SIGMA = 2e-3
 
 
@@ -107,7 +105,7 @@ class TrackStart:
         window.fit_knots()
         window.measure_turning(buffer)
         self._seen = window.observe()
-        if len(self._seen.begin) < _MIN_FEATURES:
+        if len(self._seen.begin) < MIN_FEATURES:
             raise NoStartError(
                 f"only {len(self._seen.begin)} features can be followed:"
                 " more texture or slower motion is needed"
@@ -138,7 +136,7 @@ class TrackStart:
                 "speed and scale are not visible yet: move the rig to and fro while turning it"
             )
         z, gravity = found.z, found.gravity
-        if not np.isfinite(z).all() or float(np.abs(z[ARM]).max()) > _MAX_ARM_M:
+        if not np.isfinite(z).all():
             raise NoStartError(
                 "the lever arm is not visible yet: turn the rig about two axes while moving it"
             )
@@ -188,10 +186,8 @@ class TrackStart:
             ahead = (away * d).sum(axis=1)
             depth = np.clip(ahead, NEAREST_M, FARTHEST_M)
             off = np.linalg.norm(np.matmul(P, away[..., None])[..., 0], axis=1) / depth
-            spread = sigma_by_median(off) + 1e-6
-            # a mounting turned by half a circle sees everything behind itself
-            misfit = spread if np.mean(ahead < 0.0) < _MOST_BEHIND else np.inf
-            weight = self._ok / (_RAY_SIGMA * depth) ** 2 * geman_mcclure_weight((off / (3.0 * spread)) ** 2)
+            misfit = sigma_by_median(off) + 1e-6
+            weight = self._ok / (_RAY_SIGMA * depth) ** 2 * geman_mcclure_weight((off / (3.0 * misfit)) ** 2)
             gravity = gravity + z[GRAVITY]
             gravity *= self._gravity_mps2 / float(np.linalg.norm(gravity))
         return _Linear(z, gravity, misfit)

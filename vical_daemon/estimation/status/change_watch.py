@@ -24,7 +24,6 @@ _IMAGES = 10
 after an alarm show what has changed."""
 _SOON_S = 4.0
 _DRIFT_FLOOR = 1e-6  # s/s; a crystal in still air changes by less in the 20 s that are looked back at
-_DRIFT_AFTER_S = 2.0
 
 
 class Action(Enum):
@@ -49,13 +48,12 @@ class ChangeWatch:
     _refused: int = 0
     _closer: int = 0  # images until what has changed is decided; 0: nothing has
     _pose_taken_s: float = float("-inf")
-    _started_s: float = float("inf")
     _drift: dict[str, DriftWatch] = field(default_factory=dict)
 
-    def started(self, t_s: float) -> None:
-        """A filter starts at `t_s`."""
+    def started(self) -> None:
+        """A filter starts."""
         self._refused = self._closer = 0
-        self._pose_taken_s, self._started_s = float("-inf"), t_s
+        self._pose_taken_s = float("-inf")
         self._drift.clear()
 
     def motion_restarted(self, t_s: float) -> None:
@@ -101,7 +99,7 @@ class ChangeWatch:
     def _look_for_drift(self, camera: str, f: CalibrationFilter) -> Action:
         """See once a second whether the clocks run apart, or a drift is not what it was."""
         index, t_s = f.layout.cameras[camera].skew, f.state.t_s
-        if index is None or t_s < self._started_s + _DRIFT_AFTER_S:
+        if index is None:
             return Action.NONE
         watch = self._drift.setdefault(camera, DriftWatch(_DRIFT_FLOOR))
         watch.floor = float(

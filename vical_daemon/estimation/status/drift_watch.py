@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vical_daemon.estimation.significance import CHANGED_SIGMAS, EVERY_S, PERHAPS_SIGMAS
+from vical_daemon.estimation.significance import EVERY_S, PERHAPS_SIGMAS, SURE_SIGMAS
 
 _SPAN = 20
 
@@ -56,4 +56,4 @@ class DriftWatch:
         )
         self._past.append((t_s, value, variance))
         self.doubtful = bool(far > PERHAPS_SIGMAS)
-        return bool(far > CHANGED_SIGMAS)
+        return bool(far > SURE_SIGMAS)

@@ -12,7 +12,7 @@ import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.model.priors import SHIFT_WALK, SKEW_SIGMA
-from vical_daemon.estimation.significance import CHANGED_SIGMAS
+from vical_daemon.estimation.significance import SURE_SIGMAS
 from vical_daemon.estimation.temporal.td_icp import REFUSED, TdIcpOptions, TdIcpResult, td_icp
 
 _DRIFT_WALK = 1e-6
@@ -108,7 +108,7 @@ def _tracked(before: _Delay | None, t_s: float, result: TdIcpResult) -> tuple[_D
         return anew, False
     x, P = _predicted(before, t_s)
     S, innovation = float(P[0, 0] + variance), z - float(x[0])
-    if innovation**2 > CHANGED_SIGMAS**2 * S:
+    if innovation**2 > SURE_SIGMAS**2 * S:
         return anew, True
     K = P[:, 0] / S
     P = P - np.outer(K, P[0])

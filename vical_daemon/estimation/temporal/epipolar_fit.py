@@ -33,7 +33,6 @@ from vical_daemon.estimation.temporal.epipolar_pairs import Pairs, make_pairs
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
 
 _ITERATIONS = 18
-_MOST_STEP_S = 0.02  # of the delay, in one iteration
 # What a lens may be off by: focal length and its ratio (relative), distortion.
 _FOCAL_SIGMA, _RATIO_SIGMA = 0.1, 0.003
 _DISTORTION_SIGMA = {
@@ -41,10 +40,8 @@ _DISTORTION_SIGMA = {
     "plumb_bob": (0.1, 0.1, 0.005, 0.005, 0.1),
     "equidistant": (0.05, 0.05, 0.05, 0.05),
 }
-_LENS_AFTER = 4  # iterations with the lens as given
 _LEAST_RAYS = 0.5  # share of the features; no lens near the given one leaves more of them without a ray
 _GOOD = 0.25  # weight of a feature that fits
-_LEAST_SLOPE = 0.2
 _BENT_UNSURE = 0.5  # of what noise bends: one draw, and a straight line through two sizes of noise
 _FAR_S, _FAR_EVERY = (1.0, 2.0), 4  # pairs that show how long errors last
 _BLOCK_S = 0.5  # errors of the fit are taken as independent beyond this
@@ -91,7 +88,6 @@ def epipolar_fit(
     timeshift_s: float,
     *,
     fit_lens: bool = False,
-    most: int = _ITERATIONS,
     every: int = 1,
     gyro_density: float | None = None,
 ) -> EpipolarFit | None:
@@ -105,7 +101,6 @@ def epipolar_fit(
         R_imu_cam: Start of the mounting, good to some 20 degrees.
         timeshift_s: Start of the delay, good to some 0.1 s.
         fit_lens: Fit the lens too, within what a rough lens may be off by.
-        most: Iterations.
         every: See `make_pairs`.
         gyro_density: Of the gyro's noise, rad/s/sqrt(Hz); where given, what is known of errors that persist
             along tracks goes into `covariance` and `stretches`.
@@ -119,7 +114,7 @@ def epipolar_fit(
         return None
     fit = _Fit(t_imu_s, gyro_rps, np.array([t for t, _ in frames]), pairs, lens, fit_lens)
     fit.gyro_density, fit.frames = gyro_density, frames
-    return fit.run(R_imu_cam.copy(), timeshift_s, most)
+    return fit.run(R_imu_cam.copy(), timeshift_s)
 
 
 class _Fit:
@@ -173,10 +168,10 @@ class _Fit:
         out[~np.isfinite(out).all(axis=(1, 2))] = 0.0
         return np.asarray(out)
 
-    def run(self, R: FloatArray, shift: float, most: int) -> EpipolarFit | None:
+    def run(self, R: FloatArray, shift: float) -> EpipolarFit | None:
         bias = np.zeros(3)
         weight = np.where(self.ok, 1.0, 0.0)
-        for step in range(most):
+        for step in range(_ITERATIONS):
             lin = self._linearise(R, shift, bias)
             if lin is None:
                 return None
@@ -184,17 +179,15 @@ class _Fit:
             spread = sigma_by_median(e[self.ok]) + 1e-9
             k = 4.0 if step < 5 else 2.5
             weight = np.where(self.ok, geman_mcclure_weight((e / (k * spread)) ** 2), 0.0)
-            size = 7 if step < _LENS_AFTER else J.shape[1]  # first with the lens as given
-            H, g, each = self._normal(e, J[:, :size], Jt, weight / spread**2)
-            if size > 7 and step == _LENS_AFTER:
+            size = J.shape[1]
+            H, g, each = self._normal(e, J, Jt, weight / spread**2)
+            if size > 7 and step == 0:
                 self.lasting = self._errors_last(H, each)
             if size > 7:
                 g[7:9] += (weight * (e / spread) ** 2) @ self.shrinking
             self._prior(H, g, bias)
             dx = np.asarray(-np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), g), np.float64)
-            dx *= min(
-                1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12), _MOST_STEP_S / max(abs(dx[3]), 1e-12)
-            )
+            dx *= min(1.0, 0.2 / max(float(np.abs(dx[:3]).max()), 1e-12))
             R = R @ so3.exp(dx[:3])
             shift += float(dx[3])
             bias = bias + dx[4:7]
@@ -204,7 +197,7 @@ class _Fit:
                 self._rays()
                 if self.ok.mean() < _LEAST_RAYS:
                     return None  # the lens has run away
-            if step > _LENS_AFTER + 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
+            if step > 2 and float(np.abs(dx[:3]).max()) < 1e-5 and abs(dx[3]) < 1e-6:
                 break
         return self._result(R, shift, bias, weight)
 
@@ -376,7 +369,6 @@ class _Fit:
         # a robust fit gives way by the slope of its influence, not by its weight: the large errors hold less
         u2 = 1.0 / np.sqrt(np.maximum(weight, 1e-12)) - 1.0
         slope = float((good * weight * (1.0 - 3.0 * u2) / (1.0 + u2)).sum() / max(good.sum(), 1.0))
-        slope = max(slope, _LEAST_SLOPE)
         # in the gradient large errors count by their weight: smaller, but as persistent
         gain = float((good * (weight * e) ** 2).sum() / max(float((good * e**2).sum()), 1e-30))
         noise = replace(self.noise, white=gain * self.noise.white, persistent=gain * self.noise.persistent)

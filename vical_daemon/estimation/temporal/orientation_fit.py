@@ -16,7 +16,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.robust import MEDIAN_CHI2_3
-from vical_daemon.estimation.significance import ORIENTATION_REFUSED, chi_square_limit
+from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import BIAS, DriftSolution, solve
 from vical_daemon.estimation.temporal.orientation_noise import estimate_scales, scaled, scales_of
 from vical_daemon.estimation.temporal.orientation_problem import (
@@ -30,7 +30,7 @@ from vical_daemon.estimation.temporal.td_icp_input import TdIcpOptions
 
 __all__ = ["Fit", "OrientationSensor", "polish"]
 
-_GATE = chi_square_limit(3, ORIENTATION_REFUSED)
+_GATE = chi_square_limit(3, PERHAPS_SIGMAS)
 _ROUNDS = 12
 _SHIFT_DONE_S = 2e-8
 # in which rounds the noises are estimated and with what steps, for one sensor and for several

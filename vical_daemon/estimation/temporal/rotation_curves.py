@@ -9,7 +9,6 @@ sample).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -18,26 +17,6 @@ from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 
 _GAP = 2.5  # intervals longer than this many median intervals are holes in the data
-
-
-class RotationCurve(Protocol):
-    """What registration needs to know of an orientation curve."""
-
-    @property
-    def span_s(self) -> tuple[float, float]:
-        """First and last instant of the curve, s."""
-
-    def at(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return R_ref_imu (..., 3, 3), rate in the imu frame (..., 3), integral of R_ref_imu (..., 3, 3)."""
-
-    def matrix_effect(self, times_s: FloatArray) -> FloatArray:
-        """Return what an error of the gyro's 3x3 matrix does to the orientation, (..., 3, 9), row-major."""
-
-    def quaternion(self, times_s: FloatArray) -> FloatArray:
-        """Return the orientation alone, w x y z, shape (..., 4)."""
-
-    def variance(self, times_s: FloatArray, density: float) -> FloatArray:
-        """Return the variance per axis that the curve's drift has gathered since its start, rad^2, (...,)."""
 
 
 def cumulative_product(steps: FloatArray) -> FloatArray:
@@ -227,3 +206,7 @@ class OrientationCurve:
         """Return a small drift: measured orientations do not walk; their noise is the caller's to add."""
         out: FloatArray = (0.02 * density) ** 2 * (times_s - self.t_s[0])
         return out
+
+
+RotationCurve = GyroCurve | OrientationCurve
+"""What registration needs: the methods that both have."""

@@ -16,7 +16,7 @@ import numpy as np
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
 from vical_daemon.estimation.robust import geman_mcclure_weight
-from vical_daemon.estimation.temporal.rotation_curves import GyroCurve, RotationCurve
+from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, Turns, camera_turns
 
 _GRID_S = 0.01
@@ -94,38 +94,6 @@ def shift_costs(
 def agreement_scale(turns: Turns) -> float:
     """How far two turns may differ and still agree: a quarter of a usual turn, at least 0.6 deg."""
     return max(0.25 * float(np.quantile(turns.angle, 0.4)), 0.01)
-
-
-def debiased_start(
-    t_imu_s: FloatArray,
-    gyro_rps: FloatArray,
-    t_cam_s: FloatArray,
-    q_world_cam: FloatArray,
-    shifts_s: tuple[float, float],
-) -> tuple[Start | None, FloatArray]:
-    """Find a start from a raw gyro, and again with the bias it reveals if that bias blurs the agreement.
-
-    Args:
-        t_imu_s: Stamps, s, shape (m,).
-        gyro_rps: Rates, rad/s, shape (m, 3).
-        t_cam_s: Camera stamps, s, shape (n,).
-        q_world_cam: Camera orientations, shape (n, 4).
-        shifts_s: Lowest and highest shift to look at, s.
-
-    Returns:
-        The start or None, and the gyro bias, rad/s, shape (3,).
-    """
-    bias = np.zeros(3)
-    start: Start | None = None
-    for _ in range(3):
-        curve = GyroCurve.integrate(t_imu_s, gyro_rps, bias)
-        start = coarse_start(curve, t_cam_s, q_world_cam, shifts_s)
-        if start is None:
-            break
-        bias = bias + start.bias_rps
-        if np.linalg.norm(start.bias_rps) * start.baseline_s < 0.25 * start.scale_rad:
-            break
-    return start, bias
 
 
 def _minima(costs: FloatArray, apart: int) -> list[int]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import SHIFT_MISFIT, SURE_SIGMAS, chi_square_limit
+from vical_daemon.estimation.significance import LIKELY_SIGMAS, SURE_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.rotation_curves import RotationCurve
 
 _GRID_S = 5e-3  # a turn of 2 rad/s is 0.6 deg off there: well inside the basin of the fit
@@ -122,9 +122,9 @@ def find_shift(
         return None
     best = float((_errors(curve, seen, R_imu_cam, np.array([shift_s])) ** 2).sum())
     dof = 3 * len(seen.t_cam_s) - 4
-    if best > usual_level * chi_square_limit(dof, SHIFT_MISFIT):
+    if best > usual_level * chi_square_limit(dof, SURE_SIGMAS):
         return None
-    sure = best + SURE_SIGMAS**2 * usual_level
+    sure = best + LIKELY_SIGMAS**2 * usual_level
     if float(cost[:-1][np.abs(grid[:-1] - shift_s) > _APART_S].min(initial=np.inf)) < sure:
         return None
     return ShiftFit(shift_s, float(np.sqrt(usual_level / curvature)), float(cost[-1]) > sure)
@@ -136,7 +136,7 @@ def first_after_step(
     """Index of the earliest orientation that may be from after a step of the time shift.
 
     Each place of the step has a sum of squares: those before it at the first time shift, the others at the
-    second, with the worlds aligned on either side. All places within five sigma of the best are possible.
+    second, with the worlds aligned on either side. All places within six sigma of the best are possible.
 
     Args:
         curve: The gyro's, about its bias.

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from vical_daemon.estimation.measurements import BoolArray, FloatArray
-from vical_daemon.estimation.significance import STRETCHES_DISAGREE, chi_square_limit
+from vical_daemon.estimation.significance import PERHAPS_SIGMAS, chi_square_limit
 from vical_daemon.estimation.temporal.drift_smoother import DriftProblem, solve
 
 _STRETCHES = 6
@@ -63,7 +63,7 @@ def scatter_factor(values: Sequence[FloatArray], covariances: Sequence[FloatArra
     mean = np.linalg.solve(information.sum(axis=0), np.einsum("kij,kj->i", information, x))
     chi2 = float(np.einsum("ki,kij,kj->", x - mean, information, x - mean))
     freedom = x.size - x.shape[1]
-    return float(np.sqrt(chi2 / freedom)) if chi2 > chi_square_limit(freedom, STRETCHES_DISAGREE) else 1.0
+    return float(np.sqrt(chi2 / freedom)) if chi2 > chi_square_limit(freedom, PERHAPS_SIGMAS) else 1.0
 
 
 def _stretches(problem: DriftProblem, used: BoolArray, sensors: int) -> list[slice]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from vical_daemon.estimation.measurements import FloatArray, ImuNoise
+from vical_daemon.estimation.geometry import so3
+from vical_daemon.estimation.measurements import BoolArray, FloatArray, ImuNoise
+from vical_daemon.estimation.temporal.rotation_turns import without_long_rest
 
 _USUAL = ImuNoise()
+USUAL_RAD = float(np.deg2rad(0.1))
+"""Noise of an orientation from a board as it usually is, rad."""
 MIN_ORIENTATIONS = 12
 SLOWEST_GYRO_HZ = 10.0  # as for `calibrate`: between slower samples a hand turns to and fro unseen
 
@@ -52,19 +56,78 @@ def clean_gyro(t_s: FloatArray, gyro: FloatArray) -> tuple[FloatArray, FloatArra
     return t_s[keep], gyro[keep]
 
 
-def clean_orientations(
-    t_s: FloatArray, R: FloatArray, rotation_sigma: float | FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, npt.NDArray[np.intp]] | str:
-    """Sort, drop what is not a number, and bring the noise into the form of covariances.
+@dataclass(frozen=True)
+class OrientationStream:
+    """Orientations of one sensor in any fixed world.
 
-    Returns:
-        Stamps, orientations, covariances, and the index of each in the input; or why nothing is left.
+    Attributes:
+        name: For the report.
+        t_s: Stamps in the sensor's clock, s, shape (n,).
+        R_world_sensor: Orientations, shape (n, 3, 3).
+        rotation_sigma: Their noise, rad: one number, or (n,), or covariances of the local error (n, 3, 3).
+            Only the proportions between orientations matter: the noise is measured.
     """
-    t_s, R = np.asarray(t_s, dtype=np.float64), np.asarray(R, dtype=np.float64)
+
+    name: str
+    t_s: FloatArray
+    R_world_sensor: FloatArray
+    rotation_sigma: float | FloatArray = USUAL_RAD
+
+
+@dataclass(frozen=True)
+class CleanStream:
+    """Orientations that can be registered, in order of time.
+
+    Attributes:
+        name: Of the sensor.
+        t_s: Stamps, increasing, s, shape (n,).
+        R_world_sensor: Orientations, shape (n, 3, 3).
+        covariance: Of their local errors, rad^2, shape (n, 3, 3).
+        q: The orientations as quaternions, shape (n, 4).
+        index: Of each in the stream as it was given, shape (n,).
+        n_given: Orientations in that.
+        at_rest: Of these, those left out because the rig rested for most of the recording.
+    """
+
+    name: str
+    t_s: FloatArray
+    R_world_sensor: FloatArray
+    covariance: FloatArray
+    q: FloatArray
+    index: npt.NDArray[np.intp]
+    n_given: int
+    at_rest: int = 0
+
+    def some(self, which: slice | BoolArray) -> CleanStream:
+        """Only these orientations."""
+        return replace(
+            self,
+            t_s=self.t_s[which],
+            R_world_sensor=self.R_world_sensor[which],
+            covariance=self.covariance[which],
+            q=self.q[which],
+            index=self.index[which],
+        )
+
+    def thinned(self) -> CleanStream:
+        """Every other orientation; the rest counts as not given."""
+        half = self.some(slice(None, None, 2))
+        n = len(half.t_s)
+        return replace(half, index=np.arange(n), n_given=self.n_given - len(self.t_s) + n)
+
+    def moving(self) -> CleanStream:
+        """The stream without most of its rest, where it mostly rests."""
+        keep = without_long_rest(self.t_s, self.q)
+        return replace(self.some(keep), at_rest=int(np.count_nonzero(~keep)))
+
+
+def clean_stream(stream: OrientationStream, base_s: float = 0.0) -> CleanStream | str:
+    """Sort, drop what is not a number, count stamps from `base_s`; a string says why nothing is left."""
+    t_s, R = np.asarray(stream.t_s, dtype=np.float64), np.asarray(stream.R_world_sensor, dtype=np.float64)
     n = len(t_s)
     if n < MIN_ORIENTATIONS:
         return f"{n} camera orientations: at least {MIN_ORIENTATIONS} are needed (is the target in view?)"
-    sigma = np.asarray(rotation_sigma, dtype=np.float64)
+    sigma = np.asarray(stream.rotation_sigma, dtype=np.float64)
     if sigma.ndim < 3:
         sigma = (np.broadcast_to(sigma, (n,)) ** 2)[:, None, None] * np.eye(3)
     good = np.flatnonzero(
@@ -74,4 +137,6 @@ def clean_orientations(
     index = index[np.concatenate(([True], np.diff(t_s[index]) > 1e-6))] if len(index) else index
     if len(index) < MIN_ORIENTATIONS:
         return f"{len(index)} usable camera orientations: at least {MIN_ORIENTATIONS} are needed"
-    return t_s[index], R[index], sigma[index] + 1e-14 * np.eye(3), index
+    R = R[index]
+    q, covariance = so3.quat_from_matrix(R), sigma[index] + 1e-14 * np.eye(3)
+    return CleanStream(stream.name, t_s[index] - base_s, R, covariance, q, index, n)

@@ -7,18 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from vical_daemon.estimation.measurements import FloatArray
-from vical_daemon.estimation.significance import CHANGED_SIGMAS
-from vical_daemon.estimation.temporal.orientation_fit import Fit
+from vical_daemon.estimation.significance import SURE_SIGMAS
+from vical_daemon.estimation.temporal.rotation_reference import GyroReference, Reference
 from vical_daemon.estimation.temporal.rotation_start import Start
 from vical_daemon.estimation.temporal.rotation_suspects import stretched
 from vical_daemon.estimation.temporal.rotation_turns import MIN_PAIRS, MIN_RATE_RPS, camera_turns
 from vical_daemon.estimation.temporal.td_icp_input import MIN_ORIENTATIONS, TdIcpOptions
-from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED
+from vical_daemon.estimation.temporal.td_icp_result import DEGENERATE, OK, REFUSED, TdIcpResult
 
 _STEADY = 0.1  # changes of the rate over the rate below which it counts as one rate
 _SHIFT_LOST_S = 3e-3
 _ROTATION_LOST_RAD = float(np.deg2rad(3.0))
-UNEVEN = 1e-3  # no two crystals are as far apart
+_UNEVEN = 1e-3  # no two crystals are as far apart
 _STRETCHED = 5e-3  # beyond this no delay makes sense
 
 
@@ -34,10 +34,11 @@ class Refusal(NamedTuple):
     still: bool = False
 
 
-def refuse_motion(
-    t_imu: FloatArray, gyro: FloatArray, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions
-) -> Refusal:
-    """Say why the motion cannot be used, from the rotation rates alone."""
+def refuse_motion(reference: Reference, t_cam: FloatArray, q: FloatArray, options: TdIcpOptions) -> Refusal:
+    """Say why the motion cannot be used, from the rotation rates alone; a gyro is needed for that."""
+    if not isinstance(reference, GyroReference):
+        return Refusal()
+    t_imu, gyro = reference.t_s, reference.gyro_rps
     turns = camera_turns(t_cam, q)
     if len(turns.first) < MIN_PAIRS:
         return Refusal("the camera orientations are too far apart in time: at least 5 a second are needed")
@@ -137,19 +138,20 @@ def refuse_start(start: Start | None, options: TdIcpOptions) -> str:
     return ""
 
 
-def judge(fit: Fit, covariance: FloatArray, pairs: int, n: int) -> tuple[str, str]:
-    """Status and reason from the final covariance and residuals."""
-    if pairs < max(MIN_ORIENTATIONS, 0.25 * n):
-        return REFUSED, f"only {pairs} of {n} orientations fit the gyro at the best delay"
-    noise = fit.sensors[0].noise_rad
-    rate, rate_sigma = float(fit.stamp_rate[0]), float(fit.stamp_rate_sigma[0])
-    if abs(rate) > max(_STRETCHED, CHANGED_SIGMAS * rate_sigma):
-        return REFUSED, stretched(rate)
+def judge(result: TdIcpResult, of: int, reference: Reference) -> tuple[str, str]:
+    """Status and reason from the final covariance and residuals of a sensor with `of` orientations."""
+    other, noise = reference.name, result.camera_noise_rad
+    rate, rate_sigma = result.stamp_rate, result.stamp_rate_sigma
+    if result.pairs < max(MIN_ORIENTATIONS, 0.25 * of):
+        return REFUSED, f"only {result.pairs} of {of} orientations fit the {other} at the best delay"
+    if abs(rate) > max(_STRETCHED, SURE_SIGMAS * rate_sigma):
+        return REFUSED, stretched(rate, reference)
     if noise > _ROTATION_LOST_RAD:
-        return REFUSED, f"gyro and camera disagree by {np.rad2deg(noise):.1f} deg (rms) at the best delay"
-    reasons = lost_in_words(covariance, fit.sensors[0].R_imu_sensor)
-    if abs(rate) > max(UNEVEN, CHANGED_SIGMAS * rate_sigma):
-        reasons.append(stretched(rate))
+        degrees = f"{np.rad2deg(noise):.1f} deg (rms)"
+        return REFUSED, f"{other} and {reference.sensor} disagree by {degrees} at the best delay"
+    reasons = lost_in_words(result.covariance, result.R_imu_cam)
+    if abs(rate) > max(_UNEVEN, SURE_SIGMAS * rate_sigma):
+        reasons.append(stretched(rate, reference))
     return (DEGENERATE if reasons else OK), "; ".join(reasons)
 
 

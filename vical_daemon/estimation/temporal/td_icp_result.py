@@ -1,8 +1,8 @@
-"""What temporal calibration answers: the result of `td_icp`."""
+"""What temporal calibration answers: of one camera and an imu, and of several sensors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -17,7 +17,9 @@ REFUSED = "refused"
 
 @dataclass(frozen=True)
 class TdIcpResult:
-    """What registration found.
+    """What registration of one sensor with a reference found.
+
+    The attributes name a camera and an imu, which the sensor and the reference usually are.
 
     Attributes:
         status: "ok"; "degenerate": part of the answer is not determined, `reason` says which; "refused":
@@ -89,3 +91,83 @@ class TdIcpResult:
 def _number(value: float) -> float | None:
     """JSON knows no not-a-number."""
     return float(value) if np.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class PairDelay:
+    """The delay between two sensors: t_b = t_a + timeshift_s."""
+
+    a: str
+    b: str
+    timeshift_s: float
+    timeshift_sigma_s: float
+
+
+@dataclass(frozen=True)
+class JointResult:
+    """All sensors together.
+
+    Attributes:
+        status: "ok" if every sensor took part, "degenerate" if some did not, "refused" if none did.
+        reason: Which did not take part and why, in words.
+        reference: Name of the reference.
+        sensors: By name; of those that took part.
+        pairs: Every pair of sensors, the reference among them.
+        names: Order of `covariance`.
+        covariance: Of [R_ref_sensor (3, local, rad), timeshift (s)] for each of `names`; (4 S, 4 S).
+        gyro_bias_rps: Bias of the reference gyro, shape (3,); zeros without one.
+    """
+
+    status: str
+    reason: str
+    reference: str
+    sensors: dict[str, TdIcpResult] = field(default_factory=dict)
+    pairs: list[PairDelay] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    gyro_bias_rps: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def to_json(self) -> dict[str, object]:
+        """Return what `vical td-icp --sensors ... --json` prints."""
+        return {
+            "status": self.status,
+            "reason": self.reason,
+            "reference": self.reference,
+            "sensors": {
+                name: {
+                    "timeshift_s": s.timeshift_cam_imu_s,
+                    "timeshift_sigma_s": s.timeshift_sigma_s,
+                    "R_ref_sensor_q_wxyz": so3.quat_from_matrix(s.R_imu_cam).tolist(),
+                    "rotation_sigma_rad": s.rotation_sigma_rad.tolist(),
+                    "noise_rad": s.camera_noise_rad,
+                    "pairs": s.pairs,
+                    "rejected": s.rejected,
+                    "widened": s.widened,
+                }
+                for name, s in self.sensors.items()
+            },
+            "pairs": [asdict(p) for p in self.pairs],
+            "order": self.names,
+            "covariance": self.covariance.tolist(),
+            "gyro_bias_rps": self.gyro_bias_rps.tolist(),
+        }
+
+
+def pair_delays(names: list[str], timeshifts_s: list[float], covariance: FloatArray) -> list[PairDelay]:
+    """All pairs: t_b = t_a + (shift_a - shift_b).
+
+    Args:
+        names: Of the reference, whose shift is exactly zero, and of the S sensors.
+        timeshifts_s: Of the sensors, s.
+        covariance: Of these, s^2, (S, S).
+    """
+    shift, P = np.array([0.0, *timeshifts_s]), np.zeros((len(names), len(names)))
+    P[1:, 1:] = covariance
+    variance = np.diagonal(P)[:, None] + np.diagonal(P) - 2.0 * P
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    return [
+        PairDelay(a, b, float(shift[i] - shift[j]), float(sigma[i, j]))
+        for i, a in enumerate(names)
+        for j, b in enumerate(names)
+        if i < j
+    ]

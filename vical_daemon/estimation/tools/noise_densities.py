@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.optimize import nnls
 
 from vical_daemon.estimation.measurements import FloatArray, ImuNoise, IntArray
-from vical_daemon.estimation.significance import TERM_SIGMAS
+from vical_daemon.estimation.significance import LIKELY_SIGMAS
 from vical_daemon.estimation.tools.allan_variance import TooShortError, allan_deviation, degrees_of_freedom
 
 FLICKER = 2.0 * np.log(2.0) / np.pi  # Allan variance of 1/f noise of unit coefficient
@@ -134,7 +134,7 @@ def _fit_variances(tau_s: FloatArray, adev: FloatArray, edf: FloatArray) -> tupl
     """Weighted non-negative least squares for (Q^2, N^2, B^2, K^2) and their standard deviations.
 
     White noise and rate random walk are always in the model; flicker and quantisation only where
-    they lower chi^2 by more than `TERM_SIGMAS` squared. Without that, a flicker term of pure chance takes
+    they lower chi^2 by more than `LIKELY_SIGMAS` squared. Without that, a flicker term of pure chance takes
     variance from the walk, which then comes out low with too small a sigma.
     """
     included = np.array([False, True, False, True])
@@ -143,7 +143,7 @@ def _fit_variances(tau_s: FloatArray, adev: FloatArray, edf: FloatArray) -> tupl
         trial = included.copy()
         trial[candidate] = True
         trial_terms, trial_chi2 = _fit_included(tau_s, adev, edf, trial)
-        if chi2 - trial_chi2 > TERM_SIGMAS**2:
+        if chi2 - trial_chi2 > LIKELY_SIGMAS**2:
             included, terms, chi2 = trial, trial_terms, trial_chi2
     design = _design(tau_s)
     columns = design * (np.sqrt(edf / 2.0) / np.maximum(design @ terms, 1e-300))[:, None]

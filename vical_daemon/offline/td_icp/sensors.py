@@ -8,13 +8,13 @@ import numpy as np
 
 from vical_daemon.estimation.geometry import so3
 from vical_daemon.estimation.temporal.rotation_curves import GyroCurve
-from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
-from vical_daemon.estimation.temporal.td_icp_joint import (
+from vical_daemon.estimation.temporal.td_icp import (
     JointResult,
     OrientationStream,
     joint_of_orientations,
     joint_with_gyro,
 )
+from vical_daemon.estimation.temporal.td_icp_input import clean_gyro
 from vical_daemon.logs import Recording, RecordingError
 from vical_daemon.offline.errors import InputError, OptionError
 from vical_daemon.offline.td_icp.recorded_orientations import pose_topic, trajectory_file

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vical_daemon.estimation.temporal.td_icp_joint import (
+from vical_daemon.estimation.temporal.td_icp import (
     OrientationStream,
+    _thinned,
     joint_of_orientations,
     joint_with_gyro,
 )
+from vical_daemon.estimation.temporal.td_icp_input import clean_stream
 
 DEG = np.pi / 180
 F = np.random.default_rng(1).uniform(0.25, 0.9, (3, 3))
@@ -54,7 +56,7 @@ def test_two_cameras_and_a_tracker_against_a_gyro():
         assert abs(error) < 4.5 * pair.timeshift_sigma_s, pair
         assert pair.timeshift_sigma_s < 1e-3
     for name, (_, mounting) in made.items():
-        found = Rotation.from_matrix(result.sensors[name].R_ref_sensor)
+        found = Rotation.from_matrix(result.sensors[name].R_imu_cam)
         assert (found.inv() * mounting).magnitude() < 0.3 * DEG
     assert set(result.to_json()["sensors"]) == set(shifts)
 
@@ -65,9 +67,9 @@ def test_streams_without_any_gyro():
     assert result.status == "ok", result.reason
     assert result.reference == "mocap"
     delay = result.sensors["cam0"]
-    assert abs(delay.timeshift_s - 0.25) < 4.5 * delay.timeshift_sigma_s
+    assert abs(delay.timeshift_cam_imu_s - 0.25) < 4.5 * delay.timeshift_sigma_s
     assert delay.timeshift_sigma_s < 0.5e-3
-    assert delay.noise_rad == pytest.approx(0.11 * DEG, rel=0.2)
+    assert delay.camera_noise_rad == pytest.approx(0.11 * DEG, rel=0.2)
 
 
 def test_a_stream_that_does_not_belong_is_named_and_left_out():
@@ -93,12 +95,11 @@ def test_inverted_and_stretched_streams_are_named_without_a_gyro_too():
 
 
 def test_long_streams_are_thinned_the_largest_first():
-    from vical_daemon.estimation.temporal.td_icp_joint import _thinned
-
     def stream(name, n):
-        return OrientationStream(name, np.arange(n) * 1.0, np.tile(np.eye(3), (n, 1, 1)), np.full(n, 0.1))
+        R = np.tile(np.eye(3), (n, 1, 1))
+        return clean_stream(OrientationStream(name, np.arange(n) * 1.0, R, np.full(n, 0.1)))
 
     thin = _thinned([stream("mocap", 8000), stream("cam0", 900)], most=3000)
     assert [len(s.t_s) for s in thin] == [2000, 900]
-    assert len(thin[0].R_world_sensor) == len(thin[0].rotation_sigma) == 2000
+    assert len(thin[0].R_world_sensor) == len(thin[0].covariance) == thin[0].n_given == 2000
     assert thin[0].t_s[1] == 4.0
