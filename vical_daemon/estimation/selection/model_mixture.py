@@ -20,7 +20,7 @@ import numpy as np
 from vical_daemon.estimation.measurements import FloatArray, IntArray
 from vical_daemon.estimation.model.held_lens import FixedLens
 from vical_daemon.estimation.model.priors import OFF
-from vical_daemon.estimation.model.unscented import root, solve_lower
+from vical_daemon.estimation.model.unscented import root, solve_lower, unit
 
 _MOST = 300.0  # of a logarithm
 _NEGLIGIBLE = 1e-9
@@ -126,9 +126,9 @@ def mixture(
         shares.append(p)
     share, d = np.array(shares) / sum(shares), np.array(shifts) @ S.T
     mean = share @ d
-    V = np.concatenate([np.sqrt(p) * U for p, U in zip(shares, ways, strict=True)])
-    M = (sum(shares) + RIDGE) * np.eye(V.shape[1]) - V.T @ V
-    mixed = S @ root(M)[: S.shape[1]]
+    taken = [p * (2.0 * U - (U @ U.T) @ U) for p, U in zip(shares, ways, strict=True)]
+    M = sum(shares) * unit(ways[0].shape[1]) - np.concatenate(ways).T @ np.concatenate(taken)
+    mixed = S @ root(M + RIDGE * unit(len(M)))[: S.shape[1]]
     for name in surely:
         if not every[name].stated.any():
             mixed[every[name].where] = 0.0
@@ -244,7 +244,8 @@ class _Zeros:
 
     With E the rows of these blocks, R the noise with which they are said to be zero, L L' = E S S' E' + R and
     U = L^-1 [E S, R^1/2], that takes [S 0] U' U [S 0]' off P and moves the mean by -d, d = [S 0] U' L^-1 x.
-    The covariance over all models is [S 0] M [S 0]', M = sum p (I - U' U).
+    The covariance over all models is [S 0] M [S 0]', M = sum p (I - U' U)^2 = sum p (I - U' (2 I - U U') U).
+    Without the square, which changes nothing but rounding, M may have negative eigenvalues.
 
     Attributes:
         places: Of each block among the rows of all blocks.
