@@ -59,6 +59,7 @@ from vical_daemon.estimation.noise.consistency import Consistency, normalised
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import WAYS, SharedErrors, shared_ways
+from vical_daemon.estimation.robust import median
 
 _TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 
@@ -223,7 +224,7 @@ class CalibrationFilter:
             True,
             fit.nis,
             fit.dof,
-            float(np.median(image.sigma_px)) * fit.noise,
+            median(image.sigma_px) * fit.noise,
             predicted_px=predicted,
             log_likelihood=log_likelihood(fit, len(keep) - int(keep.sum())),
         )
@@ -329,8 +330,9 @@ class CalibrationFilter:
         information, shared = ways[:, :6].T @ ways[:, :6], self.shared.get(image.camera)
         if shared is not None:  # what corners share is noise, too
             alike = ways @ (by_shared * shared.sigmas)
-            across = ways[:, :6].T @ alike
-            information -= across @ np.linalg.solve(unscented.unit(WAYS) + alike.T @ alike, across.T)
+            L = unscented.root(unscented.unit(WAYS) + alike.T @ alike)
+            known = unscented.solve_lower(L, alike.T @ ways[:, :6])
+            information -= known.T @ known
         at = list(self.layout.cameras).index(image.camera)
         to_cam = self.state.cameras[image.camera].R_imu_cam.T
         return self.arm_score.update(information, by_error[:6, :MOTION_ERRORS], to_cam, at)

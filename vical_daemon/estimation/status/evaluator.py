@@ -83,8 +83,8 @@ class Evaluator:
             self._first_ns = t_ns
         self.imu_samples += 1
         self.newest_ns = t_ns
-        self._events.now_s = self.elapsed_s
-        self.motion.add(self.elapsed_s, gyro)
+        self._events.now_s = elapsed_s = self.elapsed_s
+        self.motion.add(elapsed_s, gyro)
         self._readings.add(gyro, accel)
         if self.imu_samples % _EVERY_READINGS == 1:
             self._size.append(math.hypot(*accel))
@@ -125,8 +125,8 @@ class Evaluator:
 
     def nis_per_dof(self) -> float:
         """Consistency: mean of normalised squares per degree of freedom; 1 when consistent."""
-        dof = sum(n for _, n in self._squares)
-        return sum(s for s, _ in self._squares) / dof if dof else 0.0
+        square, dof = map(sum, zip(*self._squares, strict=True)) if self._squares else (0.0, 0)
+        return square / dof if dof else 0.0
 
     def _announce_jitter(self, camera: str, jitter_s: float, cause: Cause = Cause.NONE) -> None:
         if jitter_s >= ANNOUNCED_S:
