@@ -464,9 +464,8 @@ class CalibrationFilter:
             },
         )
         self.corner_noise, self.consistency, self.shared = known.corner_noise, known.consistency, known.shared
-        self.agreement, self.walk = known.agreement, known.walk
+        self.agreement, self.walk, self.wandered = known.agreement, known.walk, known.wandered
         self.drifting, self.off, self.began_s = known.drifting, known.off, known.began_s
-        self.wandered = known.wandered
         for consistency in self.consistency.values():
             consistency.settle()
 
