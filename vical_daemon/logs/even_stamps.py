@@ -234,7 +234,7 @@ def _line(grid_s: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     if len(x) < 2:
         return np.full(len(grid_s), y[0])
     line = np.array([_local_line(x, y, float(at)) for at in x])
-    fitted = np.interp(grid_s, x, line)
+    fitted: FloatArray = np.interp(grid_s, x, line)
     for end, inner in ((0, 1), (-1, -2)):  # beyond the first and the last one: straight on
         outside = grid_s < x[0] if end == 0 else grid_s > x[-1]
         slope = (line[inner] - line[end]) / (x[inner] - x[end])
