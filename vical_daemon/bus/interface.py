@@ -8,16 +8,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from vical_daemon.bus.topics import parse_key
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One message on the bus.
+class Sample(NamedTuple):
+    """One message on the bus (a tuple because millions of them are made).
 
     Attributes:
         key: Full key, e.g. ``vical/rig0/imu/imu0``.

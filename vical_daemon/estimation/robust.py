@@ -16,9 +16,16 @@ MEDIAN_CHI2, MEDIAN_CHI2_3 = float(chdtri(1, 0.5)), float(chdtri(3, 0.5))
 """Of a chi-square variable with one degree of freedom, and with three."""
 
 
+def median(values: FloatArray) -> float:
+    """Of a few dozen numbers, at least one; numpy's takes five times as long for so few."""
+    ordered = np.sort(values, axis=None)
+    half = len(ordered) // 2
+    return float(ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half]))
+
+
 def sigma_by_median(errors: FloatArray) -> float:
     """Standard deviation of normal errors about zero, by the median of their sizes."""
-    return float(np.median(np.abs(errors))) / MEDIAN_ABSOLUTE
+    return median(np.abs(errors)) / MEDIAN_ABSOLUTE
 
 
 def geman_mcclure_weight(square: FloatArray) -> FloatArray:

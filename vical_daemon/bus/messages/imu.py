@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 from vical_daemon.bus.messages.cdr import LITTLE_ENDIAN, CdrReader, MessageError
 
@@ -19,9 +19,8 @@ EncodeImu = Callable[[int, Sequence[float], Sequence[float]], bytes]
 """Stamp (UNIX ns), angular rate (rad/s), specific force (m/s^2) to a message; see `encode_imu`."""
 
 
-@dataclass(frozen=True, slots=True)
-class ImuMessage:
-    """One inertial sample as it travels.
+class ImuMessage(NamedTuple):
+    """One inertial sample as it travels (a tuple because millions of them are made).
 
     Attributes:
         stamp_ns: Instant of the measurement, UNIX ns.

@@ -59,6 +59,7 @@ from vical_daemon.estimation.noise.consistency import Consistency, normalised
 from vical_daemon.estimation.noise.corner_noise import CornerNoise
 from vical_daemon.estimation.noise.lens_agreement import LensAgreement
 from vical_daemon.estimation.noise.shared_errors import WAYS, SharedErrors, shared_ways
+from vical_daemon.estimation.robust import median
 
 _TURNED_RAD = 5e-5  # half a turn below which the chart of the covariance stays
 
@@ -221,7 +222,7 @@ class CalibrationFilter:
             True,
             fit.nis,
             fit.dof,
-            float(np.median(image.sigma_px)) * fit.noise,
+            median(image.sigma_px) * fit.noise,
             predicted_px=predicted,
             log_likelihood=log_likelihood(fit, len(keep) - int(keep.sum())),
         )

@@ -62,7 +62,9 @@ class RangeLimits(Generic[T]):
         self._extreme = [1e-9] * 12
         self._near = [_NEAR * 1e-9] * 12
         self._at = [0] * 12
+        self._usual = [(-_NEAR * 1e-9, _NEAR * 1e-9)] * 6  # values of each channel that are not close to one
         self._stays = [0] * 12  # readings in a row at the extreme, reached in motion
+        self._staying = False  # any of them
         self._values: list[dict[float, int]] = [{} for _ in range(12)]
         self._clips = [False] * 12
         self._step = [math.inf] * 2  # smallest change of a channel of each sensor: its resolution, or more
@@ -77,27 +79,19 @@ class RangeLimits(Generic[T]):
         Returns:
             The readings that are decided on, in order, each with those of its six channels at their range.
         """
-        a, b, c, d, e, f = six
-        both = (a, b, c, d, e, f, -a, -b, -c, -d, -e, -f)
-        fresh = _measured_anew(six[:3], self._previous[:3]), _measured_anew(six[3:], self._previous[3:])
-        for i, (value, before) in enumerate(zip(six, self._previous, strict=True)):
+        usual = not self._staying
+        for i, (value, before, (low, high)) in enumerate(zip(six, self._previous, self._usual, strict=True)):
             if 0.0 < abs(value - before) < self._step[i // 3]:
                 self._step[i // 3] = abs(value - before)
-        waiting = 0  # readings, the newest ones
-        for i, (value, near) in enumerate(zip(both, self._near, strict=True)):
-            if not fresh[i % 6 // 3]:
-                continue
-            if value > near:
-                self._follow(i, value, abs(six[i % 6] - self._previous[i % 6]))
-                self._near[i] = _NEAR * self._extreme[i]
-                if 1 < self._stays[i] < _STOPS and not self._clips[i]:
-                    waiting = max(waiting, self._stays[i])
-            elif self._stays[i]:
-                self._stays[i] = 0
+            if not low <= value <= high:
+                usual = False
+        waiting = 0 if usual else self._close_to_extremes(six)
         if len(self._first) <= _AT_RANGE:
             self._first.append(six)
             self._begins_at_range()
         self._previous = six
+        if not (waiting or self._held):
+            return [(six, item, self.at_range(six))]
         self._held.append((six, item))
         decided = max(len(self._held) - waiting, 0)
         held, self._held = self._held[:decided], self._held[decided:]
@@ -105,7 +99,7 @@ class RangeLimits(Generic[T]):
 
     def restart(self) -> None:
         """Another recording follows: readings that wait for a decision are dropped, the range stays."""
-        self._held, self._stays = [], [0] * 12
+        self._held, self._stays, self._staying = [], [0] * 12, False
 
     def at_range(self, six: Six) -> tuple[int, ...]:
         """Which of the six channels of a reading are at the end of their range."""
@@ -122,6 +116,26 @@ class RangeLimits(Generic[T]):
     def _ends(self, channels: Sequence[int]) -> set[float]:
         """Where the range of a sensor ends."""
         return {self._extreme[i] for i in channels if self._clips[i]}
+
+    def _close_to_extremes(self, six: Six) -> int:
+        """Take a reading of which a value is close to an extreme, or was; the newest readings that wait."""
+        a, b, c, d, e, f = six
+        both = (a, b, c, d, e, f, -a, -b, -c, -d, -e, -f)
+        fresh = _measured_anew(six[:3], self._previous[:3]), _measured_anew(six[3:], self._previous[3:])
+        waiting = 0
+        for i, (value, near) in enumerate(zip(both, self._near, strict=True)):
+            if not fresh[i % 6 // 3]:
+                continue
+            if value > near:
+                self._follow(i, value, abs(six[i % 6] - self._previous[i % 6]))
+                self._near[i] = _NEAR * self._extreme[i]
+                if 1 < self._stays[i] < _STOPS and not self._clips[i]:
+                    waiting = max(waiting, self._stays[i])
+            elif self._stays[i]:
+                self._stays[i] = 0
+        self._usual = [(-low, high) for high, low in zip(self._near[:6], self._near[6:], strict=True)]
+        self._staying = any(self._stays)
+        return waiting
 
     def _follow(self, i: int, value: float, change: float) -> None:
         extreme, values = self._extreme[i], self._values[i]
@@ -266,11 +280,12 @@ class SpikeFilter(Generic[T]):
         return gyro / more, accel / more
 
     def _note(self, six: Six, missed: tuple[float, float]) -> None:
-        if not math.isnan(missed[0]):  # one that was not noticed at most doubles it
-            (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
+        (gyro, accel), (usual_gyro, usual_accel) = missed, self._largest
+        if not math.isnan(gyro):  # one that was not noticed at most doubles it
+            fades_gyro, fades_accel = _FADES * usual_gyro, _FADES * usual_accel
             self._largest = (
-                max(min(gyro, 2.0 * usual_gyro), _FADES * usual_gyro),
-                max(min(accel, 2.0 * usual_accel), _FADES * usual_accel),
+                fades_gyro if gyro <= fades_gyro else min(gyro, 2.0 * usual_gyro),
+                fades_accel if accel <= fades_accel else min(accel, 2.0 * usual_accel),
             )
         self._before, self._last = self._last, six
 

@@ -44,7 +44,7 @@ from vical_daemon.estimation.model.retract import difference, orthonormal, retra
 from vical_daemon.estimation.model.state import ACCEL_BIAS, GRAVITY, GYRO_BIAS, MOTION, State
 from vical_daemon.estimation.noise.corner_noise import LEAST_PX, MOST_PX, noise_of_image, relative_noise
 from vical_daemon.estimation.noise.shared_errors import shared_ways
-from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, geman_mcclure_weight
+from vical_daemon.estimation.robust import MEDIAN_RAYLEIGH, geman_mcclure_weight, median
 from vical_daemon.estimation.significance import OUTLIER_SIGMAS
 
 _IMAGES = 50  # of each camera: they say where all is linearised, not what is reported
@@ -439,7 +439,7 @@ class BoardWindow:
 def _level(size: FloatArray, images: int = 1) -> float:
     """Corner noise per axis by the median length of residuals, as far as poses have not taken them up."""
     share = max(1.0 - _OF_POSE * images / (2.0 * len(size)), 0.05)
-    return float(np.median(size)) / MEDIAN_RAYLEIGH / math.sqrt(share)
+    return median(size) / MEDIAN_RAYLEIGH / math.sqrt(share)
 
 
 def _nodes(state: State, poses: Sequence[TargetPose], frames: Frames, buffer: ImuBuffer) -> list[Node]:

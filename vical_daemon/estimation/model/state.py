@@ -8,7 +8,7 @@ parameters; equal to the rotation vector for small angles), local (right): R = R
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -236,6 +236,10 @@ class State:
     def __post_init__(self) -> None:
         if not len(self.tilt):
             self.tilt = tilt_basis(self.gravity)
+
+    def __deepcopy__(self, memo: object) -> State:
+        """With cameras of its own; arrays are shared, as every change of the state makes new ones."""
+        return replace(self, cameras={name: replace(camera) for name, camera in self.cameras.items()})
 
 
 class BiasStart(NamedTuple):

@@ -33,6 +33,10 @@ class _JackknifeBlock(NamedTuple):
     information: FloatArray
     weighted: FloatArray
 
+    def __deepcopy__(self, memo: object) -> _JackknifeBlock:
+        """Itself: it does not change."""
+        return self
+
     def plus(self, other: _JackknifeBlock) -> _JackknifeBlock:
         return _JackknifeBlock(self.information + other.information, self.weighted + other.weighted)
 

@@ -81,8 +81,8 @@ class Evaluator:
             self._first_ns = t_ns
         self.imu_samples += 1
         self.newest_ns = t_ns
-        self._events.now_s = self.elapsed_s
-        self.motion.add(self.elapsed_s, gyro)
+        self._events.now_s = elapsed_s = self.elapsed_s
+        self.motion.add(elapsed_s, gyro)
         if self.imu_samples % _EVERY_READINGS == 1:
             self._size.append(math.hypot(*accel))
 

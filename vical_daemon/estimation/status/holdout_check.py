@@ -15,6 +15,7 @@ from vical_daemon.estimation.filter.calibration_filter import CalibrationFilter
 from vical_daemon.estimation.inertial.imu_buffer import ImuBuffer
 from vical_daemon.estimation.measurements import FloatArray, MeasuredNoise, PointsFrame
 from vical_daemon.estimation.model.frame_report import FrameReport
+from vical_daemon.estimation.robust import median
 
 EVERY_S = 1.5
 _AHEAD_S = 0.3
@@ -71,7 +72,7 @@ class HoldoutCheck:
         held.predict(segment)
         image = held.image(frame, t_cam_s, target[frame.ids])
         if report.used:  # then the noise of its corners is known
-            own = report.sigma_px / float(np.median(image.sigma_px))
+            own = report.sigma_px / median(image.sigma_px)
             image = replace(image, sigma_px=own * image.sigma_px)
         return held.prediction_nis(image)
 

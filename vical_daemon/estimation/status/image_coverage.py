@@ -60,7 +60,7 @@ class ImageCoverage:
     def add(self, uv_px: FloatArray) -> None:
         """Take the corners of one image, shape (n, 2)."""
         x, y = np.clip((uv_px / self._part_px).astype(np.int64), 0, (_ACROSS - 1, _DOWN - 1)).T
-        np.add.at(self._counts, (y, x), 1)
+        self._counts += np.bincount(y * _ACROSS + x, minlength=self._counts.size).reshape(_DOWN, _ACROSS)
         self._most, self._least = max(self._most, len(uv_px)), min(self._least, len(uv_px))
 
     def unseen_edges(self) -> tuple[Edge, ...]:
